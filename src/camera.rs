@@ -1,0 +1,98 @@
+//! The pinhole camera: intrinsics and how the camera sits on its vehicle.
+//!
+//! Camera frame: x to the right, y downwards, z along the axis, metres. Pixels: origin at the upper left corner of the
+//! image, x to the right, y downwards. Lens distortion is removed where images are handled; pixels here are undistorted.
+
+use nalgebra::{Point2, Point3};
+
+use crate::geometry::Pose;
+
+/// Focal lengths and principal point of an image, in pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Intrinsics {
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Horizontal focal length in pixels.
+    pub fx: f64,
+    /// Vertical focal length in pixels.
+    pub fy: f64,
+    /// Column of the principal point in pixels.
+    pub cx: f64,
+    /// Row of the principal point in pixels.
+    pub cy: f64,
+}
+
+impl Intrinsics {
+    /// A camera without distortion whose axis goes through the middle of the image: f = (w/2) / tan(fov/2).
+    pub fn from_field_of_view(width: u32, height: u32, horizontal_rad: f64, vertical_rad: f64) -> Self {
+        let (half_width, half_height) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
+        Self {
+            width,
+            height,
+            fx: half_width / (horizontal_rad / 2.0).tan(),
+            fy: half_height / (vertical_rad / 2.0).tan(),
+            cx: half_width,
+            cy: half_height,
+        }
+    }
+
+    /// Bearing of an image column in radians off the axis, counter-clockwise (left) positive.
+    pub fn bearing(&self, x_px: f64) -> f64 {
+        ((self.cx - x_px) / self.fx).atan()
+    }
+
+    /// Angle that each column takes when the field of view is spread evenly over the image, the paper's γ, in radians.
+    pub fn angle_per_pixel(&self) -> f64 {
+        self.horizontal_field_of_view() / f64::from(self.width)
+    }
+
+    /// Horizontal field of view in radians.
+    pub fn horizontal_field_of_view(&self) -> f64 {
+        self.bearing(0.0) - self.bearing(f64::from(self.width))
+    }
+
+    /// Where a point of the camera frame appears, in pixels; `None` behind the camera.
+    pub fn project(&self, point: &Point3<f64>) -> Option<Point2<f64>> {
+        (point.z > 0.0)
+            .then(|| Point2::new(self.cx + self.fx * point.x / point.z, self.cy + self.fy * point.y / point.z))
+    }
+}
+
+/// Where the camera sits on its vehicle.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Mount {
+    /// Metres ahead of the vehicle's reference point.
+    pub forward_m: f64,
+    /// Metres to the left of the vehicle's reference point.
+    pub left_m: f64,
+    /// Angle of the axis from the vehicle's heading in radians, counter-clockwise.
+    pub pan_rad: f64,
+}
+
+impl Mount {
+    /// The camera's pose for a pose of the vehicle.
+    pub fn camera_pose(&self, vehicle: &Pose) -> Pose {
+        Pose {
+            position: vehicle.transform(self.forward_m, self.left_m),
+            heading_rad: vehicle.heading_rad + self.pan_rad,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_image_edges_are_half_the_field_of_view_off_axis() {
+        let fov = 62.2f64.to_radians();
+        let camera = Intrinsics::from_field_of_view(640, 480, fov, 48.8f64.to_radians());
+        assert!((camera.bearing(0.0) - fov / 2.0).abs() < 1e-12);
+        assert!((camera.bearing(640.0) + fov / 2.0).abs() < 1e-12);
+        assert_eq!(camera.bearing(320.0), 0.0);
+        let pixel = camera.project(&Point3::new(0.5, 0.0, 1.0)).expect("in front");
+        assert!((camera.bearing(pixel.x) + 0.5f64.atan()).abs() < 1e-12);
+    }
+}

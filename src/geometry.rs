@@ -1,0 +1,123 @@
+//! Planar geometry in one world frame: east-north (ENU), metres, radians, counter-clockwise.
+
+use std::f64::consts::{PI, TAU};
+
+use nalgebra::{Matrix2, Point2, Vector2};
+
+/// Position and heading of a vehicle's camera in the world frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pose {
+    /// Position in metres.
+    pub position: Point2<f64>,
+    /// Direction of the camera's axis in radians, counter-clockwise from +x.
+    pub heading_rad: f64,
+}
+
+impl Pose {
+    /// A pose from metres and radians.
+    pub fn new(x_m: f64, y_m: f64, heading_rad: f64) -> Self {
+        Self { position: Point2::new(x_m, y_m), heading_rad }
+    }
+
+    /// The world position of a point `forward_m` ahead of and `left_m` left of this pose.
+    pub fn transform(&self, forward_m: f64, left_m: f64) -> Point2<f64> {
+        let (sin, cos) = self.heading_rad.sin_cos();
+        self.position + Vector2::new(cos * forward_m - sin * left_m, sin * forward_m + cos * left_m)
+    }
+
+    /// Range in metres and bearing in radians, wrapped to (-π, π] and relative to the heading, of a world point.
+    pub fn range_bearing(&self, point: &Point2<f64>) -> (f64, f64) {
+        let offset = point - self.position;
+        (offset.norm(), wrap_angle(offset.y.atan2(offset.x) - self.heading_rad))
+    }
+}
+
+/// The same angle in (-π, π].
+pub fn wrap_angle(angle_rad: f64) -> f64 {
+    let wrapped = angle_rad.rem_euclid(TAU);
+    if wrapped > PI { wrapped - TAU } else { wrapped }
+}
+
+/// Symmetric 2×2 position covariance in m².
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Covariance {
+    /// Variance along x.
+    pub xx: f64,
+    /// Covariance of x and y.
+    pub xy: f64,
+    /// Variance along y.
+    pub yy: f64,
+}
+
+impl Covariance {
+    /// The same variance in every direction.
+    pub fn isotropic(sigma_m: f64) -> Self {
+        Self { xx: sigma_m * sigma_m, xy: 0.0, yy: sigma_m * sigma_m }
+    }
+
+    /// Independent errors along and across a line of sight whose world direction is `bearing_rad`.
+    pub fn along_bearing(bearing_rad: f64, along_m: f64, across_m: f64) -> Self {
+        let (sin, cos) = bearing_rad.sin_cos();
+        let (along, across) = (along_m * along_m, across_m * across_m);
+        Self {
+            xx: cos * cos * along + sin * sin * across,
+            xy: sin * cos * (along - across),
+            yy: sin * sin * along + cos * cos * across,
+        }
+    }
+
+    /// The covariance as a matrix.
+    pub fn matrix(&self) -> Matrix2<f64> {
+        Matrix2::new(self.xx, self.xy, self.xy, self.yy)
+    }
+
+    /// Whether all entries are finite and the matrix is positive semi-definite up to rounding.
+    pub fn is_valid(&self) -> bool {
+        let finite = self.xx.is_finite() && self.xy.is_finite() && self.yy.is_finite();
+        let slack = 1e-9 * (self.xx.abs() + self.yy.abs());
+        finite && self.xx >= 0.0 && self.yy >= 0.0 && self.xx * self.yy - self.xy * self.xy >= -slack * slack
+    }
+
+    /// Squared Mahalanobis distance of `offset`, with `floor_m` added as an isotropic standard deviation.
+    pub fn mahalanobis_squared(&self, offset: &Vector2<f64>, floor_m: f64) -> f64 {
+        let floor = floor_m * floor_m;
+        let (xx, yy) = (self.xx + floor, self.yy + floor);
+        let determinant = xx * yy - self.xy * self.xy;
+        (yy * offset.x * offset.x - 2.0 * self.xy * offset.x * offset.y + xx * offset.y * offset.y) / determinant
+    }
+}
+
+impl std::ops::Add for Covariance {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self { xx: self.xx + other.xx, xy: self.xy + other.xy, yy: self.yy + other.yy }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wraps_across_north_and_the_cut() {
+        assert!((wrap_angle(359f64.to_radians() - 1f64.to_radians()) - (-2f64).to_radians()).abs() < 1e-12);
+        assert_eq!(wrap_angle(PI), PI);
+        assert_eq!(wrap_angle(-PI), PI);
+    }
+
+    #[test]
+    fn a_line_of_sight_covariance_is_long_along_the_sight() {
+        let c = Covariance::along_bearing(std::f64::consts::FRAC_PI_2, 2.0, 0.5);
+        assert!((c.xx - 0.25).abs() < 1e-12 && (c.yy - 4.0).abs() < 1e-12 && c.xy.abs() < 1e-12);
+        assert!(c.is_valid());
+    }
+
+    #[test]
+    fn bearing_is_relative_to_the_heading() {
+        let pose = Pose::new(1.0, 1.0, 3.0);
+        let (range, bearing) = pose.range_bearing(&pose.transform(3.0, 4.0));
+        assert!((range - 5.0).abs() < 1e-12);
+        assert!((bearing - (4f64).atan2(3.0)).abs() < 1e-12);
+    }
+}

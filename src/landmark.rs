@@ -1,0 +1,38 @@
+//! Known locations: the set R of the paper.
+
+use nalgebra::Point2;
+
+use crate::names::{Label, LandmarkId};
+
+/// A known location at which an object may stand.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Landmark {
+    /// The location's name.
+    pub id: LandmarkId,
+    /// Where an object stands, in metres.
+    pub position: Point2<f64>,
+    /// Direction from which an object here can be read, in radians; `None` from all around.
+    pub facing_rad: Option<f64>,
+    /// A sign that is in view while the location is empty.
+    pub vacancy: Option<VacancySign>,
+    /// Labels that count as one: each of these is taken for `label`.
+    pub synonyms: Vec<Synonym>,
+}
+
+/// A fixed sign behind a location, such as a card that reads `EMPTY`; any object before it outweighs it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct VacancySign {
+    /// What it reads.
+    pub label: Label,
+    /// Where it stands, in metres.
+    pub position: Point2<f64>,
+}
+
+/// One label that is taken for another.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Synonym {
+    /// The label as detected, such as `vase`.
+    pub from: Label,
+    /// The label that it counts as, such as `sports ball`.
+    pub label: Label,
+}

@@ -1,0 +1,98 @@
+//! Names that travel in topics and payloads.
+
+use std::fmt;
+use std::str::FromStr;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use smol_str::SmolStr;
+
+/// Longest accepted name, label or landmark id in bytes.
+pub const MAX_NAME_BYTES: usize = 64;
+
+/// A name that is not made of 1 to 64 of the characters `A-Z a-z 0-9 _ -`.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("name {0:?} must be 1 to 64 characters of A-Z, a-z, 0-9, _ and -")]
+pub struct InvalidName(pub String);
+
+/// A node's or cell's name: a single MQTT topic level of `[A-Za-z0-9_-]{1,64}`. Cheap to clone.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(try_from = "SmolStr", into = "SmolStr")]
+#[schemars(extend("pattern" = "^[A-Za-z0-9_-]{1,64}$"))]
+pub struct NodeName(SmolStr);
+
+impl NodeName {
+    /// Checks and takes a name.
+    ///
+    /// # Errors
+    /// [`InvalidName`] when a character or the length is not allowed.
+    pub fn new(name: impl AsRef<str>) -> Result<Self, InvalidName> {
+        let name = name.as_ref();
+        let allowed = |b: u8| b.is_ascii_alphanumeric() || b == b'_' || b == b'-';
+        if (1..=MAX_NAME_BYTES).contains(&name.len()) && name.bytes().all(allowed) {
+            Ok(Self(SmolStr::new(name)))
+        } else {
+            Err(InvalidName(name.chars().take(MAX_NAME_BYTES).collect()))
+        }
+    }
+
+    /// The name as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl TryFrom<SmolStr> for NodeName {
+    type Error = InvalidName;
+
+    fn try_from(name: SmolStr) -> Result<Self, InvalidName> {
+        Self::new(name)
+    }
+}
+
+impl From<NodeName> for SmolStr {
+    fn from(name: NodeName) -> Self {
+        name.0
+    }
+}
+
+impl FromStr for NodeName {
+    type Err = InvalidName;
+
+    fn from_str(name: &str) -> Result<Self, InvalidName> {
+        Self::new(name)
+    }
+}
+
+impl fmt::Display for NodeName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl fmt::Debug for NodeName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self.as_str(), f)
+    }
+}
+
+/// A class label or decoded text, such as `car` or `ABCD123`. Cheap to clone.
+pub type Label = SmolStr;
+
+/// The id of a known location, such as `slot-0`. Cheap to clone.
+pub type LandmarkId = SmolStr;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_single_topic_levels() {
+        for good in ["euclid", "A-1_b", &"x".repeat(64)] {
+            assert!(NodeName::new(good).is_ok(), "{good}");
+        }
+        for bad in ["", "a/b", "a+", "#", "a b", "é", &"x".repeat(65)] {
+            assert!(NodeName::new(bad).is_err(), "{bad}");
+        }
+    }
+}

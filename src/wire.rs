@@ -1,0 +1,269 @@
+//! The payloads that nodes exchange, version 1, and their encodings.
+//!
+//! One round on the wire:
+//!
+//! ```text
+//! CAV         -> detections/<node>        ObjectReport   (PACE)
+//! CAV         -> vote_detections/<node>   ObjectReport   whose objects name a landmark (VOTE)
+//! aggregator  -> global_detections        GlobalMap
+//! aggregator  -> global_verdicts          Verdicts
+//! aggregator  -> reputations              Reputations    retained
+//! every node  -> nodes/<node>             NodeStatus     retained, with last will
+//! ```
+//!
+//! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
+
+mod codec;
+mod topic;
+
+use std::collections::BTreeMap;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use uuid::Uuid;
+
+pub use codec::{Encoding, Limits, RejectReason, decode, decode_report, encode};
+pub use topic::{Topic, Topics};
+
+use crate::geometry::{Covariance, Pose};
+use crate::names::{Label, LandmarkId, NodeName};
+use crate::time::Timestamp;
+
+/// Major version of every payload; others are rejected.
+pub const SCHEMA_VERSION: u32 = 1;
+
+/// What one vehicle saw in one frame.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ObjectReport {
+    /// Major version of the payload, [`SCHEMA_VERSION`].
+    pub schema: u32,
+    /// The reporting node; equals the last level of the topic.
+    pub node: NodeName,
+    /// Counts up by one with every report of a node since it started.
+    pub seq: u64,
+    /// When the frame was captured, by the node's own clock.
+    pub captured_at_us: Timestamp,
+    /// Where the camera was; absent when the node does not know.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pose: Option<WirePose>,
+    /// What was detected.
+    pub objects: Vec<PerceivedObject>,
+    /// Landmarks that were in view, near enough and not hidden, whether or not something was detected there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seen: Option<Vec<LandmarkId>>,
+}
+
+/// A camera pose on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct WirePose {
+    /// East in metres.
+    pub x_m: f64,
+    /// North in metres.
+    pub y_m: f64,
+    /// Direction of the camera's axis in radians, counter-clockwise from east.
+    pub heading_rad: f64,
+}
+
+impl From<WirePose> for Pose {
+    fn from(pose: WirePose) -> Self {
+        Self::new(pose.x_m, pose.y_m, pose.heading_rad)
+    }
+}
+
+impl From<Pose> for WirePose {
+    fn from(pose: Pose) -> Self {
+        Self { x_m: pose.position.x, y_m: pose.position.y, heading_rad: pose.heading_rad }
+    }
+}
+
+/// A detection with its place in the world.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct PerceivedObject {
+    /// Class label or decoded text.
+    pub label: Label,
+    /// The detector's confidence, 0 to 1.
+    pub confidence: f64,
+    /// East in metres.
+    pub x_m: f64,
+    /// North in metres.
+    pub y_m: f64,
+    /// Position covariance `[xx, xy, yy]` in m².
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub covariance_m2: Option<[f64; 3]>,
+    /// The known location that the node takes this object for; required in VOTE.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub landmark: Option<LandmarkId>,
+}
+
+impl PerceivedObject {
+    /// The reported covariance, if any.
+    pub fn covariance(&self) -> Option<Covariance> {
+        self.covariance_m2.map(|[xx, xy, yy]| Covariance { xx, xy, yy })
+    }
+}
+
+/// The fused map of one round (PACE).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct GlobalMap {
+    /// Major version of the payload, [`SCHEMA_VERSION`].
+    pub schema: u32,
+    /// The node that fused this map.
+    pub aggregator: NodeName,
+    /// Term of leadership in which it was fused.
+    pub epoch: u64,
+    /// Counts up by one with every round of an epoch.
+    pub round: u64,
+    /// When the round was closed, by the aggregator's clock.
+    pub fused_at_us: Timestamp,
+    /// Capture time, on the aggregator's clock, of the oldest report that the map rests on; absent when none did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub oldest_capture_us: Option<Timestamp>,
+    /// One entry per known location, in configuration order.
+    pub landmarks: Vec<LandmarkState>,
+    /// Objects that matched no known location.
+    pub objects: Vec<FusedObject>,
+}
+
+/// What is agreed to be at one known location.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct LandmarkState {
+    /// The location.
+    pub id: LandmarkId,
+    /// The agreed label, or null when nothing was detected there.
+    pub label: Option<Label>,
+    /// Confidence in the label, 0 to 1; 0 without a label.
+    pub confidence: f64,
+    /// Fused east in metres, or the location's own.
+    pub x_m: f64,
+    /// Fused north in metres, or the location's own.
+    pub y_m: f64,
+    /// The nodes whose detections went into the entry.
+    pub contributors: Vec<NodeName>,
+    /// The nodes that had the location in view, with or without a detection: a null label with observers is
+    /// known to be empty, without observers it is unknown.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub observers: Vec<NodeName>,
+}
+
+/// An object of the open world.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct FusedObject {
+    /// Stable identity of the object.
+    pub id: Uuid,
+    /// The agreed label.
+    pub label: Label,
+    /// Confidence in the label, 0 to 1.
+    pub confidence: f64,
+    /// East in metres.
+    pub x_m: f64,
+    /// North in metres.
+    pub y_m: f64,
+    /// Position covariance `[xx, xy, yy]` in m².
+    pub covariance_m2: [f64; 3],
+    /// The nodes whose detections went into the entry.
+    pub contributors: Vec<NodeName>,
+}
+
+/// The verdicts of one round (VOTE).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Verdicts {
+    /// Major version of the payload, [`SCHEMA_VERSION`].
+    pub schema: u32,
+    /// The node that counted the votes.
+    pub aggregator: NodeName,
+    /// Term of leadership in which they were counted.
+    pub epoch: u64,
+    /// Counts up by one with every round of an epoch.
+    pub round: u64,
+    /// When the round was closed, by the aggregator's clock.
+    pub fused_at_us: Timestamp,
+    /// One entry per known location.
+    pub verdicts: Vec<Verdict>,
+}
+
+/// The agreed label of one known location.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Verdict {
+    /// The location.
+    pub landmark: LandmarkId,
+    /// The label with the highest score, or null without votes.
+    pub label: Option<Label>,
+    /// Score of the label; 0 without a label.
+    pub score: f64,
+    /// Score of the label minus that of the next best.
+    pub margin: f64,
+    /// Score of every label that was voted for.
+    pub votes: BTreeMap<Label, f64>,
+    /// The nodes whose votes went into the entry.
+    pub contributors: Vec<NodeName>,
+}
+
+/// How far each vehicle is trusted.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Reputations {
+    /// Major version of the payload, [`SCHEMA_VERSION`].
+    pub schema: u32,
+    /// Term of leadership.
+    pub epoch: u64,
+    /// The last round that went into the reputations.
+    pub round: u64,
+    /// One entry per known vehicle.
+    pub reputations: BTreeMap<NodeName, Reputation>,
+}
+
+/// The trust in one vehicle and what it rests on.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Reputation {
+    /// Weight of the vehicle's votes, 0.30 to 1.00.
+    pub score: f64,
+    /// Votes that agreed with the verdict.
+    pub correct: u64,
+    /// Votes that did not.
+    pub incorrect: u64,
+}
+
+/// A node's own word about itself; the broker publishes the last will when the node goes silent.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct NodeStatus {
+    /// Major version of the payload, [`SCHEMA_VERSION`].
+    pub schema: u32,
+    /// The node; equals the last level of the topic.
+    pub node: NodeName,
+    /// Identity of this run of the node.
+    pub id: Uuid,
+    /// The role it was started with.
+    pub role: Role,
+    /// What it does now.
+    pub state: NodeState,
+    /// The epoch it follows or leads.
+    pub epoch: u64,
+    /// The aggregator it follows, or itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aggregator: Option<NodeName>,
+    /// Version of the software.
+    pub version: String,
+}
+
+/// What a node is meant to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Aggregates if no better candidate is alive, otherwise follows.
+    Auto,
+    /// Never aggregates.
+    Cav,
+    /// Always the preferred aggregator, has no camera.
+    Edge,
+}
+
+/// What a node does now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum NodeState {
+    /// Takes maps and verdicts from an aggregator.
+    Following,
+    /// Makes maps and verdicts.
+    Aggregating,
+    /// Not there.
+    Offline,
+}

@@ -1,0 +1,97 @@
+//! The topics of a cell.
+
+use std::fmt;
+
+use crate::names::NodeName;
+
+/// What a topic carries.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Topic {
+    /// A vehicle's reports for PACE.
+    Detections(NodeName),
+    /// A vehicle's reports for VOTE.
+    VoteDetections(NodeName),
+    /// Fused maps.
+    GlobalDetections,
+    /// Verdicts.
+    GlobalVerdicts,
+    /// Reputations, retained.
+    Reputations,
+    /// A node's status, retained.
+    Nodes(NodeName),
+}
+
+/// Builds and takes apart the topics below `ecod/v1/<cell>`.
+#[derive(Debug, Clone)]
+pub struct Topics {
+    root: String,
+}
+
+impl Topics {
+    /// The topics of a cell.
+    pub fn new(cell: &NodeName) -> Self {
+        Self { root: format!("ecod/v1/{cell}") }
+    }
+
+    /// The full topic, such as `ecod/v1/lot-1/detections/euclid`.
+    pub fn path(&self, topic: &Topic) -> String {
+        format!("{}/{topic}", self.root)
+    }
+
+    /// A subscription filter for one kind of topic, such as `ecod/v1/lot-1/detections/+`.
+    pub fn filter(&self, level: &str) -> String {
+        format!("{}/{level}", self.root)
+    }
+
+    /// What a full topic carries; `None` for a topic that is none of this cell's.
+    pub fn parse(&self, path: &str) -> Option<Topic> {
+        let level = path.strip_prefix(&self.root)?.strip_prefix('/')?;
+        let (kind, node) = level.split_once('/').map_or((level, None), |(kind, node)| (kind, Some(node)));
+        match (kind, node) {
+            ("detections", Some(node)) => NodeName::new(node).ok().map(Topic::Detections),
+            ("vote_detections", Some(node)) => NodeName::new(node).ok().map(Topic::VoteDetections),
+            ("nodes", Some(node)) => NodeName::new(node).ok().map(Topic::Nodes),
+            ("global_detections", None) => Some(Topic::GlobalDetections),
+            ("global_verdicts", None) => Some(Topic::GlobalVerdicts),
+            ("reputations", None) => Some(Topic::Reputations),
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for Topic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Detections(node) => write!(f, "detections/{node}"),
+            Self::VoteDetections(node) => write!(f, "vote_detections/{node}"),
+            Self::GlobalDetections => f.write_str("global_detections"),
+            Self::GlobalVerdicts => f.write_str("global_verdicts"),
+            Self::Reputations => f.write_str("reputations"),
+            Self::Nodes(node) => write!(f, "nodes/{node}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn topics_round_trip_and_strangers_are_none() {
+        let topics = Topics::new(&NodeName::new("lot-1").expect("valid name"));
+        let node = NodeName::new("euclid").expect("valid name");
+        for topic in [
+            Topic::Detections(node.clone()),
+            Topic::VoteDetections(node.clone()),
+            Topic::GlobalDetections,
+            Topic::GlobalVerdicts,
+            Topic::Reputations,
+            Topic::Nodes(node),
+        ] {
+            assert_eq!(topics.parse(&topics.path(&topic)), Some(topic));
+        }
+        for stranger in ["ecod/v1/lot-2/reputations", "ecod/v1/lot-1", "ecod/v1/lot-1/detections/a/b", ""] {
+            assert_eq!(topics.parse(stranger), None, "{stranger}");
+        }
+    }
+}
