@@ -1,6 +1,10 @@
 //! Known locations: the set R of the paper.
 
+mod index;
+
 use nalgebra::Point2;
+
+pub use index::{Candidate, Gate, LandmarkIndex};
 
 use crate::names::{Label, LandmarkId};
 

@@ -10,5 +10,8 @@ pub mod detection;
 pub mod geometry;
 pub mod landmark;
 pub mod names;
+pub mod pace;
+pub mod round;
 pub mod time;
+pub mod window;
 pub mod wire;

@@ -1,0 +1,182 @@
+//! When a round closes: every period, or as soon as every live vehicle has reported.
+//!
+//! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at [`RoundTrigger::deadline`];
+//! either says when to close the round.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::config::{ConfigError, check_range};
+use crate::names::NodeName;
+use crate::time::Timestamp;
+
+/// The rhythm of rounds.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RoundConfig {
+    /// Longest time between rounds in seconds, the paper's τ. Default 0.1.
+    pub period_s: f64,
+    /// What closes a round before the period is over.
+    pub close: RoundClose,
+}
+
+/// What closes a round.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum RoundClose {
+    /// Nothing but the period, as in the paper. Adds up to a period of latency.
+    Periodic,
+    /// Every live vehicle has reported since the last round; the period is the bound. The default.
+    WhenComplete,
+}
+
+impl Default for RoundConfig {
+    fn default() -> Self {
+        Self { period_s: 0.1, close: RoundClose::WhenComplete }
+    }
+}
+
+impl RoundConfig {
+    /// Checks all values.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the key, the value and the allowed range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("period_s", self.period_s, 0.005, 60.0)
+    }
+
+    fn period(&self) -> Duration {
+        Duration::from_secs_f64(self.period_s)
+    }
+}
+
+/// Decides when to close a round.
+#[derive(Debug, Clone)]
+pub struct RoundTrigger {
+    config: RoundConfig,
+    last_close: Timestamp,
+    live: BTreeMap<NodeName, Vehicle>,
+    missing: usize,
+}
+
+#[derive(Debug, Clone)]
+struct Vehicle {
+    last_report: Timestamp,
+    reported: bool,
+}
+
+/// Periods after which a silent vehicle is no longer waited for.
+const LIVE_PERIODS: u32 = 3;
+
+/// Rounds close at most this many times as often as the period says.
+const MAX_RATE: u32 = 5;
+
+impl RoundTrigger {
+    /// Starts counting at `now`.
+    pub fn new(config: RoundConfig, now: Timestamp) -> Self {
+        Self { config, last_close: now, live: BTreeMap::new(), missing: 0 }
+    }
+
+    /// Takes note of a report; true when the round closes now.
+    pub fn report(&mut self, node: &NodeName, now: Timestamp) -> bool {
+        if let Some(vehicle) = self.live.get_mut(node) {
+            vehicle.last_report = now;
+            if !std::mem::replace(&mut vehicle.reported, true) {
+                self.missing -= 1;
+            }
+        } else {
+            self.live.insert(node.clone(), Vehicle { last_report: now, reported: true });
+        }
+        self.tick(now)
+    }
+
+    /// True when the round closes now; call it at the latest at [`Self::deadline`].
+    pub fn tick(&mut self, now: Timestamp) -> bool {
+        if now < self.deadline() {
+            return false;
+        }
+        let limit = self.config.period() * LIVE_PERIODS;
+        self.live.retain(|_, vehicle| now.since(vehicle.last_report) < limit);
+        for vehicle in self.live.values_mut() {
+            vehicle.reported = false;
+        }
+        self.missing = self.live.len();
+        self.last_close = now;
+        true
+    }
+
+    /// When the round closes without a further report.
+    pub fn deadline(&self) -> Timestamp {
+        let complete = self.config.close == RoundClose::WhenComplete && self.missing == 0 && !self.live.is_empty();
+        let wait = if complete { self.config.period() / MAX_RATE } else { self.config.period() };
+        self.last_close + wait
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000;
+
+    fn at(ms: u64) -> Timestamp {
+        Timestamp(1_000_000_000 + ms * MS)
+    }
+
+    fn node(name: &str) -> NodeName {
+        NodeName::new(name).unwrap()
+    }
+
+    fn trigger(close: RoundClose) -> RoundTrigger {
+        RoundTrigger::new(RoundConfig { close, ..RoundConfig::default() }, at(0))
+    }
+
+    #[test]
+    fn closes_with_the_last_of_the_live_vehicles() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        assert!(!rounds.report(&node("a"), at(10)));
+        assert!(rounds.report(&node("b"), at(20)), "both known vehicles have reported, a fifth of the period is over");
+        assert!(!rounds.report(&node("a"), at(110)));
+        assert!(rounds.report(&node("b"), at(115)));
+    }
+
+    #[test]
+    fn the_period_bounds_the_wait_for_a_silent_vehicle() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        rounds.report(&node("a"), at(1));
+        rounds.report(&node("b"), at(2));
+        assert!(rounds.tick(at(20)));
+        assert!(!rounds.report(&node("a"), at(100)));
+        assert_eq!(rounds.deadline(), at(120));
+        assert!(rounds.tick(at(120)));
+    }
+
+    #[test]
+    fn a_vehicle_that_left_is_not_waited_for() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        rounds.report(&node("gone"), at(0));
+        for round in 1..=4 {
+            rounds.report(&node("a"), at(round * 100));
+            rounds.tick(at(round * 100 + 99));
+        }
+        assert!(rounds.report(&node("a"), at(600)), "closes without the vehicle that left");
+    }
+
+    #[test]
+    fn periodic_rounds_ignore_completeness() {
+        let mut rounds = trigger(RoundClose::Periodic);
+        assert!(!rounds.report(&node("a"), at(50)));
+        assert!(!rounds.tick(at(99)));
+        assert!(rounds.tick(at(100)));
+    }
+
+    #[test]
+    fn one_fast_vehicle_does_not_drive_the_rate() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        let closed = (0..1000).filter(|ms| rounds.report(&node("a"), at(*ms))).count();
+        assert!((45..=50).contains(&closed), "{closed} rounds in a second at a period of 100 ms");
+    }
+}

@@ -1,0 +1,245 @@
+//! The gate for reports: freshest per vehicle, on the aggregator's clock.
+//!
+//! Call [`ReportWindow::admit`] with every decoded report; what it returns may be fused once. A rejected report
+//! changes nothing but the vehicle's clock estimate.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::config::{ConfigError, check_range};
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::{ObjectReport, RejectReason};
+
+/// Which reports are fresh enough to be used.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct WindowConfig {
+    /// Age in seconds beyond which a report is stale. Default 1.0; higher bridges slower links, lower forgets sooner.
+    pub max_age_s: f64,
+    /// How far in seconds a vehicle's clock may be from the aggregator's. Default 2.0; offsets within it are estimated
+    /// and removed, reports beyond it rejected.
+    pub max_clock_offset_s: f64,
+    /// Clock offsets in seconds up to which clocks count as synchronised and nothing is removed. Default 0.05.
+    pub clock_tolerance_s: f64,
+    /// Most vehicles kept at once. Default 4096.
+    pub max_vehicles: usize,
+}
+
+impl Default for WindowConfig {
+    fn default() -> Self {
+        Self { max_age_s: 1.0, max_clock_offset_s: 2.0, clock_tolerance_s: 0.05, max_vehicles: 4096 }
+    }
+}
+
+impl WindowConfig {
+    /// Checks all values.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the key, the value and the allowed range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("max_age_s", self.max_age_s, 0.01, 3600.0)?;
+        check_range("max_clock_offset_s", self.max_clock_offset_s, 0.0, 3600.0)?;
+        check_range("clock_tolerance_s", self.clock_tolerance_s, 0.0, self.max_clock_offset_s)?;
+        check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e6)
+    }
+}
+
+/// Admits each vehicle's reports once, in order of capture, and puts them on the aggregator's clock.
+#[derive(Debug, Clone)]
+pub struct ReportWindow {
+    config: WindowConfig,
+    vehicles: BTreeMap<NodeName, VehicleClock>,
+}
+
+#[derive(Debug, Clone)]
+struct VehicleClock {
+    last_captured: Timestamp,
+    last_received: Timestamp,
+    delay: MinimumDelay,
+}
+
+impl ReportWindow {
+    /// An empty window.
+    pub fn new(config: WindowConfig) -> Self {
+        Self { config, vehicles: BTreeMap::new() }
+    }
+
+    /// Admits a report and returns its capture time on the aggregator's clock.
+    ///
+    /// # Errors
+    /// [`RejectReason::FromTheFuture`], [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] (also for duplicates) or
+    /// [`RejectReason::TooManyVehicles`].
+    pub fn admit(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<Timestamp, RejectReason> {
+        let delay = received_at.micros_from(report.captured_at_us);
+        let reach = seconds(self.config.max_clock_offset_s) + seconds(self.config.max_age_s);
+        if delay < -seconds(self.config.max_clock_offset_s) {
+            return Err(RejectReason::FromTheFuture);
+        }
+        if delay > reach {
+            return Err(RejectReason::Stale);
+        }
+        if !self.vehicles.contains_key(&report.node) {
+            self.make_room(received_at)?;
+        }
+        let vehicle = self.vehicles.entry(report.node.clone()).or_insert_with(|| VehicleClock {
+            last_captured: Timestamp(0),
+            last_received: received_at,
+            delay: MinimumDelay::new(received_at),
+        });
+        let stepped_back = vehicle.last_captured.micros_from(report.captured_at_us) > reach;
+        if stepped_back {
+            vehicle.delay = MinimumDelay::new(received_at);
+        } else if report.captured_at_us <= vehicle.last_captured {
+            return Err(RejectReason::OutOfOrder);
+        }
+        vehicle.delay.observe(delay, received_at);
+        let offset = vehicle.delay.clock_offset(seconds(self.config.clock_tolerance_s));
+        if delay - offset > seconds(self.config.max_age_s) {
+            return Err(RejectReason::Stale);
+        }
+        vehicle.last_captured = report.captured_at_us;
+        vehicle.last_received = received_at;
+        Ok(report.captured_at_us.shifted(offset))
+    }
+
+    /// Estimated microseconds to add to a vehicle's clock to get the aggregator's; `None` for an unknown vehicle.
+    pub fn clock_offset_us(&self, node: &NodeName) -> Option<i64> {
+        let tolerance = seconds(self.config.clock_tolerance_s);
+        self.vehicles.get(node).map(|vehicle| vehicle.delay.clock_offset(tolerance))
+    }
+
+    fn make_room(&mut self, now: Timestamp) -> Result<(), RejectReason> {
+        if self.vehicles.len() >= self.config.max_vehicles {
+            self.vehicles.retain(|_, vehicle| now.since(vehicle.last_received) < RETENTION);
+        }
+        if self.vehicles.len() < self.config.max_vehicles { Ok(()) } else { Err(RejectReason::TooManyVehicles) }
+    }
+}
+
+/// How long a silent vehicle's clock is remembered when room is short.
+const RETENTION: Duration = Duration::from_secs(10);
+
+/// Least delay from capture to receipt over the last one to two spans.
+///
+/// The least delay of a one-way stream is the clock offset plus the shortest transit, so later arrivals stand out by
+/// their queueing alone (Moon, Skelly, Towsley, "Estimation and removal of clock skew", INFOCOM 1999).
+#[derive(Debug, Clone)]
+struct MinimumDelay {
+    span_start: Timestamp,
+    current_us: i64,
+    previous_us: i64,
+}
+
+impl MinimumDelay {
+    const SPAN: Duration = Duration::from_secs(10);
+
+    fn new(now: Timestamp) -> Self {
+        Self { span_start: now, current_us: i64::MAX, previous_us: i64::MAX }
+    }
+
+    fn observe(&mut self, delay_us: i64, now: Timestamp) {
+        if now.since(self.span_start) >= Self::SPAN {
+            self.previous_us = self.current_us;
+            self.current_us = i64::MAX;
+            self.span_start = now;
+        }
+        self.current_us = self.current_us.min(delay_us);
+    }
+
+    fn clock_offset(&self, tolerance_us: i64) -> i64 {
+        let least = self.current_us.min(self.previous_us);
+        if least == i64::MAX || least.abs() <= tolerance_us { 0 } else { least }
+    }
+}
+
+fn seconds(s: f64) -> i64 {
+    (s * 1e6) as i64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::SCHEMA_VERSION;
+
+    const NOON: u64 = 1_732_154_400_000_000;
+
+    fn report(node: &str, captured_us: u64) -> ObjectReport {
+        ObjectReport {
+            schema: SCHEMA_VERSION,
+            node: NodeName::new(node).unwrap(),
+            seq: 0,
+            captured_at_us: Timestamp(captured_us),
+            pose: None,
+            objects: vec![],
+            seen: None,
+        }
+    }
+
+    fn window() -> ReportWindow {
+        ReportWindow::new(WindowConfig::default())
+    }
+
+    #[test]
+    fn takes_each_report_once_and_in_order() {
+        let mut window = window();
+        let now = Timestamp(NOON + 10_000);
+        assert_eq!(window.admit(&report("a", NOON), now), Ok(Timestamp(NOON)));
+        assert_eq!(window.admit(&report("a", NOON), now), Err(RejectReason::OutOfOrder));
+        assert_eq!(window.admit(&report("a", NOON - 1), now), Err(RejectReason::OutOfOrder));
+        assert_eq!(window.admit(&report("b", NOON - 1), now), Ok(Timestamp(NOON - 1)));
+    }
+
+    #[test]
+    fn tomorrow_and_yesterday_are_rejected() {
+        let mut window = window();
+        let day = 86_400_000_000;
+        assert_eq!(window.admit(&report("a", NOON + day), Timestamp(NOON)), Err(RejectReason::FromTheFuture));
+        assert_eq!(window.admit(&report("a", NOON - day), Timestamp(NOON)), Err(RejectReason::Stale));
+        assert_eq!(window.admit(&report("a", u64::MAX), Timestamp(NOON)), Err(RejectReason::FromTheFuture));
+        assert_eq!(window.admit(&report("a", 0), Timestamp(NOON)), Err(RejectReason::Stale));
+    }
+
+    #[test]
+    fn a_clock_one_and_a_half_seconds_ahead_is_corrected() {
+        let mut window = window();
+        for step in 0..20 {
+            let sent = NOON + step * 100_000;
+            let admitted = window.admit(&report("fast", sent + 1_500_000), Timestamp(sent + 2_000)).unwrap();
+            assert_eq!(admitted, Timestamp(sent + 2_000), "the fastest transit counts as none");
+        }
+        let late = NOON + 2_000_000;
+        let admitted = window.admit(&report("fast", late + 1_500_000), Timestamp(late + 302_000)).unwrap();
+        assert_eq!(admitted, Timestamp(late + 2_000), "queueing does not move the capture time");
+    }
+
+    #[test]
+    fn a_delayed_report_from_a_synchronised_vehicle_is_stale() {
+        let mut window = window();
+        assert!(window.admit(&report("a", NOON), Timestamp(NOON + 5_000)).is_ok());
+        let held_back = window.admit(&report("a", NOON + 100_000), Timestamp(NOON + 1_200_000));
+        assert_eq!(held_back, Err(RejectReason::Stale));
+    }
+
+    #[test]
+    fn a_vehicle_whose_clock_was_set_back_is_heard_again() {
+        let config = WindowConfig { max_clock_offset_s: 10.0, ..WindowConfig::default() };
+        let mut window = ReportWindow::new(config);
+        assert!(window.admit(&report("a", NOON + 9_000_000), Timestamp(NOON)).is_ok());
+        assert!(window.admit(&report("a", NOON - 9_000_000), Timestamp(NOON + 100_000)).is_ok());
+    }
+
+    #[test]
+    fn vehicles_are_bounded_and_silent_ones_make_room() {
+        let mut window = ReportWindow::new(WindowConfig { max_vehicles: 2, ..WindowConfig::default() });
+        for node in ["a", "b"] {
+            assert!(window.admit(&report(node, NOON), Timestamp(NOON)).is_ok());
+        }
+        assert_eq!(window.admit(&report("c", NOON), Timestamp(NOON)), Err(RejectReason::TooManyVehicles));
+        let later = NOON + 11_000_000;
+        assert!(window.admit(&report("c", later), Timestamp(later)).is_ok());
+    }
+}

@@ -1,0 +1,253 @@
+//! What PACE promises: the paper's formulas in paper mode, and sound fusion by default.
+
+use std::sync::Arc;
+
+use ecod::landmark::{Landmark, LandmarkIndex, VacancySign};
+use ecod::names::{Label, NodeName};
+use ecod::pace::{Pace, PaceConfig, PaceMode};
+use ecod::time::Timestamp;
+use ecod::wire::{LandmarkState, ObjectReport, PerceivedObject, SCHEMA_VERSION};
+use nalgebra::Point2;
+use proptest::prelude::*;
+
+const START: Timestamp = Timestamp(1_732_154_400_000_000);
+
+fn landmark(id: usize, x: f64, y: f64) -> Landmark {
+    Landmark {
+        id: format!("slot-{id}").into(),
+        position: Point2::new(x, y),
+        facing_rad: None,
+        vacancy: None,
+        synonyms: vec![],
+    }
+}
+
+fn object(label: &str, confidence: f64, x_m: f64, y_m: f64) -> PerceivedObject {
+    PerceivedObject { label: label.into(), confidence, x_m, y_m, covariance_m2: None, landmark: None }
+}
+
+fn report(node: &str, objects: Vec<PerceivedObject>, seen: &[&str]) -> ObjectReport {
+    ObjectReport {
+        schema: SCHEMA_VERSION,
+        node: NodeName::new(node).unwrap(),
+        seq: 0,
+        captured_at_us: START,
+        pose: None,
+        objects,
+        seen: Some(seen.iter().map(|id| Label::new(id)).collect()),
+    }
+}
+
+fn pace(config: PaceConfig, landmarks: Vec<Landmark>) -> Pace {
+    config.validate().unwrap();
+    Pace::new(config, Arc::new(LandmarkIndex::new(landmarks)))
+}
+
+fn frame(n: u64) -> Timestamp {
+    START.shifted(n as i64 * 100_000)
+}
+
+fn labels(states: &[LandmarkState]) -> Vec<Option<&str>> {
+    states.iter().map(|state| state.label.as_deref()).collect()
+}
+
+/// Algorithm 2 of the paper, line by line.
+fn paper_reference(
+    config: &PaceConfig,
+    landmarks: &[Landmark],
+    reports: &[ObjectReport],
+) -> Vec<(Option<Label>, f64, f64, f64)> {
+    landmarks
+        .iter()
+        .map(|rho| {
+            let near: Vec<&PerceivedObject> = reports
+                .iter()
+                .flat_map(|r| &r.objects)
+                .filter(|o| (o.x_m - rho.position.x).hypot(o.y_m - rho.position.y) <= config.gate_m)
+                .collect();
+            if near.is_empty() {
+                return (None, 0.0, rho.position.x, rho.position.y);
+            }
+            let score = |label: &Label| near.iter().filter(|o| o.label == *label).map(|o| o.confidence).sum::<f64>();
+            let mut candidates: Vec<Label> = near.iter().map(|o| o.label.clone()).collect();
+            candidates.sort();
+            candidates.dedup();
+            let best = candidates.iter().rev().max_by(|a, b| score(a).total_cmp(&score(b))).unwrap();
+            let (sum, squares): (f64, f64) =
+                near.iter().fold((0.0, 0.0), |(s, q), o| (s + o.confidence, q + o.confidence * o.confidence));
+            let n = near.len() as f64;
+            (
+                Some(best.clone()),
+                if sum > 0.0 { squares / sum } else { 0.0 },
+                near.iter().map(|o| o.x_m).sum::<f64>() / n,
+                near.iter().map(|o| o.y_m).sum::<f64>() / n,
+            )
+        })
+        .collect()
+}
+
+fn any_object() -> impl Strategy<Value = PerceivedObject> {
+    (0..4usize, 0..=16u32, -3.0..3.0f64, -3.0..3.0f64)
+        .prop_map(|(label, c, x, y)| object(["car", "van", "cup", "mouse"][label], f64::from(c) / 16.0, x, y))
+}
+
+proptest! {
+    #[test]
+    fn paper_mode_equals_the_formulas(
+        places in prop::collection::vec((-3.0..3.0f64, -3.0..3.0f64), 0..20),
+        objects in prop::collection::vec(prop::collection::vec(any_object(), 0..12), 0..5),
+        gate_m in 0.05..2.0f64,
+    ) {
+        let config = PaceConfig { mode: PaceMode::Paper, gate_m, ..PaceConfig::default() };
+        let landmarks: Vec<_> = places.iter().enumerate().map(|(i, (x, y))| landmark(i, *x, *y)).collect();
+        let reports: Vec<_> = objects.into_iter().enumerate().map(|(v, o)| report(&format!("v{v}"), o, &[])).collect();
+        let mut pace = pace(config.clone(), landmarks.clone());
+        for report in &reports {
+            pace.observe(report, START);
+        }
+        let round = pace.close(START);
+        for (state, (label, confidence, x, y)) in round.landmarks.iter().zip(paper_reference(&config, &landmarks, &reports)) {
+            prop_assert_eq!(&state.label, &label);
+            prop_assert!((state.confidence - confidence).abs() < 1e-12);
+            prop_assert!((state.x_m - x).abs() < 1e-9 && (state.y_m - y).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn no_label_comes_from_nowhere_and_vehicles_are_equal(
+        objects in prop::collection::vec(prop::collection::vec(any_object(), 0..8), 1..5),
+    ) {
+        let landmarks: Vec<_> = (0..9).map(|i| landmark(i, f64::from(i as u32 % 3) * 2.0 - 2.0, f64::from(i as u32 / 3) * 2.0 - 2.0)).collect();
+        let reports: Vec<_> = objects.iter().enumerate().map(|(v, o)| report(&format!("v{v}"), o.clone(), &[])).collect();
+        let fuse = |order: &mut dyn Iterator<Item = &ObjectReport>| {
+            let mut pace = pace(PaceConfig::default(), landmarks.clone());
+            order.for_each(|report| pace.observe(report, START));
+            pace.close(START)
+        };
+        let round = fuse(&mut reports.iter());
+        prop_assert_eq!(&fuse(&mut reports.iter().rev()), &round, "the order of vehicles does not matter");
+        for state in &round.landmarks {
+            prop_assert!((0.0..=1.0).contains(&state.confidence));
+            prop_assert_eq!(state.label.is_some(), !state.contributors.is_empty());
+            if let Some(label) = &state.label {
+                prop_assert!(objects.iter().flatten().any(|o| o.label == *label));
+            }
+        }
+    }
+}
+
+#[test]
+fn two_plates_cannot_share_a_spot() {
+    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
+    pace.observe(&report("a", vec![object("FAR", 0.99, 0.3, 0.0), object("NEAR", 0.9, 0.05, 0.0)], &[]), START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("NEAR")]);
+}
+
+#[test]
+fn a_detection_goes_to_one_landmark_only() {
+    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0), landmark(1, 0.6, 0.0)]);
+    pace.observe(&report("a", vec![object("car", 0.9, 0.25, 0.0)], &[]), START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("car"), None]);
+}
+
+#[test]
+fn empty_is_known_only_where_somebody_looked() {
+    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0), landmark(1, 5.0, 0.0)]);
+    for n in 0..3 {
+        pace.observe(&report("a", vec![], &["slot-0"]), frame(n));
+    }
+    let round = pace.close(frame(2));
+    assert_eq!(labels(&round.landmarks), [None, None]);
+    assert_eq!(round.landmarks[0].observers, [NodeName::new("a").unwrap()], "looked at and known to be empty");
+    assert!(round.landmarks[1].observers.is_empty(), "never looked at");
+    assert_eq!(round.landmarks[0].confidence, 0.0);
+}
+
+#[test]
+fn a_label_survives_misses_and_goes_when_the_object_has_gone() {
+    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
+    for n in 0..5 {
+        pace.observe(&report("a", vec![object("car", 0.9, 0.0, 0.0)], &["slot-0"]), frame(n));
+    }
+    let mut lasted = 0;
+    for n in 5..30 {
+        pace.observe(&report("a", vec![], &["slot-0"]), frame(n));
+        lasted += u32::from(pace.close(frame(n)).landmarks[0].label.is_some());
+    }
+    assert!((5..=15).contains(&lasted), "kept for {lasted} frames of 100 ms after the object had left");
+}
+
+#[test]
+fn the_fresh_reading_of_one_outweighs_the_blindness_of_others() {
+    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
+    for n in 0..20 {
+        for blind in ["b", "c", "d"] {
+            pace.observe(&report(blind, vec![], &["slot-0"]), frame(n));
+        }
+        pace.observe(&report("a", vec![object("ABC", 0.95, 0.0, 0.0)], &["slot-0"]), frame(n));
+    }
+    assert_eq!(labels(&pace.close(frame(19)).landmarks), [Some("ABC")]);
+}
+
+#[test]
+fn a_silent_vehicle_is_forgotten() {
+    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
+    pace.observe(&report("a", vec![object("car", 0.9, 0.0, 0.0)], &[]), START);
+    assert_eq!(labels(&pace.close(frame(9)).landmarks), [Some("car")]);
+    assert_eq!(labels(&pace.close(frame(11)).landmarks), [None]);
+}
+
+#[test]
+fn precise_vehicles_move_the_position_more() {
+    let mut pace = pace(
+        PaceConfig { position_floor_m: 0.01, gate_sigmas: 10.0, ..PaceConfig::default() },
+        vec![landmark(0, 0.0, 0.0)],
+    );
+    let precise = PerceivedObject { covariance_m2: Some([1e-4, 0.0, 1e-4]), ..object("car", 0.9, 0.1, 0.0) };
+    let vague = PerceivedObject { covariance_m2: Some([1e-1, 0.0, 1e-1]), ..object("car", 0.9, -0.1, 0.0) };
+    pace.observe(&report("precise", vec![precise], &[]), START);
+    pace.observe(&report("vague", vec![vague], &[]), START);
+    let round = pace.close(START);
+    assert!(round.landmarks[0].x_m > 0.09, "{}", round.landmarks[0].x_m);
+}
+
+#[test]
+fn a_vacancy_sign_yields_to_the_car_before_it() {
+    let spot = Landmark {
+        vacancy: Some(VacancySign { label: "EMPTY".into(), position: Point2::new(-0.1, 0.0) }),
+        ..landmark(0, 0.0, 0.0)
+    };
+    let config = PaceConfig { gate_m: 0.05, ..PaceConfig::default() };
+    let sign = report("side", vec![object("EMPTY", 1.0, -0.1, 0.0)], &[]);
+    let mut pace = pace(config, vec![spot]);
+    pace.observe(&sign, START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("EMPTY")]);
+    pace.observe(&report("front", vec![object("ABCD123", 0.6, 0.0, 0.0)], &[]), START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("ABCD123")]);
+}
+
+#[test]
+fn a_place_that_was_looked_at_takes_the_vacancy_label_without_a_sign_in_view() {
+    let spot = Landmark {
+        vacancy: Some(VacancySign { label: "EMPTY".into(), position: Point2::new(-0.1, 0.0) }),
+        ..landmark(0, 0.0, 0.0)
+    };
+    let mut pace = pace(PaceConfig::default(), vec![spot]);
+    pace.observe(&report("a", vec![], &["slot-0"]), frame(0));
+    assert_eq!(labels(&pace.close(frame(0)).landmarks), [None], "one look is not enough");
+    for n in 1..5 {
+        pace.observe(&report("a", vec![], &["slot-0"]), frame(n));
+    }
+    assert_eq!(labels(&pace.close(frame(4)).landmarks), [Some("EMPTY")]);
+}
+
+#[test]
+fn flicker_within_the_lead_does_not_change_the_label() {
+    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
+    pace.observe(&report("a", vec![object("car", 0.80, 0.0, 0.0)], &[]), START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("car")]);
+    pace.observe(&report("b", vec![object("van", 0.85, 0.0, 0.0)], &[]), START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("car")], "van leads by less than the lead");
+    pace.observe(&report("c", vec![object("van", 0.85, 0.0, 0.0)], &[]), START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("van")]);
+}
