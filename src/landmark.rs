@@ -1,5 +1,6 @@
 //! Known locations: the set R of the paper.
 
+mod grid;
 mod index;
 
 use nalgebra::Point2;

@@ -4,6 +4,8 @@
 //! equal inputs give equal outputs. Lengths are metres, angles radians, positions east-north with counter-clockwise
 //! headings; other units are converted where they enter.
 
+#![warn(clippy::unwrap_used)]
+
 pub mod camera;
 pub mod config;
 pub mod detection;

@@ -34,13 +34,14 @@ fn report(node: &str, objects: Vec<PerceivedObject>, seen: &[&str]) -> ObjectRep
         captured_at_us: START,
         pose: None,
         objects,
-        seen: Some(seen.iter().map(|id| Label::new(id)).collect()),
+        seen: Some(seen.iter().map(Label::new).collect()),
     }
 }
 
 fn pace(config: PaceConfig, landmarks: Vec<Landmark>) -> Pace {
     config.validate().unwrap();
-    Pace::new(config, Arc::new(LandmarkIndex::new(landmarks)))
+    let index = LandmarkIndex::new(landmarks, config.gate_m);
+    Pace::new(config, Arc::new(index))
 }
 
 fn frame(n: u64) -> Timestamp {

@@ -1,12 +1,12 @@
 //! Nearest-landmark queries whose cost does not grow with the number of landmarks far away.
 
-use std::collections::HashMap;
+use std::cmp::Ordering;
 
-use nalgebra::{Point2, Vector2};
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
+use hashbrown::HashMap;
+use nalgebra::Point2;
 
 use super::Landmark;
+use super::grid::{Grid, GridPoint};
 use crate::geometry::Covariance;
 use crate::names::{Label, LandmarkId};
 
@@ -15,11 +15,9 @@ use crate::names::{Label, LandmarkId};
 pub struct LandmarkIndex {
     landmarks: Vec<Landmark>,
     by_id: HashMap<LandmarkId, usize>,
-    objects: RTree<Place>,
-    vacancy_signs: RTree<Place>,
+    objects: Grid,
+    vacancy_signs: Grid,
 }
-
-type Place = GeomWithData<[f64; 2], usize>;
 
 /// A landmark that a detection may belong to.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,21 +43,17 @@ pub struct Gate {
 }
 
 impl LandmarkIndex {
-    /// Indexes the landmarks.
-    pub fn new(landmarks: Vec<Landmark>) -> Self {
-        let place = |(index, point): (usize, Point2<f64>)| Place::new([point.x, point.y], index);
-        let objects = landmarks.iter().map(|l| l.position).enumerate().map(place).collect();
-        let vacancy_signs = landmarks
-            .iter()
-            .enumerate()
-            .filter_map(|(index, l)| l.vacancy.as_ref().map(|sign| (index, sign.position)))
-            .map(place)
-            .collect();
+    /// Indexes the landmarks for queries of about `radius_m` metres.
+    pub fn new(landmarks: Vec<Landmark>, radius_m: f64) -> Self {
+        let point = |(landmark, position)| GridPoint { position, landmark };
+        let objects = landmarks.iter().map(|l| l.position).enumerate().map(point).collect();
+        let signs = landmarks.iter().enumerate().filter_map(|(index, l)| Some((index, l.vacancy.as_ref()?.position)));
+        let signs = signs.map(point).collect();
         Self {
             by_id: landmarks.iter().enumerate().map(|(index, l)| (l.id.clone(), index)).collect(),
+            objects: Grid::new(objects, 4.0 * radius_m),
+            vacancy_signs: Grid::new(signs, 4.0 * radius_m),
             landmarks,
-            objects: RTree::bulk_load(objects),
-            vacancy_signs: RTree::bulk_load(vacancy_signs),
         }
     }
 
@@ -73,13 +67,9 @@ impl LandmarkIndex {
         self.by_id.get(id).copied()
     }
 
-    /// Landmarks within `radius_m` of a point in metres, in no particular order, with the squared distance in m².
-    pub fn within(&self, point: &Point2<f64>, radius_m: f64) -> impl Iterator<Item = (usize, f64)> {
-        let query = [point.x, point.y];
-        self.objects.locate_within_distance(query, radius_m * radius_m).map(move |place| {
-            let [x, y] = *place.geom();
-            (place.data, (x - query[0]).powi(2) + (y - query[1]).powi(2))
-        })
+    /// Landmarks whose object would stand within `radius_m` of a point in metres, in no particular order.
+    pub fn within(&self, point: &Point2<f64>, radius_m: f64) -> impl Iterator<Item = usize> {
+        self.objects.within(*point, radius_m).map(|(landmark, _)| landmark)
     }
 
     /// The landmark that best explains a detection: within the gate and at the least Mahalanobis distance.
@@ -87,31 +77,25 @@ impl LandmarkIndex {
     /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
     /// with where objects stand.
     pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
-        let reads = |index: usize| self.landmarks[index].vacancy.as_ref().is_some_and(|sign| sign.label == *label);
-        let query = [point.x, point.y];
-        let radius_squared = gate.radius_m * gate.radius_m;
-        let signs = self
-            .vacancy_signs
-            .locate_within_distance(query, radius_squared)
-            .filter(|place| reads(place.data))
-            .map(|place| (place, true));
-        let objects = self
-            .objects
-            .locate_within_distance(query, radius_squared)
-            .filter(|place| !reads(place.data))
-            .map(|place| (place, false));
-        signs
-            .chain(objects)
-            .map(|(place, is_vacancy_sign)| {
-                let [x, y] = *place.geom();
-                let offset = Vector2::new(point.x - x, point.y - y);
-                Candidate {
-                    landmark: place.data,
+        let is_sign_of = |index: usize| self.landmarks[index].vacancy.as_ref().is_some_and(|sign| sign.label == *label);
+        let near = |grid: &'_ Grid, is_vacancy_sign: bool| {
+            grid.within(*point, gate.radius_m)
+                .filter(|(landmark, _)| is_sign_of(*landmark) == is_vacancy_sign)
+                .map(|(landmark, offset)| Candidate {
+                    landmark,
                     is_vacancy_sign,
                     mahalanobis_squared: covariance.mahalanobis_squared(&offset, gate.floor_m),
-                }
-            })
-            .filter(|candidate| candidate.mahalanobis_squared <= gate.sigmas * gate.sigmas)
-            .min_by(|a, b| a.mahalanobis_squared.total_cmp(&b.mahalanobis_squared).then(a.landmark.cmp(&b.landmark)))
+                })
+                .filter(|candidate| candidate.mahalanobis_squared <= gate.sigmas * gate.sigmas)
+                .min_by(Candidate::compare)
+        };
+        let (object, sign) = (near(&self.objects, false), near(&self.vacancy_signs, true));
+        object.into_iter().chain(sign).min_by(Candidate::compare)
+    }
+}
+
+impl Candidate {
+    fn compare(&self, other: &Self) -> Ordering {
+        self.mahalanobis_squared.total_cmp(&other.mahalanobis_squared).then(self.landmark.cmp(&other.landmark))
     }
 }

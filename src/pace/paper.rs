@@ -39,7 +39,7 @@ impl PaperPace {
         let mut near: Vec<Group<'_>> = vec![Group::default(); self.landmarks.landmarks().len()];
         for (node, (_, objects)) in &self.reports {
             for object in objects {
-                for (landmark, _) in self.landmarks.within(&Point2::new(object.x_m, object.y_m), self.gate_m) {
+                for landmark in self.landmarks.within(&Point2::new(object.x_m, object.y_m), self.gate_m) {
                     near[landmark].add(node, object);
                 }
             }
