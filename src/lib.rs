@@ -10,5 +10,7 @@ pub mod detection;
 pub mod geometry;
 pub mod landmark;
 pub mod names;
+pub mod projection;
 pub mod time;
+pub mod view;
 pub mod wire;
