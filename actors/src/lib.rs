@@ -1,1 +1,6 @@
+//! ECOD's actors: everything that touches a clock, a socket, a camera or a disk.
 
+#[cfg(feature = "camera")]
+pub mod detect;
+#[cfg(feature = "camera")]
+pub mod frame;

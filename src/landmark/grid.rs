@@ -41,8 +41,7 @@ impl Grid {
     ) -> impl Iterator<Item = (usize, nalgebra::Vector2<f64>)> + '_ {
         let span = |middle: f64| line(middle - radius_m, self.cell_m)..=line(middle + radius_m, self.cell_m);
         let rows = span(point.y);
-        let columns = if self.points.is_empty() { 1..=0 } else { span(point.x) };
-        columns
+        span(point.x)
             .flat_map(move |x| rows.clone().map(move |y| cell(x, y)))
             .filter_map(|at| self.cells.get(&at))
             .flat_map(|range| &self.points[range.clone()])

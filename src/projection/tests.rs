@@ -1,0 +1,186 @@
+use nalgebra::{Point2, Point3, Vector2};
+use proptest::prelude::*;
+
+use super::*;
+use crate::detection::BoundingBox;
+
+const SIDE_M: f64 = 0.05;
+
+fn camera() -> Intrinsics {
+    Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians())
+}
+
+fn projection(ranging: Ranging) -> Projection {
+    let sizes = ObjectSizes { default: Some(ObjectSize::square(SIDE_M)), ..ObjectSizes::default() };
+    Projection::new(ProjectionConfig { ranging, sizes, ..ProjectionConfig::default() }, camera())
+}
+
+fn detection(bounding_box: BoundingBox) -> Detection {
+    Detection { label: "QR1".into(), confidence: 0.9, bounding_box, corners: None }
+}
+
+/// The box of an upright board of side `SIDE_M` whose middle is at `range_m` and `bearing_rad` and whose normal is
+/// turned by `yaw_rad` from the camera's axis.
+fn board(range_m: f64, bearing_rad: f64, yaw_rad: f64) -> BoundingBox {
+    let (forward, left) = (range_m * bearing_rad.cos(), range_m * bearing_rad.sin());
+    let half = SIDE_M / 2.0;
+    let corners = [(-half, -half), (half, -half), (half, half), (-half, half)].map(|(along, down)| {
+        let point = Point3::new(along * yaw_rad.cos() - left, down, forward + along * yaw_rad.sin());
+        camera().project(&point).expect("before the camera")
+    });
+    BoundingBox::around(&corners)
+}
+
+fn poses() -> impl Strategy<Value = Pose> {
+    (-5.0..5.0, -5.0..5.0, -7.0..7.0).prop_map(|(x, y, heading)| Pose::new(x, y, heading))
+}
+
+fn offset_m(object: &PerceivedObject, expected: Point2<f64>) -> f64 {
+    (Point2::new(object.x_m, object.y_m) - expected).norm()
+}
+
+proptest! {
+    #[test]
+    fn every_pinhole_ranging_returns_to_the_point_that_was_projected(
+        pose in poses(), range_m in 0.2..3.0, bearing_rad in -0.4..0.4f64,
+    ) {
+        let expected = pose.transform(range_m * bearing_rad.cos(), range_m * bearing_rad.sin());
+        // Parallel to the image for the height, square to the sight for the width.
+        for (ranging, yaw_rad) in [(Ranging::BoxHeight, 0.0), (Ranging::BoxWidth, bearing_rad)] {
+            let placed = projection(ranging).place(&detection(board(range_m, bearing_rad, yaw_rad)), None, &pose).unwrap();
+            prop_assert!(offset_m(&placed, expected) <= 1e-9, "{ranging:?}");
+        }
+        let target = Point3::new(-range_m * bearing_rad.sin(), 0.1, range_m * bearing_rad.cos());
+        let seen = detection(board(range_m, bearing_rad, 0.7));
+        let placed = projection(Ranging::Corners).place(&seen, Some(&target), &pose).unwrap();
+        prop_assert!(offset_m(&placed, expected) <= 1e-9);
+    }
+
+    #[test]
+    fn paper_ranging_is_the_published_algorithm(pose in poses(), x_min in 0.0..500.0f64, w in 1.0..130.0f64) {
+        let seen = detection(BoundingBox { x_min, y_min: 100.0, x_max: x_min + w, y_max: 150.0 });
+        let placed = projection(Ranging::Paper).place(&seen, None, &pose).unwrap();
+
+        // Algorithm 1 of the paper, line by line, in its own units.
+        let gamma_deg = 62.2 / 640.0;
+        let w_omega = seen.bounding_box.x_max - seen.bounding_box.x_min;
+        let alpha_deg = gamma_deg * w_omega;
+        let d_omega = SIDE_M / alpha_deg.to_radians().tan();
+        let x_center = seen.bounding_box.x_min + w_omega / 2.0;
+        let theta_deg = pose.heading_rad.to_degrees() - gamma_deg * x_center;
+        let x = pose.position.x + d_omega * theta_deg.to_radians().cos();
+        let y = pose.position.y + d_omega * theta_deg.to_radians().sin();
+
+        prop_assert!(offset_m(&placed, Point2::new(x, y)) <= 1e-9 * d_omega.max(1.0));
+    }
+
+    #[test]
+    fn positions_and_covariances_move_and_turn_with_the_camera(
+        pose in poses(), range_m in 0.2..3.0, bearing_rad in -0.4..0.4f64, turn_rad in -4.0..4.0f64, shift in -9.0..9.0f64,
+    ) {
+        let seen = detection(board(range_m, bearing_rad, 0.3));
+        for ranging in [Ranging::Corners, Ranging::BoxHeight, Ranging::BoxWidth, Ranging::Paper] {
+            let here = projection(ranging).place(&seen, None, &pose).unwrap();
+            let moved = Pose::new(pose.position.x + shift, pose.position.y - shift, pose.heading_rad + turn_rad);
+            let there = projection(ranging).place(&seen, None, &moved).unwrap();
+
+            let turn = nalgebra::Rotation2::new(turn_rad);
+            let offset = Vector2::new(here.x_m, here.y_m) - pose.position.coords;
+            prop_assert!(offset_m(&there, moved.position + turn * offset) <= 1e-9);
+            let turned = turn.matrix() * here.covariance().unwrap().matrix() * turn.matrix().transpose();
+            prop_assert!((turned - there.covariance().unwrap().matrix()).norm() <= 1e-9);
+        }
+    }
+
+    #[test]
+    fn whatever_the_box_the_result_is_an_error_or_a_finite_position_with_a_positive_covariance(
+        edges in proptest::array::uniform4(prop_oneof![
+            -1e3..1e3f64, Just(f64::NAN), Just(f64::INFINITY), Just(0.0), Just(1e-320), Just(1e300),
+        ]),
+    ) {
+        let [x_min, y_min, x_max, y_max] = edges;
+        let seen = detection(BoundingBox { x_min, y_min, x_max, y_max });
+        for ranging in [Ranging::Corners, Ranging::BoxHeight, Ranging::BoxWidth, Ranging::Paper] {
+            if let Ok(placed) = projection(ranging).place(&seen, None, &Pose::new(0.0, 0.0, 1.0)) {
+                let covariance = placed.covariance().unwrap();
+                prop_assert!(placed.x_m.is_finite() && placed.y_m.is_finite());
+                prop_assert!(covariance.is_valid() && covariance.xx > 0.0 && covariance.yy > 0.0);
+            }
+        }
+    }
+}
+
+#[test]
+fn yaw_leaves_the_range_by_height_alone_and_stretches_the_range_by_width() {
+    let seen = detection(board(0.5, 0.0, 60f64.to_radians()));
+    let range = |ranging| projection(ranging).place(&seen, None, &Pose::new(0.0, 0.0, 0.0)).unwrap().x_m;
+    assert!((range(Ranging::BoxHeight) - 0.5).abs() < 0.03, "{}", range(Ranging::BoxHeight));
+    assert!(range(Ranging::BoxWidth) > 0.95, "{}", range(Ranging::BoxWidth));
+}
+
+#[test]
+fn paper_ranging_turns_an_object_on_the_axis_half_a_field_of_view_clockwise() {
+    let placed = projection(Ranging::Paper).place(&detection(board(0.5, 0.0, 0.0)), None, &Pose::new(0.0, 0.0, 0.0));
+    let placed = placed.unwrap();
+    assert!((placed.y_m.atan2(placed.x_m) + 31.1f64.to_radians()).abs() < 1e-9);
+}
+
+#[test]
+fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
+    let at = |range_m| {
+        let placed =
+            projection(Ranging::BoxHeight).place(&detection(board(range_m, 0.0, 0.0)), None, &Pose::new(0.0, 0.0, 0.0));
+        placed.unwrap().covariance().unwrap()
+    };
+    assert!(at(2.0).xx > 4.0 * at(1.0).xx, "range error grows faster than the distance");
+    assert!(at(2.0).xx > at(2.0).yy);
+    let exact = ProjectionConfig {
+        pixel_sigma_px: 0.0,
+        heading_sigma_rad: 0.0,
+        position_sigma_m: 0.0,
+        sizes: ObjectSizes {
+            default: Some(ObjectSize { relative_sigma: 0.0, ..ObjectSize::square(SIDE_M) }),
+            ..ObjectSizes::default()
+        },
+        ..ProjectionConfig::default()
+    };
+    let floor = exact.floor_m;
+    let placed =
+        Projection::new(exact, camera()).place(&detection(board(1.0, 0.0, 0.0)), None, &Pose::new(0.0, 0.0, 0.0));
+    assert!((placed.unwrap().covariance().unwrap().yy - floor * floor).abs() < 1e-12);
+}
+
+#[test]
+fn each_unusable_detection_has_its_reason() {
+    let origin = Pose::new(0.0, 0.0, 0.0);
+    let reason = |projection: &Projection, seen: &Detection, target: Option<Point3<f64>>| {
+        projection.place(seen, target.as_ref(), &origin).expect_err("unusable").as_str()
+    };
+    let whole = detection(board(0.5, 0.0, 0.0));
+    let sizeless = Projection::new(ProjectionConfig::default(), camera());
+    assert_eq!(reason(&sizeless, &whole, None), "unknown_size");
+
+    let flat = detection(BoundingBox { x_max: whole.bounding_box.x_min, ..whole.bounding_box });
+    assert_eq!(reason(&projection(Ranging::BoxWidth), &flat, None), "degenerate_box");
+
+    let cut_below = detection(BoundingBox { y_max: 480.0, ..whole.bounding_box });
+    assert_eq!(reason(&projection(Ranging::BoxHeight), &cut_below, None), "clipped");
+    let cut_left = detection(BoundingBox { x_min: 0.0, ..whole.bounding_box });
+    assert_eq!(reason(&projection(Ranging::BoxWidth), &cut_left, None), "clipped");
+
+    for target in [Point3::new(0.0, 0.0, -1.0), Point3::new(f64::NAN, 0.0, 1.0)] {
+        assert_eq!(reason(&projection(Ranging::Corners), &whole, Some(target)), "invalid_corners");
+    }
+}
+
+#[test]
+fn listed_sizes_win_over_the_default_and_are_checked() {
+    let text =
+        r#"{"default": {"width_m": 0.05, "height_m": 0.05}, "labels": {"cup": {"width_m": 0.08, "height_m": 0.1}}}"#;
+    let mut sizes: ObjectSizes = serde_json::from_str(text).unwrap();
+    assert_eq!(sizes.of("cup").map(|s| s.height_m), Some(0.1));
+    assert_eq!(sizes.of("ABCD123").map(|s| s.height_m), Some(0.05));
+    sizes.labels.get_mut("cup").unwrap().height_m = 0.0;
+    let config = ProjectionConfig { sizes, ..ProjectionConfig::default() };
+    assert_eq!(config.validate().expect_err("zero height").key, "sizes.labels.cup.height_m");
+}

@@ -1,0 +1,218 @@
+//! Which known locations a camera has in view: near enough to be read, inside the image, not turned away, not hidden.
+//!
+//! A report lists them as `seen`, so that a location in view without a detection is known to be empty. To claim too
+//! much hurts more than to claim too little: each condition alone rules a location out.
+
+use nalgebra::{Point2, Point3, Vector2};
+use serde::{Deserialize, Serialize};
+
+use crate::camera::Intrinsics;
+use crate::config::{ConfigError, check_range};
+use crate::geometry::{Pose, wrap_angle};
+use crate::landmark::Landmark;
+use crate::names::LandmarkId;
+use crate::projection::ObjectSizes;
+use crate::wire::PerceivedObject;
+
+/// What it takes to have a location in view.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ViewConfig {
+    /// Width of the target or object to be recognised at a location, in metres; default 0.05.
+    pub target_width_m: f64,
+    /// Pixels that the target must take across, as it is turned; default 36: a placard code of 21 modules at 1.7
+    /// pixels each. Less claims more locations and with them some whose object is overlooked.
+    pub min_target_px: f64,
+    /// Pixels that the target must keep from the left and right edges of the image; default 8.
+    pub margin_px: f64,
+    /// Farthest location in metres; default 20.
+    pub max_range_m: f64,
+    /// Most that the camera may stand off the direction that the location faces, in radians; default 0.87 (50°).
+    pub max_yaw_rad: f64,
+    /// Width in metres of a perceived object whose label has no listed size, for what it hides; default 0.07.
+    pub occluder_width_m: f64,
+    /// Metres by which an object must be nearer than a location to hide it; default 0.05. Must exceed the error of a
+    /// position, or an object hides the place where it stands.
+    pub clearance_m: f64,
+}
+
+impl Default for ViewConfig {
+    fn default() -> Self {
+        Self {
+            target_width_m: 0.05,
+            min_target_px: 36.0,
+            margin_px: 8.0,
+            max_range_m: 20.0,
+            max_yaw_rad: 0.87,
+            occluder_width_m: 0.07,
+            clearance_m: 0.05,
+        }
+    }
+}
+
+impl ViewConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first key out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("target_width_m", self.target_width_m, 1e-4, 1e3)?;
+        check_range("min_target_px", self.min_target_px, 0.0, 1e5)?;
+        check_range("margin_px", self.margin_px, 0.0, 1e5)?;
+        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
+        check_range("max_yaw_rad", self.max_yaw_rad, 0.0, std::f64::consts::PI)?;
+        check_range("occluder_width_m", self.occluder_width_m, 0.0, 1e3)?;
+        check_range("clearance_m", self.clearance_m, 0.0, 1e3)
+    }
+}
+
+/// The landmarks that `camera` has in view, in their order; `objects` are what it just perceived, `sizes` the widths
+/// by which listed labels hide what is behind them.
+pub fn landmarks_in_view(
+    landmarks: &[Landmark],
+    camera: &Pose,
+    intrinsics: &Intrinsics,
+    objects: &[PerceivedObject],
+    sizes: &ObjectSizes,
+    config: &ViewConfig,
+) -> Vec<LandmarkId> {
+    let occluders: Vec<Occluder> = objects.iter().map(|object| Occluder::new(object, camera, sizes, config)).collect();
+    let in_view = |landmark: &&Landmark| {
+        let (range_m, bearing_rad) = camera.range_bearing(&landmark.position);
+        range_m <= config.max_range_m
+            && is_readable(landmark, camera, intrinsics, config)
+            && !occluders.iter().any(|occluder| occluder.hides(range_m, bearing_rad, config))
+    };
+    landmarks.iter().filter(in_view).map(|landmark| landmark.id.clone()).collect()
+}
+
+/// Whether a target at the landmark, turned as the landmark faces, lies inside the image and is large enough there.
+fn is_readable(landmark: &Landmark, camera: &Pose, intrinsics: &Intrinsics, config: &ViewConfig) -> bool {
+    let to_camera = camera.position - landmark.position;
+    let towards_camera_rad = to_camera.y.atan2(to_camera.x);
+    let facing_rad = landmark.facing_rad.unwrap_or(towards_camera_rad);
+    if wrap_angle(towards_camera_rad - facing_rad).abs() > config.max_yaw_rad {
+        return false;
+    }
+    // The left end as seen from the side that the target faces.
+    let half_width = Vector2::new(facing_rad.sin(), -facing_rad.cos()) * (config.target_width_m / 2.0);
+    let columns =
+        [landmark.position + half_width, landmark.position - half_width].map(|end| column(&end, camera, intrinsics));
+    let [Some(left_px), Some(right_px)] = columns else { return false };
+    right_px - left_px >= config.min_target_px
+        && left_px >= config.margin_px
+        && right_px <= f64::from(intrinsics.width) - config.margin_px
+}
+
+/// The image column of a world point; `None` behind the camera.
+fn column(point: &Point2<f64>, camera: &Pose, intrinsics: &Intrinsics) -> Option<f64> {
+    let (range_m, bearing_rad) = camera.range_bearing(point);
+    let in_camera = Point3::new(-range_m * bearing_rad.sin(), 0.0, range_m * bearing_rad.cos());
+    intrinsics.project(&in_camera).map(|pixel| pixel.x)
+}
+
+/// A perceived object as something that hides what is behind it.
+struct Occluder {
+    range_m: f64,
+    bearing_rad: f64,
+    half_angle_rad: f64,
+}
+
+impl Occluder {
+    fn new(object: &PerceivedObject, camera: &Pose, sizes: &ObjectSizes, config: &ViewConfig) -> Self {
+        let (range_m, bearing_rad) = camera.range_bearing(&Point2::new(object.x_m, object.y_m));
+        let width_m = sizes.labels.get(&object.label).map_or(config.occluder_width_m, |size| size.width_m);
+        Self { range_m, bearing_rad, half_angle_rad: half_angle(width_m, range_m) }
+    }
+
+    /// Whether any part of a target at the given place lies behind this object.
+    fn hides(&self, range_m: f64, bearing_rad: f64, config: &ViewConfig) -> bool {
+        self.range_m + config.clearance_m < range_m
+            && wrap_angle(self.bearing_rad - bearing_rad).abs()
+                < self.half_angle_rad + half_angle(config.target_width_m, range_m)
+    }
+}
+
+fn half_angle(width_m: f64, range_m: f64) -> f64 {
+    (width_m / 2.0).atan2(range_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use super::*;
+
+    fn landmark(id: &str, x_m: f64, y_m: f64, facing_rad: Option<f64>) -> Landmark {
+        Landmark { id: id.into(), position: Point2::new(x_m, y_m), facing_rad, vacancy: None, synonyms: vec![] }
+    }
+
+    fn object(label: &str, x_m: f64, y_m: f64) -> PerceivedObject {
+        PerceivedObject { label: label.into(), confidence: 0.9, x_m, y_m, covariance_m2: None, landmark: None }
+    }
+
+    /// Seen from the origin, looking east with a field of view of 62.2°.
+    fn seen(landmarks: &[Landmark], objects: &[PerceivedObject], sizes: &ObjectSizes) -> Vec<LandmarkId> {
+        let camera = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
+        landmarks_in_view(landmarks, &Pose::new(0.0, 0.0, 0.0), &camera, objects, sizes, &ViewConfig::default())
+    }
+
+    fn sees(x_m: f64, y_m: f64, facing_rad: Option<f64>, objects: &[PerceivedObject]) -> bool {
+        !seen(&[landmark("a", x_m, y_m, facing_rad)], objects, &ObjectSizes::default()).is_empty()
+    }
+
+    #[test]
+    fn a_location_ahead_that_faces_the_camera_is_in_view() {
+        assert!(sees(0.5, 0.0, Some(PI), &[]));
+        assert!(sees(0.5, 0.0, Some(-PI), &[]), "the same direction, written otherwise");
+        assert!(sees(0.5, 0.0, None, &[]), "readable from all around");
+    }
+
+    #[test]
+    fn the_whole_target_must_lie_inside_the_image() {
+        let edge_m = 0.5 * 31.1f64.to_radians().tan();
+        assert!(sees(0.5, edge_m - 0.04, Some(PI), &[]));
+        assert!(!sees(0.5, edge_m - 0.02, Some(PI), &[]), "its left end is outside");
+        assert!(!sees(0.5, -edge_m + 0.02, Some(PI), &[]), "its right end is outside");
+        assert!(!sees(-0.5, 0.0, None, &[]), "behind the camera");
+    }
+
+    #[test]
+    fn a_target_that_is_turned_away_or_too_small_is_not_in_view() {
+        assert!(sees(0.4, 0.0, Some(PI - 0.8), &[]));
+        assert!(!sees(0.4, 0.0, Some(PI - 0.9), &[]), "beyond the largest yaw");
+        assert!(!sees(0.4, 0.0, Some(0.0), &[]), "from behind");
+        assert!(!sees(0.4, 0.0, Some(FRAC_PI_2), &[]), "edge on");
+        // 0.05 m at 530 px focal length take 36 px at 0.736 m, and less when turned.
+        assert!(sees(0.73, 0.0, Some(PI), &[]));
+        assert!(!sees(0.75, 0.0, Some(PI), &[]));
+        assert!(!sees(0.73, 0.0, Some(PI - 0.5), &[]));
+    }
+
+    #[test]
+    fn nothing_beyond_the_largest_range_is_in_view() {
+        let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
+        let config = ViewConfig { max_range_m: 2.0, min_target_px: 0.0, ..ViewConfig::default() };
+        let landmarks = [landmark("near", 1.9, 0.0, None), landmark("far", 2.1, 0.0, None)];
+        let pose = Pose::new(0.0, 0.0, 0.0);
+        assert_eq!(landmarks_in_view(&landmarks, &pose, &camera, &[], &ObjectSizes::default(), &config), ["near"]);
+    }
+
+    #[test]
+    fn a_nearer_object_hides_what_is_behind_it_but_not_its_own_place() {
+        assert!(!sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.0)]));
+        assert!(!sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.045)]), "covers its left end");
+        assert!(sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.06)]), "passes beside");
+        assert!(sees(0.6, 0.0, Some(PI), &[object("QR", 0.58, 0.0)]), "stands there itself");
+        assert!(sees(0.6, 0.0, Some(PI), &[object("QR", 0.9, 0.0)]), "stands behind");
+    }
+
+    #[test]
+    fn a_listed_width_decides_how_much_an_object_hides() {
+        let sizes: ObjectSizes =
+            serde_json::from_str(r#"{"labels": {"truck": {"width_m": 0.3, "height_m": 0.3}}}"#).unwrap();
+        let landmarks = [landmark("a", 0.6, 0.0, Some(PI)), landmark("b", 0.6, -0.2, Some(PI))];
+        assert_eq!(seen(&landmarks, &[object("truck", 0.3, 0.1)], &sizes), ["b"]);
+        assert_eq!(seen(&landmarks, &[object("van", 0.3, 0.1)], &sizes), ["a", "b"]);
+    }
+}
