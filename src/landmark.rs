@@ -1,10 +1,12 @@
 //! Known locations: the set R of the paper.
 
+mod config;
 mod grid;
 mod index;
 
 use nalgebra::Point2;
 
+pub use config::{LandmarkConfig, VacancyConfig};
 pub use index::{Candidate, Gate, LandmarkIndex};
 
 use crate::names::{Label, LandmarkId};

@@ -6,6 +6,7 @@
 
 #![warn(clippy::unwrap_used)]
 
+pub mod aggregator;
 pub mod camera;
 pub mod config;
 pub mod detection;
@@ -15,7 +16,6 @@ pub mod names;
 pub mod pace;
 pub mod projection;
 pub mod round;
-pub mod time;
 pub mod time;
 pub mod view;
 pub mod window;

@@ -1,0 +1,116 @@
+//! Known locations as they are written in a configuration file.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use nalgebra::Point2;
+use serde::{Deserialize, Serialize};
+
+use super::{Landmark, Synonym, VacancySign};
+use crate::config::{ConfigError, check_range};
+use crate::names::{Label, LandmarkId, MAX_NAME_BYTES};
+
+/// One known location.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LandmarkConfig {
+    /// Name, unique in the cell.
+    pub id: LandmarkId,
+    /// East in metres of where an object stands.
+    pub x_m: f64,
+    /// North in metres of where an object stands.
+    pub y_m: f64,
+    /// Direction in degrees, counter-clockwise from east, from which an object here can be read. Default: from all
+    /// around.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub facing_deg: Option<f64>,
+    /// A fixed sign that is in view while the location is empty. Default: none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub vacancy: Option<VacancyConfig>,
+    /// Labels that count as another one here, such as `vase = "sports ball"`. Default: none.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub synonyms: BTreeMap<Label, Label>,
+}
+
+/// A vacancy sign.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VacancyConfig {
+    /// What the sign reads.
+    pub label: Label,
+    /// East in metres.
+    pub x_m: f64,
+    /// North in metres.
+    pub y_m: f64,
+}
+
+impl LandmarkConfig {
+    /// Checks one location.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the key, the value and the allowed range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if !(1..=MAX_NAME_BYTES).contains(&self.id.len()) {
+            return Err(ConfigError::new("id", format!("{:?}", self.id), format!("1 to {MAX_NAME_BYTES} bytes long")));
+        }
+        check_range("x_m", self.x_m, -1e8, 1e8)?;
+        check_range("y_m", self.y_m, -1e8, 1e8)?;
+        check_range("facing_deg", self.facing_deg.unwrap_or(0.0), -360.0, 360.0)?;
+        if let Some(sign) = &self.vacancy {
+            check_range("vacancy.x_m", sign.x_m, -1e8, 1e8)?;
+            check_range("vacancy.y_m", sign.y_m, -1e8, 1e8)?;
+        }
+        Ok(())
+    }
+
+    /// Checks all locations of a cell and that their names differ.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the location by its position in the list.
+    pub fn validate_all(locations: &[Self]) -> Result<(), ConfigError> {
+        let mut ids = BTreeSet::new();
+        for (index, location) in locations.iter().enumerate() {
+            let section = format!("landmarks[{index}]");
+            location.validate().map_err(|error| error.within(&section))?;
+            if !ids.insert(&location.id) {
+                return Err(ConfigError::new("id", format!("{:?}", location.id), "unique").within(&section));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl From<&LandmarkConfig> for Landmark {
+    fn from(config: &LandmarkConfig) -> Self {
+        let sign =
+            |sign: &VacancyConfig| VacancySign { label: sign.label.clone(), position: Point2::new(sign.x_m, sign.y_m) };
+        Self {
+            id: config.id.clone(),
+            position: Point2::new(config.x_m, config.y_m),
+            facing_rad: config.facing_deg.map(f64::to_radians),
+            vacancy: config.vacancy.as_ref().map(sign),
+            synonyms: config
+                .synonyms
+                .iter()
+                .map(|(from, label)| Synonym { from: from.clone(), label: label.clone() })
+                .collect(),
+        }
+    }
+}
+
+impl From<&Landmark> for LandmarkConfig {
+    fn from(landmark: &Landmark) -> Self {
+        let sign = |sign: &VacancySign| VacancyConfig {
+            label: sign.label.clone(),
+            x_m: sign.position.x,
+            y_m: sign.position.y,
+        };
+        Self {
+            id: landmark.id.clone(),
+            x_m: landmark.position.x,
+            y_m: landmark.position.y,
+            facing_deg: landmark.facing_rad.map(f64::to_degrees),
+            vacancy: landmark.vacancy.as_ref().map(sign),
+            synonyms: landmark.synonyms.iter().map(|s| (s.from.clone(), s.label.clone())).collect(),
+        }
+    }
+}
