@@ -1,1 +1,5 @@
+//! ECOD nodes: the actors, transports and cameras around the core of [`ecod`].
 
+pub mod broker;
+pub mod clock;
+pub mod counters;
