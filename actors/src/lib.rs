@@ -1,5 +1,10 @@
-//! ECOD's actors: everything that touches a clock, a socket, a camera or a disk.
+//! ECOD nodes: the actors, transports and cameras around the core of [`ecod`].
 
+#![warn(clippy::unwrap_used)]
+
+pub mod broker;
+pub mod clock;
+pub mod counters;
 #[cfg(feature = "camera")]
 pub mod detect;
 #[cfg(feature = "camera")]

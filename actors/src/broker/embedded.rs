@@ -1,0 +1,215 @@
+//! The embedded broker: rmqtt on a thread of its own.
+
+use std::net::SocketAddr;
+use std::sync::mpsc;
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+use std::{fmt, io};
+
+use ecod::config::{ConfigError, check_range};
+use rmqtt::context::ServerContext;
+use rmqtt::net::{Builder, Listener};
+use rmqtt::server::MqttServer;
+use serde::{Deserialize, Serialize};
+use tokio::runtime::{self, Runtime};
+use tokio::sync::oneshot;
+
+use super::BrokerHealth;
+use super::retained::RetainedMessages;
+
+/// An MQTT broker that lives inside the process.
+pub trait Mqtt: Send + fmt::Debug {
+    /// Listens on `address`, port 0 for a free one, and returns the bound address; clients may connect at once.
+    ///
+    /// # Errors
+    /// [`BrokerError`] names the address; nothing is left running.
+    fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError>;
+
+    /// Disconnects all clients and frees the port before it returns; nothing happens when not started. Retained
+    /// messages are lost.
+    fn stop(&mut self);
+
+    /// Whether it serves.
+    fn health(&self) -> BrokerHealth;
+
+    /// Stops and starts again at the address it is bound to, empty; `fallback` is for a broker that does not run.
+    ///
+    /// # Errors
+    /// As [`Mqtt::start`]; the broker is then stopped.
+    fn restart(&mut self, fallback: SocketAddr) -> Result<SocketAddr, BrokerError> {
+        let address = match self.health() {
+            BrokerHealth::Serving(address) => address,
+            BrokerHealth::Stopped | BrokerHealth::Dead => fallback,
+        };
+        self.stop();
+        self.start(address)
+    }
+}
+
+/// Why the embedded broker does not run; nothing was left behind.
+#[derive(Debug, thiserror::Error)]
+pub enum BrokerError {
+    /// It is already running.
+    #[error("broker already serves at {0}")]
+    Running(SocketAddr),
+    /// The address cannot be listened on: busy, not this machine's, or not permitted.
+    #[error("broker cannot listen on {address}: {reason}")]
+    Bind {
+        /// The address asked for.
+        address: SocketAddr,
+        /// What the operating system said.
+        reason: String,
+    },
+    /// The operating system gave no thread or event queue.
+    #[error("broker for {address} cannot get a thread: {source}")]
+    Thread {
+        /// The address asked for.
+        address: SocketAddr,
+        /// What the operating system said.
+        source: io::Error,
+    },
+}
+
+/// Limits of the embedded broker.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BrokerConfig {
+    /// Largest MQTT packet in bytes; default 1 MiB. A client that sends more is cut off. Larger admits larger reports,
+    /// smaller bounds the memory that a stranger can take.
+    pub max_packet_bytes: u32,
+    /// Most clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
+    pub max_clients: usize,
+    /// Most messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
+    /// then gets is old.
+    pub max_waiting: usize,
+    /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
+    pub max_retained: usize,
+}
+
+impl Default for BrokerConfig {
+    fn default() -> Self {
+        Self { max_packet_bytes: 1024 * 1024, max_clients: 2048, max_waiting: 256, max_retained: 8192 }
+    }
+}
+
+impl BrokerConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the key, the value and what is allowed.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("max_packet_bytes", f64::from(self.max_packet_bytes), 1024.0, 268_435_455.0)?;
+        check_range("max_clients", self.max_clients as f64, 1.0, 1e6)?;
+        check_range("max_waiting", self.max_waiting as f64, 1.0, 1e6)?;
+        check_range("max_retained", self.max_retained as f64, 1.0, 1e6)
+    }
+}
+
+/// rmqtt as a library, on one thread, with retained messages in memory.
+#[derive(Debug, Default)]
+pub struct EmbeddedBroker {
+    config: BrokerConfig,
+    running: Option<Running>,
+}
+
+#[derive(Debug)]
+struct Running {
+    address: SocketAddr,
+    stop: oneshot::Sender<()>,
+    thread: JoinHandle<()>,
+}
+
+/// How long connections may take to end when the broker stops; beyond it their thread is left to end by itself.
+const STOP_TIMEOUT: Duration = Duration::from_secs(1);
+
+impl EmbeddedBroker {
+    /// A broker that is not started.
+    pub fn new(config: BrokerConfig) -> Self {
+        Self { config, running: None }
+    }
+
+    fn listener(&self, address: SocketAddr) -> Builder {
+        Builder::new()
+            .name("ecod")
+            .laddr(address)
+            // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
+            .reuseaddr(Some(true))
+            .nodelay(true)
+            .max_packet_size(self.config.max_packet_bytes)
+            .max_connections(self.config.max_clients)
+            .max_mqueue_len(self.config.max_waiting)
+            .handshake_timeout(Duration::from_secs(5))
+    }
+}
+
+impl Mqtt for EmbeddedBroker {
+    fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
+        if let Some(running) = &self.running {
+            return Err(BrokerError::Running(running.address));
+        }
+        let thread_error = |source| BrokerError::Thread { address, source };
+        let runtime = runtime::Builder::new_current_thread().enable_all().build().map_err(thread_error)?;
+        let bind_error = |error: rmqtt::Error| BrokerError::Bind { address, reason: error.root_cause().to_string() };
+        let listener = {
+            let _context = runtime.enter();
+            self.listener(address).bind().and_then(Listener::tcp).map_err(bind_error)?
+        };
+        let bound = listener.local_addr().map_err(bind_error)?;
+        let (stop, stopped) = oneshot::channel();
+        let (ready, started) = mpsc::channel();
+        let retained = RetainedMessages::new(self.config.max_retained);
+        let thread = thread::Builder::new()
+            .name("mqtt-broker".to_owned())
+            .spawn(move || serve(runtime, listener, retained, &ready, stopped))
+            .map_err(thread_error)?;
+        if started.recv().is_err() {
+            return Err(thread_error(io::Error::other("the broker's thread ended")));
+        }
+        self.running = Some(Running { address: bound, stop, thread });
+        Ok(bound)
+    }
+
+    fn stop(&mut self) {
+        let Some(Running { address, stop, thread }) = self.running.take() else { return };
+        if stop.send(()).is_err() || thread.join().is_err() {
+            tracing::warn!(%address, "broker had ended by itself");
+        }
+    }
+
+    fn health(&self) -> BrokerHealth {
+        match &self.running {
+            None => BrokerHealth::Stopped,
+            Some(running) if running.thread.is_finished() => BrokerHealth::Dead,
+            Some(running) => BrokerHealth::Serving(running.address),
+        }
+    }
+}
+
+impl Drop for EmbeddedBroker {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+fn serve(
+    runtime: Runtime,
+    listener: Listener,
+    retained: RetainedMessages,
+    ready: &mpsc::Sender<()>,
+    stopped: oneshot::Receiver<()>,
+) {
+    runtime.block_on(async {
+        // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
+        let context = ServerContext::new().busy_check_enable(false).build().await;
+        *context.extends.retain_mut().await = Box::new(retained);
+        let server = MqttServer::new(context).listener_by_id(listener, 1).build();
+        if ready.send(()).is_err() {
+            return;
+        }
+        tokio::select! {
+            ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
+            _ = stopped => {}
+        }
+    });
+    runtime.shutdown_timeout(STOP_TIMEOUT);
+}

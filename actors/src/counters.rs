@@ -1,0 +1,129 @@
+//! What went wrong or was left out, counted by reason: cheap enough for every packet.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use ecod::wire::RejectReason;
+
+/// Something that happens often enough to be counted rather than logged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Event {
+    /// A payload was handed to a broker connection.
+    Published,
+    /// A payload was not sent because a link was down or its queue full.
+    PublishRefused,
+    /// A packet came in from a broker.
+    Received,
+    /// The broker sent back what this node had published; it was delivered in-process already.
+    Echo,
+    /// A decoded message was dropped because its receivers were too far behind.
+    InboxFull,
+    /// A link was established.
+    Connected,
+    /// An established link was lost.
+    Disconnected,
+    /// An attempt to establish a link failed.
+    ConnectFailed,
+    /// A camera frame gave way to a later one.
+    FrameSkipped,
+}
+
+impl Event {
+    /// All events, for snapshots.
+    pub const ALL: [Self; 9] = [
+        Self::Published,
+        Self::PublishRefused,
+        Self::Received,
+        Self::Echo,
+        Self::InboxFull,
+        Self::Connected,
+        Self::Disconnected,
+        Self::ConnectFailed,
+        Self::FrameSkipped,
+    ];
+
+    /// The event as a counter's label.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Published => "published",
+            Self::PublishRefused => "publish_refused",
+            Self::Received => "received",
+            Self::Echo => "echo",
+            Self::InboxFull => "inbox_full",
+            Self::Connected => "connected",
+            Self::Disconnected => "disconnected",
+            Self::ConnectFailed => "connect_failed",
+            Self::FrameSkipped => "frame_skipped",
+        }
+    }
+}
+
+/// The counters of one node, shared by its actors.
+#[derive(Debug, Default)]
+pub struct Counters {
+    events: [AtomicU64; Event::ALL.len()],
+    rejects: [AtomicU64; RejectReason::ALL.len()],
+}
+
+impl Counters {
+    /// Counts an event.
+    pub fn count(&self, event: Event) {
+        self.events[event as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Counts a payload that was not used.
+    pub fn reject(&self, reason: RejectReason) {
+        self.rejects[reason as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// How often an event happened.
+    pub fn events(&self, event: Event) -> u64 {
+        self.events[event as usize].load(Ordering::Relaxed)
+    }
+
+    /// How many payloads were not used for this reason.
+    pub fn rejects(&self, reason: RejectReason) -> u64 {
+        self.rejects[reason as usize].load(Ordering::Relaxed)
+    }
+
+    /// All counts by label; zeros are left in, so that a metric exists before it matters.
+    pub fn snapshot(&self) -> CounterSnapshot {
+        CounterSnapshot {
+            events: Event::ALL.map(|event| (event.as_str(), self.events(event))).into(),
+            rejects: RejectReason::ALL.map(|reason| (reason.as_str(), self.rejects(reason))).into(),
+        }
+    }
+}
+
+/// All counters of a node at one moment.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct CounterSnapshot {
+    /// Counts of [`Event`]s by label.
+    pub events: BTreeMap<&'static str, u64>,
+    /// Payloads that were not used, by [`RejectReason`].
+    pub rejects: BTreeMap<&'static str, u64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_reason_and_event_has_its_own_counter() {
+        let counters = Counters::default();
+        for (times, reason) in RejectReason::ALL.into_iter().enumerate() {
+            (0..times).for_each(|_| counters.reject(reason));
+        }
+        for (times, event) in Event::ALL.into_iter().enumerate() {
+            (0..times).for_each(|_| counters.count(event));
+        }
+        for (times, reason) in RejectReason::ALL.into_iter().enumerate() {
+            assert_eq!(counters.rejects(reason), times as u64, "{reason}");
+        }
+        for (times, event) in Event::ALL.into_iter().enumerate() {
+            assert_eq!(counters.events(event), times as u64, "{event:?}");
+        }
+        let snapshot = counters.snapshot();
+        assert_eq!((snapshot.events.len(), snapshot.rejects.len()), (Event::ALL.len(), RejectReason::ALL.len()));
+    }
+}
