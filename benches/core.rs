@@ -126,6 +126,7 @@ fn report(vehicle: usize, objects: usize, landmarks: usize, side: usize) -> Obje
     }
 }
 
+#[expect(clippy::disallowed_methods, reason = "a benchmark reads the clock")]
 fn median(runs: usize, mut run: impl FnMut()) -> Duration {
     run();
     let mut times: Vec<Duration> = (0..runs)

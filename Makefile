@@ -1,0 +1,52 @@
+# `make demo` and `make test` do everything on a fresh Debian 12 machine with git, make and a Rust toolchain.
+
+PACKAGES := build-essential ca-certificates clang cmake libopencv-dev mosquitto pkg-config
+SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
+SECONDS_PER_SCENE ?= 15
+
+.PHONY: help setup demo testbed test lint doc audit bench core-only edge-only clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: ## install the system packages that are missing
+	@missing=$$(for p in $(PACKAGES); do dpkg-query -W -f='$${Status}' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
+	if [ -n "$$missing" ]; then \
+	    echo "installing" $$missing; \
+	    $(SUDO) apt-get update -qq && \
+	    DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends $$missing >/dev/null; \
+	fi
+
+demo: setup ## run a whole cell as separate processes on this machine and print what it saw
+	cargo build --release --locked --bin ecod-node
+	target/release/ecod-node demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
+
+testbed: setup ## accuracy on the recorded parking lots, rendered and detected
+	cargo build --release --locked --bin ecod-node
+	for setup in 1 2; do target/release/ecod-node testbed --scenes examples/testbed/pace_setup$$setup.json --out target/testbed-setup$$setup.json; done
+
+test: setup ## all tests
+	cargo test --locked --workspace
+
+lint: setup ## formatting, clippy and rustdoc with warnings denied
+	cargo fmt --all --check
+	cargo clippy --locked --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps --document-private-items
+
+doc: setup ## API documentation in target/doc
+	cargo doc --locked --workspace --no-deps
+
+audit: ## licences, sources and duplicate policies of all dependencies; known vulnerabilities where the database is reachable
+	packaging/audit
+
+core-only: ## prove that the core needs no runtime: its dependency tree has no tokio, socket or OpenCV crate
+	packaging/check-core
+
+edge-only: setup ## an aggregator without camera and OpenCV
+	cargo build --locked -p ecod-actors --no-default-features
+
+bench: setup ## speed of the core, the detectors and the path through the broker, in target/bench.json
+	packaging/bench
+
+clean: ## remove everything that was built
+	cargo clean
