@@ -28,18 +28,36 @@ impl NodeName {
     /// [`InvalidName`] when a character or the length is not allowed.
     pub fn new(name: impl AsRef<str>) -> Result<Self, InvalidName> {
         let name = name.as_ref();
-        let allowed = |b: u8| b.is_ascii_alphanumeric() || b == b'_' || b == b'-';
-        if (1..=MAX_NAME_BYTES).contains(&name.len()) && name.bytes().all(allowed) {
+        if (1..=MAX_NAME_BYTES).contains(&name.len()) && name.bytes().all(is_allowed) {
             Ok(Self(SmolStr::new(name)))
         } else {
             Err(InvalidName(name.chars().take(MAX_NAME_BYTES).collect()))
         }
     }
 
+    /// A name known at compile time.
+    ///
+    /// # Panics
+    /// When the name is not allowed.
+    pub const fn from_static(name: &'static str) -> Self {
+        let bytes = name.as_bytes();
+        assert!(!bytes.is_empty() && bytes.len() <= MAX_NAME_BYTES, "a name has 1 to 64 bytes");
+        let mut at = 0;
+        while at < bytes.len() {
+            assert!(is_allowed(bytes[at]), "a name has only A-Z, a-z, 0-9, _ and -");
+            at += 1;
+        }
+        Self(SmolStr::new_static(name))
+    }
+
     /// The name as text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
+}
+
+const fn is_allowed(byte: u8) -> bool {
+    byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-'
 }
 
 impl TryFrom<SmolStr> for NodeName {

@@ -24,13 +24,15 @@ pub enum Event {
     Disconnected,
     /// An attempt to establish a link failed.
     ConnectFailed,
+    /// A map newer than all before was taken.
+    MapAccepted,
     /// A camera frame gave way to a later one.
     FrameSkipped,
 }
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Published,
         Self::PublishRefused,
         Self::Received,
@@ -39,6 +41,7 @@ impl Event {
         Self::Connected,
         Self::Disconnected,
         Self::ConnectFailed,
+        Self::MapAccepted,
         Self::FrameSkipped,
     ];
 
@@ -53,6 +56,7 @@ impl Event {
             Self::Connected => "connected",
             Self::Disconnected => "disconnected",
             Self::ConnectFailed => "connect_failed",
+            Self::MapAccepted => "map_accepted",
             Self::FrameSkipped => "frame_skipped",
         }
     }

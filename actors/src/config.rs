@@ -1,0 +1,182 @@
+//! The configuration of a node: defaults, then a TOML file, then `ECOD_…` in the environment, then flags.
+//!
+//! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use ecod::aggregator::FusionConfig;
+use ecod::config::{ConfigError, check_range};
+use ecod::geometry::Pose;
+use ecod::landmark::{Landmark, LandmarkConfig};
+use ecod::names::NodeName;
+use ecod::wire::Role;
+use figment::Figment;
+use figment::providers::{Env, Format, Serialized, Toml};
+use serde::{Deserialize, Serialize};
+
+use crate::broker::BrokerConfig;
+#[cfg(feature = "camera")]
+use crate::camera::CameraConfig;
+use crate::gateway::{MqttConfig, ReportKind};
+
+/// Everything that a node can be told.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NodeConfig {
+    /// Name of the node, unique in its cell. Default: none, and it must be given.
+    pub name: Option<NodeName>,
+    /// Name of the cell; nodes of other cells are not heard. Default `cell`.
+    pub cell: NodeName,
+    /// What the node is meant to do. Default `auto`.
+    pub role: Role,
+    /// Where an aggregator's embedded broker listens. Default `127.0.0.1:1883`: other machines reach it only when told
+    /// so, such as by `0.0.0.0:1883`.
+    pub listen: SocketAddr,
+    /// What the cell fuses. Default PACE alone.
+    pub fuse: Vec<Fuse>,
+    /// A file to which every accepted map is appended, one JSON object a line. Default none.
+    pub map_log: Option<PathBuf>,
+    /// Pose of the vehicle. Default the origin, looking east.
+    pub pose: PoseConfig,
+    /// MQTT connections.
+    pub mqtt: MqttConfig,
+    /// Limits of the embedded broker.
+    pub broker: BrokerConfig,
+    /// How reports are fused; used by aggregators.
+    pub fusion: FusionConfig,
+    /// The camera and what is made of its frames. Default none.
+    #[cfg(feature = "camera")]
+    pub camera: Option<CameraConfig>,
+    /// The cell's known locations, the same on every node. Default none.
+    pub landmarks: Vec<LandmarkConfig>,
+}
+
+/// An algorithm of the aggregator.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Fuse {
+    /// What the vehicles see together.
+    Pace,
+    /// What the vehicles agree on where they disagree.
+    Vote,
+}
+
+/// Where a vehicle stands.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PoseConfig {
+    /// East in metres. Default 0.
+    pub x_m: f64,
+    /// North in metres. Default 0.
+    pub y_m: f64,
+    /// Heading in degrees, counter-clockwise from east. Default 0.
+    pub heading_deg: f64,
+}
+
+impl Default for NodeConfig {
+    fn default() -> Self {
+        Self {
+            name: None,
+            cell: NodeName::from_static("cell"),
+            role: Role::Auto,
+            listen: SocketAddr::from(([127, 0, 0, 1], 1883)),
+            fuse: vec![Fuse::Pace],
+            map_log: None,
+            pose: PoseConfig::default(),
+            mqtt: MqttConfig::default(),
+            broker: BrokerConfig::default(),
+            fusion: FusionConfig::default(),
+            #[cfg(feature = "camera")]
+            camera: None,
+            landmarks: Vec::new(),
+        }
+    }
+}
+
+/// A configuration that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum LoadError {
+    /// The file is not there or cannot be read.
+    #[error("cannot read configuration {path}: {source}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// A key or value is of the wrong kind or unknown; the message names key and source.
+    #[error("configuration: {0}")]
+    Malformed(#[from] Box<figment::Error>),
+    /// A value is out of its range.
+    #[error(transparent)]
+    OutOfRange(#[from] ConfigError),
+}
+
+impl NodeConfig {
+    /// Reads the file, if any, lays the environment and `flags` over it, and checks the result.
+    ///
+    /// # Errors
+    /// [`LoadError`] naming the file, or the key, the value and what is allowed.
+    pub fn load(file: Option<&std::path::Path>, flags: &impl Serialize) -> Result<Self, LoadError> {
+        let mut figment = Figment::from(Serialized::defaults(Self::default()));
+        if let Some(path) = file {
+            std::fs::metadata(path).map_err(|source| LoadError::Unreadable { path: path.into(), source })?;
+            figment = figment.merge(Toml::file_exact(path));
+        }
+        let figment = figment.merge(Env::prefixed("ECOD_").split("__")).merge(Serialized::defaults(flags));
+        let config: Self = figment.extract().map_err(Box::new)?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// Checks every value and that they fit together.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the key, the value and what is allowed.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if self.name.is_none() {
+            return Err(ConfigError::new("name", "nothing", "the node's name, unique in its cell"));
+        }
+        if self.role == Role::Auto {
+            return Err(ConfigError::new("role", "auto", "`edge` or `cav`: this version does not elect aggregators"));
+        }
+        if self.fuse.is_empty() {
+            return Err(ConfigError::new("fuse", "[]", "at least one of `pace` and `vote`"));
+        }
+        check_range("pose.x_m", self.pose.x_m, -1e8, 1e8)?;
+        check_range("pose.y_m", self.pose.y_m, -1e8, 1e8)?;
+        check_range("pose.heading_deg", self.pose.heading_deg, -360.0, 360.0)?;
+        self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
+        self.broker.validate().map_err(|error| error.within("broker"))?;
+        self.fusion.validate().map_err(|error| error.within("fusion"))?;
+        #[cfg(feature = "camera")]
+        if let Some(camera) = &self.camera {
+            camera.validate().map_err(|error| error.within("camera"))?;
+        }
+        if self.role == Role::Cav && self.mqtt.broker.is_none() {
+            let allowed = "the aggregator's address as host:port, for a node of role `cav`";
+            return Err(ConfigError::new("mqtt.broker", "nothing", allowed));
+        }
+        LandmarkConfig::validate_all(&self.landmarks)
+    }
+
+    /// The vehicle's pose.
+    pub fn pose(&self) -> Pose {
+        Pose::new(self.pose.x_m, self.pose.y_m, self.pose.heading_deg.to_radians())
+    }
+
+    /// The cell's known locations.
+    pub fn landmarks(&self) -> Vec<Landmark> {
+        self.landmarks.iter().map(Landmark::from).collect()
+    }
+
+    /// What this node's reports are for.
+    pub fn report_kinds(&self) -> Vec<ReportKind> {
+        let kind = |fuse: &Fuse| match fuse {
+            Fuse::Pace => ReportKind::Detections,
+            Fuse::Vote => ReportKind::VoteDetections,
+        };
+        self.fuse.iter().map(kind).collect()
+    }
+}

@@ -1,0 +1,138 @@
+//! The actor that takes the cell's maps: it drops what was superseded and hands on the rest.
+//!
+//! ```text
+//! Gateway ── TakeMap ──> Follower ──> watch of the newest map, optional log file
+//! ```
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{GlobalMap, NodeStatus, RejectReason};
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
+
+use crate::counters::{Counters, Event};
+use crate::gateway::{Delivery, GatewayMessage, Incoming};
+use crate::seat::Seat;
+
+/// What the follower is asked to do.
+#[derive(Debug)]
+pub enum FollowerMessage {
+    /// Take a map.
+    TakeMap {
+        /// The map and when it came.
+        delivery: Delivery,
+    },
+}
+
+/// The newest map and when it came.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReceivedMap {
+    /// The map.
+    pub map: Arc<GlobalMap>,
+    /// When it came, by this node's clock.
+    pub received_at: Timestamp,
+}
+
+/// What a follower needs at its start.
+pub struct FollowerArguments {
+    /// Gets the newest map.
+    pub newest: watch::Sender<Option<ReceivedMap>>,
+    /// A file to which every accepted map is appended, one JSON object a line.
+    pub log: Option<PathBuf>,
+    /// What the node says about itself; epoch and aggregator follow the maps.
+    pub status: NodeStatus,
+    /// Where the status is published.
+    pub gateway: Seat<GatewayMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// Keeps the newest map.
+#[derive(Debug, Default)]
+pub struct Follower;
+
+/// The newest map and where it goes.
+pub struct FollowerState {
+    newest: watch::Sender<Option<ReceivedMap>>,
+    log: Option<BufWriter<File>>,
+    status: NodeStatus,
+    gateway: Seat<GatewayMessage>,
+    counters: Arc<Counters>,
+}
+
+impl Actor for Follower {
+    type Msg = FollowerMessage;
+    type State = FollowerState;
+    type Arguments = FollowerArguments;
+
+    async fn pre_start(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let FollowerArguments { newest, log, status, gateway, counters } = arguments;
+        let log = log.as_deref().map(open).transpose()?;
+        Ok(FollowerState { newest, log, status, gateway, counters })
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let FollowerMessage::TakeMap { delivery } = message;
+        if let Incoming::Map(map) = &delivery.message {
+            state.take(map, delivery.received_at);
+        }
+        Ok(())
+    }
+}
+
+impl FollowerState {
+    fn take(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) {
+        let superseded = self.newest.borrow().as_ref().is_some_and(|newest| order(map) <= order(&newest.map));
+        if superseded {
+            self.counters.reject(RejectReason::Superseded);
+            return;
+        }
+        self.counters.count(Event::MapAccepted);
+        self.follow(map);
+        self.write(map);
+        self.newest.send_replace(Some(ReceivedMap { map: Arc::clone(map), received_at }));
+    }
+
+    /// Says so when the aggregator or its epoch has changed.
+    fn follow(&mut self, map: &GlobalMap) {
+        if (self.status.epoch, &self.status.aggregator) != (map.epoch, &Some(map.aggregator.clone())) {
+            tracing::info!(aggregator = %map.aggregator, epoch = map.epoch, "following");
+            self.status.epoch = map.epoch;
+            self.status.aggregator = Some(map.aggregator.clone());
+            self.gateway.send(GatewayMessage::PublishStatus { status: self.status.clone() });
+        }
+    }
+
+    fn write(&mut self, map: &GlobalMap) {
+        let Some(log) = &mut self.log else { return };
+        let written = serde_json::to_writer(&mut *log, map).map_err(std::io::Error::from);
+        if let Err(error) = written.and_then(|()| log.write_all(b"\n")).and_then(|()| log.flush()) {
+            tracing::warn!(%error, "map log abandoned");
+            self.log = None;
+        }
+    }
+}
+
+/// Maps are ordered by epoch, then aggregator, then round.
+fn order(map: &GlobalMap) -> (u64, &NodeName, u64) {
+    (map.epoch, &map.aggregator, map.round)
+}
+
+fn open(path: &Path) -> Result<BufWriter<File>, ActorProcessingErr> {
+    let file = File::options().create(true).append(true).open(path);
+    file.map(BufWriter::new).map_err(|error| format!("cannot open map log {}: {error}", path.display()).into())
+}

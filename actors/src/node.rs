@@ -1,0 +1,200 @@
+//! The supervisor of a node.
+//!
+//! ```text
+//! Node
+//! ├─ Broker      embedded MQTT broker             an aggregator without an external broker
+//! ├─ Gateway     the only owner of MQTT clients   always
+//! ├─ Follower    takes the cell's maps            always
+//! ├─ Fuser       closes rounds, makes maps        an aggregator
+//! ├─ Projector   detections -> report             with a camera
+//! └─ Detector    frames -> detections             with a camera
+//! ```
+//!
+//! A part that ends is started anew, and the others go on: they reach each other through seats. A node whose parts end
+//! more often than [`MAX_RESTARTS`] times in [`RESTART_SPAN`] gives up, so that the service manager starts it afresh.
+
+mod parts;
+mod restarts;
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+use crate::clock;
+use crate::config::NodeConfig;
+use crate::counters::Counters;
+use crate::follower::ReceivedMap;
+
+pub use parts::{Part, Seats};
+pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
+
+use parts::Assembly;
+use restarts::Restarts;
+
+/// What the supervisor is asked to do; it stops by [`NodeHandle::stop`].
+#[derive(Debug)]
+pub enum NodeMessage {
+    /// Log how the node is.
+    LogHealth,
+}
+
+/// Starts the parts of a node and starts them again.
+#[derive(Debug, Default)]
+struct Node;
+
+/// The running parts.
+struct NodeState {
+    assembly: Assembly,
+    running: HashMap<ActorId, Part>,
+    restarts: Restarts,
+}
+
+/// A node that could not start or had to give up.
+#[derive(Debug, thiserror::Error)]
+pub enum NodeError {
+    /// A part did not start, or the node gave up on one.
+    #[error("{0}")]
+    Failed(String),
+}
+
+/// A running node.
+pub struct NodeHandle {
+    supervisor: ActorRef<NodeMessage>,
+    ended: JoinHandle<()>,
+    failure: watch::Receiver<Option<String>>,
+    newest: watch::Receiver<Option<ReceivedMap>>,
+    broker: watch::Receiver<Option<SocketAddr>>,
+    seats: Seats,
+    counters: Arc<Counters>,
+}
+
+/// How often a node logs how it is.
+const HEALTH_PERIOD: Duration = Duration::from_secs(30);
+
+/// Starts a node; `config` is taken as valid.
+///
+/// # Errors
+/// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
+pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
+    let (failed, failure) = watch::channel(None);
+    let assembly = Assembly::new(config, failed);
+    let (newest, broker) = (assembly.newest(), assembly.broker_address());
+    let (seats, counters) = (assembly.seats().clone(), assembly.counters());
+    let started = Actor::spawn(None, Node, assembly).await;
+    let (supervisor, ended) = started.map_err(|error| NodeError::Failed(error.to_string()))?;
+    supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
+    Ok(NodeHandle { supervisor, ended, failure, newest, broker, seats, counters })
+}
+
+impl NodeHandle {
+    /// The newest map of the cell, as it changes.
+    pub fn newest_map(&self) -> watch::Receiver<Option<ReceivedMap>> {
+        self.newest.clone()
+    }
+
+    /// Where the embedded broker listens, if there is one.
+    pub fn broker_address(&self) -> Option<SocketAddr> {
+        *self.broker.borrow()
+    }
+
+    /// Where the node's actors are reached.
+    pub fn seats(&self) -> &Seats {
+        &self.seats
+    }
+
+    /// The node's counters.
+    pub fn counters(&self) -> &Arc<Counters> {
+        &self.counters
+    }
+
+    /// Waits until the node has given up.
+    ///
+    /// # Errors
+    /// [`NodeError`] always says why; the node never ends well by itself.
+    pub async fn failed(&mut self) -> Result<(), NodeError> {
+        let why = self.failure.wait_for(Option::is_some).await.ok().and_then(|why| why.clone());
+        Err(NodeError::Failed(why.unwrap_or_else(|| "the supervisor ended".into())))
+    }
+
+    /// Stops all parts, the camera first and the broker last, and waits until they have ended.
+    pub async fn stop(self) {
+        self.supervisor.stop(None);
+        if self.ended.await.is_err() {
+            tracing::warn!("the supervisor did not end well");
+        }
+    }
+}
+
+impl Actor for Node {
+    type Msg = NodeMessage;
+    type State = NodeState;
+    type Arguments = Assembly;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        assembly: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let mut state = NodeState { assembly, running: HashMap::new(), restarts: Restarts::default() };
+        for part in state.assembly.parts() {
+            state.start(part, &myself.get_cell()).await?;
+        }
+        Ok(state)
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let NodeMessage::LogHealth = message;
+        let snapshot = state.assembly.counters().snapshot();
+        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, "health");
+        Ok(())
+    }
+
+    async fn handle_supervisor_evt(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        event: SupervisionEvent,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let (actor, why) = match event {
+            SupervisionEvent::ActorTerminated(actor, _, why) => (actor, why.unwrap_or_else(|| "stopped".into())),
+            SupervisionEvent::ActorFailed(actor, error) => (actor, error.to_string()),
+            SupervisionEvent::ActorStarted(_) | SupervisionEvent::ProcessGroupChanged(_) => return Ok(()),
+        };
+        let Some(part) = state.running.remove(&actor.get_id()) else { return Ok(()) };
+        tracing::warn!(?part, why, "part ended, starting it anew");
+        let restarted = if state.restarts.allow(clock::now()) {
+            state.start(part, &myself.get_cell()).await
+        } else {
+            Err(format!("parts ended more than {MAX_RESTARTS} times in {RESTART_SPAN:?}, the last: {part:?}: {why}").into())
+        };
+        restarted.inspect_err(|error| state.assembly.give_up(error.to_string()))
+    }
+
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        state.running.clear();
+        state.assembly.stop_all().await;
+        Ok(())
+    }
+}
+
+impl NodeState {
+    async fn start(&mut self, part: Part, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+        let actor = self.assembly.start(part, supervisor.clone()).await?;
+        self.running.insert(actor, part);
+        Ok(())
+    }
+}

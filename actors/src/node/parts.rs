@@ -1,0 +1,270 @@
+//! The parts of a node, how each is started, and where it is reached.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::aggregator::Aggregator;
+use ecod::names::NodeName;
+use ecod::wire::{NodeState as NodeCondition, NodeStatus, Role, SCHEMA_VERSION};
+use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
+use tokio::sync::watch;
+use uuid::Uuid;
+
+use crate::broker::{Broker, BrokerMessage, EmbeddedBroker};
+use crate::clock;
+use crate::config::NodeConfig;
+use crate::counters::Counters;
+use crate::follower::{Follower, FollowerArguments, FollowerMessage, ReceivedMap};
+use crate::fuser::{Fuser, FuserArguments, FuserMessage};
+use crate::gateway::{
+    self, BrokerAddress, Gateway, GatewayArguments, GatewayMessage, Incoming, Subscriber,
+};
+use crate::seat::Seat;
+#[cfg(feature = "camera")]
+use crate::{
+    camera,
+    detector::{Detector, DetectorMessage},
+    projector::{Projector, ProjectorArguments, ProjectorMessage},
+};
+
+/// A part of a node, in the order of starting.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Part {
+    /// The embedded broker.
+    Broker,
+    /// The MQTT connections.
+    Gateway,
+    /// The taker of maps.
+    Follower,
+    /// The maker of maps.
+    Fuser,
+    /// The maker of reports.
+    #[cfg(feature = "camera")]
+    Projector,
+    /// The finder of objects in frames.
+    #[cfg(feature = "camera")]
+    Detector,
+}
+
+/// Where the parts of a node are reached.
+#[derive(Debug, Clone, Default)]
+pub struct Seats {
+    /// The embedded broker's.
+    pub broker: Seat<BrokerMessage>,
+    /// The gateway's.
+    pub gateway: Seat<GatewayMessage>,
+    /// The follower's.
+    pub follower: Seat<FollowerMessage>,
+    /// The fuser's.
+    pub fuser: Seat<FuserMessage>,
+    /// The projector's.
+    #[cfg(feature = "camera")]
+    pub projector: Seat<ProjectorMessage>,
+    /// The detector's.
+    #[cfg(feature = "camera")]
+    pub detector: Seat<DetectorMessage>,
+}
+
+/// What the parts are made from; kept to make them again.
+pub(super) struct Assembly {
+    config: NodeConfig,
+    name: NodeName,
+    run: Uuid,
+    seats: Seats,
+    counters: Arc<Counters>,
+    newest: watch::Sender<Option<ReceivedMap>>,
+    broker_address: watch::Sender<Option<SocketAddr>>,
+    failed: watch::Sender<Option<String>>,
+    last_epoch: u64,
+}
+
+/// How long a part may take to stop.
+const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+
+impl Assembly {
+    pub(super) fn new(config: NodeConfig, failed: watch::Sender<Option<String>>) -> Self {
+        Self {
+            name: config.name.clone().unwrap_or(NodeName::from_static("node")),
+            config,
+            run: Uuid::now_v7(),
+            seats: Seats::default(),
+            counters: Arc::default(),
+            newest: watch::Sender::new(None),
+            broker_address: watch::Sender::new(None),
+            failed,
+            last_epoch: 0,
+        }
+    }
+
+    pub(super) fn seats(&self) -> &Seats {
+        &self.seats
+    }
+
+    pub(super) fn counters(&self) -> Arc<Counters> {
+        Arc::clone(&self.counters)
+    }
+
+    pub(super) fn newest(&self) -> watch::Receiver<Option<ReceivedMap>> {
+        self.newest.subscribe()
+    }
+
+    pub(super) fn broker_address(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.broker_address.subscribe()
+    }
+
+    pub(super) fn give_up(&self, why: String) {
+        self.failed.send_replace(Some(why));
+    }
+
+    /// The parts that this node has, in the order of starting.
+    pub(super) fn parts(&self) -> Vec<Part> {
+        let aggregates = self.config.role == Role::Edge;
+        let mut parts = Vec::new();
+        parts.extend((aggregates && self.config.mqtt.broker.is_none()).then_some(Part::Broker));
+        parts.extend([Part::Gateway, Part::Follower]);
+        parts.extend(aggregates.then_some(Part::Fuser));
+        #[cfg(feature = "camera")]
+        if self.config.camera.is_some() {
+            parts.extend([Part::Projector, Part::Detector]);
+        }
+        parts
+    }
+
+    /// Starts one part below the supervisor and seats it.
+    pub(super) async fn start(&mut self, part: Part, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        match part {
+            Part::Broker => self.start_broker(supervisor).await,
+            Part::Gateway => self.start_gateway(supervisor).await,
+            Part::Follower => {
+                let arguments = FollowerArguments {
+                    newest: self.newest.clone(),
+                    log: self.config.map_log.clone(),
+                    status: self.status(),
+                    gateway: self.seats.gateway.clone(),
+                    counters: self.counters(),
+                };
+                seat(&self.seats.follower, Actor::spawn_linked(None, Follower, arguments, supervisor).await)
+            }
+            Part::Fuser => {
+                let arguments = self.fuser_arguments();
+                seat(&self.seats.fuser, Actor::spawn_linked(None, Fuser, arguments, supervisor).await)
+            }
+            #[cfg(feature = "camera")]
+            Part::Projector => {
+                let arguments = ProjectorArguments {
+                    perception: camera::perception(&self.config)?,
+                    kinds: self.config.report_kinds(),
+                    gateway: self.seats.gateway.clone(),
+                };
+                seat(&self.seats.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
+            }
+            #[cfg(feature = "camera")]
+            Part::Detector => {
+                let arguments = camera::detector(&self.config, self.seats.projector.clone(), self.counters())?;
+                seat(&self.seats.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
+            }
+        }
+    }
+
+    /// Stops all parts, the last started first.
+    pub(super) async fn stop_all(&self) {
+        #[cfg(feature = "camera")]
+        {
+            stop(&self.seats.detector).await;
+            stop(&self.seats.projector).await;
+        }
+        stop(&self.seats.fuser).await;
+        stop(&self.seats.follower).await;
+        stop(&self.seats.gateway).await;
+        stop(&self.seats.broker).await;
+    }
+
+    /// The broker comes back at the address it had, so that the links find it.
+    async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let embedded = Box::new(EmbeddedBroker::new(self.config.broker.clone()));
+        let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await?;
+        let address = self.broker_address.borrow().unwrap_or(self.config.listen);
+        let bound = ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })??;
+        self.broker_address.send_replace(Some(bound));
+        let id = broker.get_id();
+        self.seats.broker.take(broker);
+        Ok(id)
+    }
+
+    async fn start_gateway(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let part = if self.config.role == Role::Cav { gateway::Part::Follower } else { gateway::Part::Candidate };
+        let arguments = GatewayArguments {
+            cell: self.config.cell.clone(),
+            part,
+            status: self.status(),
+            mqtt: self.config.mqtt.clone(),
+            counters: self.counters(),
+            subscriber: self.subscriber(),
+            seed: self.run.as_u64_pair().1,
+        };
+        let (actor, _) = Actor::spawn_linked(None, Gateway, arguments, supervisor).await?;
+        let embedded = *self.broker_address.borrow();
+        let addresses = self.config.mqtt.broker.clone().or(embedded.map(BrokerAddress::from)).into_iter().collect();
+        actor.cast(GatewayMessage::SetBrokers { addresses })?;
+        let id = actor.get_id();
+        self.seats.gateway.take(actor);
+        Ok(id)
+    }
+
+    /// Takes what comes in to the part that deals with it.
+    fn subscriber(&self) -> Subscriber {
+        let (fuser, follower) = (self.seats.fuser.clone(), self.seats.follower.clone());
+        Arc::new(move |delivery| {
+            match &delivery.message {
+                Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
+                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
+                Incoming::Verdicts(_) | Incoming::Reputations(_) | Incoming::Status(_) | Incoming::Link { .. } => true,
+            };
+        })
+    }
+
+    /// Every run of a fuser leads in an epoch of its own, later than all before: the seconds of its start.
+    fn fuser_arguments(&mut self) -> FuserArguments {
+        let now = clock::now();
+        self.last_epoch = (now.micros() / 1_000_000).max(self.last_epoch + 1);
+        let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
+        FuserArguments {
+            aggregator: Aggregator::new(self.name.clone(), self.last_epoch, fusion, landmarks, now),
+            gateway: self.seats.gateway.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    fn status(&self) -> NodeStatus {
+        let aggregates = self.config.role == Role::Edge;
+        NodeStatus {
+            schema: SCHEMA_VERSION,
+            node: self.name.clone(),
+            id: self.run,
+            role: self.config.role,
+            state: if aggregates { NodeCondition::Aggregating } else { NodeCondition::Following },
+            epoch: self.last_epoch,
+            aggregator: aggregates.then(|| self.name.clone()),
+            version: env!("CARGO_PKG_VERSION").into(),
+        }
+    }
+}
+
+fn seat<M: Message>(
+    seat: &Seat<M>,
+    spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
+) -> Result<ActorId, ActorProcessingErr> {
+    let (actor, _) = spawned?;
+    let id = actor.get_id();
+    seat.take(actor);
+    Ok(id)
+}
+
+async fn stop<M: Message>(seat: &Seat<M>) {
+    let Some(actor) = seat.holder() else { return };
+    if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT.into())).await {
+        tracing::debug!(%error, "part did not stop in time");
+        actor.kill();
+    }
+}
