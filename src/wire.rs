@@ -22,7 +22,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-pub use codec::{Encoding, Limits, RejectReason, decode, decode_report, encode};
+pub use codec::{Encoding, Limits, Payload, RejectReason, decode, decode_report, encode};
 pub use topic::{Topic, Topics};
 
 use crate::geometry::{Covariance, Pose};

@@ -2,14 +2,15 @@
 
 use std::fmt;
 
-use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 
-use super::{ObjectReport, SCHEMA_VERSION};
+use super::{GlobalMap, NodeStatus, ObjectReport, Reputations, SCHEMA_VERSION, Verdicts};
 use crate::names::{MAX_NAME_BYTES, NodeName};
 
 /// How a payload is written.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Encoding {
     /// Text that people and every language can read; the default.
     #[default]
@@ -130,18 +131,41 @@ pub fn encode<T: Serialize>(payload: &T, encoding: Encoding) -> Vec<u8> {
     bytes
 }
 
+/// What travels on a topic, with the version of its form.
+pub trait Payload: Serialize + DeserializeOwned {
+    /// Major version that the payload claims to have.
+    fn schema(&self) -> u32;
+}
+
+macro_rules! payloads {
+    ($($payload:ty),+) => {
+        $(impl Payload for $payload {
+            fn schema(&self) -> u32 {
+                self.schema
+            }
+        })+
+    };
+}
+
+payloads!(ObjectReport, GlobalMap, Verdicts, Reputations, NodeStatus);
+
 /// Reads any payload whose `schema` is known.
 ///
 /// # Errors
-/// [`RejectReason::TooLarge`], [`RejectReason::Malformed`] or [`RejectReason::UnknownSchema`].
-pub fn decode<T: DeserializeOwned>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
+/// [`RejectReason::TooLarge`], [`RejectReason::Malformed`], [`RejectReason::UnknownSchema`], or
+/// [`RejectReason::NotFinite`] for JSON numbers beyond 64-bit floats.
+pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
     if bytes.len() > limits.payload_bytes {
         return Err(RejectReason::TooLarge);
     }
-    read(bytes).map_err(|()| match read::<SchemaOnly>(bytes) {
+    let payload: T = read(bytes).map_err(|reason| match read::<SchemaOnly>(bytes) {
         Ok(SchemaOnly { schema }) if schema != SCHEMA_VERSION => RejectReason::UnknownSchema,
-        _ => RejectReason::Malformed,
-    })
+        _ => reason,
+    })?;
+    if payload.schema() != SCHEMA_VERSION {
+        return Err(RejectReason::UnknownSchema);
+    }
+    Ok(payload)
 }
 
 /// Reads a report and checks every value in it; `topic_node` is the node named by its topic.
@@ -195,16 +219,20 @@ impl ObjectReport {
     }
 }
 
-#[derive(serde::Deserialize)]
+#[derive(Deserialize)]
 struct SchemaOnly {
     schema: u32,
 }
 
-fn read<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ()> {
+fn read<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
-        Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|_| ()),
-        Some(_) => ciborium::from_reader(bytes).map_err(|_| ()),
-        None => Err(()),
+        Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|error| {
+            // serde_json has no other way to tell 1e999 from a syntax error.
+            let overflow = error.to_string().starts_with("number out of range");
+            if overflow { RejectReason::NotFinite } else { RejectReason::Malformed }
+        }),
+        Some(_) => ciborium::from_reader(bytes).map_err(|_| RejectReason::Malformed),
+        None => Err(RejectReason::Malformed),
     }
 }
 
