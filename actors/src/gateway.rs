@@ -198,11 +198,7 @@ impl Actor for Gateway {
         Ok(())
     }
 
-    async fn post_stop(
-        &self,
-        _myself: ActorRef<Self::Msg>,
-        state: &mut Self::State,
-    ) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
         state.set_status(NodeStatus { state: NodeState::Offline, ..state.status.clone() });
         for link in std::mem::take(&mut state.links).into_values() {
             link.leave(LEAVE_TIMEOUT).await;
@@ -313,14 +309,9 @@ impl Part {
     fn levels(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
-            Self::Candidate => &[
-                "detections/+",
-                "vote_detections/+",
-                "global_detections",
-                "global_verdicts",
-                "reputations",
-                "nodes/+",
-            ],
+            Self::Candidate => {
+                &["detections/+", "vote_detections/+", "global_detections", "global_verdicts", "reputations", "nodes/+"]
+            }
         }
     }
 }

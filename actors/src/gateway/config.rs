@@ -158,7 +158,8 @@ mod tests {
 
     #[test]
     fn toml_is_read_and_passwords_are_never_shown() {
-        let text = "broker = \"10.0.0.2:1883\"\nversion = \"5\"\nuser = \"u\"\npassword = \"hush\"\nencoding = \"cbor\"";
+        let text =
+            "broker = \"10.0.0.2:1883\"\nversion = \"5\"\nuser = \"u\"\npassword = \"hush\"\nencoding = \"cbor\"";
         let config: MqttConfig = toml::from_str(text).unwrap();
         assert_eq!((config.version, config.encoding), (MqttVersion::V5, Encoding::Cbor));
         assert_eq!(config.password.as_ref().map(Secret::reveal), Some("hush"));

@@ -77,9 +77,10 @@ impl ConnectionError {
             ),
             Self::V5(error) => matches!(
                 **error,
-                v5::ConnectionError::MqttState(v5::StateError::Deserialization(
-                    v5::mqttbytes::Error::PayloadSizeLimitExceeded { .. }
-                ) | v5::StateError::IncomingPacketTooLarge { .. })
+                v5::ConnectionError::MqttState(
+                    v5::StateError::Deserialization(v5::mqttbytes::Error::PayloadSizeLimitExceeded { .. })
+                        | v5::StateError::IncomingPacketTooLarge { .. }
+                )
             ),
             Self::Silent(_) => false,
         }
@@ -124,13 +125,8 @@ pub(super) fn open(
             options.set_keep_alive(config.keep_alive());
             options.set_connection_timeout(timeout_s);
             options.set_max_packet_size(u32::try_from(MAX_PACKET_BYTES).ok());
-            let will = v5::mqttbytes::v5::LastWill::new(
-                &will.topic,
-                will.payload.clone(),
-                QoS5::AtLeastOnce,
-                true,
-                None,
-            );
+            let will =
+                v5::mqttbytes::v5::LastWill::new(&will.topic, will.payload.clone(), QoS5::AtLeastOnce, true, None);
             options.set_last_will(will);
             options.set_network_options(network);
             if let Some((user, password)) = login {

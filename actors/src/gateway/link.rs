@@ -74,7 +74,10 @@ impl Link {
     /// Takes leave of the broker without a last will; what was queued before goes out first, within `patience`.
     pub(super) async fn leave(mut self, patience: Duration) {
         let said = self.client.as_ref().is_some_and(Client::disconnect);
-        if said && let Some(task) = self.task.take() && tokio::time::timeout(patience, task).await.is_err() {
+        if said
+            && let Some(task) = self.task.take()
+            && tokio::time::timeout(patience, task).await.is_err()
+        {
             tracing::debug!(broker = %self.broker, "broker did not take the farewell");
         }
     }
@@ -117,10 +120,7 @@ impl Task {
         let LinkSetup { client_id, will, config, inbox, counters, .. } = &*self.setup;
         let (client, mut connection) = connection::open(&self.broker, client_id, will, config);
         // The protocol's own timeouts are whole seconds.
-        connection
-            .next(config.connect_timeout())
-            .await
-            .inspect_err(|_| counters.count(Event::ConnectFailed))?;
+        connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
         backoff.reset();
         if !self.tell(LinkNews::Accepted(client)) {
