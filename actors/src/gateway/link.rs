@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::wire::RejectReason;
 use ractor::ActorRef;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -15,7 +16,6 @@ use super::connection::{self, Client, ConnectionError, LastWill, Packet};
 use super::inbox::{Inbox, LinkState, Outcome};
 use crate::clock;
 use crate::counters::{Counters, Event};
-use ecod::wire::RejectReason;
 
 /// Tells links apart, also an old and a new one to the same broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
