@@ -14,6 +14,7 @@
 //! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
 
 mod codec;
+mod reject;
 mod topic;
 
 use std::collections::BTreeMap;
@@ -22,7 +23,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-pub use codec::{Encoding, Limits, RejectReason, decode, decode_report, encode};
+pub use codec::{Encoding, Limits, Payload, decode, decode_report, encode};
+pub use reject::RejectReason;
 pub use topic::{Topic, Topics};
 
 use crate::geometry::{Covariance, Pose};

@@ -4,8 +4,14 @@
 
 pub mod broker;
 pub mod clock;
+pub mod config;
 pub mod counters;
 #[cfg(feature = "camera")]
 pub mod detect;
+pub mod follower;
 #[cfg(feature = "camera")]
 pub mod frame;
+pub mod fuser;
+pub mod gateway;
+pub mod node;
+pub mod seat;

@@ -1,15 +1,14 @@
 //! JSON and CBOR; the first byte tells them apart.
 
-use std::fmt;
-
-use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 
-use super::{ObjectReport, SCHEMA_VERSION};
+use super::{GlobalMap, NodeStatus, ObjectReport, RejectReason, Reputations, SCHEMA_VERSION, Verdicts};
 use crate::names::{MAX_NAME_BYTES, NodeName};
 
 /// How a payload is written.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Encoding {
     /// Text that people and every language can read; the default.
     #[default]
@@ -33,87 +32,6 @@ impl Default for Limits {
     }
 }
 
-/// Why a payload was not used; nothing was changed by it. The name is the reason's label in counters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum RejectReason {
-    /// More bytes than [`Limits::payload_bytes`].
-    TooLarge,
-    /// Neither JSON nor CBOR, truncated, not UTF-8, or without a required field.
-    Malformed,
-    /// A `schema` other than [`SCHEMA_VERSION`].
-    UnknownSchema,
-    /// The payload's node is not the topic's.
-    NodeMismatch,
-    /// More objects or seen landmarks than [`Limits::objects`].
-    TooManyObjects,
-    /// A number is NaN, infinite or out of the world's bounds, or a covariance is not one.
-    NotFinite,
-    /// A confidence outside 0 to 1.
-    ConfidenceOutOfRange,
-    /// An empty or overlong label or landmark id.
-    InvalidLabel,
-    /// Captured further in the future than clocks may differ.
-    FromTheFuture,
-    /// Captured too long ago.
-    Stale,
-    /// Not newer than a report already taken from this node.
-    OutOfOrder,
-    /// A vehicle beyond the most that an aggregator keeps.
-    TooManyVehicles,
-    /// A topic that is none of this cell's.
-    UnknownTopic,
-    /// From an aggregator or epoch that has been superseded.
-    Superseded,
-}
-
-impl RejectReason {
-    /// All reasons, for counters.
-    pub const ALL: [Self; 14] = [
-        Self::TooLarge,
-        Self::Malformed,
-        Self::UnknownSchema,
-        Self::NodeMismatch,
-        Self::TooManyObjects,
-        Self::NotFinite,
-        Self::ConfidenceOutOfRange,
-        Self::InvalidLabel,
-        Self::FromTheFuture,
-        Self::Stale,
-        Self::OutOfOrder,
-        Self::TooManyVehicles,
-        Self::UnknownTopic,
-        Self::Superseded,
-    ];
-
-    /// The reason as a counter's label.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::TooLarge => "too_large",
-            Self::Malformed => "malformed",
-            Self::UnknownSchema => "unknown_schema",
-            Self::NodeMismatch => "node_mismatch",
-            Self::TooManyObjects => "too_many_objects",
-            Self::NotFinite => "not_finite",
-            Self::ConfidenceOutOfRange => "confidence_out_of_range",
-            Self::InvalidLabel => "invalid_label",
-            Self::FromTheFuture => "from_the_future",
-            Self::Stale => "stale",
-            Self::OutOfOrder => "out_of_order",
-            Self::TooManyVehicles => "too_many_vehicles",
-            Self::UnknownTopic => "unknown_topic",
-            Self::Superseded => "superseded",
-        }
-    }
-}
-
-impl fmt::Display for RejectReason {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
-    }
-}
-
-impl std::error::Error for RejectReason {}
-
 /// Largest coordinate in metres that is taken for a position on Earth.
 const WORLD_BOUND_M: f64 = 1e8;
 
@@ -130,18 +48,41 @@ pub fn encode<T: Serialize>(payload: &T, encoding: Encoding) -> Vec<u8> {
     bytes
 }
 
+/// What travels on a topic, with the version of its form.
+pub trait Payload: Serialize + DeserializeOwned {
+    /// Major version that the payload claims to have.
+    fn schema(&self) -> u32;
+}
+
+macro_rules! payloads {
+    ($($payload:ty),+) => {
+        $(impl Payload for $payload {
+            fn schema(&self) -> u32 {
+                self.schema
+            }
+        })+
+    };
+}
+
+payloads!(ObjectReport, GlobalMap, Verdicts, Reputations, NodeStatus);
+
 /// Reads any payload whose `schema` is known.
 ///
 /// # Errors
-/// [`RejectReason::TooLarge`], [`RejectReason::Malformed`] or [`RejectReason::UnknownSchema`].
-pub fn decode<T: DeserializeOwned>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
+/// [`RejectReason::TooLarge`], [`RejectReason::Malformed`], [`RejectReason::UnknownSchema`], or
+/// [`RejectReason::NotFinite`] for JSON numbers beyond 64-bit floats.
+pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
     if bytes.len() > limits.payload_bytes {
         return Err(RejectReason::TooLarge);
     }
-    read(bytes).map_err(|()| match read::<SchemaOnly>(bytes) {
+    let payload: T = read(bytes).map_err(|reason| match read::<SchemaOnly>(bytes) {
         Ok(SchemaOnly { schema }) if schema != SCHEMA_VERSION => RejectReason::UnknownSchema,
-        _ => RejectReason::Malformed,
-    })
+        _ => reason,
+    })?;
+    if payload.schema() != SCHEMA_VERSION {
+        return Err(RejectReason::UnknownSchema);
+    }
+    Ok(payload)
 }
 
 /// Reads a report and checks every value in it; `topic_node` is the node named by its topic.
@@ -195,16 +136,20 @@ impl ObjectReport {
     }
 }
 
-#[derive(serde::Deserialize)]
+#[derive(Deserialize)]
 struct SchemaOnly {
     schema: u32,
 }
 
-fn read<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ()> {
+fn read<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
-        Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|_| ()),
-        Some(_) => ciborium::from_reader(bytes).map_err(|_| ()),
-        None => Err(()),
+        Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|error| {
+            // serde_json has no other way to tell 1e999 from a syntax error.
+            let overflow = error.to_string().starts_with("number out of range");
+            if overflow { RejectReason::NotFinite } else { RejectReason::Malformed }
+        }),
+        Some(_) => ciborium::from_reader(bytes).map_err(|_| RejectReason::Malformed),
+        None => Err(RejectReason::Malformed),
     }
 }
 
@@ -214,4 +159,177 @@ fn in_world(coordinate_m: f64) -> bool {
 
 fn is_label(text: &str) -> bool {
     (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use proptest::{collection, option};
+
+    use super::*;
+    use crate::time::Timestamp;
+    use crate::wire::{PerceivedObject, WirePose};
+
+    fn node() -> NodeName {
+        NodeName::new("euclid").unwrap()
+    }
+
+    fn report() -> ObjectReport {
+        ObjectReport {
+            schema: SCHEMA_VERSION,
+            node: node(),
+            seq: 412,
+            captured_at_us: Timestamp(1_732_154_400_123_456),
+            pose: Some(WirePose { x_m: 0.61, y_m: 0.46, heading_rad: 2.88 }),
+            objects: vec![PerceivedObject {
+                label: "ABCD123".into(),
+                confidence: 0.93,
+                x_m: 0.25,
+                y_m: 0.48,
+                covariance_m2: Some([0.0004, 0.0, 0.0001]),
+                landmark: Some("slot-0".into()),
+            }],
+            seen: Some(vec!["slot-0".into(), "slot-1".into()]),
+        }
+    }
+
+    /// The reason for which a report is rejected, the same in both encodings.
+    fn reason(report: &ObjectReport) -> Option<RejectReason> {
+        let cbor = decode_report(&encode(report, Encoding::Cbor), &node(), &Limits::default()).err();
+        let finite = report.objects.iter().all(|o| o.x_m.is_finite() && o.confidence.is_finite());
+        // JSON has no word for a number that is none.
+        if finite && report.pose.is_none_or(|pose| pose.heading_rad.is_finite()) {
+            let json = decode_report(&encode(report, Encoding::Json), &node(), &Limits::default()).err();
+            assert_eq!(json, cbor);
+        }
+        cbor
+    }
+
+    #[test]
+    fn each_flaw_of_a_report_has_its_reason() {
+        type Flaw = (fn(&mut ObjectReport), RejectReason);
+        let flaws: [Flaw; 18] = [
+            (|r| r.schema = 2, RejectReason::UnknownSchema),
+            (|r| r.schema = 0, RejectReason::UnknownSchema),
+            (|r| r.node = NodeName::new("gauss").unwrap(), RejectReason::NodeMismatch),
+            (|r| r.objects = vec![r.objects[0].clone(); 1025], RejectReason::TooManyObjects),
+            (|r| r.seen = Some(vec!["a".into(); 1025]), RejectReason::TooManyObjects),
+            (|r| r.objects[0].x_m = f64::NAN, RejectReason::NotFinite),
+            (|r| r.objects[0].x_m = f64::INFINITY, RejectReason::NotFinite),
+            (|r| r.objects[0].x_m = 1e9, RejectReason::NotFinite),
+            (|r| r.pose = Some(WirePose { x_m: 0.0, y_m: 0.0, heading_rad: f64::NAN }), RejectReason::NotFinite),
+            (|r| r.objects[0].covariance_m2 = Some([-1.0, 0.0, 1.0]), RejectReason::NotFinite),
+            (|r| r.objects[0].covariance_m2 = Some([1.0, 2.0, 1.0]), RejectReason::NotFinite),
+            (|r| r.objects[0].confidence = 2.0, RejectReason::ConfidenceOutOfRange),
+            (|r| r.objects[0].confidence = -0.1, RejectReason::ConfidenceOutOfRange),
+            (|r| r.objects[0].confidence = f64::NAN, RejectReason::ConfidenceOutOfRange),
+            (|r| r.objects[0].label = "".into(), RejectReason::InvalidLabel),
+            (|r| r.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
+            (|r| r.objects[0].landmark = Some("a\nb".into()), RejectReason::InvalidLabel),
+            (|r| r.seen = Some(vec!["".into()]), RejectReason::InvalidLabel),
+        ];
+        assert_eq!(reason(&report()), None);
+        for (index, (spoil, expected)) in flaws.into_iter().enumerate() {
+            let mut report = report();
+            spoil(&mut report);
+            assert_eq!(reason(&report), Some(expected), "flaw {index}");
+        }
+    }
+
+    #[test]
+    fn each_flaw_of_a_payload_has_its_reason() {
+        let json = String::from_utf8(encode(&report(), Encoding::Json)).unwrap();
+        let mut not_utf8 = json.clone().into_bytes();
+        not_utf8[json.find("ABCD").unwrap()] = 0xff;
+        let cbor = encode(&report(), Encoding::Cbor);
+        let table: Vec<(Vec<u8>, RejectReason)> = vec![
+            (vec![], RejectReason::Malformed),
+            (json.as_bytes()[..json.len() - 1].to_vec(), RejectReason::Malformed),
+            (cbor[..cbor.len() - 1].to_vec(), RejectReason::Malformed),
+            (not_utf8, RejectReason::Malformed),
+            (b"null".to_vec(), RejectReason::Malformed),
+            (json.replace("\"seq\":412,", "").into(), RejectReason::Malformed),
+            (json.replace("\"seq\":412", "\"seq\":-1").into(), RejectReason::Malformed),
+            (json.replace("\"euclid\"", "\"a/b\"").into(), RejectReason::Malformed),
+            (json.replace("0.25", "1e999").into(), RejectReason::NotFinite),
+            (b"{\"schema\":2}".to_vec(), RejectReason::UnknownSchema),
+            (vec![b' '; Limits::default().payload_bytes + 1], RejectReason::TooLarge),
+        ];
+        for (payload, expected) in table {
+            let decoded = decode_report(&payload, &node(), &Limits::default());
+            assert_eq!(decoded, Err(expected), "{:?}", String::from_utf8_lossy(&payload[..payload.len().min(99)]));
+        }
+    }
+
+    #[test]
+    fn unknown_fields_are_ignored_and_optional_ones_may_be_null() {
+        let text = r#" {"schema":1,"node":"euclid","seq":1,"captured_at_us":5,"pose":null,"objects":[],"mood":[1e3]}"#;
+        let report = decode_report(text.as_bytes(), &node(), &Limits::default()).unwrap();
+        assert_eq!((report.pose, report.seen), (None, None));
+    }
+
+    #[test]
+    fn other_payloads_of_an_unknown_version_are_rejected_too() {
+        let text = br#"{"schema":2,"epoch":1,"round":1,"reputations":{}}"#;
+        assert_eq!(decode::<Reputations>(text, &Limits::default()), Err(RejectReason::UnknownSchema));
+    }
+
+    prop_compose! {
+        fn object()(
+            label in "[a-zA-Z0-9 é]{1,20}",
+            confidence in 0.0..=1.0f64,
+            (x_m, y_m) in (-1e8..1e8f64, -1e8..1e8f64),
+            variances in option::of((1e-6..1e6f64, 1e-6..1e6f64)),
+            landmark in option::of("[a-z0-9-]{1,64}"),
+        ) -> PerceivedObject {
+            PerceivedObject {
+                label: label.into(), confidence, x_m, y_m,
+                covariance_m2: variances.map(|(xx, yy)| [xx, 0.0, yy]),
+                landmark: landmark.map(Into::into),
+            }
+        }
+    }
+
+    prop_compose! {
+        fn reports()(
+            (seq, captured_at) in (any::<u64>(), any::<u64>()),
+            pose in option::of((-1e8..1e8f64, -1e8..1e8f64, -10.0..10.0f64)),
+            objects in collection::vec(object(), 0..20),
+            seen in option::of(collection::vec("[a-z]{1,8}", 0..5)),
+        ) -> ObjectReport {
+            ObjectReport {
+                schema: SCHEMA_VERSION, node: node(), seq, captured_at_us: Timestamp(captured_at),
+                pose: pose.map(|(x_m, y_m, heading_rad)| WirePose { x_m, y_m, heading_rad }),
+                objects,
+                seen: seen.map(|ids| ids.into_iter().map(Into::into).collect()),
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_encoded_is_decoded(report in reports()) {
+            for encoding in [Encoding::Json, Encoding::Cbor] {
+                let decoded = decode_report(&encode(&report, encoding), &node(), &Limits::default());
+                prop_assert_eq!(decoded.as_ref(), Ok(&report));
+            }
+        }
+
+        #[test]
+        fn no_bytes_panic(
+            bytes in collection::vec(any::<u8>(), 0..300),
+            report in reports(),
+            cut in any::<prop::sample::Index>(),
+            flip in any::<u8>(),
+        ) {
+            let mut spoiled = encode(&report, if flip % 2 == 0 { Encoding::Json } else { Encoding::Cbor });
+            let at = cut.index(spoiled.len());
+            spoiled[at] ^= flip;
+            for payload in [&bytes, &spoiled] {
+                if let Ok(accepted) = decode_report(payload, &node(), &Limits::default()) {
+                    prop_assert_eq!(accepted.validate(&Limits::default()), Ok(()));
+                }
+            }
+        }
+    }
 }

@@ -11,7 +11,7 @@ use rmqtt::context::ServerContext;
 use rmqtt::net::{Builder, Listener};
 use rmqtt::server::MqttServer;
 use serde::{Deserialize, Serialize};
-use tokio::runtime::{self, Runtime};
+use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
@@ -148,23 +148,24 @@ impl Mqtt for EmbeddedBroker {
             return Err(BrokerError::Running(running.address));
         }
         let thread_error = |source| BrokerError::Thread { address, source };
-        let runtime = runtime::Builder::new_current_thread().enable_all().build().map_err(thread_error)?;
-        let bind_error = |error: rmqtt::Error| BrokerError::Bind { address, reason: error.root_cause().to_string() };
-        let listener = {
-            let _context = runtime.enter();
-            self.listener(address).bind().and_then(Listener::tcp).map_err(bind_error)?
-        };
-        let bound = listener.local_addr().map_err(bind_error)?;
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
-        let retained = RetainedMessages::new(self.config.max_retained);
+        let (listener, max_retained) = (self.listener(address), self.config.max_retained);
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
-            .spawn(move || serve(runtime, listener, retained, &ready, stopped))
+            .spawn(move || serve(address, listener, max_retained, &ready, stopped))
             .map_err(thread_error)?;
-        if started.recv().is_err() {
-            return Err(thread_error(io::Error::other("the broker's thread ended")));
-        }
+        let outcome = started.recv().unwrap_or_else(|_| Err(thread_error(io::Error::other("it ended at once"))));
+        let bound = match outcome {
+            Ok(bound) => bound,
+            Err(error) => {
+                // Its last act was to send the error; nothing is left to wait for but its end.
+                if thread.join().is_err() {
+                    tracing::error!(%address, "broker's thread panicked");
+                }
+                return Err(error);
+            }
+        };
         self.running = Some(Running { address: bound, stop, thread });
         Ok(bound)
     }
@@ -191,21 +192,36 @@ impl Drop for EmbeddedBroker {
     }
 }
 
+/// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made here.
 fn serve(
-    runtime: Runtime,
-    listener: Listener,
-    retained: RetainedMessages,
-    ready: &mpsc::Sender<()>,
+    address: SocketAddr,
+    listener: Builder,
+    max_retained: usize,
+    ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>,
     stopped: oneshot::Receiver<()>,
 ) {
-    runtime.block_on(async {
-        // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
-        let context = ServerContext::new().busy_check_enable(false).build().await;
-        *context.extends.retain_mut().await = Box::new(retained);
-        let server = MqttServer::new(context).listener_by_id(listener, 1).build();
-        if ready.send(()).is_err() {
+    let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(source) => {
+            // The caller waits for nothing else and cannot be gone.
+            ready.send(Err(BrokerError::Thread { address, source })).unwrap_or_default();
             return;
         }
+    };
+    runtime.block_on(async {
+        let bound = listener.bind().and_then(Listener::tcp).and_then(|l| l.local_addr().map(|bound| (l, bound)));
+        let (listener, bound) = match bound {
+            Ok(bound) => bound,
+            Err(error) => {
+                let reason = error.root_cause().to_string();
+                return ready.send(Err(BrokerError::Bind { address, reason })).unwrap_or_default();
+            }
+        };
+        // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
+        let context = ServerContext::new().busy_check_enable(false).build().await;
+        *context.extends.retain_mut().await = Box::new(RetainedMessages::new(max_retained));
+        let server = MqttServer::new(context).listener_by_id(listener, 1).build();
+        ready.send(Ok(bound)).unwrap_or_default();
         tokio::select! {
             ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
             _ = stopped => {}

@@ -30,12 +30,7 @@ impl RetainStorage for RetainedMessages {
 
     // `_listener_expiry` is the listener's bound on queued messages; a retained status holds until it is replaced,
     // unless its publisher says otherwise (MQTT 5).
-    async fn set(
-        &self,
-        topic: &TopicName,
-        message: Retain,
-        _listener_expiry: Option<Duration>,
-    ) -> rmqtt::Result<()> {
+    async fn set(&self, topic: &TopicName, message: Retain, _listener_expiry: Option<Duration>) -> rmqtt::Result<()> {
         let full = usize::try_from(self.storage.count().await).is_ok_and(|topics| topics >= self.max_topics);
         if full && !message.publish.payload.is_empty() && self.storage.get_message(topic).await?.is_empty() {
             tracing::warn!(%topic, max_topics = self.max_topics, "retained message refused");

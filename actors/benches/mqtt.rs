@@ -1,0 +1,155 @@
+//! Two hops through the embedded broker: bare clients, then gateways with decoding and encoding.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
+use ecod_actors::bench::two_hop::{self, Load};
+use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::clock;
+use ecod_actors::counters::Counters;
+use ecod_actors::gateway::{
+    BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion,
+    Part, ReportKind,
+};
+use hdrhistogram::Histogram;
+use ractor::{Actor, ActorRef};
+use tokio::sync::mpsc;
+use uuid::Uuid;
+
+#[tokio::main]
+async fn main() -> anyhow::Result<()> {
+    let mut broker = EmbeddedBroker::new(BrokerConfig::default());
+    let address = BrokerAddress::from(broker.start(([127, 0, 0, 1], 0).into())?);
+    let load = Load { messages: 1000, interval: Duration::from_millis(10), payload_bytes: 1100 };
+    print("two hops, bare clients", &two_hop::raw(&address, load).await?);
+    for version in [MqttVersion::V311, MqttVersion::V5] {
+        print(&format!("report to map, gateways {version:?}"), &through_gateways(&address, version, load).await?);
+    }
+    print("two hops, bare clients again", &two_hop::raw(&address, load).await?);
+    Ok(())
+}
+
+fn print(what: &str, histogram: &Histogram<u64>) {
+    let micros = |quantile| histogram.value_at_quantile(quantile) as f64 / 1000.0;
+    println!("{what}: p50 {:.0} µs, p99 {:.0} µs, n {}", micros(0.5), micros(0.99), histogram.len());
+}
+
+/// Times from a report's publication to the arrival of the map that answers it, in nanoseconds.
+async fn through_gateways(broker: &BrokerAddress, version: MqttVersion, load: Load) -> anyhow::Result<Histogram<u64>> {
+    let (edge, mut reports) = join("edge", Part::Candidate, version, broker).await?;
+    let (euclid, mut maps) = join("euclid", Part::Follower, version, broker).await?;
+    let aggregator = edge.clone();
+    let answer = tokio::spawn(async move {
+        while let Some(delivery) = reports.recv().await {
+            if let Incoming::Report { report, .. } = delivery.message {
+                let map = Arc::new(answer_to(&report));
+                if aggregator.cast(GatewayMessage::PublishMap { map }).is_err() {
+                    return;
+                }
+            }
+        }
+    });
+    let publisher = euclid.clone();
+    let publish = tokio::spawn(async move {
+        let mut ticks = tokio::time::interval(load.interval);
+        for seq in 0..load.messages {
+            ticks.tick().await;
+            let report = Arc::new(report(seq.into()));
+            if publisher.cast(GatewayMessage::PublishReport { kind: ReportKind::Detections, report }).is_err() {
+                return;
+            }
+        }
+    });
+    let mut histogram = Histogram::new(3)?;
+    let mut back = 0;
+    while back < load.messages {
+        let delivery = tokio::time::timeout(Duration::from_secs(5), maps.recv()).await?.context("gateway ended")?;
+        if let Incoming::Map(map) = delivery.message {
+            back += 1;
+            if map.round >= u64::from(load.messages / 10) {
+                let taken = clock::now().since(map.oldest_capture_us.context("capture time")?);
+                histogram.saturating_record(u64::try_from(taken.as_nanos())?);
+            }
+        }
+    }
+    publish.await?;
+    answer.abort();
+    edge.stop_and_wait(None, None).await?;
+    euclid.stop_and_wait(None, None).await?;
+    Ok(histogram)
+}
+
+async fn join(
+    name: &str,
+    part: Part,
+    version: MqttVersion,
+    broker: &BrokerAddress,
+) -> anyhow::Result<(ActorRef<GatewayMessage>, mpsc::UnboundedReceiver<Delivery>)> {
+    let (sender, mut deliveries) = mpsc::unbounded_channel();
+    let status = NodeStatus {
+        schema: SCHEMA_VERSION,
+        node: NodeName::new(name)?,
+        id: Uuid::new_v4(),
+        role: Role::Auto,
+        state: NodeState::Following,
+        epoch: 0,
+        aggregator: None,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+    };
+    let arguments = GatewayArguments {
+        cell: NodeName::new("bench")?,
+        part,
+        status,
+        mqtt: MqttConfig { version, ..MqttConfig::default() },
+        counters: Arc::new(Counters::default()),
+        subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
+        seed: 1,
+    };
+    let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
+    gateway.cast(GatewayMessage::SetBrokers { addresses: vec![broker.clone()] })?;
+    while let Some(delivery) = deliveries.recv().await {
+        if matches!(delivery.message, Incoming::Link { state: LinkState::Up, .. }) {
+            break;
+        }
+    }
+    // The subscription is in force a moment after the link is up.
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    Ok((gateway, deliveries))
+}
+
+fn report(seq: u64) -> ObjectReport {
+    let object = |index: u32| PerceivedObject {
+        label: "ABCD123".into(),
+        confidence: 0.93,
+        x_m: f64::from(index) * 0.25,
+        y_m: 0.48,
+        covariance_m2: Some([0.0004, 0.0, 0.0001]),
+        landmark: None,
+    };
+    ObjectReport {
+        schema: SCHEMA_VERSION,
+        node: NodeName::new("euclid").expect("a valid name"),
+        seq,
+        captured_at_us: clock::now(),
+        pose: None,
+        objects: (0..10).map(object).collect(),
+        seen: None,
+    }
+}
+
+fn answer_to(report: &ObjectReport) -> GlobalMap {
+    GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: NodeName::new("edge").expect("a valid name"),
+        epoch: 1,
+        round: report.seq,
+        fused_at_us: Timestamp::default(),
+        oldest_capture_us: Some(report.captured_at_us),
+        landmarks: vec![],
+        objects: vec![],
+    }
+}

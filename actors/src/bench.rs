@@ -1,0 +1,3 @@
+//! Measurements that the `bench` command and the benchmarks share.
+
+pub mod two_hop;

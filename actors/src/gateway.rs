@@ -1,0 +1,317 @@
+//! The actor that owns all MQTT connections of a node.
+//!
+//! A link is kept to every broker it is told of: usually the aggregator's and its standby's, so that a change of
+//! aggregator costs no connecting. Every payload is encoded once and sent on every link.
+//!
+//! ```text
+//! other actors ── PublishReport, PublishMap, … ──> Gateway ── try_publish ──> link ── MQTT ──> broker
+//!        ▲                                            │ own map, own report: in-process          │
+//!        └───────────── Subscriber ◄──────────────────┴─── Inbox ◄── link task ◄── MQTT ─────────┘
+//! ```
+//!
+//! - Nothing waits: a link that is down or full refuses, which is counted. A new connection starts with an empty queue,
+//!   so nothing old is delivered late.
+//! - Packets are decoded on the link's own task; a payload that cannot be used is a counter, never an error.
+//! - What a node publishes and also subscribes to reaches its own receivers in-process; the broker's echo is dropped.
+//! - `nodes/<node>` is published on every connection before anything else and has `offline` as last will.
+
+mod address;
+mod config;
+mod connection;
+mod inbox;
+mod link;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use ecod::names::NodeName;
+use ecod::wire::{
+    Encoding, GlobalMap, NodeState, NodeStatus, ObjectReport, Payload, Reputations, Topic, Topics, Verdicts, encode,
+};
+use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
+
+pub use address::{BrokerAddress, InvalidAddress};
+pub use config::{MqttConfig, MqttVersion, Secret};
+pub use inbox::{Delivery, Incoming, LinkState, ReportKind, Subscriber};
+pub use link::LinkEvent;
+
+use crate::counters::{Counters, Event};
+use connection::{Handling, LastWill};
+use inbox::Inbox;
+use link::{Link, LinkId, LinkNews, LinkSetup};
+
+/// What the gateway is asked to do.
+pub enum GatewayMessage {
+    /// Keep links to exactly these brokers; links that stay are not touched.
+    SetBrokers {
+        /// The brokers, in no particular order.
+        addresses: Vec<BrokerAddress>,
+    },
+    /// Hand messages to another subscriber from now on, such as after a receiver's restart.
+    SetSubscriber {
+        /// The new subscriber.
+        subscriber: Subscriber,
+    },
+    /// Send this vehicle's report; a candidate also takes it in-process.
+    PublishReport {
+        /// What it is for.
+        kind: ReportKind,
+        /// The report.
+        report: Arc<ObjectReport>,
+    },
+    /// Send the map of a round to all, this node included.
+    PublishMap {
+        /// The map.
+        map: Arc<GlobalMap>,
+    },
+    /// Send the verdicts of a round to all, this node included.
+    PublishVerdicts {
+        /// The verdicts.
+        verdicts: Arc<Verdicts>,
+    },
+    /// Send reputations to all, this node included; brokers keep them for latecomers.
+    PublishReputations {
+        /// The reputations.
+        reputations: Arc<Reputations>,
+    },
+    /// Replace what this node says about itself, now and on every later connection.
+    PublishStatus {
+        /// The status.
+        status: NodeStatus,
+    },
+    /// Tell how every link is.
+    Links {
+        /// Gets the state by broker.
+        reply: RpcReplyPort<BTreeMap<BrokerAddress, LinkState>>,
+    },
+    /// News from a link's own task.
+    LinkChanged {
+        /// The news.
+        event: LinkEvent,
+    },
+}
+
+/// Which topics a node takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Maps, verdicts, reputations and statuses.
+    Follower,
+    /// Also reports: the node aggregates or may have to.
+    Candidate,
+}
+
+/// What a gateway needs to know at its start.
+pub struct GatewayArguments {
+    /// The cell's name.
+    pub cell: NodeName,
+    /// Which topics to take.
+    pub part: Part,
+    /// What the node says about itself until told otherwise; names the node and this run of it.
+    pub status: NodeStatus,
+    /// Protocol, credentials and limits.
+    pub mqtt: MqttConfig,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+    /// Gets every message.
+    pub subscriber: Subscriber,
+    /// Seed of the jitter of reconnecting.
+    pub seed: u64,
+}
+
+/// The only owner of MQTT clients.
+#[derive(Debug, Default)]
+pub struct Gateway;
+
+/// The links and what is sent on them.
+#[derive(Debug)]
+pub struct GatewayState {
+    topics: Topics,
+    part: Part,
+    encoding: Encoding,
+    filters: Vec<String>,
+    status: NodeStatus,
+    status_topic: String,
+    status_payload: Bytes,
+    links: BTreeMap<LinkId, Link>,
+    next_link: u64,
+    setup: Arc<LinkSetup>,
+}
+
+/// How long a broker may take to accept the farewell.
+const LEAVE_TIMEOUT: Duration = Duration::from_millis(300);
+
+impl Actor for Gateway {
+    type Msg = GatewayMessage;
+    type State = GatewayState;
+    type Arguments = GatewayArguments;
+
+    async fn pre_start(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        arguments.mqtt.validate()?;
+        Ok(GatewayState::new(arguments))
+    }
+
+    async fn handle(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let inbox = Arc::clone(&state.setup.inbox);
+        match message {
+            GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
+            GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
+            GatewayMessage::PublishReport { kind, report } => {
+                state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
+                if state.part == Part::Candidate {
+                    inbox.deliver_local(Incoming::Report { kind, report });
+                }
+            }
+            GatewayMessage::PublishMap { map } => {
+                state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
+                inbox.deliver_local(Incoming::Map(map));
+            }
+            GatewayMessage::PublishVerdicts { verdicts } => {
+                state.publish(&Topic::GlobalVerdicts, &*verdicts, Handling::Stream);
+                inbox.deliver_local(Incoming::Verdicts(verdicts));
+            }
+            GatewayMessage::PublishReputations { reputations } => {
+                let payload = Bytes::from(encode(&*reputations, state.encoding));
+                inbox.expect_reputations(payload.clone());
+                state.send(&state.topics.path(&Topic::Reputations), &payload, Handling::State);
+                inbox.deliver_local(Incoming::Reputations(reputations));
+            }
+            GatewayMessage::PublishStatus { status } => state.set_status(status),
+            GatewayMessage::Links { reply } => {
+                let links = state.links.values().map(|link| (link.broker.clone(), link.state)).collect();
+                if reply.send(links).is_err() {
+                    tracing::debug!("nobody waited for the state of the links");
+                }
+            }
+            GatewayMessage::LinkChanged { event } => state.link_changed(event),
+        }
+        Ok(())
+    }
+
+    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+        state.set_status(NodeStatus { state: NodeState::Offline, ..state.status.clone() });
+        for link in std::mem::take(&mut state.links).into_values() {
+            link.leave(LEAVE_TIMEOUT).await;
+        }
+        Ok(())
+    }
+}
+
+impl GatewayState {
+    fn new(arguments: GatewayArguments) -> Self {
+        let GatewayArguments { cell, part, status, mqtt, counters, subscriber, seed } = arguments;
+        let topics = Topics::new(&cell);
+        let encoding = mqtt.encoding;
+        let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
+        let offline = NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() };
+        let will = LastWill { topic: status_topic.clone(), payload: encode(&offline, encoding).into() };
+        let inbox = Inbox::new(
+            status.node.clone(),
+            topics.clone(),
+            mqtt.limits(),
+            mqtt.inbox,
+            Arc::clone(&counters),
+            subscriber,
+        );
+        // One id for a run of the node: a broker that still holds the last connection ends it before it takes the next,
+        // so that the will comes before the new status.
+        let client_id = format!("{}-{}", status.node, status.id.simple());
+        let setup = LinkSetup { client_id, will, config: mqtt, inbox: Arc::new(inbox), counters, seed };
+        Self {
+            filters: part.levels().iter().map(|level| topics.filter(level)).collect(),
+            topics,
+            part,
+            encoding,
+            status_payload: encode(&status, encoding).into(),
+            status,
+            status_topic,
+            links: BTreeMap::new(),
+            next_link: 0,
+            setup: Arc::new(setup),
+        }
+    }
+
+    fn set_brokers(&mut self, addresses: Vec<BrokerAddress>, myself: &ActorRef<GatewayMessage>) {
+        let mut wanted: BTreeSet<_> = addresses.into_iter().collect();
+        let gone: Vec<_> = self.links.extract_if(.., |_, link| !wanted.remove(&link.broker)).collect();
+        for (_, link) in gone {
+            // The status is taken back: this node lives on, but that broker will not hear of it.
+            if let Some(client) = &link.client {
+                client.publish(&self.status_topic, &Bytes::new(), Handling::State);
+            }
+            tokio::spawn(link.leave(LEAVE_TIMEOUT));
+        }
+        for broker in wanted {
+            let id = LinkId(self.next_link);
+            self.next_link += 1;
+            self.links.insert(id, Link::spawn(id, broker, Arc::clone(&self.setup), myself.clone()));
+        }
+    }
+
+    fn set_status(&mut self, status: NodeStatus) {
+        self.status_payload = encode(&status, self.encoding).into();
+        self.status = status;
+        self.send(&self.status_topic, &self.status_payload, Handling::State);
+    }
+
+    fn publish<T: Payload>(&self, topic: &Topic, payload: &T, handling: Handling) {
+        self.send(&self.topics.path(topic), &encode(payload, self.encoding).into(), handling);
+    }
+
+    fn send(&self, topic: &str, payload: &Bytes, handling: Handling) {
+        for link in self.links.values() {
+            let sent = link.client.as_ref().is_some_and(|client| client.publish(topic, payload, handling));
+            self.setup.counters.count(if sent { Event::Published } else { Event::PublishRefused });
+        }
+    }
+
+    fn link_changed(&mut self, LinkEvent { link: id, news }: LinkEvent) {
+        let Some(link) = self.links.get_mut(&id) else { return };
+        let state = match news {
+            LinkNews::Accepted(client) => {
+                // The queue of a new connection is empty, so that both fit.
+                client.publish(&self.status_topic, &self.status_payload, Handling::State);
+                client.subscribe(&self.filters);
+                link.client = Some(client);
+                LinkState::Up
+            }
+            LinkNews::DeclaredOffline => {
+                tracing::warn!(broker = %link.broker, "broker took this node for dead");
+                if let Some(client) = &link.client {
+                    client.publish(&self.status_topic, &self.status_payload, Handling::State);
+                }
+                return;
+            }
+            LinkNews::Lost(state) => {
+                link.client = None;
+                state
+            }
+        };
+        if link.state != state {
+            link.state = state;
+            tracing::info!(broker = %link.broker, ?state, "link changed");
+            self.setup.inbox.deliver_local(Incoming::Link { broker: link.broker.clone(), state });
+        }
+    }
+}
+
+impl Part {
+    fn levels(self) -> &'static [&'static str] {
+        match self {
+            Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
+            Self::Candidate => {
+                &["detections/+", "vote_detections/+", "global_detections", "global_verdicts", "reputations", "nodes/+"]
+            }
+        }
+    }
+}

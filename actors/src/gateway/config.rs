@@ -1,0 +1,169 @@
+//! How a node talks MQTT.
+
+use std::fmt;
+use std::time::Duration;
+
+use ecod::config::{ConfigError, check_range};
+use ecod::wire::{Encoding, Limits};
+use serde::{Deserialize, Serialize};
+
+use super::address::BrokerAddress;
+
+/// Protocol, credentials and limits of the MQTT connections.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MqttConfig {
+    /// An external broker as `host:port`; default none: the aggregator's embedded broker is used.
+    pub broker: Option<BrokerAddress>,
+    /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized packets away).
+    pub version: MqttVersion,
+    /// User name; default none. Needs `password`.
+    pub user: Option<String>,
+    /// Password; default none. Never printed.
+    pub password: Option<Secret>,
+    /// How payloads are written, `"json"` (default, readable) or `"cbor"` (no text parsing of numbers).
+    pub encoding: Encoding,
+    /// Seconds of silence after which the broker is asked for a sign of life; default 5. Shorter notices a dead network
+    /// path sooner and costs packets. Not a failure detector: nodes watch each other by other means.
+    pub keep_alive_s: u16,
+    /// Milliseconds within which a broker must accept a connection; default 2000.
+    pub connect_timeout_ms: u64,
+    /// Milliseconds before the first attempt to reconnect, doubled with every failure; default 50.
+    pub retry_min_ms: u64,
+    /// Most milliseconds between attempts to reconnect; default 2000. Every wait is shortened by up to half at random,
+    /// so that a cell's vehicles do not return all at once.
+    pub retry_max_ms: u64,
+    /// Most messages waiting to be sent on one link; default 64. When full, new ones are refused and counted.
+    pub send_queue: usize,
+    /// Most decoded messages that receivers may be behind; default 1024. When full, new ones are dropped and counted.
+    pub inbox: usize,
+    /// Largest payload in bytes that is decoded; default 262144.
+    pub max_payload_bytes: usize,
+    /// Most objects, and most seen landmarks, in a report; default 1024.
+    pub max_objects: usize,
+}
+
+impl Default for MqttConfig {
+    fn default() -> Self {
+        let limits = Limits::default();
+        Self {
+            broker: None,
+            version: MqttVersion::V311,
+            user: None,
+            password: None,
+            encoding: Encoding::Json,
+            keep_alive_s: 5,
+            connect_timeout_ms: 2000,
+            retry_min_ms: 50,
+            retry_max_ms: 2000,
+            send_queue: 64,
+            inbox: 1024,
+            max_payload_bytes: limits.payload_bytes,
+            max_objects: limits.objects,
+        }
+    }
+}
+
+impl MqttConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the key, the value and what is allowed.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("keep_alive_s", f64::from(self.keep_alive_s), 1.0, 3600.0)?;
+        check_range("connect_timeout_ms", self.connect_timeout_ms as f64, 10.0, 60_000.0)?;
+        check_range("retry_min_ms", self.retry_min_ms as f64, 1.0, 60_000.0)?;
+        check_range("retry_max_ms", self.retry_max_ms as f64, self.retry_min_ms as f64, 600_000.0)?;
+        check_range("send_queue", self.send_queue as f64, 8.0, 65_536.0)?;
+        check_range("inbox", self.inbox as f64, 1.0, 1e6)?;
+        check_range("max_payload_bytes", self.max_payload_bytes as f64, 256.0, MAX_PACKET_BYTES as f64)?;
+        check_range("max_objects", self.max_objects as f64, 1.0, 1e6)?;
+        if self.user.is_none() && self.password.is_some() {
+            return Err(ConfigError::new("password", "a password", "set together with `user`"));
+        }
+        Ok(())
+    }
+
+    /// The bounds of what is decoded.
+    pub fn limits(&self) -> Limits {
+        Limits { payload_bytes: self.max_payload_bytes, objects: self.max_objects }
+    }
+
+    pub(super) fn keep_alive(&self) -> Duration {
+        Duration::from_secs(self.keep_alive_s.into())
+    }
+
+    pub(super) fn connect_timeout(&self) -> Duration {
+        Duration::from_millis(self.connect_timeout_ms)
+    }
+}
+
+/// Largest packet in bytes that a link reads at all. A larger one costs the link, which is then made anew; one between
+/// [`MqttConfig::max_payload_bytes`] and this is read, counted and dropped.
+pub(super) const MAX_PACKET_BYTES: usize = 16 * 1024 * 1024;
+
+/// A version of the MQTT protocol.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum MqttVersion {
+    /// MQTT 3.1.1.
+    #[default]
+    #[serde(rename = "3.1.1")]
+    V311,
+    /// MQTT 5.
+    #[serde(rename = "5")]
+    V5,
+}
+
+/// Text that shows in no log and no printed configuration.
+#[derive(Clone, PartialEq, Eq, Deserialize)]
+#[serde(transparent)]
+pub struct Secret(String);
+
+impl Secret {
+    /// Takes the text.
+    pub fn new(text: impl Into<String>) -> Self {
+        Self(text.into())
+    }
+
+    /// The text itself.
+    pub fn reveal(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Serialize for Secret {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str("***")
+    }
+}
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("***")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_valid_and_errors_name_the_key() {
+        MqttConfig::default().validate().unwrap();
+        let error = MqttConfig { keep_alive_s: 0, ..MqttConfig::default() }.validate().unwrap_err();
+        assert_eq!(error.key, "keep_alive_s");
+        let lone = MqttConfig { password: Some(Secret::new("x")), ..MqttConfig::default() };
+        assert_eq!(lone.validate().unwrap_err().key, "password");
+    }
+
+    #[test]
+    fn toml_is_read_and_passwords_are_never_shown() {
+        let text =
+            "broker = \"10.0.0.2:1883\"\nversion = \"5\"\nuser = \"u\"\npassword = \"hush\"\nencoding = \"cbor\"";
+        let config: MqttConfig = toml::from_str(text).unwrap();
+        assert_eq!((config.version, config.encoding), (MqttVersion::V5, Encoding::Cbor));
+        assert_eq!(config.password.as_ref().map(Secret::reveal), Some("hush"));
+        assert!(!format!("{config:?}{}", toml::to_string(&config).unwrap()).contains("hush"));
+        assert!(toml::from_str::<MqttConfig>("brokr = \"x:1\"").is_err());
+    }
+}

@@ -1,0 +1,208 @@
+//! One MQTT connection, 3.1.1 or 5, to one broker; used once and never reconnected, so that nothing old is sent late.
+
+use std::io;
+use std::time::Duration;
+
+use bytes::Bytes;
+use rumqttc::v5::mqttbytes::QoS as QoS5;
+use rumqttc::{QoS as QoS4, v5};
+
+use super::address::BrokerAddress;
+use super::config::{MAX_PACKET_BYTES, MqttConfig, MqttVersion};
+
+/// How the broker is to treat a message: contract of the topics.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Handling {
+    /// QoS 0, not retained: the next one makes it worthless.
+    Stream,
+    /// QoS 1, retained: latecomers need it.
+    State,
+}
+
+/// The sending half; never waits.
+#[derive(Debug)]
+pub(super) enum Client {
+    V311(rumqttc::AsyncClient),
+    V5(v5::AsyncClient),
+}
+
+/// The receiving half; must be polled for anything to be sent or received.
+pub(super) enum Connection {
+    V311(Box<rumqttc::EventLoop>),
+    V5(Box<v5::EventLoop>),
+}
+
+/// What polling a connection yields.
+pub(super) enum Packet {
+    /// The broker accepted the connection.
+    Accepted,
+    /// A message on a topic, which may be no UTF-8.
+    Message { topic: Bytes, payload: Bytes },
+    /// This side's farewell is on its way.
+    Left,
+    /// Something that only the protocol is concerned with.
+    Other,
+}
+
+/// Why a connection ended.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ConnectionError {
+    #[error("{0}")]
+    V311(Box<rumqttc::ConnectionError>),
+    #[error("{0}")]
+    V5(Box<v5::ConnectionError>),
+    #[error("nothing within {0:?}")]
+    Silent(Duration),
+}
+
+impl ConnectionError {
+    /// Whether nothing listens there: the broker's process is gone.
+    pub(super) fn is_refused(&self) -> bool {
+        let refused = |error: &io::Error| error.kind() == io::ErrorKind::ConnectionRefused;
+        match self {
+            Self::V311(error) => matches!(&**error, rumqttc::ConnectionError::Io(io) if refused(io)),
+            Self::V5(error) => matches!(&**error, v5::ConnectionError::Io(io) if refused(io)),
+            Self::Silent(_) => false,
+        }
+    }
+
+    /// Whether a packet beyond [`MAX_PACKET_BYTES`] came in.
+    pub(super) fn is_oversized(&self) -> bool {
+        match self {
+            Self::V311(error) => matches!(
+                **error,
+                rumqttc::ConnectionError::MqttState(rumqttc::StateError::Deserialization(
+                    rumqttc::Error::PayloadSizeLimitExceeded(_)
+                ))
+            ),
+            Self::V5(error) => matches!(
+                **error,
+                v5::ConnectionError::MqttState(
+                    v5::StateError::Deserialization(v5::mqttbytes::Error::PayloadSizeLimitExceeded { .. })
+                        | v5::StateError::IncomingPacketTooLarge { .. }
+                )
+            ),
+            Self::Silent(_) => false,
+        }
+    }
+}
+
+/// What the broker says about this node when it falls silent.
+#[derive(Debug, Clone)]
+pub(super) struct LastWill {
+    pub(super) topic: String,
+    pub(super) payload: Bytes,
+}
+
+/// Prepares a connection; the first poll makes it.
+pub(super) fn open(
+    address: &BrokerAddress,
+    client_id: &str,
+    will: &LastWill,
+    config: &MqttConfig,
+) -> (Client, Connection) {
+    let timeout_s = config.connect_timeout().as_secs().max(1);
+    let mut network = rumqttc::NetworkOptions::new();
+    network.set_tcp_nodelay(true);
+    network.set_connection_timeout(timeout_s);
+    let login = config.user.as_deref().map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
+    let (host, port) = (address.host(), address.port());
+    match config.version {
+        MqttVersion::V311 => {
+            let mut options = rumqttc::MqttOptions::new(client_id, host, port);
+            options.set_keep_alive(config.keep_alive());
+            options.set_max_packet_size(MAX_PACKET_BYTES, MAX_PACKET_BYTES);
+            options.set_last_will(rumqttc::LastWill::new(&will.topic, will.payload.clone(), QoS4::AtLeastOnce, true));
+            if let Some((user, password)) = login {
+                options.set_credentials(user, password);
+            }
+            let (client, mut events) = rumqttc::AsyncClient::new(options, config.send_queue);
+            events.set_network_options(network);
+            (Client::V311(client), Connection::V311(Box::new(events)))
+        }
+        MqttVersion::V5 => {
+            let mut options = v5::MqttOptions::new(client_id, host, port);
+            options.set_keep_alive(config.keep_alive());
+            options.set_connection_timeout(timeout_s);
+            options.set_max_packet_size(u32::try_from(MAX_PACKET_BYTES).ok());
+            let will =
+                v5::mqttbytes::v5::LastWill::new(&will.topic, will.payload.clone(), QoS5::AtLeastOnce, true, None);
+            options.set_last_will(will);
+            options.set_network_options(network);
+            if let Some((user, password)) = login {
+                options.set_credentials(user, password);
+            }
+            let (client, events) = v5::AsyncClient::new(options, config.send_queue);
+            (Client::V5(client), Connection::V5(Box::new(events)))
+        }
+    }
+}
+
+impl Client {
+    /// Queues a message; false when there is no room or the connection has ended.
+    pub(super) fn publish(&self, topic: &str, payload: &Bytes, handling: Handling) -> bool {
+        let retain = handling == Handling::State;
+        match self {
+            Self::V311(client) => {
+                let qos = if retain { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
+                client.try_publish(topic, qos, retain, payload.clone()).is_ok()
+            }
+            Self::V5(client) => {
+                let qos = if retain { QoS5::AtLeastOnce } else { QoS5::AtMostOnce };
+                client.try_publish(topic, qos, retain, payload.clone()).is_ok()
+            }
+        }
+    }
+
+    /// Queues one subscription to all filters, with at most QoS 1; false when there is no room.
+    pub(super) fn subscribe(&self, filters: &[String]) -> bool {
+        match self {
+            Self::V311(client) => client
+                .try_subscribe_many(
+                    filters.iter().map(|path| rumqttc::SubscribeFilter::new(path.clone(), QoS4::AtLeastOnce)),
+                )
+                .is_ok(),
+            Self::V5(client) => client
+                .try_subscribe_many(
+                    filters.iter().map(|path| v5::mqttbytes::v5::Filter::new(path.clone(), QoS5::AtLeastOnce)),
+                )
+                .is_ok(),
+        }
+    }
+
+    /// Queues the farewell, after which the broker does not publish the last will; false when there is no room.
+    pub(super) fn disconnect(&self) -> bool {
+        match self {
+            Self::V311(client) => client.try_disconnect().is_ok(),
+            Self::V5(client) => client.try_disconnect().is_ok(),
+        }
+    }
+}
+
+impl Connection {
+    /// Sends and receives until there is something to tell; `patience` bounds the silence.
+    pub(super) async fn next(&mut self, patience: Duration) -> Result<Packet, ConnectionError> {
+        tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Silent(patience)))
+    }
+
+    async fn poll(&mut self) -> Result<Packet, ConnectionError> {
+        Ok(match self {
+            Self::V311(events) => match events.poll().await.map_err(|e| ConnectionError::V311(Box::new(e)))? {
+                rumqttc::Event::Incoming(rumqttc::Packet::ConnAck(_)) => Packet::Accepted,
+                rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) => {
+                    Packet::Message { topic: publish.topic.into(), payload: publish.payload }
+                }
+                rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                _ => Packet::Other,
+            },
+            Self::V5(events) => match events.poll().await.map_err(|e| ConnectionError::V5(Box::new(e)))? {
+                v5::Event::Incoming(v5::Incoming::ConnAck(_)) => Packet::Accepted,
+                v5::Event::Incoming(v5::Incoming::Publish(publish)) => {
+                    Packet::Message { topic: publish.topic, payload: publish.payload }
+                }
+                v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                _ => Packet::Other,
+            },
+        })
+    }
+}

@@ -1,0 +1,249 @@
+//! From a packet to a decoded message in a receiver's hands; junk ends here as a count.
+
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+
+use bytes::Bytes;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{
+    GlobalMap, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, Reputations, Topic, Topics, Verdicts, decode,
+    decode_report,
+};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use super::address::BrokerAddress;
+use crate::clock;
+use crate::counters::{Counters, Event};
+
+/// What a report is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum ReportKind {
+    /// PACE, on `detections/<node>`.
+    Detections,
+    /// VOTE, on `vote_detections/<node>`.
+    VoteDetections,
+}
+
+impl ReportKind {
+    pub(super) fn topic(self, node: NodeName) -> Topic {
+        match self {
+            Self::Detections => Topic::Detections(node),
+            Self::VoteDetections => Topic::VoteDetections(node),
+        }
+    }
+}
+
+/// A checked message of the cell, or news about a link.
+///
+/// The same message may arrive over several links. Who drops the second: the report window, by node and `seq`; receivers
+/// of maps, verdicts and reputations, by epoch and round; a status says the same twice.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Incoming {
+    /// A vehicle's report; only candidates for aggregation get these.
+    Report {
+        /// What it is for.
+        kind: ReportKind,
+        /// The report, within the limits.
+        report: Arc<ObjectReport>,
+    },
+    /// The fused map of a round.
+    Map(Arc<GlobalMap>),
+    /// The verdicts of a round.
+    Verdicts(Arc<Verdicts>),
+    /// Reputations, at once after connecting if the broker has some.
+    Reputations(Arc<Reputations>),
+    /// What another node says about itself, or its broker about it.
+    Status(Arc<NodeStatus>),
+    /// A link changed.
+    Link {
+        /// The broker at its other end.
+        broker: BrokerAddress,
+        /// How it is now.
+        state: LinkState,
+    },
+}
+
+/// How a link is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LinkState {
+    /// Connected, subscribed, status published.
+    Up,
+    /// Not connected; attempts go on.
+    Down,
+    /// Not connected and nothing listens there: the broker's process is gone. Attempts go on.
+    Refused,
+}
+
+/// A message on its way to a receiver. Dropping it makes room for another: keep it until it has been dealt with.
+#[derive(Debug)]
+pub struct Delivery {
+    /// The message.
+    pub message: Incoming,
+    /// When its packet was read from the socket, or when it was handed over in-process.
+    pub received_at: Timestamp,
+    _place: Option<OwnedSemaphorePermit>,
+}
+
+/// Takes messages to their receivers, typically by sending to actors; runs on the link's task and must not block.
+pub type Subscriber = Arc<dyn Fn(Delivery) + Send + Sync>;
+
+/// Decodes, counts and hands over; shared by the links of a gateway.
+pub(super) struct Inbox {
+    node: NodeName,
+    topics: Topics,
+    limits: Limits,
+    counters: Arc<Counters>,
+    subscriber: RwLock<Subscriber>,
+    places: Arc<Semaphore>,
+    own_reputations: Mutex<Bytes>,
+}
+
+/// What became of a packet, as far as the link has to act on it.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Outcome {
+    Done,
+    /// The broker took this node for dead; it has to be told otherwise.
+    DeclaredOffline,
+}
+
+impl Inbox {
+    pub(super) fn new(
+        node: NodeName,
+        topics: Topics,
+        limits: Limits,
+        places: usize,
+        counters: Arc<Counters>,
+        subscriber: Subscriber,
+    ) -> Self {
+        Self {
+            node,
+            topics,
+            limits,
+            counters,
+            subscriber: RwLock::new(subscriber),
+            places: Arc::new(Semaphore::new(places)),
+            own_reputations: Mutex::default(),
+        }
+    }
+
+    pub(super) fn set_subscriber(&self, subscriber: Subscriber) {
+        *self.subscriber.write().unwrap_or_else(PoisonError::into_inner) = subscriber;
+    }
+
+    /// Reputations carry no aggregator, so that their echo is known by its bytes.
+    pub(super) fn expect_reputations(&self, payload: Bytes) {
+        *self.own_reputations.lock().unwrap_or_else(PoisonError::into_inner) = payload;
+    }
+
+    /// Deals with one packet; a payload that cannot be used is counted by its reason.
+    pub(super) fn accept(&self, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Outcome {
+        self.counters.count(Event::Received);
+        match self.read(topic, payload) {
+            Ok(Read::Message(message)) => {
+                self.deliver(message, received_at);
+                Outcome::Done
+            }
+            Ok(Read::Echo) => {
+                self.counters.count(Event::Echo);
+                Outcome::Done
+            }
+            Ok(Read::Cleared) => Outcome::Done,
+            Ok(Read::OwnDeath) => Outcome::DeclaredOffline,
+            Err(reason) => {
+                self.counters.reject(reason);
+                tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
+                Outcome::Done
+            }
+        }
+    }
+
+    /// Hands over a message that came from outside; dropped and counted when receivers are too far behind.
+    fn deliver(&self, message: Incoming, received_at: Timestamp) {
+        match Arc::clone(&self.places).try_acquire_owned() {
+            Ok(place) => self.hand_over(Delivery { message, received_at, _place: Some(place) }),
+            Err(_) => self.counters.count(Event::InboxFull),
+        }
+    }
+
+    /// Hands over what this node itself publishes or observes; its own pace bounds it.
+    pub(super) fn deliver_local(&self, message: Incoming) {
+        self.hand_over(Delivery { message, received_at: clock::now(), _place: None });
+    }
+
+    fn hand_over(&self, delivery: Delivery) {
+        let subscriber = Arc::clone(&self.subscriber.read().unwrap_or_else(PoisonError::into_inner));
+        subscriber(delivery);
+    }
+
+    fn read(&self, topic: &[u8], payload: &[u8]) -> Result<Read, RejectReason> {
+        let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
+        let message = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
+            Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload),
+            Topic::VoteDetections(node) => return self.read_report(ReportKind::VoteDetections, &node, payload),
+            Topic::Nodes(node) => return self.read_status(&node, payload),
+            Topic::GlobalDetections => {
+                let map: GlobalMap = decode(payload, &self.limits)?;
+                if map.aggregator == self.node {
+                    return Ok(Read::Echo);
+                }
+                Incoming::Map(Arc::new(map))
+            }
+            Topic::GlobalVerdicts => {
+                let verdicts: Verdicts = decode(payload, &self.limits)?;
+                if verdicts.aggregator == self.node {
+                    return Ok(Read::Echo);
+                }
+                Incoming::Verdicts(Arc::new(verdicts))
+            }
+            Topic::Reputations if payload.is_empty() => return Ok(Read::Cleared),
+            Topic::Reputations => {
+                if *self.own_reputations.lock().unwrap_or_else(PoisonError::into_inner) == payload {
+                    return Ok(Read::Echo);
+                }
+                Incoming::Reputations(Arc::new(decode(payload, &self.limits)?))
+            }
+        };
+        Ok(Read::Message(message))
+    }
+
+    fn read_report(&self, kind: ReportKind, node: &NodeName, payload: &[u8]) -> Result<Read, RejectReason> {
+        if *node == self.node {
+            return Ok(Read::Echo);
+        }
+        let report = Arc::new(decode_report(payload, node, &self.limits)?);
+        Ok(Read::Message(Incoming::Report { kind, report }))
+    }
+
+    fn read_status(&self, node: &NodeName, payload: &[u8]) -> Result<Read, RejectReason> {
+        if payload.is_empty() {
+            return Ok(Read::Cleared);
+        }
+        let status: NodeStatus = decode(payload, &self.limits)?;
+        if status.node != *node {
+            return Err(RejectReason::NodeMismatch);
+        }
+        Ok(match (status.node == self.node, status.state) {
+            (true, NodeState::Offline) => Read::OwnDeath,
+            (true, NodeState::Following | NodeState::Aggregating) => Read::Echo,
+            (false, _) => Read::Message(Incoming::Status(Arc::new(status))),
+        })
+    }
+}
+
+/// What a usable packet turned out to be.
+enum Read {
+    Message(Incoming),
+    /// Published by this node.
+    Echo,
+    /// A retained message was removed.
+    Cleared,
+    /// This node's last will.
+    OwnDeath,
+}
+
+impl fmt::Debug for Inbox {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Inbox").field("node", &self.node).finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,198 @@
+//! The task that keeps one link to one broker: connects, reads, and connects anew.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::wire::RejectReason;
+use ractor::ActorRef;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tokio::task::{AbortHandle, JoinHandle};
+
+use super::GatewayMessage;
+use super::address::BrokerAddress;
+use super::config::MqttConfig;
+use super::connection::{self, Client, ConnectionError, LastWill, Packet};
+use super::inbox::{Inbox, LinkState, Outcome};
+use crate::clock;
+use crate::counters::{Counters, Event};
+
+/// Tells links apart, also an old and a new one to the same broker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(super) struct LinkId(pub(super) u64);
+
+/// What a link's task tells the gateway.
+#[derive(Debug)]
+pub struct LinkEvent {
+    pub(super) link: LinkId,
+    pub(super) news: LinkNews,
+}
+
+#[derive(Debug)]
+pub(super) enum LinkNews {
+    /// The broker accepted the connection; nothing is subscribed yet.
+    Accepted(Client),
+    /// The broker published the last will of this living node.
+    DeclaredOffline,
+    /// Not connected; attempts go on.
+    Lost(LinkState),
+}
+
+/// What all links of a gateway have in common.
+#[derive(Debug)]
+pub(super) struct LinkSetup {
+    pub(super) client_id: String,
+    pub(super) will: LastWill,
+    pub(super) config: MqttConfig,
+    pub(super) inbox: Arc<Inbox>,
+    pub(super) counters: Arc<Counters>,
+    pub(super) seed: u64,
+}
+
+/// A running link; dropping it cuts the connection, upon which the broker publishes the last will.
+#[derive(Debug)]
+pub(super) struct Link {
+    pub(super) broker: BrokerAddress,
+    pub(super) state: LinkState,
+    pub(super) client: Option<Client>,
+    task: Option<JoinHandle<()>>,
+    abort: AbortHandle,
+}
+
+impl Link {
+    pub(super) fn spawn(
+        id: LinkId,
+        broker: BrokerAddress,
+        setup: Arc<LinkSetup>,
+        gateway: ActorRef<GatewayMessage>,
+    ) -> Self {
+        let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
+        let task = tokio::spawn(Task { id, broker: broker.clone(), setup, gateway }.run(backoff));
+        Self { broker, state: LinkState::Down, client: None, abort: task.abort_handle(), task: Some(task) }
+    }
+
+    /// Takes leave of the broker without a last will; what was queued before goes out first, within `patience`.
+    pub(super) async fn leave(mut self, patience: Duration) {
+        let said = self.client.as_ref().is_some_and(Client::disconnect);
+        if said
+            && let Some(task) = self.task.take()
+            && tokio::time::timeout(patience, task).await.is_err()
+        {
+            tracing::debug!(broker = %self.broker, "broker did not take the farewell");
+        }
+    }
+}
+
+impl Drop for Link {
+    fn drop(&mut self) {
+        self.abort.abort();
+    }
+}
+
+struct Task {
+    id: LinkId,
+    broker: BrokerAddress,
+    setup: Arc<LinkSetup>,
+    gateway: ActorRef<GatewayMessage>,
+}
+
+impl Task {
+    async fn run(self, mut backoff: Backoff) {
+        loop {
+            let error = match self.session(&mut backoff).await {
+                Ok(()) => return,
+                Err(error) => error,
+            };
+            let state = if error.is_refused() { LinkState::Refused } else { LinkState::Down };
+            tracing::debug!(broker = %self.broker, %error, "link lost");
+            if error.is_oversized() {
+                self.setup.counters.reject(RejectReason::TooLarge);
+            }
+            if !self.tell(LinkNews::Lost(state)) {
+                return;
+            }
+            tokio::time::sleep(backoff.next_wait()).await;
+        }
+    }
+
+    /// One connection from beginning to end; `Ok` after a farewell.
+    async fn session(&self, backoff: &mut Backoff) -> Result<(), ConnectionError> {
+        let LinkSetup { client_id, will, config, inbox, counters, .. } = &*self.setup;
+        let (client, mut connection) = connection::open(&self.broker, client_id, will, config);
+        // The protocol's own timeouts are whole seconds.
+        connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
+        counters.count(Event::Connected);
+        backoff.reset();
+        if !self.tell(LinkNews::Accepted(client)) {
+            return Ok(());
+        }
+        // Pings alone make a poll return every keep-alive; longer silence is a connection that hangs.
+        let patience = 2 * config.keep_alive();
+        loop {
+            match connection.next(patience).await.inspect_err(|_| counters.count(Event::Disconnected))? {
+                Packet::Message { topic, payload } => {
+                    if inbox.accept(&topic, &payload, clock::now()) == Outcome::DeclaredOffline {
+                        self.tell(LinkNews::DeclaredOffline);
+                    }
+                }
+                Packet::Left => return Ok(()),
+                Packet::Accepted | Packet::Other => {}
+            }
+        }
+    }
+
+    /// False when the gateway is gone.
+    fn tell(&self, news: LinkNews) -> bool {
+        self.gateway.cast(GatewayMessage::LinkChanged { event: LinkEvent { link: self.id, news } }).is_ok()
+    }
+}
+
+/// Waits that double with every failure, shortened by up to half at random.
+struct Backoff {
+    least: Duration,
+    most: Duration,
+    next: Duration,
+    rng: ChaCha8Rng,
+}
+
+impl Backoff {
+    fn new(config: &MqttConfig, seed: u64) -> Self {
+        let least = Duration::from_millis(config.retry_min_ms);
+        let most = Duration::from_millis(config.retry_max_ms);
+        Self { least, most, next: least, rng: ChaCha8Rng::seed_from_u64(seed) }
+    }
+
+    fn reset(&mut self) {
+        self.next = self.least;
+    }
+
+    fn next_wait(&mut self) -> Duration {
+        let wait = self.next.mul_f64(self.rng.random_range(0.5..=1.0));
+        self.next = (2 * self.next).min(self.most);
+        wait
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waits_grow_to_the_bound_with_jitter_and_start_over_after_success() {
+        let config = MqttConfig { retry_min_ms: 50, retry_max_ms: 400, ..MqttConfig::default() };
+        let waits = |seed| {
+            let mut backoff = Backoff::new(&config, seed);
+            let waits: Vec<_> = (0..6).map(|_| backoff.next_wait()).collect();
+            backoff.reset();
+            (waits, backoff.next_wait())
+        };
+        let (first, restarted) = waits(1);
+        for (wait, bound_ms) in first.iter().zip([50, 100, 200, 400, 400, 400]) {
+            let bound = Duration::from_millis(bound_ms);
+            assert!(*wait <= bound && *wait >= bound / 2, "{wait:?} {bound:?}");
+        }
+        assert!(restarted <= Duration::from_millis(50));
+        assert_eq!(waits(1).0, first);
+        assert_ne!(waits(2).0, first);
+    }
+}

@@ -1,0 +1,126 @@
+//! Links: payloads pass, several at once, and after a broker's death.
+
+use ecod::wire::Encoding;
+use ecod_actors::counters::Event;
+use ecod_actors::gateway::{BrokerAddress, GatewayMessage, LinkState, MqttConfig, MqttVersion, Part, Secret};
+
+use crate::cell::{Node, embedded, map, name, until};
+use crate::mosquitto::Mosquitto;
+
+async fn report_and_map_pass(broker: &BrokerAddress, mqtt: MqttConfig) {
+    let mut edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[broker]).await;
+    let mut euclid = Node::join("euclid", Part::Follower, mqtt, &[broker]).await;
+    settle(&mut edge, &euclid).await;
+    euclid.report(1);
+    assert_eq!(edge.next_report().await, (name("euclid"), 1));
+    settle(&mut euclid, &edge).await;
+    edge.send(GatewayMessage::PublishMap { map: map("edge", 88) });
+    assert_eq!(euclid.next_map_round().await, 88);
+    assert_eq!(edge.next_map_round().await, 88, "in-process");
+    until("the broker's echo is dropped", || edge.counters.events(Event::Echo) >= 2).await;
+}
+
+/// A node's subscription is known to be in force once another's retained status has come through it.
+async fn settle(receiver: &mut Node, sender: &Node) {
+    sender.send(GatewayMessage::PublishStatus { status: sender.status.clone() });
+    receiver.next_state_of(sender.name.as_str()).await;
+}
+
+#[tokio::test]
+async fn reports_and_maps_pass_the_embedded_broker_in_both_versions_and_encodings() {
+    let (_broker, address) = embedded();
+    for version in [MqttVersion::V311, MqttVersion::V5] {
+        for encoding in [Encoding::Json, Encoding::Cbor] {
+            report_and_map_pass(&address, MqttConfig { version, encoding, ..MqttConfig::default() }).await;
+        }
+    }
+}
+
+#[tokio::test]
+async fn reports_and_maps_pass_mosquitto_in_both_versions() {
+    let broker = Mosquitto::start();
+    for version in [MqttVersion::V311, MqttVersion::V5] {
+        report_and_map_pass(&broker.address(), MqttConfig { version, ..MqttConfig::default() }).await;
+    }
+}
+
+#[tokio::test]
+async fn versions_mix_at_one_broker() {
+    let (_broker, address) = embedded();
+    let v5 = MqttConfig { version: MqttVersion::V5, ..MqttConfig::default() };
+    let mut edge = Node::join("edge", Part::Candidate, v5, &[&address]).await;
+    let euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    settle(&mut edge, &euclid).await;
+    euclid.report(3);
+    assert_eq!(edge.next_report().await, (name("euclid"), 3));
+}
+
+#[tokio::test]
+async fn user_and_password_are_presented() {
+    let broker = Mosquitto::with_user("ecod", "hush");
+    for version in [MqttVersion::V311, MqttVersion::V5] {
+        let right = MqttConfig {
+            version,
+            user: Some("ecod".to_owned()),
+            password: Some(Secret::new("hush")),
+            ..MqttConfig::default()
+        };
+        report_and_map_pass(&broker.address(), right.clone()).await;
+        let wrong = MqttConfig { password: Some(Secret::new("loud")), ..right };
+        let intruder = Node::start("mallory", Part::Follower, wrong).await;
+        intruder.send(GatewayMessage::SetBrokers { addresses: vec![broker.address()] });
+        until("refusals are counted", || intruder.counters.events(Event::ConnectFailed) >= 2).await;
+        assert_eq!(intruder.counters.events(Event::Connected), 0);
+    }
+}
+
+#[tokio::test]
+async fn a_node_speaks_on_all_its_links_and_hears_itself_once() {
+    let ((_first, one), (_second, two)) = (embedded(), embedded());
+    let mut edge = Node::join("edge", Part::Candidate, MqttConfig::default(), &[&one, &two]).await;
+    let mut left = Node::join("left", Part::Follower, MqttConfig::default(), &[&one]).await;
+    let mut right = Node::join("right", Part::Follower, MqttConfig::default(), &[&two]).await;
+    settle(&mut left, &edge).await;
+    settle(&mut right, &edge).await;
+    for round in [1, 2] {
+        edge.send(GatewayMessage::PublishMap { map: map("edge", round) });
+        assert_eq!(left.next_map_round().await, round);
+        assert_eq!(right.next_map_round().await, round);
+        assert_eq!(edge.next_map_round().await, round);
+    }
+
+    edge.send(GatewayMessage::SetBrokers { addresses: vec![two.clone()] });
+    edge.report(5);
+    assert_eq!(edge.next_report().await, (name("edge"), 5), "a candidate takes its own report in-process");
+    edge.send(GatewayMessage::PublishMap { map: map("edge", 3) });
+    assert_eq!(right.next_map_round().await, 3);
+    edge.send(GatewayMessage::SetBrokers { addresses: vec![one.clone(), two.clone()] });
+    assert_eq!(edge.link(LinkState::Up).await, one, "the link that stayed was not touched");
+    edge.send(GatewayMessage::PublishMap { map: map("edge", 4) });
+    assert_eq!(left.next_map_round().await, 4, "round 3 was not for this broker");
+}
+
+#[tokio::test]
+async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
+    for version in [MqttVersion::V311, MqttVersion::V5] {
+        let mut broker = Mosquitto::start();
+        let address = broker.address();
+        let mqtt = MqttConfig { version, ..MqttConfig::default() };
+        let mut edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[&address]).await;
+        let mut euclid = Node::join("euclid", Part::Follower, mqtt, &[&address]).await;
+        settle(&mut edge, &euclid).await;
+
+        broker.kill();
+        euclid.link(LinkState::Refused).await;
+        let refused = euclid.counters.events(Event::PublishRefused);
+        (10..20).for_each(|seq| euclid.report(seq));
+        until("reports are refused", || euclid.counters.events(Event::PublishRefused) == refused + 10).await;
+
+        broker.revive();
+        edge.link(LinkState::Up).await;
+        euclid.link(LinkState::Up).await;
+        settle(&mut edge, &euclid).await;
+        euclid.report(100);
+        assert_eq!(edge.next_report().await, (name("euclid"), 100));
+    }
+}
