@@ -1,0 +1,173 @@
+//! A cell of nodes in one process: reports become maps on every vehicle, whatever part of a node ends.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::landmark::LandmarkConfig;
+use ecod::names::NodeName;
+use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
+use ecod_actors::clock;
+use ecod_actors::config::NodeConfig;
+use ecod_actors::gateway::{GatewayMessage, ReportKind};
+use ecod_actors::node::{self, NodeHandle};
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn config(name: &str, role: Role) -> NodeConfig {
+    let slot = |n: i32| LandmarkConfig {
+        id: format!("slot-{n}").into(),
+        x_m: f64::from(n) * 3.0,
+        y_m: 0.0,
+        facing_deg: None,
+        vacancy: None,
+        synonyms: Default::default(),
+    };
+    NodeConfig {
+        name: Some(NodeName::new(name).unwrap()),
+        cell: NodeName::from_static("lot-1"),
+        role,
+        listen: "127.0.0.1:0".parse().unwrap(),
+        landmarks: (0..3).map(slot).collect(),
+        ..NodeConfig::default()
+    }
+}
+
+async fn edge() -> NodeHandle {
+    node::start(config("edge", Role::Edge)).await.unwrap()
+}
+
+async fn cav(name: &str, edge: &NodeHandle) -> NodeHandle {
+    let mut config = config(name, Role::Cav);
+    config.mqtt.broker = edge.broker_address().map(Into::into);
+    config.mqtt.retry_max_ms = 100;
+    config.validate().unwrap();
+    node::start(config).await.unwrap()
+}
+
+fn report(node: &str, label: &str, slot: i32) -> Arc<ObjectReport> {
+    Arc::new(ObjectReport {
+        schema: SCHEMA_VERSION,
+        node: NodeName::new(node).unwrap(),
+        seq: 1,
+        captured_at_us: clock::now(),
+        pose: None,
+        objects: vec![PerceivedObject {
+            label: label.into(),
+            confidence: 0.9,
+            x_m: f64::from(slot) * 3.0 + 0.1,
+            y_m: 0.0,
+            covariance_m2: None,
+            landmark: None,
+        }],
+        seen: None,
+    })
+}
+
+fn label(map: &GlobalMap, slot: usize) -> Option<&str> {
+    map.landmarks[slot].label.as_deref()
+}
+
+/// Has the reporter say what it sees until the receiver's newest map is as wanted.
+async fn reported(
+    reporter: &NodeHandle,
+    receiver: &NodeHandle,
+    make: impl Fn() -> Arc<ObjectReport>,
+    wanted: impl Fn(&GlobalMap) -> bool,
+) {
+    let newest = receiver.newest_map();
+    let settled = async {
+        loop {
+            let message = GatewayMessage::PublishReport { kind: ReportKind::Detections, report: make() };
+            reporter.seats().gateway.send(message);
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            if newest.borrow().as_ref().is_some_and(|received| wanted(&received.map)) {
+                return;
+            }
+        }
+    };
+    timeout(PATIENCE, settled).await.expect("the map never became as wanted");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_one_vehicle_sees_reaches_another() {
+    let edge = edge().await;
+    let (euclid, galileo) = (cav("euclid", &edge).await, cav("galileo", &edge).await);
+    reported(&euclid, &galileo, || report("euclid", "ABC123", 1), |map| label(map, 1) == Some("ABC123")).await;
+    let received = galileo.newest_map().borrow().clone().unwrap();
+    assert_eq!(received.map.aggregator.as_str(), "edge");
+    assert_eq!(received.map.landmarks[1].contributors, [NodeName::from_static("euclid")]);
+    assert_eq!(label(&received.map, 0), None);
+    for node in [euclid, galileo, edge] {
+        node.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn rounds_go_on_in_order_and_old_ones_are_refused() {
+    let edge = edge().await;
+    let euclid = cav("euclid", &edge).await;
+    let mut newest = euclid.newest_map();
+    let mut last = (0, 0);
+    for _ in 0..10 {
+        timeout(PATIENCE, newest.changed()).await.unwrap().unwrap();
+        let map = newest.borrow_and_update().clone().unwrap().map;
+        assert!((map.epoch, map.round) > last, "{:?} after {last:?}", (map.epoch, map.round));
+        last = (map.epoch, map.round);
+    }
+    euclid.stop().await;
+    edge.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_cell_goes_on_when_any_part_is_killed() {
+    let edge = edge().await;
+    let euclid = cav("euclid", &edge).await;
+    let sees = |name: &'static str| move || report("euclid", name, 2);
+    reported(&euclid, &euclid, sees("before"), |map| label(map, 2) == Some("before")).await;
+
+    let kills: [(&str, &dyn Fn()); 6] = [
+        ("fuser", &|| edge.seats().fuser.holder().unwrap().kill()),
+        ("edge-gateway", &|| edge.seats().gateway.holder().unwrap().kill()),
+        ("edge-follower", &|| edge.seats().follower.holder().unwrap().kill()),
+        ("broker", &|| edge.seats().broker.holder().unwrap().kill()),
+        ("gateway", &|| euclid.seats().gateway.holder().unwrap().kill()),
+        ("follower", &|| euclid.seats().follower.holder().unwrap().kill()),
+    ];
+    for (part, kill) in kills {
+        kill();
+        eprintln!("killed {part}");
+        reported(&euclid, &euclid, sees(part), |map| label(map, 2) == Some(part)).await;
+    }
+    euclid.stop().await;
+    edge.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_part_that_keeps_ending_makes_the_node_give_up() {
+    let mut edge = edge().await;
+    for _ in 0..=node::MAX_RESTARTS {
+        let fuser = edge.seats().fuser.holder().unwrap();
+        fuser.kill();
+        let seats = edge.seats().clone();
+        let replaced = async {
+            while seats.fuser.holder().unwrap().get_id() == fuser.get_id() {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        };
+        if timeout(Duration::from_secs(2), replaced).await.is_err() {
+            break;
+        }
+    }
+    let error = timeout(PATIENCE, edge.failed()).await.unwrap().unwrap_err();
+    assert!(error.to_string().contains("Fuser"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_busy_port_is_an_error_that_names_it() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap();
+    let config = NodeConfig { listen: address, ..config("edge", Role::Edge) };
+    let error = node::start(config).await.err().expect("the port is busy");
+    assert!(error.to_string().contains(&address.to_string()), "{error}");
+}
