@@ -3,6 +3,7 @@
 #![warn(clippy::unwrap_used)]
 
 pub mod broker;
+pub mod cli;
 pub mod clock;
 pub mod config;
 pub mod counters;
