@@ -1,0 +1,38 @@
+//! The node's clock: Unix microseconds that never go backwards.
+
+use std::sync::OnceLock;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+use ecod::time::Timestamp;
+
+/// The present time.
+///
+/// The wall clock is read once, at the first call; from then on time passes by the monotonic clock. A step of the wall
+/// clock after that (NTP's first synchronisation, a daylight change by hand) is therefore not followed until the node
+/// restarts; aggregators estimate each vehicle's offset, so that a constant error does not matter to them.
+pub fn now() -> Timestamp {
+    static ANCHOR: OnceLock<(Instant, Timestamp)> = OnceLock::new();
+    let (started, wall) = ANCHOR.get_or_init(|| {
+        let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        (Instant::now(), Timestamp::default() + since_epoch)
+    });
+    *wall + started.elapsed()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_is_unix_time_and_never_goes_back() {
+        let first = now();
+        let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
+        assert!(first.micros().abs_diff(u64::try_from(wall.as_micros()).unwrap()) < 1_000_000);
+        let mut last = first;
+        for _ in 0..1000 {
+            let next = now();
+            assert!(next >= last);
+            last = next;
+        }
+    }
+}
