@@ -1,5 +1,8 @@
 //! Detectors: from an image to labels with places in the image. One trait, one file each.
 
+pub mod coco;
+pub mod recorded;
+
 use ecod::detection::Detection;
 
 use crate::frame::Frame;

@@ -3,9 +3,13 @@
 #![warn(clippy::unwrap_used)]
 
 pub mod broker;
+#[cfg(feature = "camera")]
+pub mod calibrate;
 pub mod cli;
 pub mod clock;
 pub mod config;
+#[cfg(feature = "camera")]
+pub mod corner_pose;
 pub mod counters;
 #[cfg(feature = "camera")]
 pub mod detect;
@@ -14,5 +18,7 @@ pub mod follower;
 pub mod frame;
 pub mod fuser;
 pub mod gateway;
+#[cfg(feature = "camera")]
+pub mod lens;
 pub mod node;
 pub mod seat;
