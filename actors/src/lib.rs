@@ -10,4 +10,7 @@ pub mod detect;
 #[cfg(feature = "camera")]
 pub mod frame;
 #[cfg(feature = "camera")]
+pub mod frame_source;
+pub mod latest_slot;
+#[cfg(feature = "camera")]
 pub mod lens;
