@@ -19,6 +19,9 @@ pub mod frame;
 pub mod fuser;
 pub mod gateway;
 #[cfg(feature = "camera")]
+pub mod frame_source;
+pub mod latest_slot;
+#[cfg(feature = "camera")]
 pub mod lens;
 pub mod node;
 pub mod seat;
