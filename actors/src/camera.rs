@@ -77,13 +77,7 @@ pub struct MountConfig {
 
 impl Default for OpticsConfig {
     fn default() -> Self {
-        Self {
-            calibration: None,
-            width_px: 640,
-            height_px: 480,
-            horizontal_fov_deg: 62.2,
-            vertical_fov_deg: 48.8,
-        }
+        Self { calibration: None, width_px: 640, height_px: 480, horizontal_fov_deg: 62.2, vertical_fov_deg: 48.8 }
     }
 }
 
