@@ -7,6 +7,7 @@ use opencv::core::{Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, Ter
 use opencv::{calib3d, imgcodecs, imgproc};
 use serde::{Deserialize, Serialize};
 
+use crate::frame_source::images;
 use crate::lens::Lens;
 
 /// Views of the board below which a calibration is refused.
@@ -103,6 +104,15 @@ pub enum CalibrationError {
         #[source]
         source: opencv::Error,
     },
+    /// A directory of photographs cannot be listed.
+    #[error("cannot list images in {path:?}")]
+    Directory {
+        /// The directory.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
     /// The calibration file cannot be read or written.
     #[error("calibration file {path:?}")]
     File {
@@ -120,6 +130,23 @@ pub enum CalibrationError {
         /// What is wrong with it.
         reason: String,
     },
+}
+
+/// The photographs that are meant by paths of files and directories; a directory gives its images by name.
+///
+/// # Errors
+/// [`CalibrationError::Directory`] when one cannot be listed.
+pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> {
+    let mut photographs = Vec::new();
+    for path in paths {
+        if path.is_dir() {
+            let listed = images::in_directory(path);
+            photographs.extend(listed.map_err(|source| CalibrationError::Directory { path: path.clone(), source })?);
+        } else {
+            photographs.push(path.clone());
+        }
+    }
+    Ok(photographs)
 }
 
 /// Calibrates a camera from photographs of a chessboard, held at different angles and all over the image (Zhang 2000).

@@ -1,7 +1,7 @@
 //! Where frames come from. One trait, one file per family of sources; [`capture`] runs a source on its own thread.
 
 pub mod capture;
-mod images;
+pub(crate) mod images;
 mod video;
 
 use std::path::PathBuf;

@@ -68,7 +68,7 @@ fn write(directory: &Path, name: &str, image: &Mat) -> PathBuf {
     path
 }
 
-fn photographs(directory: &Path) -> Vec<PathBuf> {
+fn take_photographs(directory: &Path) -> Vec<PathBuf> {
     let flat = flat_board();
     let views = [
         ([0.0, 0.4, 0.0], [0.0, 0.0], 420.0),
@@ -88,7 +88,7 @@ fn photographs(directory: &Path) -> Vec<PathBuf> {
 #[test]
 fn a_known_camera_is_recovered_within_one_percent_and_survives_its_file() {
     let directory = tempfile::tempdir().unwrap();
-    let mut images = photographs(directory.path());
+    let mut images = take_photographs(directory.path());
     let blank = Mat::new_rows_cols_with_default(480, 640, CV_8UC1, Scalar::all(90.0)).unwrap();
     images.insert(2, write(directory.path(), "blank.png", &blank));
 
@@ -112,7 +112,8 @@ fn a_known_camera_is_recovered_within_one_percent_and_survives_its_file() {
 #[test]
 fn errors_name_the_image() {
     let directory = tempfile::tempdir().unwrap();
-    let mut images = photographs(directory.path());
+    let mut images = take_photographs(directory.path());
+    assert_eq!(photographs(&[directory.path().to_owned()]).unwrap(), images, "a directory means its images");
     let few = calibrate(&images[..2], &BOARD).expect_err("two views").to_string();
     assert!(few.contains("found in 2 images"), "{few}");
 

@@ -56,7 +56,8 @@ impl FrameSource for ImageSequence {
     }
 }
 
-fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
+/// The images of a directory in the order of their names.
+pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(directory)?.map(|entry| Ok(entry?.path()));
     let mut files = entries.collect::<std::io::Result<Vec<PathBuf>>>()?;
     let is_image = |path: &PathBuf| {
