@@ -35,7 +35,8 @@ pub struct NodeConfig {
     pub listen: SocketAddr,
     /// What the cell fuses. Default PACE alone.
     pub fuse: Vec<Fuse>,
-    /// A file to which every accepted map is appended, one JSON object a line. Default none.
+    /// A file to which every accepted map is appended with its time of receipt, one JSON
+    /// object a line. Default none.
     pub map_log: Option<PathBuf>,
     /// Pose of the vehicle. Default the origin, looking east.
     pub pose: PoseConfig,

@@ -13,6 +13,7 @@ use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeStatus, RejectReason};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
+use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 use crate::counters::{Counters, Event};
@@ -29,20 +30,22 @@ pub enum FollowerMessage {
     },
 }
 
-/// The newest map and when it came.
-#[derive(Debug, Clone, PartialEq)]
+/// A map and when it came; one line of a map log.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReceivedMap {
+    /// When it came, by this node's clock.
+    #[serde(rename = "received_at_us")]
+    pub received_at: Timestamp,
     /// The map.
     pub map: Arc<GlobalMap>,
-    /// When it came, by this node's clock.
-    pub received_at: Timestamp,
 }
 
 /// What a follower needs at its start.
 pub struct FollowerArguments {
     /// Gets the newest map.
     pub newest: watch::Sender<Option<ReceivedMap>>,
-    /// A file to which every accepted map is appended, one JSON object a line.
+    /// A file to which every accepted map is appended with its time of receipt, one JSON
+    /// object a line.
     pub log: Option<PathBuf>,
     /// What the node says about itself; epoch and aggregator follow the maps.
     pub status: NodeStatus,
@@ -103,8 +106,9 @@ impl FollowerState {
         }
         self.counters.count(Event::MapAccepted);
         self.follow(map);
-        self.write(map);
-        self.newest.send_replace(Some(ReceivedMap { map: Arc::clone(map), received_at }));
+        let received = ReceivedMap { received_at, map: Arc::clone(map) };
+        self.write(&received);
+        self.newest.send_replace(Some(received));
     }
 
     /// Says so when the aggregator or its epoch has changed.
@@ -117,9 +121,9 @@ impl FollowerState {
         }
     }
 
-    fn write(&mut self, map: &GlobalMap) {
+    fn write(&mut self, received: &ReceivedMap) {
         let Some(log) = &mut self.log else { return };
-        let written = serde_json::to_writer(&mut *log, map).map_err(std::io::Error::from);
+        let written = serde_json::to_writer(&mut *log, received).map_err(std::io::Error::from);
         if let Err(error) = written.and_then(|()| log.write_all(b"\n")).and_then(|()| log.flush()) {
             tracing::warn!(%error, "map log abandoned");
             self.log = None;

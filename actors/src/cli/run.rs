@@ -41,7 +41,7 @@ pub struct RunArguments {
     #[arg(long, value_name = "HOST:PORT")]
     #[serde(skip)]
     broker: Option<BrokerAddress>,
-    /// Append every accepted map to this file, one JSON object a line
+    /// Append every accepted map and its time of receipt to this file, one JSON object a line
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     map_log: Option<PathBuf>,

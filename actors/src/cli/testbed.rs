@@ -1,0 +1,85 @@
+//! `ecod-node testbed`: the scenes of a file, rendered, detected and fused in virtual time.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::Args;
+use ecod::testbed::{Scene, Testbed};
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
+
+use super::Failure;
+use crate::testbed::score::SceneResult;
+use crate::testbed::table::table;
+use crate::testbed::trial::Trial;
+
+/// Flags of `testbed`.
+#[derive(Debug, Args)]
+pub struct TestbedArguments {
+    /// Scene file, such as examples/testbed/pace_setup1.json
+    #[arg(long, value_name = "FILE")]
+    scenes: PathBuf,
+    /// Run this scene only
+    #[arg(long, value_name = "NAME")]
+    scene: Option<String>,
+    /// Fused maps to judge in each scene
+    #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    verdicts: u64,
+    /// Seed of everything that varies from frame to frame
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Write the results to this file (JSON)
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+/// The file of `--out`.
+#[derive(Serialize)]
+pub(super) struct Results<'a> {
+    pub(super) scenes: &'a [SceneResult],
+}
+
+pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
+    let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
+    let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;
+    let mut results = Vec::with_capacity(scenes.len());
+    for scene in scenes {
+        let trial = Trial { testbed: &testbed, scene, verdicts: arguments.verdicts, seed: arguments.seed };
+        let frames = trial.frames_per_verdict() * arguments.verdicts * scene.cavs.len() as u64;
+        let bar = progress(frames, &scene.name);
+        results.push(trial.run(|| bar.inc(1)).with_context(|| format!("scene {}", scene.name))?);
+        bar.finish_and_clear();
+    }
+    print!("{}", table(&results));
+    if let Some(out) = &arguments.out {
+        write(out, &Results { scenes: &results })?;
+    }
+    Ok(())
+}
+
+/// Reads a scene file.
+pub(super) fn read(path: &Path) -> anyhow::Result<Testbed> {
+    let text = fs::read_to_string(path).with_context(|| format!("cannot read scenes {}", path.display()))?;
+    Testbed::from_json(&text).with_context(|| format!("scenes {}", path.display()))
+}
+
+/// The named scene, or all.
+pub(super) fn select<'a>(testbed: &'a Testbed, name: Option<&str>) -> anyhow::Result<Vec<&'a Scene>> {
+    let Some(name) = name else { return Ok(testbed.scenes.iter().collect()) };
+    let known = || testbed.scenes.iter().map(|scene| scene.name.as_str()).collect::<Vec<_>>().join(", ");
+    Ok(vec![testbed.scene(name).with_context(|| format!("no scene {name:?}; there are {}", known()))?])
+}
+
+/// Writes JSON for programs.
+pub(super) fn write(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string_pretty(value)?;
+    text.push('\n');
+    fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn progress(frames: u64, scene: &str) -> ProgressBar {
+    let style = ProgressStyle::with_template("{msg:16} {bar:40} {pos}/{len} frames, {eta} left");
+    let bar = ProgressBar::new(frames).with_message(scene.to_owned());
+    style.map_or_else(|_| bar.clone(), |style| bar.clone().with_style(style))
+}

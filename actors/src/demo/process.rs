@@ -1,0 +1,69 @@
+//! A node as a process of its own.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use tokio::process::{Child, Command};
+
+use crate::config::NodeConfig;
+
+/// A running `ecod-node`; killed when dropped.
+#[derive(Debug)]
+pub(super) struct NodeProcess {
+    name: String,
+    child: Child,
+    log: PathBuf,
+}
+
+/// How long a node may take to stop.
+const STOP_TIMEOUT: Duration = Duration::from_secs(5);
+
+impl NodeProcess {
+    /// Writes the node's configuration to the directory and starts it; its log goes there too.
+    pub(super) fn start(program: &Path, config: &NodeConfig, directory: &Path) -> anyhow::Result<Self> {
+        let name = config.name.as_ref().map_or_else(|| "node".to_owned(), ToString::to_string);
+        let (file, log) = (directory.join(format!("{name}.toml")), directory.join(format!("{name}.log")));
+        let text = toml::to_string(config).context("the configuration cannot be written as TOML")?;
+        fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))?;
+        let output = File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
+        let child = Command::new(program)
+            .arg("--config")
+            .arg(&file)
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(output)
+            .kill_on_drop(true)
+            .spawn()
+            .with_context(|| format!("cannot start {}", program.display()))?;
+        Ok(Self { name, child, log })
+    }
+
+    /// An error when the process has ended.
+    pub(super) fn check(&mut self) -> anyhow::Result<()> {
+        if let Some(status) = self.child.try_wait()? {
+            let log = fs::read_to_string(&self.log).unwrap_or_default();
+            let last = log.lines().last().unwrap_or("nothing logged");
+            bail!("node {} ended with {status}: {last}", self.name);
+        }
+        Ok(())
+    }
+
+    /// Asks the node to stop, and makes it stop when it does not.
+    pub(super) async fn stop(&mut self) {
+        let pid = self.child.id().and_then(|pid| i32::try_from(pid).ok()).map(Pid::from_raw);
+        if let Some(Err(error)) = pid.map(|pid| kill(pid, Signal::SIGTERM)) {
+            tracing::warn!(node = self.name, %error, "node not asked to stop");
+        }
+        if tokio::time::timeout(STOP_TIMEOUT, self.child.wait()).await.is_err() {
+            tracing::warn!(node = self.name, "node did not stop in time");
+            if let Err(error) = self.child.kill().await {
+                tracing::warn!(node = self.name, %error, "node not killed");
+            }
+        }
+    }
+}

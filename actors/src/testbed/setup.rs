@@ -1,0 +1,120 @@
+//! The configuration of the testbed's nodes: one set of parameters for every scene.
+
+use std::sync::Arc;
+
+use ecod::aggregator::FusionConfig;
+use ecod::camera::Mount;
+use ecod::landmark::{LandmarkConfig, LandmarkIndex};
+use ecod::names::NodeName;
+use ecod::pace::PaceConfig;
+use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
+use ecod::round::RoundConfig;
+use ecod::testbed::{Cav, Placard, Scene, Testbed};
+use ecod::view::ViewConfig;
+use ecod::wire::Role;
+
+use crate::camera::{CameraConfig, MountConfig, OpticsConfig};
+use crate::config::{NodeConfig, PoseConfig};
+use crate::detect::DetectorConfig;
+use crate::detect::placard::PlacardConfig;
+use crate::frame_source::SourceConfig;
+use crate::frame_source::capture::CaptureConfig;
+use crate::lens::Lens;
+use crate::perception::{Perception, Vantage};
+
+/// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
+const GATE_M: f64 = 0.032;
+
+/// The edge's configuration: role, known locations and fusion.
+pub fn edge(testbed: &Testbed, scene: &Scene) -> NodeConfig {
+    NodeConfig { name: Some(NodeName::from_static("edge")), role: Role::Edge, ..cell(testbed, scene) }
+}
+
+/// A vehicle's configuration, with its frames from `source`.
+pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) -> NodeConfig {
+    let (placard, intrinsics) = (&testbed.placard, &testbed.camera.intrinsics);
+    let half_angle = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
+    let camera = CameraConfig {
+        source,
+        capture: CaptureConfig::default(),
+        optics: OpticsConfig {
+            calibration: None,
+            width_px: intrinsics.width,
+            height_px: intrinsics.height,
+            horizontal_fov_deg: 2.0 * half_angle(intrinsics.width, intrinsics.fx).to_degrees(),
+            vertical_fov_deg: 2.0 * half_angle(intrinsics.height, intrinsics.fy).to_degrees(),
+        },
+        mount: MountConfig::default(),
+        detector: DetectorConfig::Placard(PlacardConfig::default()),
+        projection: projection(placard),
+        view: view(placard),
+    };
+    NodeConfig {
+        name: Some(cav.name.clone()),
+        role: Role::Cav,
+        pose: PoseConfig {
+            x_m: cav.pose.position.x,
+            y_m: cav.pose.position.y,
+            heading_deg: cav.pose.heading_rad.to_degrees(),
+        },
+        camera: Some(camera),
+        ..cell(testbed, scene)
+    }
+}
+
+/// A vehicle's way from detections to reports.
+pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
+    let gate = fusion(testbed).pace.gate();
+    let vantage = Vantage {
+        node: cav.name.clone(),
+        pose: cav.pose,
+        mount: Mount::default(),
+        lens: Lens::ideal(testbed.camera.intrinsics),
+        landmarks: Arc::new(LandmarkIndex::new(scene.landmarks(&testbed.placard), gate.radius_m)),
+    };
+    Perception::new(vantage, projection(&testbed.placard), view(&testbed.placard), gate)
+}
+
+/// How reports are fused: a round for every frame.
+pub fn fusion(testbed: &Testbed) -> FusionConfig {
+    let period_s = testbed.camera.capture_interval.as_secs_f64();
+    FusionConfig {
+        round: RoundConfig { period_s, ..RoundConfig::default() },
+        pace: PaceConfig { gate_m: GATE_M, position_floor_m: 0.01, ..PaceConfig::default() },
+        ..FusionConfig::default()
+    }
+}
+
+/// Poses are known to two millimetres, corners to half a pixel.
+fn projection(placard: &Placard) -> ProjectionConfig {
+    ProjectionConfig {
+        sizes: ObjectSizes { default: Some(ObjectSize::square(placard.qr_width_m)), ..ObjectSizes::default() },
+        pixel_sigma_px: 0.5,
+        heading_sigma_rad: 0.002,
+        position_sigma_m: 0.002,
+        floor_m: 0.002,
+        ..ProjectionConfig::default()
+    }
+}
+
+/// A spot counts as looked at where a plate would be read in most frames.
+fn view(placard: &Placard) -> ViewConfig {
+    ViewConfig {
+        target_width_m: placard.qr_width_m,
+        min_target_px: 30.0,
+        max_range_m: 1.0,
+        max_yaw_rad: 66f64.to_radians(),
+        occluder_width_m: placard.card_width_m,
+        ..ViewConfig::default()
+    }
+}
+
+/// What all nodes of the cell share.
+fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
+    NodeConfig {
+        cell: NodeName::from_static("testbed"),
+        landmarks: scene.landmarks(&testbed.placard).iter().map(LandmarkConfig::from).collect(),
+        fusion: fusion(testbed),
+        ..NodeConfig::default()
+    }
+}

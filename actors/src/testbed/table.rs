@@ -1,0 +1,56 @@
+//! Results as a table for people.
+
+use std::fmt::Write;
+
+use super::score::SceneResult;
+
+/// One line a scene: fused accuracy, on occupied spots, each vehicle alone, the guess, and the physical testbed.
+pub fn table(results: &[SceneResult]) -> String {
+    let mut text = String::new();
+    let header = ["scene", "verdicts", "fused %", "occupied %", "best alone %", "guess %", "testbed %", "not in view"];
+    let rows: Vec<[String; 8]> = results.iter().map(row).collect();
+    let mut widths = header.map(str::len);
+    for row in &rows {
+        for (width, cell) in widths.iter_mut().zip(row) {
+            *width = (*width).max(cell.chars().count());
+        }
+    }
+    let mut line = |cells: [&str; 8]| {
+        for (index, (cell, width)) in cells.iter().zip(widths).enumerate() {
+            let padding = width - cell.chars().count();
+            let (before, after) = if matches!(index, 0 | 7) { (0, padding) } else { (padding, 0) };
+            let _ = write!(text, "{:before$}{cell}{:after$}  ", "", "");
+        }
+        text.truncate(text.trim_end().len());
+        text.push('\n');
+    };
+    line(header);
+    for row in &rows {
+        line(row.each_ref().map(String::as_str));
+    }
+    text.push('\n');
+    for result in results {
+        let alone = result.single_cav_accuracy_pct.iter().map(|(name, pct)| {
+            let recorded = result.recorded_single_cav_accuracy_pct.get(name);
+            format!("{name} {pct:.1}{}", recorded.map_or_else(String::new, |pct| format!(" (testbed {pct:.1})")))
+        });
+        let _ = writeln!(text, "{} alone %: {}", result.name, alone.collect::<Vec<_>>().join(", "));
+    }
+    text
+}
+
+fn row(result: &SceneResult) -> [String; 8] {
+    let percent = |pct: Option<f64>| pct.map_or_else(|| "-".into(), |pct| format!("{pct:.2}"));
+    let best_alone = result.single_cav_accuracy_pct.values().copied().max_by(f64::total_cmp);
+    let unseen: Vec<&str> = result.unseen_spots.iter().map(|id| id.as_str()).collect();
+    [
+        result.name.clone(),
+        result.verdicts.to_string(),
+        percent(Some(result.pace_accuracy_pct)),
+        percent(result.occupied_accuracy_pct),
+        percent(best_alone),
+        percent(Some(result.always_empty_pct)),
+        percent(result.recorded_pace_accuracy_pct),
+        if unseen.is_empty() { "-".into() } else { unseen.join(" ") },
+    ]
+}
