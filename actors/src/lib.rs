@@ -15,3 +15,5 @@ pub mod fuser;
 pub mod gateway;
 pub mod node;
 pub mod seat;
+#[cfg(feature = "camera")]
+pub mod testbed;

@@ -175,16 +175,13 @@ impl Actor for Node {
         let restarted = if state.restarts.allow(clock::now()) {
             state.start(part, &myself.get_cell()).await
         } else {
-            Err(format!("parts ended more than {MAX_RESTARTS} times in {RESTART_SPAN:?}, the last: {part:?}: {why}").into())
+            Err(format!("parts ended more than {MAX_RESTARTS} times in {RESTART_SPAN:?}, the last: {part:?}: {why}")
+                .into())
         };
         restarted.inspect_err(|error| state.assembly.give_up(error.to_string()))
     }
 
-    async fn post_stop(
-        &self,
-        _myself: ActorRef<Self::Msg>,
-        state: &mut Self::State,
-    ) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
         state.running.clear();
         state.assembly.stop_all().await;
         Ok(())

@@ -17,9 +17,7 @@ use crate::config::NodeConfig;
 use crate::counters::Counters;
 use crate::follower::{Follower, FollowerArguments, FollowerMessage, ReceivedMap};
 use crate::fuser::{Fuser, FuserArguments, FuserMessage};
-use crate::gateway::{
-    self, BrokerAddress, Gateway, GatewayArguments, GatewayMessage, Incoming, Subscriber,
-};
+use crate::gateway::{self, BrokerAddress, Gateway, GatewayArguments, GatewayMessage, Incoming, Subscriber};
 use crate::seat::Seat;
 #[cfg(feature = "camera")]
 use crate::{
