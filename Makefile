@@ -1,6 +1,6 @@
 # `make demo` and `make test` do everything on a fresh Debian 12 machine with git, make and a Rust toolchain.
 
-PACKAGES := build-essential ca-certificates clang cmake libopencv-dev mosquitto pkg-config
+PACKAGES := build-essential ca-certificates clang cmake gstreamer1.0-plugins-base libopencv-dev mosquitto pkg-config
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 SECONDS_PER_SCENE ?= 15
 

@@ -119,7 +119,8 @@ impl PaceConfig {
         Duration::from_secs_f64(self.max_age_s)
     }
 
-    fn gate(&self) -> Gate {
+    /// How near a detection must be to its landmark.
+    pub fn gate(&self) -> Gate {
         Gate { radius_m: self.gate_m, sigmas: self.gate_sigmas, floor_m: self.position_floor_m }
     }
 }

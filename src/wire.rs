@@ -269,3 +269,15 @@ pub enum NodeState {
     /// Not there.
     Offline,
 }
+
+/// The JSON Schema of every payload, by the payload's name.
+pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
+    [
+        ("ObjectReport", schemars::schema_for!(ObjectReport)),
+        ("GlobalMap", schemars::schema_for!(GlobalMap)),
+        ("Verdicts", schemars::schema_for!(Verdicts)),
+        ("Reputations", schemars::schema_for!(Reputations)),
+        ("NodeStatus", schemars::schema_for!(NodeStatus)),
+    ]
+    .into()
+}

@@ -64,7 +64,7 @@ async fn through_gateways(broker: &BrokerAddress, version: MqttVersion, load: Lo
             }
         }
     });
-    let mut histogram = Histogram::new(3)?;
+    let mut histogram = two_hop::latencies();
     let mut back = 0;
     while back < load.messages {
         let delivery = tokio::time::timeout(Duration::from_secs(5), maps.recv()).await?.context("gateway ended")?;

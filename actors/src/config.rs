@@ -98,16 +98,16 @@ impl Default for NodeConfig {
 #[derive(Debug, thiserror::Error)]
 pub enum LoadError {
     /// The file is not there or cannot be read.
-    #[error("cannot read configuration {path}: {source}")]
+    #[error("cannot read configuration {path}")]
     Unreadable {
         /// The file.
         path: PathBuf,
         /// What the operating system said.
         source: std::io::Error,
     },
-    /// A key or value is of the wrong kind or unknown; the message names key and source.
-    #[error("configuration: {0}")]
-    Malformed(#[from] Box<figment::Error>),
+    /// Keys or values are of the wrong kind or unknown.
+    #[error("{0}")]
+    Malformed(String),
     /// A value is out of its range.
     #[error(transparent)]
     OutOfRange(#[from] ConfigError),
@@ -125,7 +125,7 @@ impl NodeConfig {
             figment = figment.merge(Toml::file_exact(path));
         }
         let figment = figment.merge(Env::prefixed("ECOD_").split("__")).merge(Serialized::defaults(flags));
-        let config: Self = figment.extract().map_err(Box::new)?;
+        let config: Self = figment.extract().map_err(|errors| LoadError::Malformed(describe(errors)))?;
         config.validate()?;
         Ok(config)
     }
@@ -178,5 +178,74 @@ impl NodeConfig {
             Fuse::Vote => ReportKind::VoteDetections,
         };
         self.fuse.iter().map(kind).collect()
+    }
+}
+
+/// Every error with its key and where it was read.
+fn describe(errors: figment::Error) -> String {
+    let describe = |error: figment::Error| {
+        let origin = error.metadata.as_ref().map_or_else(String::new, |metadata| {
+            let place = metadata.source.as_ref().map_or_else(String::new, |source| format!(" {source}"));
+            format!(" in {}{place}", metadata.name)
+        });
+        format!("configuration key `{}`{origin}: {}", error.path.join("."), error.kind)
+    };
+    errors.into_iter().map(describe).collect::<Vec<_>>().join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[derive(Serialize)]
+    struct Flags {
+        name: &'static str,
+    }
+
+    fn load(toml: &str) -> Result<NodeConfig, LoadError> {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(toml.as_bytes()).unwrap();
+        NodeConfig::load(Some(file.path()), &Flags { name: "from-flag" })
+    }
+
+    #[test]
+    fn flags_override_the_file_and_the_file_the_defaults() {
+        let config = load("name = \"from-file\"\nrole = \"edge\"\ncell = \"lot-9\"").unwrap();
+        assert_eq!(config.name.unwrap().as_str(), "from-flag");
+        assert_eq!(config.cell.as_str(), "lot-9");
+        assert_eq!(config.listen.to_string(), "127.0.0.1:1883");
+    }
+
+    #[test]
+    fn errors_name_the_key_the_value_and_what_is_allowed() {
+        for (toml, parts) in [
+            ("role = \"edge\"\n[fusion.pace]\ngate_m = -1", ["`fusion.pace.gate_m`", "-1", "0.001 to 1000"]),
+            ("role = \"edge\"\n[fusion.pace]\ngate = 1", ["`fusion.pace.gate`", "unknown field", "`gate_m`"]),
+            ("role = \"edge\"\n[mqtt]\nkeep_alive_s = \"x\"", ["`mqtt.keep_alive_s`", "\"x\"", "u16"]),
+            ("role = \"king\"", ["`role`", "king", "`edge`"]),
+            ("role = \"cav\"", ["`mqtt.broker`", "nothing", "host:port"]),
+            (
+                "role = \"edge\"\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 1\ny_m = 0",
+                ["`landmarks[1].id`", "\"a\"", "unique"],
+            ),
+            ("role = ", ["TOML", "configuration", ""]),
+        ] {
+            let error = load(toml).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_missing_file_is_named() {
+        let error = NodeConfig::load(Some(std::path::Path::new("/missing.toml")), &Flags { name: "x" }).unwrap_err();
+        assert!(error.to_string().contains("/missing.toml"));
+    }
+
+    #[test]
+    fn a_printed_configuration_can_be_read_back() {
+        let config = load("role = \"edge\"").unwrap();
+        assert_eq!(load(&toml::to_string(&config).unwrap()).unwrap(), config);
     }
 }

@@ -26,13 +26,17 @@ pub enum Event {
     ConnectFailed,
     /// A map newer than all before was taken.
     MapAccepted,
+    /// A camera frame was looked at.
+    FrameDetected,
+    /// A camera frame could not be used.
+    FrameFailed,
     /// A camera frame gave way to a later one.
     FrameSkipped,
 }
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::Published,
         Self::PublishRefused,
         Self::Received,
@@ -42,6 +46,8 @@ impl Event {
         Self::Disconnected,
         Self::ConnectFailed,
         Self::MapAccepted,
+        Self::FrameDetected,
+        Self::FrameFailed,
         Self::FrameSkipped,
     ];
 
@@ -57,6 +63,8 @@ impl Event {
             Self::Disconnected => "disconnected",
             Self::ConnectFailed => "connect_failed",
             Self::MapAccepted => "map_accepted",
+            Self::FrameDetected => "frame_detected",
+            Self::FrameFailed => "frame_failed",
             Self::FrameSkipped => "frame_skipped",
         }
     }
@@ -72,7 +80,12 @@ pub struct Counters {
 impl Counters {
     /// Counts an event.
     pub fn count(&self, event: Event) {
-        self.events[event as usize].fetch_add(1, Ordering::Relaxed);
+        self.add(event, 1);
+    }
+
+    /// Counts an event that happened several times.
+    pub fn add(&self, event: Event, times: u64) {
+        self.events[event as usize].fetch_add(times, Ordering::Relaxed);
     }
 
     /// Counts a payload that was not used.

@@ -1,6 +1,12 @@
 //! Detectors: from an image to labels with places in the image. One trait, one file each.
 
+pub mod coco;
+mod config;
+pub mod recorded;
+
 use ecod::detection::Detection;
+
+pub use config::DetectorConfig;
 
 use crate::frame::Frame;
 

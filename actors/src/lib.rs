@@ -2,18 +2,38 @@
 
 #![warn(clippy::unwrap_used)]
 
+pub mod bench;
 pub mod broker;
+#[cfg(feature = "camera")]
+pub mod calibrate;
+#[cfg(feature = "camera")]
+pub mod camera;
+pub mod cli;
 pub mod clock;
 pub mod config;
+#[cfg(feature = "camera")]
+pub mod corner_pose;
 pub mod counters;
 #[cfg(feature = "camera")]
 pub mod detect;
+#[cfg(feature = "camera")]
+pub mod detector;
 pub mod follower;
 #[cfg(feature = "camera")]
 pub mod frame;
+#[cfg(feature = "camera")]
+pub mod frame_source;
 pub mod fuser;
 pub mod gateway;
+#[cfg(feature = "camera")]
+pub mod latest_slot;
+#[cfg(feature = "camera")]
+pub mod lens;
 pub mod node;
+#[cfg(feature = "camera")]
+pub mod perception;
+#[cfg(feature = "camera")]
+pub mod projector;
 pub mod seat;
 #[cfg(feature = "camera")]
 pub mod testbed;

@@ -1,5 +1,7 @@
 //! The embedded broker's life, alone in its process so that its threads can be counted.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
+
 use std::net::{SocketAddr, TcpStream};
 
 use ecod_actors::broker::{BrokerConfig, BrokerError, BrokerHealth, EmbeddedBroker, Mqtt};

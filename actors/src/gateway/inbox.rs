@@ -247,3 +247,41 @@ impl fmt::Debug for Inbox {
         f.debug_struct("Inbox").field("node", &self.node).finish_non_exhaustive()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use ecod::wire::{Encoding, encode};
+
+    use super::*;
+
+    #[test]
+    fn a_full_inbox_drops_and_counts_until_a_receiver_catches_up() {
+        let counters = Arc::new(Counters::default());
+        let held = Arc::new(Mutex::new(Vec::new()));
+        let receiver = Arc::clone(&held);
+        let inbox = Inbox::new(
+            NodeName::new("edge").unwrap(),
+            Topics::new(&NodeName::new("lot").unwrap()),
+            Limits::default(),
+            2,
+            Arc::clone(&counters),
+            Arc::new(move |delivery| receiver.lock().unwrap().push(delivery)),
+        );
+        let reputations = Reputations { schema: 1, epoch: 1, round: 1, reputations: Default::default() };
+        let payload = encode(&reputations, Encoding::Json);
+        let accept = |at| inbox.accept(b"ecod/v1/lot/reputations", &payload, Timestamp(at));
+        for at in 1..=5 {
+            assert_eq!(accept(at), Outcome::Done);
+        }
+        assert_eq!(counters.events(Event::InboxFull), 3);
+        assert_eq!(held.lock().unwrap().remove(0).received_at, Timestamp(1));
+        accept(6);
+        assert_eq!(counters.events(Event::InboxFull), 3);
+        let kept: Vec<_> = held.lock().unwrap().iter().map(|delivery| delivery.received_at).collect();
+        assert_eq!(kept, [Timestamp(2), Timestamp(6)]);
+
+        inbox.expect_reputations(payload.clone().into());
+        accept(7);
+        assert_eq!((counters.events(Event::Echo), counters.events(Event::InboxFull)), (1, 3));
+    }
+}

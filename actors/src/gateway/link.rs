@@ -1,7 +1,7 @@
 //! The task that keeps one link to one broker: connects, reads, and connects anew.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ecod::wire::RejectReason;
 use ractor::ActorRef;
@@ -98,8 +98,12 @@ struct Task {
 
 impl Task {
     async fn run(self, mut backoff: Backoff) {
+        // The first answer is waited for half as long: a session that outlived this was in use. One that ends sooner,
+        // such as by a retained packet beyond all bounds, must not be tried again at full speed.
+        let in_use = 2 * self.setup.config.connect_timeout();
         loop {
-            let error = match self.session(&mut backoff).await {
+            let begun = Instant::now();
+            let error = match self.session().await {
                 Ok(()) => return,
                 Err(error) => error,
             };
@@ -111,18 +115,20 @@ impl Task {
             if !self.tell(LinkNews::Lost(state)) {
                 return;
             }
+            if begun.elapsed() > in_use {
+                backoff.reset();
+            }
             tokio::time::sleep(backoff.next_wait()).await;
         }
     }
 
     /// One connection from beginning to end; `Ok` after a farewell.
-    async fn session(&self, backoff: &mut Backoff) -> Result<(), ConnectionError> {
+    async fn session(&self) -> Result<(), ConnectionError> {
         let LinkSetup { client_id, will, config, inbox, counters, .. } = &*self.setup;
         let (client, mut connection) = connection::open(&self.broker, client_id, will, config);
         // The protocol's own timeouts are whole seconds.
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
-        backoff.reset();
         if !self.tell(LinkNews::Accepted(client)) {
             return Ok(());
         }

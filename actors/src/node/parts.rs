@@ -11,7 +11,7 @@ use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, S
 use tokio::sync::watch;
 use uuid::Uuid;
 
-use crate::broker::{Broker, BrokerMessage, EmbeddedBroker};
+use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker};
 use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
@@ -79,6 +79,10 @@ pub(super) struct Assembly {
 
 /// How long a part may take to stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// How often, and how far apart, a broker started anew tries to get its address back.
+const REBIND_ATTEMPTS: usize = 40;
+const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl Assembly {
     pub(super) fn new(config: NodeConfig, failed: watch::Sender<Option<String>>) -> Self {
@@ -178,12 +182,21 @@ impl Assembly {
         stop(&self.seats.broker).await;
     }
 
-    /// The broker comes back at the address it had, so that the links find it.
+    /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
+    /// leave it.
     async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
         let embedded = Box::new(EmbeddedBroker::new(self.config.broker.clone()));
         let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await?;
-        let address = self.broker_address.borrow().unwrap_or(self.config.listen);
-        let bound = ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })??;
+        let before = *self.broker_address.borrow();
+        let address = before.unwrap_or(self.config.listen);
+        let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
+        let bound = loop {
+            attempts -= 1;
+            match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
+                Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
+                outcome => break outcome?,
+            }
+        };
         self.broker_address.send_replace(Some(bound));
         let id = broker.get_id();
         self.seats.broker.take(broker);

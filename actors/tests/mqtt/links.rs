@@ -1,10 +1,11 @@
 //! Links: payloads pass, several at once, and after a broker's death.
 
 use ecod::wire::Encoding;
+use ecod_actors::broker::Mqtt;
 use ecod_actors::counters::Event;
 use ecod_actors::gateway::{BrokerAddress, GatewayMessage, LinkState, MqttConfig, MqttVersion, Part, Secret};
 
-use crate::cell::{Node, embedded, map, name, until};
+use crate::cell::{LOOPBACK, Node, embedded, map, name, until};
 use crate::mosquitto::Mosquitto;
 
 async fn report_and_map_pass(broker: &BrokerAddress, mqtt: MqttConfig) {
@@ -122,5 +123,20 @@ async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
         settle(&mut edge, &euclid).await;
         euclid.report(100);
         assert_eq!(edge.next_report().await, (name("euclid"), 100));
+    }
+}
+
+#[tokio::test]
+async fn a_restarted_embedded_broker_is_found_again() {
+    let (mut broker, address) = embedded();
+    let mut edge = Node::join("edge", Part::Candidate, MqttConfig::default(), &[&address]).await;
+    let mut euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    for seq in 1..=3 {
+        broker.restart(LOOPBACK).unwrap();
+        edge.link(LinkState::Up).await;
+        euclid.link(LinkState::Up).await;
+        settle(&mut edge, &euclid).await;
+        euclid.report(seq);
+        assert_eq!(edge.next_report().await, (name("euclid"), seq));
     }
 }

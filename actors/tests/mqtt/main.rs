@@ -8,3 +8,4 @@ mod junk;
 mod links;
 mod mosquitto;
 mod status;
+mod two_hop;

@@ -1,0 +1,93 @@
+//! `ecod-node --role …`: one node of a cell.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use ecod::names::NodeName;
+use serde::Serialize;
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::Failure;
+use crate::config::NodeConfig;
+use crate::gateway::BrokerAddress;
+use crate::node;
+
+/// Flags of a node; each overrides the key of its name in the configuration file.
+#[derive(Debug, Args, Serialize)]
+pub struct RunArguments {
+    /// What the node does: `edge` aggregates, `cav` sees and reports
+    #[arg(long, value_parser = ["auto", "cav", "edge"])]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    role: Option<String>,
+    /// Configuration file (TOML)
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    config: Option<PathBuf>,
+    /// Name of the node, unique in its cell
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<NodeName>,
+    /// Name of the cell
+    #[arg(long)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    cell: Option<NodeName>,
+    /// Where the embedded broker of an aggregator listens
+    #[arg(long, value_name = "IP:PORT")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    listen: Option<SocketAddr>,
+    /// The broker to connect to, for a node without an embedded one
+    #[arg(long, value_name = "HOST:PORT")]
+    #[serde(skip)]
+    broker: Option<BrokerAddress>,
+    /// Append every accepted map to this file, one JSON object a line
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    map_log: Option<PathBuf>,
+    /// Print the configuration that results from file, environment and flags, and exit
+    #[arg(long)]
+    #[serde(skip)]
+    print_config: bool,
+}
+
+/// Flags as they are laid over the configuration.
+#[derive(Serialize)]
+struct Overrides<'a> {
+    #[serde(flatten)]
+    top: &'a RunArguments,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mqtt: Option<MqttOverrides<'a>>,
+}
+
+#[derive(Serialize)]
+struct MqttOverrides<'a> {
+    broker: &'a BrokerAddress,
+}
+
+pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
+    let mqtt = arguments.broker.as_ref().map(|broker| MqttOverrides { broker });
+    let config = NodeConfig::load(arguments.config.as_deref(), &Overrides { top: arguments, mqtt });
+    let config = config.map_err(Failure::usage)?;
+    if arguments.print_config {
+        print!("{}", toml::to_string(&config).context("the configuration cannot be written as TOML")?);
+        return Ok(());
+    }
+    let runtime = tokio::runtime::Runtime::new().context("no threads for the node")?;
+    runtime.block_on(serve(config))?;
+    Ok(())
+}
+
+/// Runs the node until SIGINT or SIGTERM.
+async fn serve(config: NodeConfig) -> anyhow::Result<()> {
+    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let mut node = node::start(config).await?;
+    tokio::select! {
+        _ = interrupt.recv() => {}
+        _ = terminate.recv() => {}
+        failed = node.failed() => failed?,
+    }
+    tracing::info!("stopping");
+    node.stop().await;
+    Ok(())
+}

@@ -1,0 +1,127 @@
+//! The actor that looks at frames.
+//!
+//! ```text
+//! capture threads ── latest frame ──> pump task ── Look ──> Detector ── Report ──> Projector
+//!                                         ▲                     │
+//!                                         └── done with the last one
+//! ```
+//!
+//! The pump takes the latest frame only when the detector is done with the one before, so frames never queue up.
+
+use std::sync::Arc;
+
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::task::{JoinHandle, spawn_blocking};
+
+use crate::counters::{Counters, Event};
+use crate::detect::Detect;
+use crate::frame::Frame;
+use crate::frame_source::capture::{Capture, CaptureConfig, Opener};
+use crate::projector::ProjectorMessage;
+use crate::seat::Seat;
+
+/// What the detector is asked to do.
+#[derive(Debug)]
+pub enum DetectorMessage {
+    /// Find the objects in a frame.
+    Look {
+        /// The frame.
+        frame: Frame,
+        /// Lets the next frame in when dropped.
+        turn: OwnedSemaphorePermit,
+    },
+}
+
+/// What a detector needs at its start.
+pub struct DetectorArguments {
+    /// Opens the frame source.
+    pub open: Opener,
+    /// When the source counts as stalled.
+    pub capture: CaptureConfig,
+    /// Finds the objects.
+    pub detect: Box<dyn Detect>,
+    /// Gets the detections.
+    pub projector: Seat<ProjectorMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// Looks at the latest frame, again and again.
+#[derive(Debug, Default)]
+pub struct Detector;
+
+/// The detector between frames.
+pub struct DetectorState {
+    /// Away only while a frame is being looked at.
+    detect: Option<Box<dyn Detect>>,
+    projector: Seat<ProjectorMessage>,
+    counters: Arc<Counters>,
+    pump: JoinHandle<()>,
+}
+
+impl Actor for Detector {
+    type Msg = DetectorMessage;
+    type State = DetectorState;
+    type Arguments = DetectorArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let DetectorArguments { open, capture, detect, projector, counters } = arguments;
+        let capture = Capture::start(open, capture)?;
+        let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters)));
+        Ok(DetectorState { detect: Some(detect), projector, counters, pump })
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let DetectorMessage::Look { frame, turn } = message;
+        let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
+        let captured_at = frame.captured_at;
+        let (detect, outcome) = spawn_blocking(move || {
+            let outcome = detect.detect(&frame);
+            (detect, outcome)
+        })
+        .await?;
+        state.detect = Some(detect);
+        match outcome {
+            Ok(detections) => {
+                state.counters.count(Event::FrameDetected);
+                state.projector.send(ProjectorMessage::Report { detections, captured_at });
+            }
+            Err(error) => {
+                state.counters.count(Event::FrameFailed);
+                tracing::debug!(%error, "frame not used");
+            }
+        }
+        drop(turn);
+        Ok(())
+    }
+}
+
+impl Drop for DetectorState {
+    fn drop(&mut self) {
+        self.pump.abort();
+    }
+}
+
+/// Hands over the latest frame whenever the detector is ready, until the source or the detector ends.
+async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>) {
+    let turns = Arc::new(Semaphore::new(1));
+    let mut skipped = 0;
+    while let Ok(turn) = Arc::clone(&turns).acquire_owned().await {
+        let Some(frame) = capture.next_frame().await else { return };
+        counters.add(Event::FrameSkipped, capture.skipped() - skipped);
+        skipped = capture.skipped();
+        if detector.cast(DetectorMessage::Look { frame, turn }).is_err() {
+            return;
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! A place for the latest value: a new one replaces one that nobody took.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::Notify;
+
+/// Hands the latest value from a producing thread to one consumer; values that were replaced are counted.
+#[derive(Debug)]
+pub struct LatestSlot<T> {
+    state: Mutex<State<T>>,
+    changed: Notify,
+}
+
+#[derive(Debug)]
+struct State<T> {
+    value: Option<T>,
+    skipped: u64,
+    closed: bool,
+}
+
+impl<T> Default for LatestSlot<T> {
+    fn default() -> Self {
+        Self { state: Mutex::new(State { value: None, skipped: 0, closed: false }), changed: Notify::new() }
+    }
+}
+
+impl<T> LatestSlot<T> {
+    /// Puts a value in; one that is still there is dropped and counted as skipped.
+    pub fn put(&self, value: T) {
+        let mut state = self.lock();
+        state.skipped += u64::from(state.value.replace(value).is_some());
+        drop(state);
+        self.changed.notify_one();
+    }
+
+    /// Says that no further value will come; one that is still there can be taken.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.changed.notify_one();
+    }
+
+    /// Takes the latest value, waiting for one; `None` once closed and empty. Nothing is lost when the wait is
+    /// cancelled.
+    pub async fn take(&self) -> Option<T> {
+        loop {
+            if let Some(value) = self.try_take() {
+                return Some(value);
+            }
+            if self.lock().closed {
+                return self.try_take();
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    /// Takes the latest value, if there is one.
+    pub fn try_take(&self) -> Option<T> {
+        self.lock().value.take()
+    }
+
+    /// Values that were replaced before anyone took them.
+    pub fn skipped(&self) -> u64 {
+        self.lock().skipped
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State<T>> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn the_latest_value_wins_and_the_others_are_counted() {
+        let slot = LatestSlot::default();
+        (1..=4).for_each(|value| slot.put(value));
+        assert_eq!(slot.take().await, Some(4));
+        assert_eq!(slot.skipped(), 3);
+        slot.put(5);
+        slot.close();
+        assert_eq!((slot.take().await, slot.take().await), (Some(5), None));
+        assert_eq!(slot.skipped(), 3);
+    }
+
+    #[tokio::test]
+    async fn a_waiting_consumer_is_woken_by_a_thread() {
+        let slot = Arc::new(LatestSlot::default());
+        let waiting = tokio::spawn({
+            let slot = Arc::clone(&slot);
+            async move { slot.take().await }
+        });
+        tokio::task::yield_now().await;
+        std::thread::spawn(move || slot.put("frame")).join().unwrap();
+        assert_eq!(waiting.await.unwrap(), Some("frame"));
+    }
+}

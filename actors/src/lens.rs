@@ -1,0 +1,113 @@
+//! A camera's intrinsics with the distortion of its lens, and the removal of that distortion from detections.
+
+use ecod::camera::Intrinsics;
+use ecod::detection::{BoundingBox, Detection};
+use nalgebra::Point2;
+use opencv::calib3d;
+use opencv::core::{Mat, Matx33d, Point2d, Vector};
+
+/// A camera as calibrated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Lens {
+    /// Focal lengths and principal point, in pixels.
+    pub intrinsics: Intrinsics,
+    /// OpenCV's k1, k2, p1, p2, k3; `None` for an ideal lens.
+    pub distortion: Option<[f64; 5]>,
+}
+
+impl Lens {
+    /// A lens without distortion.
+    pub fn ideal(intrinsics: Intrinsics) -> Self {
+        Self { intrinsics, distortion: None }
+    }
+
+    /// Moves boxes and corners to where an ideal lens would have drawn them. A box is moved by the middles of its
+    /// edges.
+    ///
+    /// # Errors
+    /// OpenCV's, when it cannot compute.
+    pub fn undistort(&self, detections: &mut [Detection]) -> opencv::Result<()> {
+        let Some(distortion) = self.distortion else { return Ok(()) };
+        let mut points = Vector::<Point2d>::new();
+        for Detection { bounding_box: b, corners, .. } in detections.iter() {
+            let middle = b.center();
+            let edges = [(b.x_min, middle.y), (b.x_max, middle.y), (middle.x, b.y_min), (middle.x, b.y_max)];
+            points.extend(edges.map(|(x, y)| Point2d::new(x, y)));
+            points.extend(corners.iter().flatten().map(|corner| Point2d::new(corner.x, corner.y)));
+        }
+        if points.is_empty() {
+            return Ok(());
+        }
+        let camera = camera_matrix(&self.intrinsics);
+        let mut straight = Vector::<Point2d>::new();
+        let distortion = Vector::<f64>::from_slice(&distortion);
+        calib3d::undistort_points(&points, &mut straight, &camera, &distortion, &Mat::default(), &camera)?;
+        let mut straight = straight.iter();
+        let mut next = || straight.next().map_or(Point2::origin(), |p| Point2::new(p.x, p.y));
+        for detection in detections {
+            let [left, right, upper, lower] = std::array::from_fn(|_| next());
+            detection.bounding_box = BoundingBox { x_min: left.x, y_min: upper.y, x_max: right.x, y_max: lower.y };
+            detection.corners.iter_mut().flatten().for_each(|corner| *corner = next());
+        }
+        Ok(())
+    }
+}
+
+/// The intrinsics as OpenCV's 3×3 camera matrix.
+pub(crate) fn camera_matrix(intrinsics: &Intrinsics) -> Matx33d {
+    let Intrinsics { fx, fy, cx, cy, .. } = *intrinsics;
+    Matx33d::from_array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DISTORTION: [f64; 5] = [-0.3, 0.1, 0.001, -0.002, 0.0];
+
+    fn camera() -> Intrinsics {
+        Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians())
+    }
+
+    /// The Brown-Conrady model, as written in OpenCV's documentation of `calib3d`.
+    fn distorted(ideal: Point2<f64>) -> Point2<f64> {
+        let Intrinsics { fx, fy, cx, cy, .. } = camera();
+        let [k1, k2, p1, p2, k3] = DISTORTION;
+        let (x, y) = ((ideal.x - cx) / fx, (ideal.y - cy) / fy);
+        let r2 = x * x + y * y;
+        let radial = 1.0 + k1 * r2 + k2 * r2 * r2 + k3 * r2 * r2 * r2;
+        Point2::new(
+            cx + fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)),
+            cy + fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y),
+        )
+    }
+
+    #[test]
+    fn corners_return_to_where_an_ideal_lens_draws_them() {
+        let ideal = [(500.0, 100.0), (560.0, 105.0), (555.0, 160.0), (495.0, 150.0)].map(|(x, y)| Point2::new(x, y));
+        let bent = ideal.map(distorted);
+        assert!((bent[1] - ideal[1]).norm() > 5.0, "the lens bends enough to be seen");
+        let seen = Detection {
+            label: "QR".into(),
+            confidence: 1.0,
+            bounding_box: BoundingBox::around(&bent),
+            corners: Some(bent),
+        };
+        let mut detections = vec![Detection { corners: None, ..seen.clone() }, seen];
+        Lens { intrinsics: camera(), distortion: Some(DISTORTION) }.undistort(&mut detections).unwrap();
+        for (straight, ideal) in detections[1].corners.unwrap().iter().zip(ideal) {
+            assert!((straight - ideal).norm() < 0.05, "{straight} {ideal}");
+        }
+        assert_eq!(detections[0].bounding_box, detections[1].bounding_box);
+        assert!((detections[0].bounding_box.center() - BoundingBox::around(&ideal).center()).norm() < 1.0);
+    }
+
+    #[test]
+    fn an_ideal_lens_changes_nothing() {
+        let bounding_box = BoundingBox { x_min: 1.0, y_min: 2.0, x_max: 30.0, y_max: 40.0 };
+        let seen = vec![Detection { label: "cup".into(), confidence: 1.0, bounding_box, corners: None }];
+        let mut detections = seen.clone();
+        Lens::ideal(camera()).undistort(&mut detections).unwrap();
+        assert_eq!(detections, seen);
+    }
+}
