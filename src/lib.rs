@@ -16,6 +16,7 @@ pub mod names;
 pub mod pace;
 pub mod projection;
 pub mod round;
+pub mod testbed;
 pub mod time;
 pub mod view;
 pub mod window;

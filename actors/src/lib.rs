@@ -35,3 +35,5 @@ pub mod perception;
 #[cfg(feature = "camera")]
 pub mod projector;
 pub mod seat;
+#[cfg(feature = "camera")]
+pub mod testbed;
