@@ -15,6 +15,8 @@ pub mod config;
 pub mod corner_pose;
 pub mod counters;
 #[cfg(feature = "camera")]
+pub mod demo;
+#[cfg(feature = "camera")]
 pub mod detect;
 #[cfg(feature = "camera")]
 pub mod detector;

@@ -5,9 +5,13 @@
 //! as far below the upper end of its card as from its sides, cards stand on the floor, and vehicles hide nothing.
 
 mod render;
+pub mod score;
 mod sensor;
+pub mod setup;
+pub mod table;
 #[cfg(test)]
 mod tests;
+pub mod trial;
 
 use ecod::names::Label;
 use ecod::testbed::{Cav, Scene, Testbed};

@@ -13,7 +13,7 @@ use ecod::testbed::{Cav, Scene, Testbed};
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport};
 
-use super::render::TestbedCamera;
+use super::TestbedCamera;
 use super::score::{SceneResult, Score};
 use super::setup;
 use crate::detect::Detect;
