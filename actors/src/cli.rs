@@ -2,6 +2,8 @@
 
 mod run;
 mod schema;
+#[cfg(feature = "camera")]
+mod testbed;
 
 use std::io::IsTerminal;
 use std::process::ExitCode;
@@ -23,6 +25,9 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Run recorded parking-lot scenes: render, detect, project and fuse them in virtual time
+    #[cfg(feature = "camera")]
+    Testbed(testbed::TestbedArguments),
     /// Print the JSON Schemas of every payload
     Schema,
 }
@@ -48,6 +53,8 @@ pub fn main() -> ExitCode {
         .init();
     let outcome = match cli.command {
         None => run::run(&cli.run),
+        #[cfg(feature = "camera")]
+        Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         Some(Command::Schema) => schema::print(),
     };
     match outcome {

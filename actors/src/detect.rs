@@ -2,6 +2,7 @@
 
 pub mod coco;
 mod config;
+pub mod placard;
 pub mod recorded;
 
 use ecod::detection::Detection;
