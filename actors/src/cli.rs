@@ -1,5 +1,7 @@
 //! The command line of `ecod-node`.
 
+#[cfg(feature = "camera")]
+mod calibrate;
 mod run;
 mod schema;
 
@@ -23,6 +25,9 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Calibrate a camera from photographs of a chessboard
+    #[cfg(feature = "camera")]
+    Calibrate(calibrate::CalibrateArguments),
     /// Print the JSON Schemas of every payload
     Schema,
 }
@@ -48,6 +53,8 @@ pub fn main() -> ExitCode {
         .init();
     let outcome = match cli.command {
         None => run::run(&cli.run),
+        #[cfg(feature = "camera")]
+        Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
         Some(Command::Schema) => schema::print(),
     };
     match outcome {
