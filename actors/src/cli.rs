@@ -1,5 +1,7 @@
 //! The command line of `ecod-node`.
 
+#[cfg(feature = "camera")]
+mod calibrate;
 mod run;
 mod schema;
 #[cfg(feature = "camera")]
@@ -28,6 +30,9 @@ enum Command {
     /// Run recorded parking-lot scenes: render, detect, project and fuse them in virtual time
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
+    /// Calibrate a camera from photographs of a chessboard
+    #[cfg(feature = "camera")]
+    Calibrate(calibrate::CalibrateArguments),
     /// Print the JSON Schemas of every payload
     Schema,
 }
@@ -55,6 +60,7 @@ pub fn main() -> ExitCode {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
+        Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
         Some(Command::Schema) => schema::print(),
     };
     match outcome {

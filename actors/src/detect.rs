@@ -7,7 +7,7 @@ pub mod recorded;
 
 use ecod::detection::Detection;
 
-pub use config::DetectorConfig;
+pub use config::{CustomDetector, DetectorConfig};
 
 use crate::frame::Frame;
 

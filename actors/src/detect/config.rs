@@ -1,5 +1,8 @@
 //! Which detector a camera has.
 
+use std::fmt;
+use std::sync::Arc;
+
 use ecod::config::ConfigError;
 use serde::{Deserialize, Serialize};
 
@@ -18,6 +21,34 @@ pub enum DetectorConfig {
     Coco(CocoConfig),
     /// Detections from a file.
     Recorded(RecordedConfig),
+    /// A detector of the program's own; not for files.
+    #[serde(skip)]
+    Custom(CustomDetector),
+}
+
+/// Makes a detector that this crate does not know, anew for every start of the detector's actor.
+#[derive(Clone)]
+pub struct CustomDetector {
+    build: Arc<dyn Fn() -> anyhow::Result<Box<dyn Detect>> + Send + Sync>,
+}
+
+impl CustomDetector {
+    /// Takes the maker; it may fail, such as for want of a file, and is then asked again by the supervisor's policy.
+    pub fn new(build: impl Fn() -> anyhow::Result<Box<dyn Detect>> + Send + Sync + 'static) -> Self {
+        Self { build: Arc::new(build) }
+    }
+}
+
+impl PartialEq for CustomDetector {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.build, &other.build)
+    }
+}
+
+impl fmt::Debug for CustomDetector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("CustomDetector")
+    }
 }
 
 impl DetectorConfig {
@@ -29,7 +60,7 @@ impl DetectorConfig {
         match self {
             Self::Placard(config) => config.validate(),
             Self::Coco(config) => config.validate(),
-            Self::Recorded(_) => Ok(()),
+            Self::Recorded(_) | Self::Custom(_) => Ok(()),
         }
     }
 
@@ -42,6 +73,7 @@ impl DetectorConfig {
             Self::Placard(config) => Box::new(PlacardDetector::new(config.clone())),
             Self::Coco(config) => Box::new(CocoDetector::new(config.clone())?),
             Self::Recorded(config) => Box::new(RecordedDetector::open(config)?),
+            Self::Custom(custom) => (custom.build)()?,
         })
     }
 }

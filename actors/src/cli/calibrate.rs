@@ -1,0 +1,43 @@
+//! `ecod-node calibrate`: from photographs of a chessboard to a calibration file.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+
+use super::Failure;
+use crate::calibrate::{Chessboard, calibrate, photographs};
+
+/// Flags of `calibrate`.
+#[derive(Debug, Args)]
+pub(super) struct CalibrateArguments {
+    /// Inner corners along a row of the board: squares less one
+    #[arg(long, default_value_t = 9)]
+    columns: u16,
+    /// Inner corners along a column of the board: squares less one
+    #[arg(long, default_value_t = 6)]
+    rows: u16,
+    /// Side of a square in millimetres
+    #[arg(long, value_name = "MM")]
+    square_mm: f64,
+    /// Where to write the calibration
+    #[arg(long, value_name = "FILE", default_value = "calibration.toml")]
+    out: PathBuf,
+    /// Photographs, or directories of them
+    #[arg(required = true, value_name = "IMAGE")]
+    images: Vec<PathBuf>,
+}
+
+pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
+    let CalibrateArguments { columns, rows, square_mm, out, images } = arguments;
+    let board = Chessboard { columns: *columns, rows: *rows, square_mm: *square_mm };
+    let images = photographs(images).map_err(Failure::usage)?;
+    let report = calibrate(&images, &board).context("no calibration")?;
+    for image in &report.without_board {
+        eprintln!("no whole board in {}", image.display());
+    }
+    let found = &report.calibration;
+    found.write(out).context("no calibration")?;
+    println!("{}: {:.3} px rms over {} photographs", out.display(), found.rms_px, found.images.len());
+    Ok(())
+}
