@@ -7,6 +7,8 @@
 pub mod camera;
 pub mod config;
 pub mod detection;
+pub mod election;
+pub mod epoch;
 pub mod geometry;
 pub mod landmark;
 pub mod names;
