@@ -284,12 +284,7 @@ impl Election {
     }
 
     fn standing(&self) -> Standing {
-        Standing {
-            role: self.config.role,
-            priority: self.config.priority,
-            load: self.load,
-            fit: self.health.is_fit(),
-        }
+        Standing { role: self.config.role, priority: self.config.priority, load: self.load, fit: self.health.is_fit() }
     }
 
     /// The epoch followed or led now.

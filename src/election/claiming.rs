@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use crate::election::leading::Leading;
-use crate::election::message::{Body, Standing};
+use crate::election::message::{Body, MAX_SUCCESSORS, Standing};
 use crate::election::step::Effect;
 use crate::election::{Election, State};
 use crate::epoch::Epoch;
@@ -104,14 +104,7 @@ impl Election {
         }
     }
 
-    pub(super) fn take_vouch(
-        &mut self,
-        from: &NodeName,
-        epoch: Option<Epoch>,
-        ask: u64,
-        age_ms: u64,
-        now: Timestamp,
-    ) {
+    pub(super) fn take_vouch(&mut self, from: &NodeName, epoch: Option<Epoch>, ask: u64, age_ms: u64, now: Timestamp) {
         let (Some(epoch), Some(asked_at)) = (epoch, self.questions.asked_at(ask)) else { return };
         let heard_at = asked_at - Duration::from_millis(age_ms);
         if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) {
@@ -140,11 +133,7 @@ impl Election {
         let epoch = Epoch::new(term, self.id.clone());
         self.epoch = Some(epoch.clone());
         let known = self.standby().cloned();
-        let successors = match &mut self.state {
-            State::Leading(leading) => std::mem::take(&mut leading.successors),
-            State::Seeking(_) | State::Following(_) => Vec::new(),
-        };
-        let successors = self.peers.successors(&successors, crate::election::MAX_SUCCESSORS, now);
+        let successors = self.peers.successors(MAX_SUCCESSORS, now);
         let on_time = !matches!(self.state, State::Seeking(_));
         self.effects.push(Effect::Lead { epoch: epoch.clone(), first_round: self.round + 1, on_time });
         if known.as_ref() != successors.first() {
@@ -170,7 +159,8 @@ impl Election {
         let standing = self.standing();
         standing.may_lead().then(|| {
             let turn = |name: &NodeName| seeking.order.iter().position(|next| next == name).unwrap_or(usize::MAX);
-            let place = |name: &NodeName, standing: Standing| (turn(name), standing.class(), standing.load, name.clone());
+            let place =
+                |name: &NodeName, standing: Standing| (turn(name), standing.class(), standing.load, name.clone());
             let own = place(&self.id, standing);
             let before = self.peers.candidates(self.clock.now()).filter(|&(name, other)| place(name, other) < own);
             seeking.since + self.config.claim_step() * u32::try_from(before.count()).unwrap_or(u32::MAX)

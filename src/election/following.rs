@@ -212,8 +212,7 @@ impl Election {
                         self.adopt(other, now, now);
                     }
                     Some(other) if *other != own => {}
-                    // One of ours knows a later term: stay the leader, in a term that nobody can refuse.
-                    _ if message.term > own.term => self.lead(Some(own), now),
+                    _ if message.term > own.term => self.renew_later(now),
                     _ => {}
                 }
             }
@@ -225,7 +224,7 @@ impl Election {
         if let State::Leading(leading) = &self.state
             && over.is_some_and(|over| *over >= leading.epoch)
         {
-            self.lead(Some(leading.epoch.clone()), now);
+            self.renew_later(now);
         }
         if self.peers.get(from).is_some_and(|peer| peer.told) {
             return;
@@ -254,14 +253,9 @@ impl Election {
         }
     }
 
+    /// What the membership gave up is only doubted here: it may hear less than the leader's beats and others tell.
     pub(super) fn peer_down(&mut self, peer: &NodeName, now: Timestamp) {
-        if let State::Following(following) = &self.state
-            && following.epoch.leader == *peer
-            && now >= following.doubt_at(&self.config)
-        {
-            self.peers.gone(peer, now);
-            self.lose_leader(now);
-        }
+        self.peer_suspected(peer, now);
         self.peers.down(peer, now);
     }
 

@@ -18,13 +18,15 @@ pub(super) struct Leading {
     pub(super) successors: Vec<NodeName>,
     /// The handover under way.
     pub(super) handover: Option<Handover>,
+    /// When to lead on in a higher epoch, as this one is refused by some.
+    renew_at: Option<Timestamp>,
     beat_at: Timestamp,
     beats: u64,
 }
 
 impl Leading {
     pub(super) fn new(epoch: Epoch, after: Option<Epoch>, successors: Vec<NodeName>, now: Timestamp) -> Self {
-        Self { epoch, after, successors, handover: None, beat_at: now, beats: 0 }
+        Self { epoch, after, successors, handover: None, renew_at: None, beat_at: now, beats: 0 }
     }
 
     pub(super) fn deadline(&self) -> Timestamp {
@@ -41,6 +43,11 @@ impl Election {
         if now < leading.beat_at {
             return;
         }
+        if leading.handover.is_none() && leading.renew_at.is_some_and(|at| now >= at) {
+            let after = leading.epoch.clone();
+            self.lead(Some(after), now);
+            return;
+        }
         leading.beat_at = next;
         leading.beats += 1;
         let beats = leading.beats;
@@ -54,6 +61,15 @@ impl Election {
             .collect();
         for peer in due {
             self.send_beat(&peer, now);
+        }
+    }
+
+    /// One of ours knows a later term, or holds this epoch for over. If that is for want of a newer leader rather than
+    /// because one is just taking over, lead on in a term that nobody can refuse.
+    pub(super) fn renew_later(&mut self, now: Timestamp) {
+        let at = now + self.config.idle_beat() * 2;
+        if let State::Leading(leading) = &mut self.state {
+            leading.renew_at.get_or_insert(at);
         }
     }
 
@@ -79,7 +95,7 @@ impl Election {
     /// Chooses who leads next, and tells all when that changed.
     pub(super) fn name_successors(&mut self, now: Timestamp) {
         let State::Leading(leading) = &mut self.state else { return };
-        let mut next = self.peers.successors(&leading.successors, MAX_SUCCESSORS, now);
+        let mut next = self.peers.successors(MAX_SUCCESSORS, now);
         if let Some(handover) = &leading.handover {
             next.retain(|name| *name != handover.to);
             next.insert(0, handover.to.clone());

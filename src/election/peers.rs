@@ -145,10 +145,10 @@ impl Peers {
             .filter_map(|(name, peer)| Some((name, peer.standing?)))
     }
 
-    /// The leader's successors: heard lately and fit, `current` ones first within their class.
-    pub(super) fn successors(&self, current: &[NodeName], limit: usize, now: Timestamp) -> Vec<NodeName> {
+    /// The leader's successors: heard lately and fit, the best first.
+    pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
         let mut fit: Vec<_> = self.candidates(now).filter(|(name, _)| self.hears(name, now)).collect();
-        fit.sort_by_key(|&(name, standing)| (standing.class(), !current.contains(name), standing.load, name.clone()));
+        fit.sort_by_key(|&(name, standing)| (standing.class(), standing.load, name.clone()));
         fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
     }
 

@@ -12,15 +12,15 @@ use ecod::wire::{Encoding, Role};
 use crate::random::Random;
 
 /// Microseconds in a millisecond.
-pub const MS: u64 = 1000;
+pub(crate) const MS: u64 = 1000;
 /// Time between two rounds.
-pub const PERIOD: u64 = 100 * MS;
+pub(crate) const PERIOD: u64 = 100 * MS;
 /// All parts work.
-pub const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 10 };
+pub(crate) const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 10 };
 
 /// What can happen to a cell.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Fault {
+pub(crate) enum Fault {
     /// The process starts, with its disk.
     Start(usize),
     /// The process ends; others see broken connections and a refusing port when told so, else only silence.
@@ -62,19 +62,19 @@ enum News {
 
 /// A round accepted by a node.
 #[derive(Debug, Clone)]
-pub struct Accepted {
-    pub at: u64,
-    pub epoch: Epoch,
-    pub round: u64,
+pub(crate) struct Accepted {
+    pub(crate) at: u64,
+    pub(crate) epoch: Epoch,
+    pub(crate) round: u64,
 }
 
 /// One vehicle or edge box.
-pub struct Node {
-    pub name: NodeName,
-    pub config: ElectionConfig,
-    pub election: Option<Election>,
-    pub accepted: Vec<Accepted>,
-    pub stale_refused: u64,
+pub(crate) struct Node {
+    pub(crate) name: NodeName,
+    pub(crate) config: ElectionConfig,
+    pub(crate) election: Option<Election>,
+    pub(crate) accepted: Vec<Accepted>,
+    pub(crate) stale_refused: u64,
     life: u64,
     persisted: u64,
     clock: i64,
@@ -87,17 +87,17 @@ pub struct Node {
 }
 
 /// The cell and everything under way in it.
-pub struct World {
-    pub now: u64,
-    pub nodes: Vec<Node>,
-    pub random: Random,
+pub(crate) struct World {
+    pub(crate) now: u64,
+    pub(crate) nodes: Vec<Node>,
+    pub(crate) random: Random,
     /// When who began to lead.
-    pub led: Vec<(u64, Epoch)>,
-    pub packets: u64,
+    pub(crate) led: Vec<(u64, Epoch)>,
+    pub(crate) packets: u64,
     /// Largest extra delay of every timer in µs: a busy machine.
-    pub lateness: u64,
+    pub(crate) lateness: u64,
     /// What to print when a check fails.
-    pub history: Vec<String>,
+    pub(crate) history: Vec<String>,
     cuts: BTreeSet<(usize, usize)>,
     loss_percent: u64,
     queue: BinaryHeap<Reverse<(u64, u64, Event)>>,
@@ -106,7 +106,7 @@ pub struct World {
 }
 
 impl World {
-    pub fn new(seed: u64, configs: Vec<ElectionConfig>) -> Self {
+    pub(crate) fn new(seed: u64, configs: Vec<ElectionConfig>) -> Self {
         let nodes = configs.into_iter().enumerate().map(|(index, config)| Node::new(index, config)).collect();
         let mut world = Self {
             now: 1_732_154_400_000_000,
@@ -127,11 +127,11 @@ impl World {
     }
 
     /// Lets something happen `after` µs from now.
-    pub fn plan(&mut self, after: u64, fault: Fault) {
+    pub(crate) fn plan(&mut self, after: u64, fault: Fault) {
         self.push(after, Event::Fault(fault));
     }
 
-    pub fn run_for(&mut self, micros: u64) {
+    pub(crate) fn run_for(&mut self, micros: u64) {
         let end = self.now + micros;
         while let Some(Reverse((at, _, _))) = self.queue.peek()
             && *at <= end
@@ -143,21 +143,19 @@ impl World {
         self.now = end;
     }
 
-    pub fn alive(&self) -> impl Iterator<Item = (usize, &Node)> {
+    pub(crate) fn alive(&self) -> impl Iterator<Item = (usize, &Node)> {
         self.nodes.iter().enumerate().filter(|(_, node)| node.election.is_some())
     }
 
-    pub fn leaders(&self) -> Vec<usize> {
+    pub(crate) fn leaders(&self) -> Vec<usize> {
         self.alive().filter(|(_, node)| node.leads()).map(|(index, _)| index).collect()
     }
 
     /// The node that should lead when all is well.
-    pub fn best(&self) -> Option<usize> {
+    pub(crate) fn best(&self) -> Option<usize> {
         self.alive()
             .filter(|(_, node)| node.config.role != Role::Cav)
-            .min_by_key(|(_, node)| {
-                (node.config.role != Role::Edge, Reverse(node.config.priority), node.name.clone())
-            })
+            .min_by_key(|(_, node)| (node.config.role != Role::Edge, Reverse(node.config.priority), node.name.clone()))
             .map(|(index, _)| index)
     }
 
@@ -205,11 +203,14 @@ impl World {
             Event::Map { epoch, round, .. } => self.accept(to, &epoch, round),
             Event::Tell { about, news, .. } => {
                 let peer = self.nodes[about].name.clone();
-                self.handle(to, match news {
-                    News::Alive => Input::PeerAlive { peer },
-                    News::Down => Input::PeerDown { peer },
-                    News::Gone => Input::PeerGone { peer },
-                });
+                self.handle(
+                    to,
+                    match news {
+                        News::Alive => Input::PeerAlive { peer },
+                        News::Down => Input::PeerDown { peer },
+                        News::Gone => Input::PeerGone { peer },
+                    },
+                );
             }
             Event::Prepared { .. } => self.handle(to, Input::Prepared),
             Event::Broker { works, .. } => {
@@ -294,7 +295,11 @@ impl World {
                 let (life, after) = (self.nodes[to].life, self.random.between(20 * MS, 300 * MS));
                 let node = &mut self.nodes[to];
                 let news = if there { News::Alive } else { News::Down };
-                if there { node.known.insert(about) } else { node.known.remove(&about) };
+                if there {
+                    node.known.insert(about)
+                } else {
+                    node.known.remove(&about)
+                };
                 self.push(after, Event::Tell { to, life, about, news });
             }
         }
@@ -302,7 +307,7 @@ impl World {
     }
 
     /// Whether a connection between two nodes works, which needs both directions.
-    pub fn linked(&self, a: usize, b: usize) -> bool {
+    pub(crate) fn linked(&self, a: usize, b: usize) -> bool {
         !self.cuts.contains(&(a, b)) && !self.cuts.contains(&(b, a))
     }
 
@@ -432,11 +437,11 @@ impl Node {
         }
     }
 
-    pub fn leads(&self) -> bool {
+    pub(crate) fn leads(&self) -> bool {
         self.election.as_ref().is_some_and(Election::is_leading)
     }
 
-    pub fn leader(&self) -> Option<&NodeName> {
+    pub(crate) fn leader(&self) -> Option<&NodeName> {
         self.election.as_ref().and_then(Election::leader)
     }
 }
