@@ -111,7 +111,8 @@ impl Election {
         let own = leading.epoch.clone();
         let followers = self.peers.followers(&own, now);
         if beat.epoch < own {
-            if beat.hears_us && followers == 0 && beat.followers > 0 {
+            let succeeded = leading.after.as_ref() >= Some(&beat.epoch);
+            if beat.hears_us && followers == 0 && beat.followers > 0 && !succeeded {
                 self.effects.push(Effect::StopPublishing { epoch: own });
                 self.effects.push(Effect::SendState { to: beat.epoch.leader.clone() });
                 self.seek(vec![beat.epoch.leader.clone()], now + self.config.contact(), now);

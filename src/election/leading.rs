@@ -13,7 +13,7 @@ use crate::time::Timestamp;
 pub(super) struct Leading {
     pub(super) epoch: Epoch,
     /// The epoch that this one succeeded.
-    after: Option<Epoch>,
+    pub(super) after: Option<Epoch>,
     /// Who leads next, the standby first.
     pub(super) successors: Vec<NodeName>,
     /// The handover under way.
