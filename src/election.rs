@@ -143,7 +143,7 @@ impl Election {
             Input::PeerDown { peer } => self.peer_down(&peer, now),
             Input::PeerGone { peer } => self.peer_gone(&peer, now),
             Input::Health { health } => self.set_health(health, now),
-            Input::Round { round } => self.note_round(round, now),
+            Input::Round { epoch, round } => self.note_round(&epoch, round, now),
             Input::Prepared => self.prepared(now),
             Input::Leave => self.resign(now),
         }

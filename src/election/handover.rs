@@ -4,7 +4,7 @@
 //! nearly a whole period for the few packets it takes; the new leader goes on with the next round. Should every one of
 //! those packets be lost for a period, the old leader publishes that round too, and yields again after it.
 
-use crate::election::message::Body;
+use crate::election::message::{Body, MAX_TERM};
 use crate::election::step::Effect;
 use crate::election::{Election, State};
 use crate::epoch::Epoch;
@@ -69,7 +69,8 @@ impl Election {
         }
     }
 
-    pub(super) fn note_round(&mut self, round: u64, now: Timestamp) {
+    pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
+        self.terms.seen = self.terms.seen.max(epoch.term.min(MAX_TERM));
         self.round = self.round.max(round);
         if let State::Leading(leading) = &mut self.state
             && let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some())

@@ -39,6 +39,8 @@ pub enum Input {
     },
     /// A round was published by this node, or accepted by its gate.
     Round {
+        /// The epoch it was published in.
+        epoch: Epoch,
         /// The round's number.
         round: u64,
     },

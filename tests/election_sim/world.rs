@@ -64,7 +64,6 @@ enum News {
 #[derive(Debug, Clone)]
 pub(crate) struct Accepted {
     pub(crate) at: u64,
-    pub(crate) epoch: Epoch,
     pub(crate) round: u64,
 }
 
@@ -412,8 +411,8 @@ impl World {
             node.stale_refused += 1;
             return;
         }
-        node.accepted.push(Accepted { at: self.now, epoch: epoch.clone(), round });
-        self.handle(to, Input::Round { round });
+        node.accepted.push(Accepted { at: self.now, round });
+        self.handle(to, Input::Round { epoch: epoch.clone(), round });
     }
 }
 
