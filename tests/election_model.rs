@@ -19,7 +19,10 @@ const MAX_PACKETS: usize = 6;
 
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 enum Action {
-    Deliver { packet: usize, again: bool },
+    Deliver {
+        packet: usize,
+        again: bool,
+    },
     Tick(usize),
     /// The node's timer fires, its first effect is done, and it crashes.
     TornTick(usize),
@@ -27,7 +30,10 @@ enum Action {
     Crash(usize),
     Restart(usize),
     /// A node sees that another one's process is gone.
-    Gone { to: usize, about: usize },
+    Gone {
+        to: usize,
+        about: usize,
+    },
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -147,10 +153,7 @@ impl Cell {
                     self.packets.extend(known.map(|to| Packet::Election(to, message)));
                 }
                 Effect::Prepare { .. } => self.handle(index, Input::Prepared),
-                Effect::Follow { .. }
-                | Effect::Seek
-                | Effect::AnnounceStandby { .. }
-                | Effect::SendState { .. } => {}
+                Effect::Follow { .. } | Effect::Seek | Effect::AnnounceStandby { .. } | Effect::SendState { .. } => {}
             }
         }
     }
@@ -219,7 +222,8 @@ impl CellModel {
     /// Whether to let this state settle: it takes thousands of steps, so a fixed sample of the last ones has to do.
     fn settles(&self, cell: &Cell) -> bool {
         let clocks: u64 = cell.nodes.iter().map(|node| node.clock.micros() / 1000).sum();
-        cell.steps.is_multiple_of(self.depth.min(20)) && (clocks + cell.packets.len() as u64).is_multiple_of(self.sample)
+        cell.steps.is_multiple_of(self.depth.min(20))
+            && (clocks + cell.packets.len() as u64).is_multiple_of(self.sample)
     }
 }
 

@@ -9,6 +9,7 @@ use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{Encoding, Role};
 
+use crate::node::{Accepted, Event, Fault, News, Node};
 use crate::random::Random;
 
 /// Microseconds in a millisecond.
@@ -17,73 +18,6 @@ pub(crate) const MS: u64 = 1000;
 pub(crate) const PERIOD: u64 = 100 * MS;
 /// All parts work.
 pub(crate) const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 10 };
-
-/// What can happen to a cell.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Fault {
-    /// The process starts, with its disk.
-    Start(usize),
-    /// The process ends; others see broken connections and a refusing port when told so, else only silence.
-    Kill { node: usize, seen: bool },
-    /// The process does nothing for so many µs.
-    Pause { node: usize, micros: u64 },
-    /// The node's clock is set by so many µs.
-    SetClock { node: usize, micros: i64 },
-    /// Packets from one node to another are dropped.
-    Cut { from: usize, to: usize },
-    /// All links work again.
-    Heal,
-    /// So many percent of all packets are lost.
-    Loss(u64),
-    /// The node's broker breaks, or works again.
-    Broker { node: usize, works: bool },
-}
-
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-enum Event {
-    Packet { to: usize, life: u64, bytes: Vec<u8> },
-    Map { to: usize, life: u64, epoch: Epoch, round: u64 },
-    Tell { to: usize, life: u64, about: usize, news: News },
-    Prepared { to: usize, life: u64 },
-    Broker { to: usize, life: u64, works: bool },
-    Timer { to: usize, life: u64, armed: u64 },
-    Publish { to: usize, life: u64, term: u64 },
-    Resume { to: usize },
-    Gossip,
-    Fault(Fault),
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum News {
-    Alive,
-    Down,
-    Gone,
-}
-
-/// A round accepted by a node.
-#[derive(Debug, Clone)]
-pub(crate) struct Accepted {
-    pub(crate) at: u64,
-    pub(crate) round: u64,
-}
-
-/// One vehicle or edge box.
-pub(crate) struct Node {
-    pub(crate) name: NodeName,
-    pub(crate) config: ElectionConfig,
-    pub(crate) election: Option<Election>,
-    pub(crate) accepted: Vec<Accepted>,
-    pub(crate) stale_refused: u64,
-    life: u64,
-    persisted: u64,
-    clock: i64,
-    armed: u64,
-    paused_until: u64,
-    waiting: Vec<Event>,
-    publishing: Option<(Epoch, u64)>,
-    gate: EpochGate,
-    known: BTreeSet<usize>,
-}
 
 /// The cell and everything under way in it.
 pub(crate) struct World {
@@ -165,7 +99,7 @@ impl World {
 
     fn happen(&mut self, event: Event) {
         match event {
-            Event::Fault(fault) => self.strike(fault),
+            Event::Fault(fault) => self.strike(&fault),
             Event::Gossip => self.gossip(),
             Event::Resume { to } => {
                 for event in std::mem::take(&mut self.nodes[to].waiting) {
@@ -225,9 +159,9 @@ impl World {
         }
     }
 
-    fn strike(&mut self, fault: Fault) {
+    fn strike(&mut self, fault: &Fault) {
         self.history.push(format!("{:>10} µs {fault:?}", self.now - 1_732_154_400_000_000));
-        match fault {
+        match *fault {
             Fault::Start(index) => self.start(index),
             Fault::Kill { node, seen } => self.kill(node, seen),
             Fault::Pause { node, micros } => {
@@ -322,7 +256,7 @@ impl World {
         }
     }
 
-    fn carry_out(&mut self, index: usize, effects: Vec<Effect>) {
+    fn carry_out(&mut self, index: usize, effects: impl IntoIterator<Item = Effect>) {
         let life = self.nodes[index].life;
         for effect in effects {
             match effect {
@@ -413,34 +347,5 @@ impl World {
         }
         node.accepted.push(Accepted { at: self.now, round });
         self.handle(to, Input::Round { epoch: epoch.clone(), round });
-    }
-}
-
-impl Node {
-    fn new(index: usize, config: ElectionConfig) -> Self {
-        Self {
-            name: NodeName::new(format!("n{index:02}")).expect("valid name"),
-            config,
-            election: None,
-            accepted: Vec::new(),
-            stale_refused: 0,
-            life: 0,
-            persisted: 0,
-            clock: 0,
-            armed: 0,
-            paused_until: 0,
-            waiting: Vec::new(),
-            publishing: None,
-            gate: EpochGate::default(),
-            known: BTreeSet::new(),
-        }
-    }
-
-    pub(crate) fn leads(&self) -> bool {
-        self.election.as_ref().is_some_and(Election::is_leading)
-    }
-
-    pub(crate) fn leader(&self) -> Option<&NodeName> {
-        self.election.as_ref().and_then(Election::leader)
     }
 }
