@@ -46,15 +46,23 @@ fn a_cell_left_alone_has_the_best_leader() {
 #[test]
 fn a_killed_leader_is_replaced_in_200_ms() {
     let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| gaps.push(failover_gap(seed, true)));
+    for_seeds(seeds() / 10, |seed| gaps.extend(failover_gap(seed, true, 1)));
     report("killed", &mut gaps, 200 * MS);
+}
+
+/// A leader killed together with its standby is replaced within 200 ms too.
+#[test]
+fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
+    let mut gaps = Vec::new();
+    for_seeds(seeds() / 10, |seed| gaps.extend(failover_gap(seed, true, 2)));
+    report("killed with its standby", &mut gaps, 200 * MS);
 }
 
 /// A leader that falls silent is replaced within 400 ms, seen by the worst vehicle.
 #[test]
 fn a_silent_leader_is_replaced_in_400_ms() {
     let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| gaps.push(failover_gap(seed, false)));
+    for_seeds(seeds() / 10, |seed| gaps.extend(failover_gap(seed, false, 1)));
     report("silent", &mut gaps, 400 * MS);
 }
 
@@ -176,10 +184,16 @@ fn keeps_its_leader(lateness: u64, loss_percent: u64) {
     });
 }
 
-/// The largest gap between two accepted rounds of any vehicle around the end of the leader, in µs.
-fn failover_gap(seed: u64, seen: bool) -> u64 {
+/// The largest gap between two accepted rounds of any vehicle around the end of the leader, and of its standby if
+/// `victims` is 2, in µs; `None` in a cell too small for it.
+fn failover_gap(seed: u64, seen: bool, victims: usize) -> Option<u64> {
     let mut world = cell(seed);
-    world.nodes[1].config.role = Role::Auto;
+    if world.nodes.len() < victims + 1 {
+        return None;
+    }
+    for node in &mut world.nodes[1..=victims] {
+        node.config.role = Role::Auto;
+    }
     start_all(&mut world);
     let mut gap = 0;
     check(&mut world, seed, |world| {
@@ -188,6 +202,11 @@ fn failover_gap(seed: u64, seen: bool) -> u64 {
         one_best_leader(world)?;
         let (leader, changes, from) = (world.leaders()[0], world.led.len(), world.now);
         world.plan(0, Fault::Kill { node: leader, seen });
+        if victims > 1 {
+            let standby = world.nodes[leader].election.as_ref().and_then(|election| election.standby().cloned());
+            let standby = world.nodes.iter().position(|node| Some(&node.name) == standby.as_ref());
+            world.plan(0, Fault::Kill { node: standby.ok_or("no standby")?, seen });
+        }
         world.run_for(2 * SECOND);
         ensure(world.led.len() == changes + 1, "not exactly one new leader")?;
         for (_, node) in world.alive() {
@@ -197,7 +216,7 @@ fn failover_gap(seed: u64, seen: bool) -> u64 {
         }
         Ok(())
     });
-    gap
+    Some(gap)
 }
 
 fn report(what: &str, gaps: &mut [u64], bound: u64) {
