@@ -10,6 +10,8 @@ pub mod aggregator;
 pub mod camera;
 pub mod config;
 pub mod detection;
+pub mod election;
+pub mod epoch;
 pub mod geometry;
 pub mod landmark;
 pub mod names;

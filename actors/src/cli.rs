@@ -2,6 +2,8 @@
 
 #[cfg(feature = "camera")]
 mod calibrate;
+#[cfg(feature = "camera")]
+mod demo;
 mod run;
 mod schema;
 #[cfg(feature = "camera")]
@@ -27,6 +29,9 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Run a whole cell on this machine, as separate processes, and print what it saw
+    #[cfg(feature = "camera")]
+    Demo(demo::DemoArguments),
     /// Run recorded parking-lot scenes: render, detect, project and fuse them in virtual time
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
@@ -58,6 +63,8 @@ pub fn main() -> ExitCode {
         .init();
     let outcome = match cli.command {
         None => run::run(&cli.run),
+        #[cfg(feature = "camera")]
+        Some(Command::Demo(arguments)) => demo::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),

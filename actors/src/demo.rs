@@ -22,7 +22,8 @@ use ecod::testbed::{Cav, Scene, Testbed};
 use ecod::time::Timestamp;
 use ecod::wire::GlobalMap;
 
-use self::observer::{ObservedReport, Observer};
+pub use self::observer::ObservedReport;
+use self::observer::Observer;
 use self::process::NodeProcess;
 use crate::clock;
 use crate::follower::ReceivedMap;

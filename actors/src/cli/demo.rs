@@ -1,0 +1,88 @@
+//! `ecod-node demo`: a whole cell on this machine, as separate processes.
+
+use std::fs;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::Args;
+use ecod::testbed::Scene;
+use nalgebra::Point2;
+
+use super::Failure;
+use super::testbed::{Results, read, select, write};
+use crate::demo::{Demo, DemoResult};
+use crate::testbed::birdseye::birdseye;
+use crate::testbed::table::table;
+
+/// Flags of `demo`.
+#[derive(Debug, Args)]
+pub struct DemoArguments {
+    /// Scene file, such as examples/testbed/pace_setup1.json
+    #[arg(long, value_name = "FILE")]
+    scenes: PathBuf,
+    /// Run this scene only
+    #[arg(long, value_name = "NAME")]
+    scene: Option<String>,
+    /// Time for which each scene is judged
+    #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=3600))]
+    seconds: u64,
+    /// Directory for results, pictures, configurations and logs
+    #[arg(long, value_name = "DIR", default_value = "demo")]
+    out: PathBuf,
+}
+
+pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
+    let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
+    let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;
+    let program = std::env::current_exe().context("this program cannot be found")?;
+    let file = fs::canonicalize(&arguments.scenes).context("the scene file has gone")?;
+    let runtime = tokio::runtime::Runtime::new().context("no threads for the demo")?;
+    println!("a cell on this machine: 1 edge with its MQTT broker, {}\n", vehicles(&scenes));
+    let mut results = Vec::with_capacity(scenes.len());
+    let count = scenes.len();
+    for (index, scene) in scenes.into_iter().enumerate() {
+        let directory = arguments.out.join(&scene.name);
+        let demo = Demo {
+            program: &program,
+            file: &file,
+            testbed: &testbed,
+            scene,
+            duration: Duration::from_secs(arguments.seconds),
+            directory: &directory,
+        };
+        println!("[{}/{count}] {}: starting {} processes", index + 1, scene.name, scene.cavs.len() + 1);
+        let outcome = runtime.block_on(demo.run(|progress| {
+            println!("        {:2.0} s, {} reports", progress.elapsed.as_secs_f64(), progress.reports);
+        }));
+        let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
+        println!(
+            "        {} maps, {} missed by a vehicle, {:.1} ms from the oldest capture in a map to its receipt (median)",
+            outcome.maps,
+            outcome.missed,
+            outcome.median_age.as_secs_f64() * 1e3,
+        );
+        let picture = arguments.out.join(format!("{}.svg", scene.name));
+        let svg = birdseye(&testbed, scene, &detections(&outcome), outcome.last_map.as_ref()).context("picture")?;
+        fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
+        results.push(outcome.result);
+    }
+    println!("\n{}", table(&results));
+    write(&arguments.out.join("result.json"), &Results { scenes: &results })?;
+    println!("pictures, results, configurations and logs: {}", arguments.out.display());
+    Ok(())
+}
+
+fn vehicles(scenes: &[&Scene]) -> String {
+    let most = scenes.iter().map(|scene| scene.cavs.len()).max().unwrap_or(0);
+    format!("{most} vehicles that render, detect, project and publish, {} scenes", scenes.len())
+}
+
+/// Where every vehicle placed what it detected.
+fn detections(outcome: &DemoResult) -> Vec<(ecod::names::NodeName, Point2<f64>)> {
+    let placed = |observed: &crate::demo::ObservedReport| {
+        let node = observed.report.node.clone();
+        observed.report.objects.iter().map(move |o| (node.clone(), Point2::new(o.x_m, o.y_m))).collect::<Vec<_>>()
+    };
+    outcome.reports.iter().flat_map(placed).collect()
+}

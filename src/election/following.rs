@@ -1,0 +1,281 @@
+//! Following a leader: hearing it, doubting it, losing it.
+
+use std::time::Duration;
+
+use crate::election::config::ElectionConfig;
+use crate::election::message::{Body, ElectionMessage};
+use crate::election::step::Effect;
+use crate::election::{Beat, Election, State};
+use crate::epoch::Epoch;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::Role;
+
+/// A node that follows a leader, by its beats or by others' word.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Following {
+    pub(super) epoch: Epoch,
+    pub(super) successors: Vec<NodeName>,
+    /// How often the leader beats for this node.
+    every: Duration,
+    /// When the leader was heard.
+    direct_at: Timestamp,
+    /// When the leader said that it hears this node.
+    mutual_at: Timestamp,
+    /// When others heard the leader, at least.
+    pub(super) hearsay_at: Timestamp,
+    /// When the leader last offered the lead.
+    pub(super) offered_at: Option<Timestamp>,
+    /// Whether this node is ready to take it.
+    pub(super) prepared: bool,
+}
+
+impl Following {
+    /// When the leader was last alive for certain.
+    pub(super) fn evidence_at(&self) -> Timestamp {
+        self.direct_at.max(self.hearsay_at)
+    }
+
+    /// From when on the leader is doubted: it missed two beats, or does not hear this node.
+    pub(super) fn doubt_at(&self, config: &ElectionConfig) -> Timestamp {
+        (self.direct_at + self.every * 2).min(self.mutual_at + config.idle_beat() * 2)
+    }
+
+    /// From when on this node's own ear no longer counts.
+    fn deaf_at(&self, config: &ElectionConfig) -> Timestamp {
+        (self.direct_at + self.every * config.silence_beats).min(self.mutual_at + config.contact())
+    }
+
+    /// From when on the leader is lost.
+    ///
+    /// Others that heard the leader well after this node did prove the link broken rather than the leader; then their
+    /// word is enough, and allowed to be as old as the leader's slowest beat makes it.
+    fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
+        let deaf_at = self.deaf_at(config);
+        if self.hearsay_at > self.direct_at.min(self.mutual_at) + self.every {
+            deaf_at.max(self.hearsay_at + config.contact())
+        } else {
+            deaf_at
+        }
+    }
+}
+
+impl Election {
+    pub(super) fn following_deadline(&self, following: &Following) -> Timestamp {
+        following.lost_at(&self.config).min(self.ask_at(following))
+    }
+
+    pub(super) fn follow_timers(&mut self, now: Timestamp) {
+        let State::Following(following) = &self.state else { return };
+        if now >= following.lost_at(&self.config) {
+            let leader = following.epoch.leader.clone();
+            self.peers.gone(&leader, now);
+            self.lose_leader(now);
+        } else if now >= self.ask_at(following) {
+            self.ask_all(now);
+        }
+    }
+
+    fn ask_at(&self, following: &Following) -> Timestamp {
+        let deaf = self.clock.now() >= following.deaf_at(&self.config);
+        let pause = if deaf { self.config.idle_beat() } else { self.config.beat() / 2 };
+        following.doubt_at(&self.config).max(self.questions.last_at() + pause)
+    }
+
+    /// Takes a leader's sign of life, or its claim.
+    pub(super) fn take_beat(&mut self, beat: Beat, now: Timestamp) {
+        if self.is_over(&beat.epoch) {
+            self.greet(&beat.epoch.leader, now);
+            return;
+        }
+        match &mut self.state {
+            State::Following(following) if following.epoch == beat.epoch => self.refresh(beat, now),
+            State::Leading(_) => self.meet_leader(beat, now),
+            State::Seeking(_) if Some(&beat.epoch) >= self.epoch.as_ref() => self.follow(beat, now),
+            State::Following(following) if beat.epoch > following.epoch => {
+                let content = now < following.doubt_at(&self.config);
+                let rightful = beat.followers > 0 || beat.after.as_ref() >= Some(&following.epoch);
+                if content && !(beat.hears_us && rightful) {
+                    self.greet(&beat.epoch.leader, now);
+                } else {
+                    self.follow(beat, now);
+                }
+            }
+            State::Following(_) | State::Seeking(_) => self.greet(&beat.epoch.leader, now),
+        }
+    }
+
+    /// Two leaders met. The higher epoch stays, but a leader without followers never unseats one that has some.
+    fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
+        let State::Leading(leading) = &self.state else { return };
+        let own = leading.epoch.clone();
+        let followers = self.peers.followers(&own, now);
+        if beat.epoch < own {
+            let succeeded = leading.after.as_ref() >= Some(&beat.epoch);
+            if beat.hears_us && followers == 0 && beat.followers > 0 && !succeeded {
+                self.effects.push(Effect::StopPublishing { epoch: own });
+                self.effects.push(Effect::SendState { to: beat.epoch.leader.clone() });
+                self.seek(vec![beat.epoch.leader.clone()], now + self.config.contact(), now);
+                self.greet(&beat.epoch.leader, now);
+            } else {
+                self.send_beat(&beat.epoch.leader, now);
+            }
+            return;
+        }
+        let stays = if beat.hears_us {
+            followers > 0 && beat.followers == 0 && beat.after.as_ref() < Some(&own)
+        } else {
+            // It does not hear us. An edge that nobody else hears either serves nobody; a vehicle serves itself.
+            followers > 0 || self.config.role != Role::Edge
+        };
+        if !stays {
+            self.stop_leading(&beat.epoch.leader.clone());
+            self.follow(beat, now);
+        }
+    }
+
+    fn stop_leading(&mut self, next: &NodeName) {
+        if let State::Leading(leading) = &self.state {
+            self.effects.push(Effect::StopPublishing { epoch: leading.epoch.clone() });
+            self.effects.push(Effect::SendState { to: next.clone() });
+        }
+    }
+
+    fn follow(&mut self, beat: Beat, now: Timestamp) {
+        self.epoch = Some(beat.epoch.clone());
+        self.round = self.round.max(beat.round);
+        let leader = beat.epoch.leader.clone();
+        self.effects.push(Effect::Follow { epoch: beat.epoch.clone(), standby: beat.successors.first().cloned() });
+        self.state = State::Following(Following {
+            epoch: beat.epoch,
+            successors: beat.successors,
+            every: Duration::from_millis(beat.every_ms),
+            direct_at: now,
+            mutual_at: now,
+            hearsay_at: Timestamp::default(),
+            offered_at: None,
+            prepared: false,
+        });
+        self.greet(&leader, now);
+    }
+
+    /// Follows a leader that is known from others only; its own beat makes it complete.
+    pub(super) fn adopt(&mut self, epoch: Epoch, heard_at: Timestamp, now: Timestamp) {
+        let leader = epoch.leader.clone();
+        self.epoch = Some(epoch.clone());
+        self.effects.push(Effect::Follow { epoch: epoch.clone(), standby: None });
+        self.state = State::Following(Following {
+            epoch,
+            successors: Vec::new(),
+            every: self.config.beat(),
+            direct_at: Timestamp::default(),
+            mutual_at: Timestamp::default(),
+            hearsay_at: heard_at,
+            offered_at: None,
+            prepared: false,
+        });
+        self.peers.add(&leader);
+        self.greet(&leader, now);
+    }
+
+    fn refresh(&mut self, beat: Beat, now: Timestamp) {
+        let State::Following(following) = &mut self.state else { return };
+        self.round = self.round.max(beat.round);
+        following.every = Duration::from_millis(beat.every_ms);
+        following.direct_at = now;
+        if beat.hears_us {
+            following.mutual_at = now;
+        }
+        if following.successors.first() != beat.successors.first() {
+            let standby = beat.successors.first().cloned();
+            self.effects.push(Effect::Follow { epoch: beat.epoch.clone(), standby });
+        }
+        following.successors = beat.successors;
+        self.greet(&beat.epoch.leader, now);
+    }
+
+    /// What any message tells about leadership, whatever it says.
+    pub(super) fn hear_others(&mut self, message: &ElectionMessage, now: Timestamp) {
+        match &self.state {
+            State::Following(following) if following.epoch.leader == message.from => {
+                let leads = message.epoch.as_ref() == Some(&following.epoch);
+                if !leads && !matches!(message.body, Body::Beat { .. }) {
+                    self.close(following.epoch.clone());
+                    self.lose_leader(now);
+                }
+            }
+            State::Leading(leading) if message.hears_you => {
+                let own = leading.epoch.clone();
+                match &message.epoch {
+                    Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
+                        let other = other.clone();
+                        self.stop_leading(&other.leader);
+                        self.adopt(other, now, now);
+                    }
+                    Some(other) if *other != own => {}
+                    _ if message.term > own.term => self.renew_later(now),
+                    _ => {}
+                }
+            }
+            State::Seeking(_) | State::Following(_) | State::Leading(_) => {}
+        }
+    }
+
+    pub(super) fn take_status(&mut self, from: &NodeName, over: Option<&Epoch>, now: Timestamp) {
+        if let State::Leading(leading) = &self.state
+            && over.is_some_and(|over| *over >= leading.epoch)
+        {
+            self.renew_later(now);
+        }
+        if self.peers.get(from).is_some_and(|peer| peer.told) {
+            return;
+        }
+        if self.is_leading() {
+            self.send_beat(from, now);
+        } else {
+            self.greet(from, now);
+        }
+    }
+
+    pub(super) fn take_resign(&mut self, epoch: &Epoch, last_round: u64, now: Timestamp) {
+        if self.epoch.as_ref() == Some(epoch) {
+            self.round = self.round.max(last_round);
+        }
+        let followed = matches!(&self.state, State::Following(following) if following.epoch == *epoch);
+        self.close(epoch.clone());
+        if followed {
+            self.lose_leader(now);
+        }
+    }
+
+    pub(super) fn peer_suspected(&mut self, peer: &NodeName, now: Timestamp) {
+        if matches!(&self.state, State::Following(following) if following.epoch.leader == *peer) {
+            self.ask_all(now);
+        }
+    }
+
+    /// What the membership gave up is only doubted here: it may hear less than the leader's beats and others tell.
+    pub(super) fn peer_down(&mut self, peer: &NodeName, now: Timestamp) {
+        self.peer_suspected(peer, now);
+        self.peers.down(peer, now);
+    }
+
+    pub(super) fn peer_gone(&mut self, peer: &NodeName, now: Timestamp) {
+        self.peers.gone(peer, now);
+        match &self.state {
+            State::Following(following) if following.epoch.leader == *peer => {
+                self.close(following.epoch.clone());
+                self.lose_leader(now);
+            }
+            State::Leading(_) => self.name_successors(now),
+            State::Seeking(_) | State::Following(_) => {}
+        }
+    }
+
+    fn lose_leader(&mut self, now: Timestamp) {
+        if let State::Following(following) = &mut self.state {
+            let order = std::mem::take(&mut following.successors);
+            self.seek(order, now, now);
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Handing the lead to a better candidate, make before break.
+//!
+//! The old leader publishes until it hears that the new one leads. Right after a round it yields, so that there is
+//! nearly a whole period for the few packets it takes; the new leader goes on with the next round. Should every one of
+//! those packets be lost for a period, the old leader publishes that round too, and yields again after it.
+
+use crate::election::message::{Body, MAX_TERM};
+use crate::election::step::Effect;
+use crate::election::{Election, State};
+use crate::epoch::Epoch;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+
+/// A handover as the old leader sees it.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Handover {
+    pub(super) to: NodeName,
+    pub(super) retry_at: Timestamp,
+    started_at: Timestamp,
+    ready_at: Option<Timestamp>,
+    yielded: bool,
+}
+
+impl Election {
+    /// Starts a handover when a better candidate has been there long enough.
+    pub(super) fn start_handover(&mut self, now: Timestamp) {
+        let challenger = self.peers.challenger(&self.id, self.standing(), self.config.stable(), now);
+        let State::Leading(leading) = &mut self.state else { return };
+        let Some((to, _)) = challenger.filter(|(_, from)| leading.handover.is_none() && now >= *from) else { return };
+        leading.handover =
+            Some(Handover { to: to.clone(), retry_at: now, started_at: now, ready_at: None, yielded: false });
+        self.name_successors(now);
+        self.effects.push(Effect::SendState { to });
+        self.drive_handover(now);
+    }
+
+    /// Repeats what the challenger has to know, or gives the handover up.
+    pub(super) fn drive_handover(&mut self, now: Timestamp) {
+        let limit = self.config.handover();
+        let beat = self.config.beat();
+        let State::Leading(leading) = &mut self.state else { return };
+        let Some(handover) = &mut leading.handover else { return };
+        let to = handover.to.clone();
+        let fit = self.peers.hears(&to, now) && self.peers.may_lead(&to, now);
+        if !fit || now.since(handover.started_at) > limit {
+            leading.handover = None;
+            self.peers.restart_trial(&to, now);
+            return;
+        }
+        if now < handover.retry_at {
+            return;
+        }
+        // A cell that publishes no rounds has none to miss.
+        handover.yielded |= handover.ready_at.is_some_and(|at| now.since(at) > limit / 3);
+        handover.retry_at = if handover.yielded { now + beat / 4 } else { now + beat };
+        let last_round = self.round;
+        if handover.yielded {
+            self.send(&to, Body::Yield { last_round }, now);
+        } else if handover.ready_at.is_none() {
+            self.send(&to, Body::Offer, now);
+        }
+    }
+
+    pub(super) fn take_ready(&mut self, from: &NodeName, now: Timestamp) {
+        if let State::Leading(leading) = &mut self.state
+            && let Some(handover) = leading.handover.as_mut().filter(|handover| handover.to == *from)
+        {
+            handover.ready_at.get_or_insert(now);
+        }
+    }
+
+    pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
+        self.terms.seen = self.terms.seen.max(epoch.term.min(MAX_TERM));
+        self.round = self.round.max(round);
+        if let State::Leading(leading) = &mut self.state
+            && let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some())
+        {
+            handover.yielded = true;
+            handover.retry_at = now;
+            self.drive_handover(now);
+        }
+    }
+
+    pub(super) fn take_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
+        let may_lead = self.standing().may_lead();
+        let State::Following(following) = &mut self.state else { return };
+        if following.epoch.leader != *from || epoch != Some(&following.epoch) || !may_lead {
+            return;
+        }
+        let fresh = following.offered_at.is_some_and(|at| now.since(at) <= self.config.contact());
+        following.offered_at = Some(now);
+        if !fresh {
+            following.prepared = false;
+            self.effects.push(Effect::Prepare { leader: from.clone() });
+        } else if following.prepared {
+            self.send(from, Body::Ready, now);
+        }
+    }
+
+    pub(super) fn prepared(&mut self, now: Timestamp) {
+        if let State::Following(following) = &mut self.state
+            && following.offered_at.is_some()
+        {
+            following.prepared = true;
+            let leader = following.epoch.leader.clone();
+            self.send(&leader, Body::Ready, now);
+        }
+    }
+
+    pub(super) fn take_yield(&mut self, from: &NodeName, epoch: Option<&Epoch>, last_round: u64, now: Timestamp) {
+        let State::Following(following) = &self.state else { return };
+        let ours = following.epoch.leader == *from && epoch == Some(&following.epoch) && following.prepared;
+        if ours && self.standing().may_lead() {
+            let after = following.epoch.clone();
+            self.round = self.round.max(last_round);
+            self.lead(Some(after), now);
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! What a node knows of the others, and who of them would lead.
+
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use crate::election::message::{ElectionMessage, Standing};
+use crate::epoch::Epoch;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::Role;
+
+/// What is worth a handover: edge before auto, then the higher priority.
+pub(super) type Class = (bool, Reverse<u8>);
+
+impl Standing {
+    pub(super) fn class(&self) -> Class {
+        (self.role != Role::Edge, Reverse(self.priority))
+    }
+
+    pub(super) fn may_lead(&self) -> bool {
+        self.fit && self.role != Role::Cav
+    }
+}
+
+/// Another node.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub(super) struct Peer {
+    pub(super) standing: Option<Standing>,
+    /// The epoch it said to follow or lead.
+    pub(super) epoch: Option<Epoch>,
+    /// Whether our last message to it said that we hear it.
+    pub(super) told: bool,
+    run: u64,
+    seq: u64,
+    heard_at: Option<Timestamp>,
+    /// Since when it has been heard without a gap, fit, and of one class.
+    fit_since: Option<Timestamp>,
+    /// Until when it counts as gone although messages of its may still be on their way.
+    gone_until: Option<Timestamp>,
+}
+
+/// All other nodes that were ever heard of and not given up.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Peers {
+    table: BTreeMap<NodeName, Peer>,
+    contact: Duration,
+}
+
+impl Peers {
+    /// `contact` is how long a peer may be silent and still count as heard.
+    pub(super) fn new(contact: Duration) -> Self {
+        Self { table: BTreeMap::new(), contact }
+    }
+
+    pub(super) fn add(&mut self, name: &NodeName) {
+        self.table.entry(name.clone()).or_default();
+    }
+
+    pub(super) fn names(&self) -> impl Iterator<Item = &NodeName> {
+        self.table.keys()
+    }
+
+    pub(super) fn get(&self, name: &NodeName) -> Option<&Peer> {
+        self.table.get(name)
+    }
+
+    pub(super) fn told(&mut self, name: &NodeName, hears: bool) {
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.told = hears;
+        }
+    }
+
+    /// Notes what every message says about its sender; false for one that is repeated or overtaken.
+    pub(super) fn note(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
+        let contact = self.contact;
+        let peer = self.table.entry(message.from.clone()).or_default();
+        let silent = peer.heard_at.is_none_or(|at| now.since(at) > contact);
+        let newer = (message.run, message.seq) > (peer.run, peer.seq);
+        if !newer && (message.run == peer.run || !silent) {
+            return false;
+        }
+        let same = peer.standing.is_some_and(|standing| standing.class() == message.standing.class());
+        if !message.standing.fit {
+            peer.fit_since = None;
+        } else if silent || !same || message.run != peer.run || peer.fit_since.is_none() {
+            peer.fit_since = Some(now);
+        }
+        // A new run, or one out of touch, has to be told again that it is heard.
+        peer.told &= !silent && message.run == peer.run;
+        peer.run = message.run;
+        peer.seq = message.seq;
+        peer.heard_at = Some(now);
+        peer.standing = Some(message.standing);
+        peer.epoch = message.epoch.clone();
+        true
+    }
+
+    /// Marks a peer whose process is gone.
+    pub(super) fn gone(&mut self, name: &NodeName, now: Timestamp) {
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.gone_until = Some(now + self.contact);
+            peer.fit_since = None;
+            peer.heard_at = None;
+        }
+    }
+
+    /// Forgets a peer that the membership gave up, unless it was heard lately.
+    pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
+        if !self.hears(name, now) {
+            self.table.remove(name);
+        }
+    }
+
+    /// Lets a peer prove itself anew before it is handed the lead.
+    pub(super) fn restart_trial(&mut self, name: &NodeName, now: Timestamp) {
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.fit_since = peer.fit_since.map(|_| now);
+        }
+    }
+
+    /// Whether a peer was heard lately.
+    pub(super) fn hears(&self, name: &NodeName, now: Timestamp) -> bool {
+        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| now.since(at) <= self.contact)
+    }
+
+    /// How many nodes heard lately follow `epoch`.
+    pub(super) fn followers(&self, epoch: &Epoch, now: Timestamp) -> usize {
+        self.table.iter().filter(|(name, peer)| peer.epoch.as_ref() == Some(epoch) && self.hears(name, now)).count()
+    }
+
+    /// Whether a peer could lead, as far as is known without having heard it lately.
+    pub(super) fn may_lead(&self, name: &NodeName, now: Timestamp) -> bool {
+        self.table.get(name).is_some_and(|peer| {
+            peer.standing.is_some_and(|standing| standing.may_lead())
+                && peer.gone_until.is_none_or(|until| now >= until)
+        })
+    }
+
+    /// Everyone who could lead, in no order of preference.
+    pub(super) fn candidates(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, Standing)> {
+        self.table
+            .iter()
+            .filter(move |(name, _)| self.may_lead(name, now))
+            .filter_map(|(name, peer)| Some((name, peer.standing?)))
+    }
+
+    /// The leader's successors: heard lately and fit, the best first.
+    pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
+        let mut fit: Vec<_> = self.candidates(now).filter(|(name, _)| self.hears(name, now)).collect();
+        fit.sort_by_key(|&(name, standing)| (standing.class(), standing.load, name.clone()));
+        fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
+    }
+
+    /// The best peer that has been fit for `stable` and should have the lead of `leader` with `standing`.
+    ///
+    /// Load never takes the lead from a living leader: leading is load, and moving for it would swing. It is only
+    /// respected: among equals the lesser name is handed the lead unless it is busier.
+    pub(super) fn challenger(
+        &self,
+        leader: &NodeName,
+        standing: Standing,
+        stable: Duration,
+        now: Timestamp,
+    ) -> Option<(NodeName, Timestamp)> {
+        self.candidates(now)
+            .filter(|(name, _)| self.hears(name, now))
+            .filter(|&(name, other)| {
+                let (ours, theirs) = (standing.class(), other.class());
+                theirs < ours || (theirs == ours && other.load <= standing.load && name < leader)
+            })
+            .filter_map(|(name, other)| Some((name, other, self.table[name].fit_since? + stable)))
+            .min_by_key(|&(name, other, from)| (from > now, other.class(), name.clone()))
+            .map(|(name, _, from)| (name.clone(), from))
+    }
+}

@@ -1,0 +1,361 @@
+//! A model check of the election: every order of deliveries, losses, repeats, timers, crashes and restarts, to a bound.
+//!
+//! Breadth first over everything that three nodes can do from a cold start, a settled cell, a split one and a handover;
+//! then long random walks over four nodes. Every node's clock runs at its own pace, so every timeout may come too early.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
+use ecod::epoch::{Epoch, EpochGate};
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::Role;
+use stateright::{Checker, HasDiscoveries, Model, Property, UniformChooser};
+
+const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
+/// Packets under way; beyond that the oldest are lost.
+const MAX_PACKETS: usize = 6;
+
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+enum Action {
+    Deliver {
+        packet: usize,
+        again: bool,
+    },
+    Tick(usize),
+    /// The node's timer fires, its first effect is done, and it crashes.
+    TornTick(usize),
+    Publish(usize),
+    Crash(usize),
+    Restart(usize),
+    /// A node sees that another one's process is gone.
+    Gone {
+        to: usize,
+        about: usize,
+    },
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+enum Packet {
+    Election(usize, ElectionMessage),
+    Map(usize, Epoch, u64),
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Node {
+    election: Option<Election>,
+    clock: Timestamp,
+    persisted: u64,
+    publishing: Option<(Epoch, u64)>,
+    gate: EpochGate,
+    /// The highest term accepted in any run.
+    accepted: u64,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Cell {
+    nodes: Vec<Node>,
+    packets: Vec<Packet>,
+    /// Who led which epoch, counted by leaderships.
+    led: BTreeMap<Epoch, usize>,
+    crashes_left: usize,
+    went_back: bool,
+    led_unwritten: bool,
+    steps: usize,
+}
+
+struct CellModel {
+    initial: Vec<Cell>,
+    depth: usize,
+    /// One in so many states of the last depth is let settle.
+    sample: u64,
+}
+
+fn name(index: usize) -> NodeName {
+    NodeName::new(format!("n{index}")).expect("valid name")
+}
+
+fn config(index: usize) -> ElectionConfig {
+    let role = [Role::Edge, Role::Auto, Role::Auto, Role::Cav][index];
+    ElectionConfig { role, stable_ms: 200, join_ms: 100, handover_ms: 600, ..ElectionConfig::default() }
+}
+
+impl Cell {
+    fn new(nodes: usize) -> Self {
+        let down = Node {
+            election: None,
+            clock: Timestamp(1_000_000_000),
+            persisted: 0,
+            publishing: None,
+            gate: EpochGate::default(),
+            accepted: 0,
+        };
+        let mut cell = Self {
+            nodes: vec![down; nodes],
+            packets: Vec::new(),
+            led: BTreeMap::new(),
+            crashes_left: 2,
+            went_back: false,
+            led_unwritten: false,
+            steps: 0,
+        };
+        for index in 0..nodes {
+            cell.start(index);
+        }
+        cell
+    }
+
+    fn start(&mut self, index: usize) {
+        let node = &mut self.nodes[index];
+        node.clock = node.clock + Duration::from_millis(1);
+        let election = Election::new(config(index), name(index), node.persisted, node.clock);
+        node.gate = EpochGate::new(election.floor());
+        node.election = Some(election);
+        self.handle(index, Input::Health { health: FIT });
+        for peer in (0..self.nodes.len()).filter(|peer| *peer != index) {
+            self.handle(index, Input::PeerAlive { peer: name(peer) });
+        }
+    }
+
+    fn handle(&mut self, index: usize, input: Input) {
+        let node = &mut self.nodes[index];
+        let Some(election) = &mut node.election else { return };
+        let effects = election.handle(input, node.clock);
+        self.carry_out(index, effects);
+    }
+
+    fn tick(&mut self, index: usize) -> Vec<Effect> {
+        let node = &mut self.nodes[index];
+        let Some(election) = &mut node.election else { return Vec::new() };
+        node.clock = node.clock.max(election.next_deadline());
+        election.tick(node.clock)
+    }
+
+    fn crash(&mut self, index: usize) {
+        self.nodes[index].election = None;
+        self.nodes[index].publishing = None;
+    }
+
+    fn carry_out(&mut self, index: usize, effects: Vec<Effect>) {
+        for effect in effects {
+            let node = &mut self.nodes[index];
+            match effect {
+                Effect::PersistTerm { term } => node.persisted = term,
+                Effect::Lead { epoch, first_round, .. } => {
+                    self.led_unwritten |= epoch.term > node.persisted;
+                    *self.led.entry(epoch.clone()).or_default() += 1;
+                    node.publishing = Some((epoch, first_round));
+                }
+                Effect::StopPublishing { .. } => node.publishing = None,
+                Effect::Send { to, message } => {
+                    let known = (0..self.nodes.len()).find(|index| name(*index) == to);
+                    self.packets.extend(known.map(|to| Packet::Election(to, message)));
+                }
+                Effect::Prepare { .. } => self.handle(index, Input::Prepared),
+                Effect::Follow { .. } | Effect::Seek | Effect::AnnounceStandby { .. } | Effect::SendState { .. } => {}
+            }
+        }
+    }
+
+    fn publish(&mut self, index: usize) {
+        let Some((epoch, next)) = &mut self.nodes[index].publishing else { return };
+        let (epoch, round) = (epoch.clone(), *next);
+        *next += 1;
+        for to in (0..self.nodes.len()).filter(|to| *to != index) {
+            self.packets.push(Packet::Map(to, epoch.clone(), round));
+        }
+        self.accept(index, &epoch, round);
+    }
+
+    fn accept(&mut self, index: usize, epoch: &Epoch, round: u64) {
+        let node = &mut self.nodes[index];
+        if node.election.is_none() || node.gate.admit(epoch, round).is_err() {
+            return;
+        }
+        self.went_back |= epoch.term < node.accepted;
+        node.accepted = epoch.term;
+        self.handle(index, Input::Round { epoch: epoch.clone(), round });
+    }
+
+    fn deliver(&mut self, packet: Packet) {
+        match packet {
+            Packet::Election(to, message) => self.handle(to, Input::Receive { message }),
+            Packet::Map(to, epoch, round) => self.accept(to, &epoch, round),
+        }
+    }
+
+    /// Time passes evenly, everything sent arrives, and nobody crashes.
+    fn run_quietly(&mut self, millis: u64) {
+        let mut left = Duration::from_millis(millis);
+        while !left.is_zero() {
+            while !self.packets.is_empty() {
+                let packet = self.packets.remove(0);
+                self.deliver(packet);
+            }
+            let due = |node: &Node| Some(node.election.as_ref()?.next_deadline().since(node.clock));
+            let next = self.nodes.iter().filter_map(due).min().unwrap_or(left);
+            let step = next.clamp(Duration::from_millis(1), Duration::from_millis(20)).min(left);
+            left -= step;
+            for index in 0..self.nodes.len() {
+                let node = &mut self.nodes[index];
+                node.clock = node.clock + step;
+                let Some(election) = &mut node.election else { continue };
+                let effects = election.tick(node.clock);
+                self.carry_out(index, effects);
+            }
+        }
+    }
+
+    fn converges(&self) -> bool {
+        let mut quiet = self.clone();
+        quiet.run_quietly(4000);
+        let running = || quiet.nodes.iter().filter_map(|node| node.election.as_ref());
+        let candidates = quiet.nodes.iter().take(3).any(|node| node.election.is_some());
+        let leaders = running().filter(|election| election.is_leading()).count();
+        let followed: BTreeSet<_> = running().map(Election::leader).collect();
+        leaders == usize::from(candidates) && (!candidates || followed.len() == 1)
+    }
+}
+
+impl CellModel {
+    /// Whether to let this state settle: it takes thousands of steps, so a fixed sample of the last ones has to do.
+    fn settles(&self, cell: &Cell) -> bool {
+        let clocks: u64 = cell.nodes.iter().map(|node| node.clock.micros() / 1000).sum();
+        cell.steps.is_multiple_of(self.depth.min(20))
+            && (clocks + cell.packets.len() as u64).is_multiple_of(self.sample)
+    }
+}
+
+impl Model for CellModel {
+    type State = Cell;
+    type Action = Action;
+
+    fn init_states(&self) -> Vec<Cell> {
+        self.initial.clone()
+    }
+
+    fn actions(&self, cell: &Cell, actions: &mut Vec<Action>) {
+        for packet in 0..cell.packets.len() {
+            actions.push(Action::Deliver { packet, again: false });
+            actions.push(Action::Deliver { packet, again: true });
+        }
+        for (index, node) in cell.nodes.iter().enumerate() {
+            if node.election.is_none() {
+                actions.push(Action::Restart(index));
+                let others = (0..cell.nodes.len()).filter(|to| *to != index);
+                actions.extend(others.map(|to| Action::Gone { to, about: index }));
+                continue;
+            }
+            actions.push(Action::Tick(index));
+            if node.publishing.is_some() {
+                actions.push(Action::Publish(index));
+            }
+            if cell.crashes_left > 0 {
+                actions.push(Action::Crash(index));
+                actions.push(Action::TornTick(index));
+            }
+        }
+    }
+
+    fn next_state(&self, last: &Cell, action: Action) -> Option<Cell> {
+        let mut cell = last.clone();
+        cell.steps += 1;
+        match action {
+            Action::Deliver { packet, again: false } => {
+                let packet = cell.packets.remove(packet);
+                cell.deliver(packet);
+            }
+            Action::Deliver { packet, again: true } => cell.deliver(last.packets[packet].clone()),
+            Action::Tick(index) => {
+                let effects = cell.tick(index);
+                cell.carry_out(index, effects);
+            }
+            Action::TornTick(index) => {
+                let effects = cell.tick(index);
+                cell.carry_out(index, effects.into_iter().take(1).collect());
+                cell.crash(index);
+                cell.crashes_left -= 1;
+            }
+            Action::Publish(index) => cell.publish(index),
+            Action::Crash(index) => {
+                cell.crash(index);
+                cell.crashes_left -= 1;
+            }
+            Action::Restart(index) => cell.start(index),
+            Action::Gone { to, about } => cell.handle(to, Input::PeerGone { peer: name(about) }),
+        }
+        let surplus = cell.packets.len().saturating_sub(MAX_PACKETS);
+        cell.packets.drain(..surplus);
+        (cell != *last).then_some(cell)
+    }
+
+    fn within_boundary(&self, cell: &Cell) -> bool {
+        cell.steps <= self.depth
+    }
+
+    fn properties(&self) -> Vec<Property<Self>> {
+        vec![
+            Property::always("never two leaderships with one epoch", |_, cell: &Cell| {
+                cell.led.values().all(|count| *count == 1)
+            }),
+            Property::always("the term is on disk before it is led in", |_, cell: &Cell| !cell.led_unwritten),
+            Property::always("terms accepted by a node never go back, restarts included", |_, cell: &Cell| {
+                !cell.went_back
+            }),
+            Property::always("a quiet component converges", |model: &Self, cell: &Cell| {
+                !model.settles(cell) || cell.converges()
+            }),
+            Property::sometimes("two lead at once", |_, cell: &Cell| {
+                cell.nodes.iter().filter(|node| node.publishing.is_some()).count() > 1
+            }),
+        ]
+    }
+}
+
+/// A cell that has just elected its leader, and one a moment before its edge is handed the lead.
+fn settled(nodes: usize) -> Vec<Cell> {
+    let cold = Cell::new(nodes);
+    let mut quiet = cold.clone();
+    quiet.run_quietly(1500);
+    let mut late_edge = cold.clone();
+    late_edge.crash(0);
+    late_edge.run_quietly(1500);
+    late_edge.start(0);
+    late_edge.run_quietly(195);
+    let mut split = quiet.clone();
+    split.crash(0);
+    split.run_quietly(400);
+    split.start(0);
+    split.packets.clear();
+    vec![cold, quiet, late_edge, split]
+}
+
+#[test]
+fn three_nodes_in_every_order() {
+    let model = CellModel { initial: settled(3), depth: 4, sample: 61 };
+    let checker = model.checker().finish_when(HasDiscoveries::AnyFailures).spawn_bfs().join();
+    println!("{} states, {} of them different", checker.state_count(), checker.unique_state_count());
+    checker.assert_no_discovery("never two leaderships with one epoch");
+    checker.assert_no_discovery("the term is on disk before it is led in");
+    checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
+    checker.assert_no_discovery("a quiet component converges");
+    assert!(checker.unique_state_count() > 10_000, "the model hardly moves");
+}
+
+#[test]
+fn four_nodes_in_long_random_orders() {
+    let model = CellModel { initial: settled(4), depth: 120, sample: 1 };
+    let checker = model
+        .checker()
+        .finish_when(HasDiscoveries::AnyFailures)
+        .target_state_count(60_000)
+        .spawn_simulation(7, UniformChooser)
+        .join();
+    println!("{} states on random walks", checker.state_count());
+    checker.assert_no_discovery("never two leaderships with one epoch");
+    checker.assert_no_discovery("the term is on disk before it is led in");
+    checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
+    checker.assert_no_discovery("a quiet component converges");
+    assert!(checker.discovery("two lead at once").is_some(), "the walks never split the cell");
+}
