@@ -4,6 +4,7 @@
 //! Assumed, as it was not recorded: the axis of a camera is level and as high as the middle of the codes, a code sits
 //! as far below the upper end of its card as from its sides, cards stand on the floor, and vehicles hide nothing.
 
+pub mod birdseye;
 mod render;
 pub mod score;
 mod sensor;

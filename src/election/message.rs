@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::epoch::Epoch;
 use crate::names::NodeName;
-use crate::wire::{self, Encoding, Limits, RejectReason, Role, SCHEMA_VERSION};
+use crate::wire::{self, Encoding, Limits, RejectReason, Role};
 
 /// Most successors that a leader names, the standby first.
 pub const MAX_SUCCESSORS: usize = 3;
@@ -134,6 +134,12 @@ pub enum Body {
     },
 }
 
+impl wire::Payload for ElectionMessage {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+}
+
 impl ElectionMessage {
     /// Writes the message.
     pub fn encode(&self, encoding: Encoding) -> Vec<u8> {
@@ -148,9 +154,6 @@ impl ElectionMessage {
     pub fn decode(bytes: &[u8]) -> Result<Self, RejectReason> {
         let limits = Limits { payload_bytes: MAX_MESSAGE_BYTES, ..Limits::default() };
         let message: Self = wire::decode(bytes, &limits)?;
-        if message.schema != SCHEMA_VERSION {
-            return Err(RejectReason::UnknownSchema);
-        }
         if message.is_plausible() { Ok(message) } else { Err(RejectReason::Malformed) }
     }
 

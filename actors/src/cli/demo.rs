@@ -17,7 +17,7 @@ use crate::testbed::table::table;
 
 /// Flags of `demo`.
 #[derive(Debug, Args)]
-pub struct DemoArguments {
+pub(super) struct DemoArguments {
     /// Scene file, such as examples/testbed/pace_setup1.json
     #[arg(long, value_name = "FILE")]
     scenes: PathBuf,

@@ -16,7 +16,7 @@ use crate::testbed::trial::Trial;
 
 /// Flags of `testbed`.
 #[derive(Debug, Args)]
-pub struct TestbedArguments {
+pub(super) struct TestbedArguments {
     /// Scene file, such as examples/testbed/pace_setup1.json
     #[arg(long, value_name = "FILE")]
     scenes: PathBuf,

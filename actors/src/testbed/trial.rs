@@ -94,7 +94,7 @@ impl Trial<'_> {
 
     /// One vehicle's reports.
     fn watch(&self, cav: &Cav, progress: &impl Fn()) -> anyhow::Result<Vec<ObjectReport>> {
-        let mut camera = TestbedCamera::new(self.testbed, self.scene, cav, self.seed)?;
+        let camera = TestbedCamera::new(self.testbed, self.scene, cav, self.seed)?;
         let mut detector = PlacardDetector::new(PlacardConfig::default());
         let mut perception = setup::perception(self.testbed, self.scene, cav);
         let interval = self.testbed.camera.capture_interval;
