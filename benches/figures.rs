@@ -5,24 +5,25 @@ use std::path::{Path, PathBuf};
 use serde_json::{Map, Value};
 
 /// One benchmark's section of `target/bench.json`, or of the file that `BENCH_JSON` names.
-pub struct Figures {
+pub(crate) struct Figures {
     section: &'static str,
     values: Map<String, Value>,
 }
 
 impl Figures {
     /// An empty section.
-    pub fn new(section: &'static str) -> Self {
+    pub(crate) fn new(section: &'static str) -> Self {
         Self { section, values: Map::new() }
     }
 
     /// Takes a figure, or an object of figures.
-    pub fn insert(&mut self, name: impl Into<String>, value: Value) {
+    pub(crate) fn insert(&mut self, name: impl Into<String>, value: Value) {
         self.values.insert(name.into(), value);
     }
 
     /// Takes whether a goal was met, and says so.
-    pub fn goal(&mut self, name: &str, figure: f64, goal: f64, unit: &str) {
+    #[allow(dead_code, reason = "not every benchmark has a goal")]
+    pub(crate) fn goal(&mut self, name: &str, figure: f64, goal: f64, unit: &str) {
         let met = figure <= goal;
         println!("{name}: {figure:.2}{unit}, goal {goal}{unit}: {}", if met { "met" } else { "MISSED" });
         self.insert(name, serde_json::json!({ "figure": figure, "goal": goal, "met": met }));
@@ -32,7 +33,7 @@ impl Figures {
     ///
     /// # Panics
     /// When the file cannot be written.
-    pub fn save(self) {
+    pub(crate) fn save(self) {
         let path = std::env::var_os("BENCH_JSON").map_or_else(default_path, PathBuf::from);
         let read = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
         let mut sections: Map<String, Value> = read.unwrap_or_default();
