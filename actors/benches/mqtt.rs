@@ -1,5 +1,8 @@
 //! Two hops through the embedded broker: bare clients, then gateways with decoding and encoding.
 
+#[path = "../../benches/figures.rs"]
+mod figures;
+
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -15,6 +18,7 @@ use ecod_actors::gateway::{
     BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion,
     Part, ReportKind,
 };
+use figures::Figures;
 use hdrhistogram::Histogram;
 use ractor::{Actor, ActorRef};
 use tokio::sync::mpsc;
@@ -25,17 +29,21 @@ async fn main() -> anyhow::Result<()> {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address = BrokerAddress::from(broker.start(([127, 0, 0, 1], 0).into())?);
     let load = Load { messages: 1000, interval: Duration::from_millis(10), payload_bytes: 1100 };
-    print("two hops, bare clients", &two_hop::raw(&address, load).await?);
-    for version in [MqttVersion::V311, MqttVersion::V5] {
-        print(&format!("report to map, gateways {version:?}"), &through_gateways(&address, version, load).await?);
+    let mut figures = Figures::new("mqtt");
+    println!("{:<28} {:>8} {:>8} {:>6}", "path", "p50 µs", "p99 µs", "n");
+    take(&mut figures, "two_hops", &two_hop::raw(&address, load).await?);
+    for (name, version) in [("gateways_mqtt_3_1_1", MqttVersion::V311), ("gateways_mqtt_5", MqttVersion::V5)] {
+        take(&mut figures, name, &through_gateways(&address, version, load).await?);
     }
-    print("two hops, bare clients again", &two_hop::raw(&address, load).await?);
+    take(&mut figures, "two_hops_again", &two_hop::raw(&address, load).await?);
+    figures.save();
     Ok(())
 }
 
-fn print(what: &str, histogram: &Histogram<u64>) {
-    let micros = |quantile| histogram.value_at_quantile(quantile) as f64 / 1000.0;
-    println!("{what}: p50 {:.0} µs, p99 {:.0} µs, n {}", micros(0.5), micros(0.99), histogram.len());
+fn take(figures: &mut Figures, path: &str, histogram: &Histogram<u64>) {
+    let [p50, p99] = [0.5, 0.99].map(|quantile| histogram.value_at_quantile(quantile) as f64 / 1000.0);
+    println!("{path:<28} {p50:>8.0} {p99:>8.0} {:>6}", histogram.len());
+    figures.insert(path, serde_json::json!({ "p50_us": p50, "p99_us": p99, "n": histogram.len() }));
 }
 
 /// Times from a report's publication to the arrival of the map that answers it, in nanoseconds.

@@ -64,9 +64,13 @@ impl BayesPace {
     }
 
     pub(super) fn close(&mut self, now: Timestamp) -> PaceRound {
-        let oldest = now - self.config.max_age();
-        self.vehicles.retain(|_, vehicle| vehicle.forget_before(oldest));
-        let oldest_capture = self.vehicles.values().flat_map(Vehicle::looks).map(|look| look.last_look).min();
+        let limit = now - self.config.max_age();
+        let mut oldest_capture = None;
+        self.vehicles.retain(|_, vehicle| {
+            let oldest = vehicle.forget_before(limit);
+            oldest_capture = [oldest_capture, oldest].into_iter().flatten().min();
+            oldest.is_some()
+        });
         let mut grouping = std::mem::take(&mut self.grouping);
         let by_place = grouping.group(&self.vehicles, 2 * self.landmarks.landmarks().len());
         let landmarks: Vec<LandmarkState> = self

@@ -112,10 +112,17 @@ impl Vehicle {
         }
     }
 
-    /// Drops what was last looked at before `oldest`; false when nothing is left.
-    pub(super) fn forget_before(&mut self, oldest: Timestamp) -> bool {
-        self.looks.retain(|look| look.last_look >= oldest);
-        !self.looks.is_empty()
+    /// Drops what was last looked at before `limit`; the time of the oldest look that is left, `None` when none is.
+    pub(super) fn forget_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
+        let mut oldest = None;
+        self.looks.retain(|look| {
+            let kept = look.last_look >= limit;
+            if kept && oldest.is_none_or(|oldest| look.last_look < oldest) {
+                oldest = Some(look.last_look);
+            }
+            kept
+        });
+        oldest
     }
 
     pub(super) fn looks(&self) -> &[Look] {

@@ -1,0 +1,50 @@
+//! The file that all benchmarks write their figures to, each into a section of its own.
+
+use std::path::{Path, PathBuf};
+
+use serde_json::{Map, Value};
+
+/// One benchmark's section of `target/bench.json`, or of the file that `BENCH_JSON` names.
+pub(crate) struct Figures {
+    section: &'static str,
+    values: Map<String, Value>,
+}
+
+impl Figures {
+    /// An empty section.
+    pub(crate) fn new(section: &'static str) -> Self {
+        Self { section, values: Map::new() }
+    }
+
+    /// Takes a figure, or an object of figures.
+    pub(crate) fn insert(&mut self, name: impl Into<String>, value: Value) {
+        self.values.insert(name.into(), value);
+    }
+
+    /// Takes whether a goal was met, and says so.
+    #[allow(dead_code, reason = "not every benchmark has a goal")]
+    pub(crate) fn goal(&mut self, name: &str, figure: f64, goal: f64, unit: &str) {
+        let met = figure <= goal;
+        println!("{name}: {figure:.2}{unit}, goal {goal}{unit}: {}", if met { "met" } else { "MISSED" });
+        self.insert(name, serde_json::json!({ "figure": figure, "goal": goal, "met": met }));
+    }
+
+    /// Replaces the section in the file and keeps the others.
+    ///
+    /// # Panics
+    /// When the file cannot be written.
+    pub(crate) fn save(self) {
+        let path = std::env::var_os("BENCH_JSON").map_or_else(default_path, PathBuf::from);
+        let read = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        let mut sections: Map<String, Value> = read.unwrap_or_default();
+        sections.insert(self.section.into(), Value::Object(self.values));
+        let text = serde_json::to_string_pretty(&sections).expect("figures are plain numbers");
+        std::fs::write(&path, text + "\n").unwrap_or_else(|error| panic!("cannot write {}: {error}", path.display()));
+    }
+}
+
+/// Cargo runs a benchmark in the directory of its package.
+fn default_path() -> PathBuf {
+    let workspace = [".", ".."].into_iter().find(|place| Path::new(place).join("Cargo.lock").exists());
+    Path::new(workspace.unwrap_or(".")).join("target/bench.json")
+}
