@@ -128,6 +128,6 @@ fn draw(directory: &Path) -> anyhow::Result<PathBuf> {
     // A disc of radius r covers 2r + 1 pixels.
     let radius_px = (camera.fx * BALL_M / 2.0 - 0.5).round() as i32;
     imgproc::circle(&mut image, centre, radius_px, Scalar::new(30.0, 30.0, 200.0, 0.0), imgproc::FILLED, 8, 0)?;
-    imgcodecs::imwrite_def(&directory.join("0.png"), &image)?;
+    imgcodecs::imwrite_def(directory.join("0.png"), &image)?;
     Ok(directory.to_owned())
 }

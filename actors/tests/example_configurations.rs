@@ -1,6 +1,8 @@
 //! The configurations that the documentation hands out can be used as they are.
 
 use std::collections::BTreeMap;
+#[cfg(feature = "camera")]
+use std::io::Write;
 use std::path::Path;
 
 use ecod::wire::Role;
@@ -30,4 +32,42 @@ fn the_example_vehicle_fits_the_example_edge() {
     assert_eq!(cav.fusion.pace.gate_m, edge.fusion.pace.gate_m);
     assert_eq!(cav.mqtt.broker.unwrap().port(), edge.listen.port());
     assert!(cav.camera.is_some());
+}
+
+#[cfg(feature = "camera")]
+#[test]
+fn configurations_in_the_operations_manual_can_be_used() {
+    let manual = manual();
+    let blocks: Vec<&str> = manual.split("```toml\n").skip(1).map(|rest| rest.split_once("```").unwrap().0).collect();
+    assert!(blocks.len() >= 10, "only {} blocks found", blocks.len());
+    for block in blocks {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        write!(file, "name = \"n\"\nrole = \"edge\"\n{block}\n").unwrap();
+        for (key, value) in [("source", "kind = \"v4l2\""), ("detector", "kind = \"coco\"")] {
+            if block.contains("[camera") && !block.contains(&format!("[camera.{key}]")) {
+                writeln!(file, "[camera.{key}]\n{value}").unwrap();
+            }
+        }
+        let loaded = NodeConfig::load(Some(file.path()), &BTreeMap::<(), ()>::new());
+        assert!(loaded.is_ok(), "{block}\n{}", loaded.unwrap_err());
+    }
+}
+
+#[cfg(feature = "camera")]
+#[test]
+fn the_operations_manual_names_every_key() {
+    let manual = manual();
+    let config = toml::to_string(&load("cav.toml")).unwrap();
+    let keys = config.lines().filter_map(|line| Some(line.split_once(" = ")?.0.trim()));
+    for key in keys {
+        let named =
+            [format!("`{key}`"), format!(".{key}`"), format!("\n{key} = ")].iter().any(|name| manual.contains(name));
+        assert!(named, "docs/operations.md does not name `{key}`");
+    }
+}
+
+#[cfg(feature = "camera")]
+fn manual() -> String {
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/operations.md");
+    std::fs::read_to_string(file).unwrap()
 }

@@ -33,7 +33,7 @@ pub struct CustomDetector {
 }
 
 impl CustomDetector {
-    /// Takes the maker; it may fail, such as for want of a file, and is then asked again by the supervisor's policy.
+    /// Takes the maker; if it fails, such as for want of a file, the detector does not start and the node fails.
     pub fn new(build: impl Fn() -> anyhow::Result<Box<dyn Detect>> + Send + Sync + 'static) -> Self {
         Self { build: Arc::new(build) }
     }
