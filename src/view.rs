@@ -76,12 +76,16 @@ pub fn landmarks_in_view(
     sizes: &ObjectSizes,
     config: &ViewConfig,
 ) -> Vec<LandmarkId> {
-    let occluders: Vec<Occluder> = objects.iter().map(|object| Occluder::new(object, camera, sizes, config)).collect();
+    let occluder = |object: &PerceivedObject| {
+        let landmark = object.landmark.as_ref().and_then(|id| landmarks.iter().find(|landmark| landmark.id == *id));
+        Occluder::new(object, landmark.and_then(|landmark| landmark.facing_rad), camera, sizes, config)
+    };
+    let occluders: Vec<Occluder> = objects.iter().map(occluder).collect();
     let in_view = |landmark: &&Landmark| {
         let (range_m, bearing_rad) = camera.range_bearing(&landmark.position);
         range_m <= config.max_range_m
             && is_readable(landmark, camera, intrinsics, config)
-            && !occluders.iter().any(|occluder| occluder.hides(range_m, bearing_rad, config))
+            && !occluders.iter().any(|occluder| occluder.hides(range_m, bearing_rad, turned(landmark.facing_rad, camera, &landmark.position), config))
     };
     landmarks.iter().filter(in_view).map(|landmark| landmark.id.clone()).collect()
 }
@@ -119,18 +123,34 @@ struct Occluder {
 }
 
 impl Occluder {
-    fn new(object: &PerceivedObject, camera: &Pose, sizes: &ObjectSizes, config: &ViewConfig) -> Self {
-        let (range_m, bearing_rad) = camera.range_bearing(&Point2::new(object.x_m, object.y_m));
+    /// An object that faces `facing_rad`, or is as wide from everywhere.
+    fn new(
+        object: &PerceivedObject,
+        facing_rad: Option<f64>,
+        camera: &Pose,
+        sizes: &ObjectSizes,
+        config: &ViewConfig,
+    ) -> Self {
+        let position = Point2::new(object.x_m, object.y_m);
+        let (range_m, bearing_rad) = camera.range_bearing(&position);
         let width_m = sizes.labels.get(&object.label).map_or(config.occluder_width_m, |size| size.width_m);
-        Self { range_m, bearing_rad, half_angle_rad: half_angle(width_m, range_m) }
+        let half_angle_rad = half_angle(width_m * turned(facing_rad, camera, &position), range_m);
+        Self { range_m, bearing_rad, half_angle_rad }
     }
 
-    /// Whether any part of a target at the given place lies behind this object.
-    fn hides(&self, range_m: f64, bearing_rad: f64, config: &ViewConfig) -> bool {
+    /// Whether any part of a target at the given place lies behind this object; `turned` is the part of its width that
+    /// shows.
+    fn hides(&self, range_m: f64, bearing_rad: f64, turned: f64, config: &ViewConfig) -> bool {
         self.range_m + config.clearance_m < range_m
             && wrap_angle(self.bearing_rad - bearing_rad).abs()
-                < self.half_angle_rad + half_angle(config.target_width_m, range_m)
+                < self.half_angle_rad + half_angle(config.target_width_m * turned, range_m)
     }
+}
+
+/// The part of a flat target's width that shows from the camera, 0 to 1; all of it when its facing is not known.
+fn turned(facing_rad: Option<f64>, camera: &Pose, position: &Point2<f64>) -> f64 {
+    let to_camera = camera.position - position;
+    facing_rad.map_or(1.0, |facing_rad| (to_camera.y.atan2(to_camera.x) - facing_rad).cos().abs())
 }
 
 fn half_angle(width_m: f64, range_m: f64) -> f64 {
@@ -159,6 +179,16 @@ mod tests {
 
     fn sees(x_m: f64, y_m: f64, facing_rad: Option<f64>, objects: &[PerceivedObject]) -> bool {
         !seen(&[landmark("a", x_m, y_m, facing_rad)], objects, &ObjectSizes::default()).is_empty()
+    }
+
+    #[test]
+    fn a_target_that_is_turned_away_hides_less() {
+        let behind = landmark("behind", 0.40, 0.062, None);
+        let before = landmark("before", 0.25, 0.0, Some(PI - 1.0));
+        let hiding = PerceivedObject { landmark: Some("before".into()), ..object("ABC", 0.25, 0.0) };
+        let all_around = landmark("before", 0.25, 0.0, None);
+        assert!(seen(&[behind.clone(), before], &[hiding.clone()], &ObjectSizes::default()).contains(&"behind".into()));
+        assert!(!seen(&[behind, all_around], &[hiding], &ObjectSizes::default()).contains(&"behind".into()));
     }
 
     #[test]
