@@ -1,5 +1,7 @@
 //! Detectors: from an image to labels with places in the image. One trait, one file each.
 
+pub mod placard;
+
 use ecod::detection::Detection;
 
 use crate::frame::Frame;
