@@ -85,7 +85,9 @@ pub fn landmarks_in_view(
         let (range_m, bearing_rad) = camera.range_bearing(&landmark.position);
         range_m <= config.max_range_m
             && is_readable(landmark, camera, intrinsics, config)
-            && !occluders.iter().any(|occluder| occluder.hides(range_m, bearing_rad, turned(landmark.facing_rad, camera, &landmark.position), config))
+            && !occluders.iter().any(|occluder| {
+                occluder.hides(range_m, bearing_rad, turned(landmark.facing_rad, camera, &landmark.position), config)
+            })
     };
     landmarks.iter().filter(in_view).map(|landmark| landmark.id.clone()).collect()
 }
@@ -187,7 +189,10 @@ mod tests {
         let before = landmark("before", 0.25, 0.0, Some(PI - 1.0));
         let hiding = PerceivedObject { landmark: Some("before".into()), ..object("ABC", 0.25, 0.0) };
         let all_around = landmark("before", 0.25, 0.0, None);
-        assert!(seen(&[behind.clone(), before], &[hiding.clone()], &ObjectSizes::default()).contains(&"behind".into()));
+        assert!(
+            seen(&[behind.clone(), before], std::slice::from_ref(&hiding), &ObjectSizes::default())
+                .contains(&"behind".into())
+        );
         assert!(!seen(&[behind, all_around], &[hiding], &ObjectSizes::default()).contains(&"behind".into()));
     }
 

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use crate::broker::BrokerConfig;
 #[cfg(feature = "camera")]
 use crate::camera::CameraConfig;
-use crate::gateway::{MqttConfig, ReportKind};
+use crate::gateway::MqttConfig;
 
 /// Everything that a node can be told.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -33,8 +33,6 @@ pub struct NodeConfig {
     /// Where an aggregator's embedded broker listens. Default `127.0.0.1:1883`: other machines reach it only when told
     /// so, such as by `0.0.0.0:1883`.
     pub listen: SocketAddr,
-    /// What the cell fuses. Default PACE alone.
-    pub fuse: Vec<Fuse>,
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line. Default none.
     pub map_log: Option<PathBuf>,
@@ -51,16 +49,6 @@ pub struct NodeConfig {
     pub camera: Option<CameraConfig>,
     /// The cell's known locations, the same on every node. Default none.
     pub landmarks: Vec<LandmarkConfig>,
-}
-
-/// An algorithm of the aggregator.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Fuse {
-    /// What the vehicles see together.
-    Pace,
-    /// What the vehicles agree on where they disagree.
-    Vote,
 }
 
 /// Where a vehicle stands.
@@ -82,7 +70,6 @@ impl Default for NodeConfig {
             cell: NodeName::from_static("cell"),
             role: Role::Auto,
             listen: SocketAddr::from(([127, 0, 0, 1], 1883)),
-            fuse: vec![Fuse::Pace],
             map_log: None,
             pose: PoseConfig::default(),
             mqtt: MqttConfig::default(),
@@ -142,9 +129,6 @@ impl NodeConfig {
         if self.role == Role::Auto {
             return Err(ConfigError::new("role", "auto", "`edge` or `cav`: this version does not elect aggregators"));
         }
-        if self.fuse.is_empty() {
-            return Err(ConfigError::new("fuse", "[]", "at least one of `pace` and `vote`"));
-        }
         check_range("pose.x_m", self.pose.x_m, -1e8, 1e8)?;
         check_range("pose.y_m", self.pose.y_m, -1e8, 1e8)?;
         check_range("pose.heading_deg", self.pose.heading_deg, -360.0, 360.0)?;
@@ -170,15 +154,6 @@ impl NodeConfig {
     /// The cell's known locations.
     pub fn landmarks(&self) -> Vec<Landmark> {
         self.landmarks.iter().map(Landmark::from).collect()
-    }
-
-    /// What this node's reports are for.
-    pub fn report_kinds(&self) -> Vec<ReportKind> {
-        let kind = |fuse: &Fuse| match fuse {
-            Fuse::Pace => ReportKind::Detections,
-            Fuse::Vote => ReportKind::VoteDetections,
-        };
-        self.fuse.iter().map(kind).collect()
     }
 }
 

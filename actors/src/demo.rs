@@ -112,7 +112,11 @@ impl Demo<'_> {
         let started = clock::now();
         while observer.reporters() < self.scene.cavs.len() {
             if clock::now().since(started) > START_TIMEOUT {
-                bail!("only {} of {} vehicles reported within {START_TIMEOUT:?}", observer.reporters(), self.scene.cavs.len());
+                bail!(
+                    "only {} of {} vehicles reported within {START_TIMEOUT:?}",
+                    observer.reporters(),
+                    self.scene.cavs.len()
+                );
             }
             check(nodes)?;
             tokio::time::sleep(Duration::from_millis(50)).await;
@@ -127,12 +131,7 @@ impl Demo<'_> {
         Ok((from, clock::now()))
     }
 
-    fn evaluate(
-        &self,
-        reports: Vec<ObservedReport>,
-        from: Timestamp,
-        until: Timestamp,
-    ) -> anyhow::Result<DemoResult> {
+    fn evaluate(&self, reports: Vec<ObservedReport>, from: Timestamp, until: Timestamp) -> anyhow::Result<DemoResult> {
         let within = |time: Timestamp| from <= time && time <= until;
         let mut maps: BTreeMap<(u64, u64), GlobalMap> = BTreeMap::new();
         let (mut received, mut ages) = (0, Vec::new());
@@ -161,8 +160,7 @@ impl Demo<'_> {
         let alone = |cav: &Cav| {
             let landmarks = self.scene.landmarks(&self.testbed.placard);
             let start = reports.first().map_or(from, |observed| observed.received_at);
-            let mut aggregator =
-                Aggregator::new(cav.name.clone(), 1, setup::fusion(self.testbed), landmarks, start);
+            let mut aggregator = Aggregator::new(cav.name.clone(), 1, setup::fusion(self.testbed), landmarks, start);
             let mut score = Score::default();
             for observed in reports.iter().filter(|observed| observed.report.node == cav.name) {
                 if let Ok(Some(map)) = aggregator.report(&observed.report, observed.received_at)

@@ -15,7 +15,7 @@ use ractor::{Actor, ActorProcessingErr, ActorRef};
 
 use crate::clock;
 use crate::counters::Counters;
-use crate::gateway::{Delivery, GatewayMessage, Incoming};
+use crate::gateway::{Delivery, GatewayMessage, Incoming, ReportKind};
 use crate::seat::Seat;
 
 /// What the fuser is asked to do.
@@ -89,7 +89,7 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn take(&mut self, delivery: &Delivery) {
-        let Incoming::Report { report, .. } = &delivery.message else { return };
+        let Incoming::Report { kind: ReportKind::Detections, report } = &delivery.message else { return };
         match self.aggregator.report(report, delivery.received_at) {
             Ok(map) => self.publish(map),
             Err(reason) => {

@@ -30,8 +30,6 @@ pub enum ProjectorMessage {
 pub struct ProjectorArguments {
     /// Camera, pose and known locations.
     pub perception: Perception,
-    /// What the reports are for; one report is published for each.
-    pub kinds: Vec<ReportKind>,
     /// Where reports are published.
     pub gateway: Seat<GatewayMessage>,
 }
@@ -61,9 +59,7 @@ impl Actor for Projector {
     ) -> Result<(), ActorProcessingErr> {
         let ProjectorMessage::Report { detections, captured_at } = message;
         let report = Arc::new(state.perception.report(detections, captured_at));
-        for &kind in &state.kinds {
-            state.gateway.send(GatewayMessage::PublishReport { kind, report: Arc::clone(&report) });
-        }
+        state.gateway.send(GatewayMessage::PublishReport { kind: ReportKind::Detections, report });
         Ok(())
     }
 }

@@ -175,6 +175,7 @@ impl ElectionMessage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::SCHEMA_VERSION;
 
     fn beat(term: u64, leader: &str) -> ElectionMessage {
         ElectionMessage {

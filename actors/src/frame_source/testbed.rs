@@ -39,7 +39,8 @@ impl FrameSource for TestbedVehicle {
         self.pace.wait();
         let captured_at = clock::now();
         let image = self.camera.frame(self.next);
-        let image = image.map_err(|error| FrameError::Lost { origin: self.origin.clone(), reason: error.to_string() })?;
+        let image =
+            image.map_err(|error| FrameError::Lost { origin: self.origin.clone(), reason: error.to_string() })?;
         let seq = self.next;
         self.next += 1;
         Ok(Frame { image, captured_at, seq })

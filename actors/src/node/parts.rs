@@ -155,15 +155,15 @@ impl Assembly {
             #[cfg(feature = "camera")]
             Part::Projector => {
                 let arguments = ProjectorArguments {
-                    perception: camera::perception(&self.config)?,
-                    kinds: self.config.report_kinds(),
+                    perception: camera::perception(&self.config).map_err(in_full)?,
                     gateway: self.seats.gateway.clone(),
                 };
                 seat(&self.seats.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
             }
             #[cfg(feature = "camera")]
             Part::Detector => {
-                let arguments = camera::detector(&self.config, self.seats.projector.clone(), self.counters())?;
+                let arguments = camera::detector(&self.config, self.seats.projector.clone(), self.counters());
+                let arguments = arguments.map_err(in_full)?;
                 seat(&self.seats.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }
         }
@@ -272,9 +272,16 @@ fn seat<M: Message>(
     Ok(id)
 }
 
+/// An error with all its causes, which the actor framework would leave out.
+#[cfg(feature = "camera")]
+#[expect(clippy::needless_pass_by_value, reason = "takes what map_err gives")]
+fn in_full(error: anyhow::Error) -> ActorProcessingErr {
+    format!("{error:#}").into()
+}
+
 async fn stop<M: Message>(seat: &Seat<M>) {
     let Some(actor) = seat.holder() else { return };
-    if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT.into())).await {
+    if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT)).await {
         tracing::debug!(%error, "part did not stop in time");
         actor.kill();
     }

@@ -60,11 +60,7 @@ pub enum BirdseyeError {
     },
 }
 
-fn check(
-    scene: &Scene,
-    detections: &[(NodeName, Point2<f64>)],
-    map: Option<&GlobalMap>,
-) -> Result<(), BirdseyeError> {
+fn check(scene: &Scene, detections: &[(NodeName, Point2<f64>)], map: Option<&GlobalMap>) -> Result<(), BirdseyeError> {
     for (node, place) in detections {
         if !scene.cavs.iter().any(|cav| cav.name == *node) {
             return Err(BirdseyeError::Stranger { scene: scene.name.clone(), node: node.clone() });
@@ -179,9 +175,7 @@ impl Picture<'_> {
             None => "no map".to_owned(),
         };
         let name = text(Sheet::MARGIN_PX, 32.0, &printable(&self.scene.name)).set("font-size", 20);
-        Group::new()
-            .add(name.set("font-weight", "bold"))
-            .add(text(Sheet::MARGIN_PX, 54.0, &share).set("font-size", 15))
+        Group::new().add(name.set("font-weight", "bold")).add(text(Sheet::MARGIN_PX, 54.0, &share).set("font-size", 15))
     }
 
     /// The body of each parked vehicle, between its two placards.
@@ -295,7 +289,14 @@ impl Picture<'_> {
         for (spot, y) in spots.into_iter().zip(spread(&heights, self.sheet.top() + LINE_PX / 2.0)) {
             let judgement = self.judge(spot);
             let (end_x, end_y) = self.sheet.at(&anchor(spot));
-            let lead = format!("M{} {}H{}L{} {}", frame_left - 4.0, round(y), frame_left + 8.0, round(end_x - 5.0), round(end_y));
+            let lead = format!(
+                "M{} {}H{}L{} {}",
+                frame_left - 4.0,
+                round(y),
+                frame_left + 8.0,
+                round(end_x - 5.0),
+                round(end_y)
+            );
             group = group
                 .add(Path::new().set("d", lead).set("fill", "none").set("stroke", "#bdbdbd"))
                 .add(text(columns[0], y + 4.5, &printable(&spot.id)).set("fill", FAINT))
@@ -311,7 +312,7 @@ impl Picture<'_> {
     }
 
     fn legend(&self, beyond: usize) -> Group {
-        let (x, mut y) = (self.sheet.right() + 28.0, self.sheet.top() + 12.0);
+        let (x, mut y) = (self.sheet.right() + 52.0, self.sheet.top() + 12.0);
         let mut group = Group::new();
         let mut entry = |sign: Group, words: &str| {
             let row = std::mem::replace(&mut group, Group::new());
@@ -322,18 +323,17 @@ impl Picture<'_> {
             ));
             y += 24.0;
         };
-        let stroke = |weight: f64| Group::new().set("stroke", INK).add(line(0.0, -8.0, 0.0, 8.0).set("stroke-width", weight));
+        let stroke =
+            |weight: f64| Group::new().set("stroke", INK).add(line(0.0, -8.0, 0.0, 8.0).set("stroke-width", weight));
         for (cav, color) in self.vehicles() {
             let dots = [(-5.0, 2.0), (0.0, -3.0), (5.0, 3.0)].into_iter().map(dot);
             entry(dots.fold(Group::new().set("fill", color), Group::add), &format!("seen by {}", cav.name));
         }
         entry(stroke(5.0), "plate of a parked vehicle");
         entry(stroke(1.5), "EMPTY placard");
-        for (judgement, words) in [
-            (Judgement::Right, "agreed, right"),
-            (Judgement::Wrong, "agreed, wrong"),
-            (Judgement::Unknown, "unknown"),
-        ] {
+        for (judgement, words) in
+            [(Judgement::Right, "agreed, right"), (Judgement::Wrong, "agreed, wrong"), (Judgement::Unknown, "unknown")]
+        {
             entry(judgement.mark(0.0, 0.0), words);
         }
         if beyond > 0 {

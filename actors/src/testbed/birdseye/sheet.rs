@@ -1,7 +1,7 @@
 //! From metres of the world to pixels of the picture.
 
 use ecod::testbed::Scene;
-use nalgebra::Point2;
+use nalgebra::{Point2, Vector2};
 use svg::node::element::{Group, Rectangle};
 
 use super::{FAINT, line, text};
@@ -23,7 +23,7 @@ impl Sheet {
     pub(super) const MARGIN_PX: f64 = 24.0;
     /// Beside the frame: the table to the left, the legend to the right.
     const LEFT_PX: f64 = 300.0;
-    const RIGHT_PX: f64 = 230.0;
+    const RIGHT_PX: f64 = 260.0;
     const TOP_PX: f64 = 96.0;
     const BOTTOM_PX: f64 = 52.0;
     /// Length of the frame's longer side.
@@ -33,6 +33,9 @@ impl Sheet {
     /// Least side of the frame.
     const LEAST_M: f64 = 24.0 * METRES_PER_INCH;
 
+    /// Room to the right of that, for the names of vehicles.
+    const NAMES_M: f64 = 3.0 * METRES_PER_INCH;
+
     /// A sheet that holds every placard and vehicle of a scene.
     pub(super) fn around(scene: &Scene) -> Self {
         let spots = scene.spots.iter().flat_map(|spot| spot.empty.into_iter().chain([spot.occupied]));
@@ -41,7 +44,7 @@ impl Sheet {
         let (low, high) = places.iter().fold((first, first), |(low, high), place| (low.inf(place), high.sup(place)));
         let lacking = (high - low).map(|side| (Self::LEAST_M / 2.0 - Self::PADDING_M - side / 2.0).max(0.0));
         let room = lacking.add_scalar(Self::PADDING_M);
-        let (low, high) = (low - room, high + room);
+        let (low, high) = (low - room, high + room + Vector2::new(Self::NAMES_M, 0.0));
         Self { low, high, px_per_m: Self::FRAME_PX / (high - low).max() }
     }
 

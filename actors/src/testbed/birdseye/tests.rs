@@ -64,7 +64,8 @@ fn a_picture_tells_truth_agreement_and_share() {
 fn labels_from_the_network_stay_text() {
     let testbed = Testbed::from_json(SETUP1).unwrap();
     let scene = &testbed.scenes[0];
-    let nasty = [("slot-0", Some("<script>")), ("slot-1", Some("a&\"'\u{0}\u{1b}\u{ffff}")), ("slot-3", Some("</text><"))];
+    let nasty =
+        [("slot-0", Some("<script>")), ("slot-1", Some("a&\"'\u{0}\u{1b}\u{ffff}")), ("slot-3", Some("</text><"))];
     let svg = birdseye(&testbed, scene, &[], Some(&map(&testbed, scene, &nasty))).unwrap();
     assert!(!svg.contains("<script"));
     let texts = texts(&svg);
