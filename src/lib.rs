@@ -10,5 +10,7 @@ pub mod detection;
 pub mod geometry;
 pub mod landmark;
 pub mod names;
+pub mod reputation;
 pub mod time;
+pub mod vote;
 pub mod wire;
