@@ -190,32 +190,39 @@ impl Vote {
     /// Ends the round: judges what changed.
     pub fn close(&mut self, now: Timestamp) -> Round {
         self.heard.values_mut().for_each(|h| h.frames = 0);
-        match &mut self.tally {
-            Tally::Paper(tally) => Round { verdicts: tally.close(), evidence: Vec::new() },
-            Tally::Weighted(tally) => {
-                let changed = tally.close(now);
-                let verdicts = if self.open {
-                    changed.iter().filter_map(|landmark| tally.verdict(landmark)).collect()
-                } else {
-                    self.landmarks.keys().filter_map(|landmark| tally.verdict(landmark)).collect()
-                };
-                Round { verdicts, evidence: tally.take_evidence() }
-            }
+        let (changed, evidence) = match &mut self.tally {
+            Tally::Paper(tally) => (tally.close(), Vec::new()),
+            Tally::Weighted(tally) => (tally.close(now), tally.take_evidence()),
+        };
+        let verdicts = if self.open {
+            changed.iter().filter_map(|landmark| self.verdict(landmark)).collect()
+        } else {
+            self.verdicts()
+        };
+        Round { verdicts, evidence }
+    }
+
+    fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
+        match &self.tally {
+            Tally::Paper(tally) => tally.verdict(landmark),
+            Tally::Weighted(tally) => tally.verdict(landmark),
         }
+    }
+
+    /// The verdict of every landmark as of the last round, by landmark.
+    pub fn verdicts(&self) -> Vec<Verdict> {
+        self.landmarks.keys().filter_map(|landmark| self.verdict(landmark)).collect()
     }
 
     /// Goes over the stored votes `passes` times, from equal trust, and returns the verdict of every landmark.
     ///
     /// Dawid & Skene (1979) with the priors of the online machine; it does not depend on the order of arrival. In
-    /// `paper` mode there is nothing to refine: the verdicts are those of another round without votes.
+    /// `paper` mode there is nothing to refine.
     pub fn refine(&mut self, passes: u32) -> Vec<Verdict> {
-        match &mut self.tally {
-            Tally::Paper(tally) => tally.close(),
-            Tally::Weighted(tally) => {
-                tally.refine(passes);
-                self.landmarks.keys().filter_map(|landmark| tally.verdict(landmark)).collect()
-            }
+        if let Tally::Weighted(tally) = &mut self.tally {
+            tally.refine(passes);
         }
+        self.verdicts()
     }
 
     /// How far each vehicle is trusted.
@@ -248,15 +255,20 @@ fn verdict(
     shown: Option<Label>,
     contributors: Vec<NodeName>,
 ) -> Verdict {
-    let mut best: Option<(&Label, f64)> = None;
-    for (label, &score) in &votes {
-        if best.is_none_or(|(_, most)| score > most) {
-            best = Some((label, score));
-        }
-    }
-    let label = shown.or_else(|| best.map(|(label, _)| label.clone()));
+    let label = shown.or_else(|| best(&votes).cloned());
     let score = label.as_ref().and_then(|l| votes.get(l)).copied().unwrap_or(0.0);
     let others = votes.iter().filter(|(l, _)| Some(*l) != label.as_ref()).map(|(_, s)| *s);
     let margin = score - others.fold(0.0, f64::max);
     Verdict { landmark, label, score, margin, votes, contributors }
+}
+
+/// The label of the highest score, the first in alphabetical order on a tie.
+fn best(votes: &BTreeMap<Label, f64>) -> Option<&Label> {
+    let mut best: Option<(&Label, f64)> = None;
+    for (label, &score) in votes {
+        if best.is_none_or(|(_, most)| score > most) {
+            best = Some((label, score));
+        }
+    }
+    best.map(|(label, _)| label)
 }

@@ -1,6 +1,6 @@
 //! The paper's tally, to the letter.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::config::PaperConfig;
 use crate::names::{Label, LandmarkId, NodeName};
@@ -24,14 +24,15 @@ struct Vehicle {
 #[derive(Debug, Clone)]
 pub struct PaperTally {
     config: PaperConfig,
-    scores: BTreeMap<LandmarkId, (BTreeMap<Label, f64>, BTreeMap<NodeName, ()>)>,
+    scores: BTreeMap<LandmarkId, (BTreeMap<Label, f64>, BTreeSet<NodeName>)>,
     vehicles: BTreeMap<NodeName, Vehicle>,
+    touched: BTreeSet<LandmarkId>,
 }
 
 impl PaperTally {
     /// An empty tally.
     pub fn new(config: PaperConfig) -> Self {
-        Self { config, scores: BTreeMap::new(), vehicles: BTreeMap::new() }
+        Self { config, scores: BTreeMap::new(), vehicles: BTreeMap::new(), touched: BTreeSet::new() }
     }
 
     /// Makes a location known, so that it has a verdict even without votes.
@@ -55,24 +56,31 @@ impl PaperTally {
         });
         let (scores, contributors) = self.scores.entry(landmark.clone()).or_default();
         *scores.entry(label.clone()).or_insert(0.0) += vehicle.reputation * confidence * visibility;
-        contributors.insert(node.clone(), ());
+        contributors.insert(node.clone());
+        self.touched.insert(landmark.clone());
         vehicle.votes.push((landmark.clone(), label.clone()));
     }
 
-    /// The label with the most score at every location, the first in alphabetical order on a tie; then changes every
-    /// vehicle's reputation by step · (correct − incorrect) / objects over its votes since the last verdict.
-    pub fn close(&mut self) -> Vec<Verdict> {
-        let verdicts: Vec<_> = self
-            .scores
+    /// The label with the most score at a location, the first in alphabetical order on a tie.
+    pub fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
+        let (scores, contributors) = self.scores.get(landmark)?;
+        Some(super::verdict(landmark.clone(), scores.clone(), None, contributors.iter().cloned().collect()))
+    }
+
+    /// Ends a round: changes every vehicle's reputation by step · (correct − incorrect) / objects over its votes since
+    /// the last verdict, and returns the locations that were voted on.
+    pub fn close(&mut self) -> BTreeSet<LandmarkId> {
+        let touched = std::mem::take(&mut self.touched);
+        let labels: BTreeMap<_, _> = touched
             .iter()
-            .map(|(landmark, (scores, contributors))| {
-                super::verdict(landmark.clone(), scores.clone(), None, contributors.keys().cloned().collect())
+            .filter_map(|landmark| {
+                self.scores.get(landmark).map(|(scores, _)| (landmark, super::best(scores).cloned()))
             })
             .collect();
-        let labels: BTreeMap<_, _> = verdicts.iter().map(|v| (&v.landmark, v.label.as_ref())).collect();
         for vehicle in self.vehicles.values_mut().filter(|v| !v.votes.is_empty()) {
             let objects = vehicle.votes.len() as u64;
-            let right = |(landmark, label): &&(LandmarkId, Label)| labels.get(landmark) == Some(&Some(label));
+            let right =
+                |(landmark, label): &&(LandmarkId, Label)| labels.get(landmark).and_then(Option::as_ref) == Some(label);
             let correct = vehicle.votes.iter().filter(right).count() as u64;
             let balance = (2.0 * correct as f64 - objects as f64) / objects as f64;
             let (low, high) = REPUTATION_RANGE;
@@ -81,7 +89,7 @@ impl PaperTally {
             vehicle.incorrect += objects - correct;
             vehicle.votes.clear();
         }
-        verdicts
+        touched
     }
 
     /// Every vehicle's reputation.
