@@ -124,7 +124,7 @@ pub struct WeightedConfig {
     pub half_visibility_rad: f64,
     /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the square of the distance.
     pub visibility_at_max_range: f64,
-    /// Older landmarks that are judged again per fresh vote, in votes; default 4. More settles sooner, costs more.
+    /// Older landmarks that are judged again per fresh vote, in votes; default 8. More settles sooner, costs more.
     pub revisit_votes: f64,
     /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 50.
     pub calibration_votes: f64,
@@ -145,7 +145,7 @@ impl Default for WeightedConfig {
             hysteresis: 0.1,
             half_visibility_rad: 0.8,
             visibility_at_max_range: 0.3,
-            revisit_votes: 4.0,
+            revisit_votes: 8.0,
             calibration_votes: 50.0,
         }
     }

@@ -131,8 +131,30 @@ impl Model {
         }
     }
 
-    /// Natural logarithm of the probability that a vehicle states `stated` where `truth` is.
+    /// As [`Self::log_of_stating`], but never more than where the stated label is true: no vote counts against its own
+    /// label. Otherwise the model has a mirrored solution, in which the honest majority is taken for consistent liars.
     fn log_likelihood(&self, word: &Word, truth: LabelIndex, accuracy: f64) -> f64 {
+        let own = self.log_of_stating(word, word.label, accuracy);
+        if truth == word.label { own } else { own.min(self.log_of_stating(word, truth, accuracy)) }
+    }
+
+    /// The posterior as it would be without `word`: what the other vehicles say about its label.
+    pub(super) fn without(&self, posterior: &[(LabelIndex, f64)], word: &Word) -> Vec<(LabelIndex, f64)> {
+        let accuracy = self.fleet_accuracy();
+        let own = self.log_likelihood(word, word.label, accuracy);
+        let others: Vec<_> = posterior
+            .iter()
+            .map(|&(label, p)| {
+                let lead = word.weight * (own - self.log_likelihood(word, label, accuracy));
+                (label, p * lead.min(500.0).exp())
+            })
+            .collect();
+        let total: f64 = others.iter().map(|(_, p)| p).sum();
+        if total > 0.0 { others.into_iter().map(|(label, p)| (label, p / total)).collect() } else { posterior.to_vec() }
+    }
+
+    /// Natural logarithm of the probability that a vehicle states the word's label where `truth` is.
+    fn log_of_stating(&self, word: &Word, truth: LabelIndex, accuracy: f64) -> f64 {
         let witness = &self.witnesses[word.vehicle];
         let right = self.fleet(truth, truth, accuracy).clamp(1e-6, 1.0 - 1e-6);
         let assumed_right = 1.0 / (1.0 + (-(log_odds(right) + witness.advantage)).exp());

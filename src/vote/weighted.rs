@@ -190,7 +190,9 @@ impl WeightedTally {
             ballot.shown = None;
         }
         for cast in past.iter().filter(|_| !posterior.is_empty()) {
-            self.model.settle(&cast.word(), &posterior);
+            // Judged by the others: a vehicle that decides alone must not prove itself right.
+            let others = self.model.without(&posterior, &cast.word());
+            self.model.settle(&cast.word(), &others);
             let agreement = posterior.iter().find(|(l, _)| *l == cast.label).map_or(0.0, |(_, p)| *p);
             self.calibration.observe(cast.confidence, agreement);
             let correct = shown == Some(cast.label);
