@@ -24,6 +24,8 @@ struct Cast {
     at: Timestamp,
     /// When it began to count once more as evidence.
     since: Timestamp,
+    /// Whether a posterior rests on it.
+    judged: bool,
 }
 
 impl Cast {
@@ -36,7 +38,10 @@ impl Cast {
 #[derive(Debug, Clone, Default)]
 struct Ballot {
     casts: Vec<Cast>,
+    /// As of the last judgement.
     posterior: Vec<(LabelIndex, f64)>,
+    /// Whether votes and posterior are in the live evidence at present.
+    counted: bool,
     shown: Option<LabelIndex>,
 }
 
@@ -141,6 +146,7 @@ impl WeightedTally {
         (label, confidence, visibility): (&Label, f64, f64),
         at: Timestamp,
     ) {
+        self.expire(at);
         let (vehicle, label) = (self.vehicle(node), self.label(label));
         let freshness = Duration::from_secs_f64(self.config.freshness_s);
         let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
@@ -155,7 +161,7 @@ impl WeightedTally {
         } else {
             self.uncount(landmark);
         }
-        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, at, since };
+        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, at, since, judged: false };
         let ballot = self.ballots.entry(landmark.clone()).or_default();
         match ballot.casts.binary_search_by_key(&vehicle, |c| c.vehicle) {
             Ok(place) => ballot.casts[place] = cast,
@@ -168,28 +174,30 @@ impl WeightedTally {
 
     /// Takes a landmark's votes out of the live evidence until it is judged again.
     fn uncount(&mut self, landmark: &LandmarkId) {
-        if let Some(ballot) = self.ballots.get_mut(landmark) {
-            let words = ballot.words();
-            self.model.count(&words, &std::mem::take(&mut ballot.posterior), -1.0);
+        if let Some(ballot) = self.ballots.get_mut(landmark)
+            && std::mem::take(&mut ballot.counted)
+        {
+            self.model.count(&ballot.words(), &ballot.posterior, -1.0);
         }
     }
 
     /// Turns the votes that `is_past` selects into fading evidence and a record, and removes them.
     fn retire(&mut self, landmark: &LandmarkId, is_past: impl Fn(&Cast) -> bool) {
-        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        if !ballot.casts.iter().any(&is_past) {
+        if !self.ballots.get(landmark).is_some_and(|b| b.casts.iter().any(&is_past)) {
             return;
         }
-        let posterior = std::mem::take(&mut ballot.posterior);
-        self.model.count(&ballot.words(), &posterior, -1.0);
+        self.uncount(landmark);
+        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
+        let posterior = ballot.posterior.clone();
         let (past, casts) = std::mem::take(&mut ballot.casts).into_iter().partition(is_past);
         ballot.casts = casts;
         let shown = ballot.shown;
         let past: Vec<Cast> = past;
         if ballot.casts.is_empty() {
             ballot.shown = None;
+            ballot.posterior.clear();
         }
-        for cast in past.iter().filter(|_| !posterior.is_empty()) {
+        for cast in past.iter().filter(|cast| cast.judged) {
             // Judged by the others: a vehicle that decides alone must not prove itself right.
             let others = self.model.without(&posterior, &cast.word());
             self.model.settle(&cast.word(), &others);
@@ -223,12 +231,14 @@ impl WeightedTally {
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
         for cast in &mut ballot.casts {
             cast.weight = weights.of(cast.confidence) * cast.visibility;
+            cast.judged = true;
         }
         let words = ballot.words();
         self.model.prepare(words.iter().map(|w| w.vehicle));
         let posterior = self.model.posterior(&words, &ballot.candidates());
         self.model.count(&words, &posterior, 1.0);
         ballot.posterior = posterior;
+        ballot.counted = true;
         Self::show(ballot, self.config.hysteresis);
     }
 
@@ -285,6 +295,7 @@ impl WeightedTally {
         self.model.clear_live();
         for ballot in self.ballots.values_mut() {
             ballot.shown = None;
+            ballot.counted = true;
             let total: f64 = ballot.casts.iter().map(|c| c.weight).sum();
             let share = |label| ballot.casts.iter().filter(|c| c.label == label).map(|c| c.weight).sum::<f64>() / total;
             ballot.posterior = ballot.candidates().into_iter().map(|label| (label, share(label))).collect();
