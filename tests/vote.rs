@@ -21,7 +21,7 @@ fn report(node: &str, seq: u64, at: Timestamp, votes: &[(&str, &str, f64)]) -> O
     };
     ObjectReport {
         schema: SCHEMA_VERSION,
-        node: NodeName::new(node).unwrap(),
+        node: NodeName::new(node).expect("test names are valid"),
         seq,
         captured_at_us: at,
         pose: None,
