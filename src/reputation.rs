@@ -1,0 +1,216 @@
+//! Evidence about vehicles that aggregators can merge without counting anything twice.
+//!
+//! Every aggregator writes only the lane of its own epoch, and counts only grow, so that the state of a lane at any
+//! time is an upper bound of its earlier states: merging takes the larger count, lane by lane. Merging is idempotent,
+//! commutative and associative (a state-based grow-only counter, Shapiro et al. 2011); two partitions that each went on
+//! counting merge to the sum of what they saw.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::{ConfigError, check_range};
+use crate::names::{Label, NodeName};
+use crate::wire::Reputation;
+
+/// One vote of which it is settled whether it agreed with the verdict.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Evidence {
+    /// Who voted.
+    pub node: NodeName,
+    /// What for.
+    pub label: Label,
+    /// Whether the verdict was the same.
+    pub correct: bool,
+}
+
+/// Votes that agreed with the verdict and votes that did not.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Counts {
+    /// Votes that agreed.
+    pub correct: u64,
+    /// Votes that did not.
+    pub incorrect: u64,
+}
+
+impl Counts {
+    fn merge(&mut self, other: Self) {
+        self.correct = self.correct.max(other.correct);
+        self.incorrect = self.incorrect.max(other.incorrect);
+    }
+}
+
+/// Settings of reputations.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ReputationConfig {
+    /// Score of a vehicle without evidence, 0.3 to 1; default 0.5. Below what a proven vehicle reaches.
+    pub initial: f64,
+    /// Weight of the initial score in votes; default 10. More trusts newcomers and new liars later.
+    pub initial_votes: f64,
+    /// Factor by which evidence counts less with every epoch that follows, 0 to 1; default 0.9.
+    pub epoch_fade: f64,
+}
+
+impl Default for ReputationConfig {
+    fn default() -> Self {
+        Self { initial: 0.5, initial_votes: 10.0, epoch_fade: 0.9 }
+    }
+}
+
+impl ReputationConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the first value out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("initial", self.initial, 0.3, 1.0)?;
+        check_range("initial_votes", self.initial_votes, 1e-3, 1e6)?;
+        check_range("epoch_fade", self.epoch_fade, 0.0, 1.0)
+    }
+}
+
+type Vehicles = BTreeMap<NodeName, BTreeMap<Label, Counts>>;
+
+/// The evidence of all epochs. Serialised, it is the snapshot that is persisted and replicated.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReputationLedger {
+    /// By epoch, the aggregator that wrote the lane, vehicle and stated label.
+    lanes: BTreeMap<u64, BTreeMap<NodeName, Vehicles>>,
+}
+
+impl ReputationLedger {
+    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there.
+    pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
+        let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
+        let counts = lane.entry(evidence.node.clone()).or_default().entry(evidence.label.clone()).or_default();
+        let count = if evidence.correct { &mut counts.correct } else { &mut counts.incorrect };
+        *count = count.saturating_add(1);
+    }
+
+    /// Takes in all that `other` knows.
+    pub fn merge(&mut self, other: &Self) {
+        for (epoch, aggregators) in &other.lanes {
+            for (aggregator, vehicles) in aggregators {
+                let lane = self.lanes.entry(*epoch).or_default().entry(aggregator.clone()).or_default();
+                for (node, labels) in vehicles {
+                    let known = lane.entry(node.clone()).or_default();
+                    for (label, counts) in labels {
+                        known.entry(label.clone()).or_default().merge(*counts);
+                    }
+                }
+            }
+        }
+    }
+
+    fn counts(&self) -> impl Iterator<Item = (u64, &NodeName, &Label, Counts)> {
+        self.lanes.iter().flat_map(|(epoch, aggregators)| {
+            let vehicles = aggregators.values().flatten();
+            vehicles.flat_map(move |(node, labels)| labels.iter().map(move |(label, c)| (*epoch, node, label, *c)))
+        })
+    }
+
+    /// Every vehicle's (correct, incorrect) over all lanes.
+    pub fn totals(&self) -> BTreeMap<NodeName, (u64, u64)> {
+        let mut totals: BTreeMap<_, (u64, u64)> = BTreeMap::new();
+        for (_, node, _, counts) in self.counts() {
+            let total = totals.entry(node.clone()).or_default();
+            *total = (total.0.saturating_add(counts.correct), total.1.saturating_add(counts.incorrect));
+        }
+        totals
+    }
+
+    /// A vehicle's counts by the label that it stated, over all lanes.
+    pub fn by_label(&self, vehicle: &NodeName) -> BTreeMap<Label, Counts> {
+        let mut labels: BTreeMap<Label, Counts> = BTreeMap::new();
+        for (_, _, label, counts) in self.counts().filter(|(_, node, ..)| *node == vehicle) {
+            let sum = labels.entry(label.clone()).or_default();
+            sum.correct = sum.correct.saturating_add(counts.correct);
+            sum.incorrect = sum.incorrect.saturating_add(counts.incorrect);
+        }
+        labels
+    }
+
+    /// What is published: the mean of a Beta distribution (Jøsang & Ismail 2002) over faded evidence, 0.30 to 1.00.
+    pub fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
+        let latest = self.lanes.last_key_value().map_or(0, |(epoch, _)| *epoch);
+        let mut faded: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
+        for (epoch, node, _, counts) in self.counts() {
+            let fade = config.epoch_fade.powi(i32::try_from(latest - epoch).unwrap_or(i32::MAX));
+            let entry = faded.entry(node).or_default();
+            entry.0 += fade * counts.correct as f64;
+            entry.1 += fade * counts.incorrect as f64;
+        }
+        let score = |node: &NodeName| {
+            let (correct, incorrect) = faded.get(node).copied().unwrap_or_default();
+            let mean = (correct + config.initial * config.initial_votes) / (correct + incorrect + config.initial_votes);
+            mean.clamp(0.30, 1.00)
+        };
+        self.totals()
+            .into_iter()
+            .map(|(node, (correct, incorrect))| {
+                let score = score(&node);
+                (node, Reputation { score, correct, incorrect })
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn ledger() -> impl Strategy<Value = ReputationLedger> {
+        let vote = (0u64..3, 0usize..2, 0usize..3, 0usize..2, any::<bool>());
+        proptest::collection::vec(vote, 0..40).prop_map(|votes| {
+            let name = |prefix: &str, n: usize| NodeName::new(format!("{prefix}{n}")).unwrap();
+            let mut ledger = ReputationLedger::default();
+            for (epoch, aggregator, node, label, correct) in votes {
+                let evidence = Evidence { node: name("v", node), label: format!("l{label}").into(), correct };
+                ledger.record(epoch, &name("a", aggregator), &evidence);
+            }
+            ledger
+        })
+    }
+
+    fn merged(a: &ReputationLedger, b: &ReputationLedger) -> ReputationLedger {
+        let mut merged = a.clone();
+        merged.merge(b);
+        merged
+    }
+
+    proptest! {
+        #[test]
+        fn merging_is_a_join_semilattice(a in ledger(), b in ledger(), c in ledger()) {
+            prop_assert_eq!(merged(&a, &a), a.clone());
+            prop_assert_eq!(merged(&a, &b), merged(&b, &a));
+            prop_assert_eq!(merged(&merged(&a, &b), &c), merged(&a, &merged(&b, &c)));
+        }
+
+        #[test]
+        fn scores_stay_within_bounds_and_snapshots_come_back(a in ledger()) {
+            for reputation in a.reputations(&ReputationConfig::default()).values() {
+                prop_assert!((0.30..=1.00).contains(&reputation.score));
+            }
+            let snapshot = serde_json::to_string(&a).unwrap();
+            prop_assert_eq!(serde_json::from_str::<ReputationLedger>(&snapshot).unwrap(), a);
+        }
+    }
+
+    #[test]
+    fn partitions_that_counted_apart_merge_to_their_sum() {
+        let name = |n: &str| NodeName::new(n).unwrap();
+        let evidence = Evidence { node: name("euclid"), label: "cup".into(), correct: true };
+        let mut common = ReputationLedger::default();
+        common.record(1, &name("edge"), &evidence);
+        let (mut left, mut right) = (common.clone(), common);
+        left.record(2, &name("left"), &evidence);
+        right.record(2, &name("right"), &evidence);
+        left.merge(&right);
+        assert_eq!(left.totals()[&name("euclid")], (3, 0));
+    }
+}

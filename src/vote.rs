@@ -1,0 +1,274 @@
+//! VOTE: which label is right at a known location when vehicles disagree.
+//!
+//! [`Vote`] is a machine without clocks. Call [`Vote::observe`] with every report and [`Vote::close`] at the end of a
+//! round; [`Vote::refine`] goes over the stored votes again. Equal calls give equal results.
+//!
+//! What is not counted, without error: objects at unknown landmarks of a closed cell, without a landmark, of zero
+//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report whose `seq` and capture time are
+//! not newer than the last of its vehicle is rejected. Of several objects that one report has at one landmark, the most
+//! confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
+
+mod calibration;
+mod config;
+mod confusion;
+mod model;
+mod paper;
+mod visibility;
+mod weighted;
+
+use std::collections::BTreeMap;
+
+pub use calibration::{Calibration, Weights};
+pub use config::{PaperConfig, VoteConfig, VoteMode, WeightedConfig};
+pub use paper::{PaperTally, REPUTATION_RANGE};
+pub use visibility::{falling as falling_visibility, paper as paper_visibility};
+
+use crate::geometry::Pose;
+use crate::landmark::Landmark;
+use crate::names::{Label, LandmarkId, NodeName};
+use crate::reputation::{Evidence, ReputationLedger};
+use crate::time::Timestamp;
+use crate::wire::{Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict};
+
+use nalgebra::Point2;
+use weighted::WeightedTally;
+
+#[derive(Debug, Clone)]
+enum Tally {
+    Paper(PaperTally),
+    Weighted(Box<WeightedTally>),
+}
+
+/// What a round came to.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Round {
+    /// One verdict for every landmark of a closed cell; in an open cell, for every landmark with news.
+    pub verdicts: Vec<Verdict>,
+    /// Votes of which it has been settled whether they were right, for the ledger.
+    pub evidence: Vec<Evidence>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Heard {
+    seq: u64,
+    captured_at: Timestamp,
+    frames: u32,
+}
+
+/// The voting machine of a cell.
+#[derive(Debug, Clone)]
+pub struct Vote {
+    config: VoteConfig,
+    open: bool,
+    landmarks: BTreeMap<LandmarkId, Option<Landmark>>,
+    arrivals: std::collections::VecDeque<LandmarkId>,
+    heard: BTreeMap<NodeName, Heard>,
+    tally: Tally,
+    ignored: u64,
+}
+
+impl Vote {
+    /// A machine for `landmarks`; without any, the cell is open and takes landmarks from the reports as they appear.
+    pub fn new(config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
+        let mut tally = match config.mode {
+            VoteMode::Paper => Tally::Paper(PaperTally::new(config.paper.clone())),
+            VoteMode::Weighted => Tally::Weighted(Box::new(WeightedTally::new(config.weighted.clone()))),
+        };
+        for landmark in &landmarks {
+            match &mut tally {
+                Tally::Paper(tally) => tally.expect(landmark.id.clone()),
+                Tally::Weighted(tally) => tally.expect(landmark.id.clone()),
+            }
+        }
+        let open = landmarks.is_empty();
+        let landmarks = landmarks.into_iter().map(|l| (l.id.clone(), Some(l))).collect();
+        let arrivals = std::collections::VecDeque::new();
+        Self { config, open, landmarks, arrivals, heard: BTreeMap::new(), tally, ignored: 0 }
+    }
+
+    /// Counts the votes of a report that was received at `received_at`.
+    ///
+    /// # Errors
+    /// The reason why the report was not used; nothing has changed then.
+    pub fn observe(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
+        report.validate(&Limits::default())?;
+        let frames = match self.heard.get(&report.node) {
+            // A restarted node counts from the start again, but time goes on.
+            Some(last) if report.captured_at_us < last.captured_at => return Err(RejectReason::OutOfOrder),
+            Some(last) if report.captured_at_us == last.captured_at && report.seq <= last.seq => {
+                return Err(RejectReason::OutOfOrder);
+            }
+            Some(last) if report.seq == last.seq => return Err(RejectReason::OutOfOrder),
+            Some(last) => last.frames,
+            None if self.heard.len() >= self.config.max_vehicles => return Err(RejectReason::TooManyVehicles),
+            None => 0,
+        };
+        let heard = Heard { seq: report.seq, captured_at: report.captured_at_us, frames: frames.saturating_add(1) };
+        self.heard.insert(report.node.clone(), heard);
+        let mut objects: Vec<&PerceivedObject> = report.objects.iter().collect();
+        if matches!(self.tally, Tally::Weighted(_)) {
+            objects = self.one_per_landmark(objects);
+        }
+        let pose = report.pose.map(Pose::from);
+        for object in objects {
+            if !self.count(report, object, pose, received_at) {
+                self.ignored += 1;
+            }
+        }
+        Ok(())
+    }
+
+    /// The most confident object at each landmark, the first on a tie, by landmark.
+    fn one_per_landmark<'a>(&mut self, objects: Vec<&'a PerceivedObject>) -> Vec<&'a PerceivedObject> {
+        let mut best: BTreeMap<Option<&LandmarkId>, &PerceivedObject> = BTreeMap::new();
+        let all = objects.len();
+        for object in objects {
+            let place = best.entry(object.landmark.as_ref()).or_insert(object);
+            if object.confidence > place.confidence {
+                *place = object;
+            }
+        }
+        self.ignored += (all - best.len()) as u64;
+        best.into_values().collect()
+    }
+
+    fn count(&mut self, report: &ObjectReport, object: &PerceivedObject, pose: Option<Pose>, at: Timestamp) -> bool {
+        let Some(landmark) = object.landmark.as_ref().filter(|_| object.confidence > 0.0) else { return false };
+        let known = self.landmarks.get(landmark);
+        if known.is_none() && !self.open {
+            return false;
+        }
+        let place = known.and_then(Option::as_ref);
+        let position = place.map_or(Point2::new(object.x_m, object.y_m), |l| l.position);
+        let synonym = place.and_then(|l| l.synonyms.iter().find(|s| s.from == object.label));
+        let label = synonym.map_or(object.label.clone(), |s| s.label.clone());
+        let geometry = pose.map(|p| p.range_bearing(&position));
+        let max_range = self.config.max_range_m;
+        if geometry.is_some_and(|(distance, _)| distance > max_range) {
+            return false;
+        }
+        if let Tally::Weighted(tally) = &self.tally
+            && !tally.has_room_for(&label, self.config.max_labels)
+        {
+            return false;
+        }
+        if known.is_none() {
+            self.open_landmark(landmark);
+        }
+        match &mut self.tally {
+            Tally::Paper(tally) => {
+                let k = geometry.map_or(1.0, |(d, a)| visibility::paper(&self.config.paper, max_range, d, a));
+                tally.add(landmark, &report.node, &label, object.confidence, k);
+            }
+            Tally::Weighted(tally) => {
+                let k = geometry.map_or(1.0, |(d, a)| visibility::falling(&self.config.weighted, max_range, d, a));
+                tally.cast(landmark, &report.node, (&label, object.confidence, k), at);
+            }
+        }
+        true
+    }
+
+    fn open_landmark(&mut self, landmark: &LandmarkId) {
+        if self.arrivals.len() >= self.config.max_landmarks
+            && let Some(oldest) = self.arrivals.pop_front()
+        {
+            self.landmarks.remove(&oldest);
+            match &mut self.tally {
+                Tally::Paper(tally) => tally.forget(&oldest),
+                Tally::Weighted(tally) => tally.forget(&oldest),
+            }
+        }
+        self.arrivals.push_back(landmark.clone());
+        self.landmarks.insert(landmark.clone(), None);
+    }
+
+    /// Whether a vehicle has sent a packet's worth of frames since the last verdict (`paper` mode).
+    pub fn is_packet_complete(&self) -> bool {
+        self.heard.values().any(|h| h.frames >= self.config.paper.frames_per_verdict)
+    }
+
+    /// Ends the round: judges what changed.
+    pub fn close(&mut self, now: Timestamp) -> Round {
+        self.heard.values_mut().for_each(|h| h.frames = 0);
+        let (changed, evidence) = match &mut self.tally {
+            Tally::Paper(tally) => (tally.close(), Vec::new()),
+            Tally::Weighted(tally) => (tally.close(now), tally.take_evidence()),
+        };
+        let verdicts = if self.open {
+            changed.iter().filter_map(|landmark| self.verdict(landmark)).collect()
+        } else {
+            self.verdicts()
+        };
+        Round { verdicts, evidence }
+    }
+
+    fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
+        match &self.tally {
+            Tally::Paper(tally) => tally.verdict(landmark),
+            Tally::Weighted(tally) => tally.verdict(landmark),
+        }
+    }
+
+    /// The verdict of every landmark as of the last round, by landmark.
+    pub fn verdicts(&self) -> Vec<Verdict> {
+        self.landmarks.keys().filter_map(|landmark| self.verdict(landmark)).collect()
+    }
+
+    /// Goes over the stored votes `passes` times, from equal trust, and returns the verdict of every landmark.
+    ///
+    /// Dawid & Skene (1979) with the priors of the online machine; it does not depend on the order of arrival. In
+    /// `paper` mode there is nothing to refine.
+    pub fn refine(&mut self, passes: u32) -> Vec<Verdict> {
+        if let Tally::Weighted(tally) = &mut self.tally {
+            tally.refine(passes);
+        }
+        self.verdicts()
+    }
+
+    /// How far each vehicle is trusted.
+    pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
+        match &self.tally {
+            Tally::Paper(tally) => tally.reputations(),
+            Tally::Weighted(tally) => tally.reputations(),
+        }
+    }
+
+    /// Starts from what a ledger knows, after a restart or a change of aggregator; without effect in `paper` mode.
+    pub fn adopt(&mut self, ledger: &ReputationLedger) {
+        if let Tally::Weighted(tally) = &mut self.tally {
+            tally.adopt(ledger);
+        }
+    }
+
+    /// Objects that voted for nothing so far; see the module's documentation.
+    pub fn ignored(&self) -> u64 {
+        self.ignored
+    }
+}
+
+/// A verdict with `shown` or else the label of the highest score, the first in alphabetical order on a tie.
+///
+/// With hysteresis the shown label may for a while not be the highest; its margin is negative then.
+fn verdict(
+    landmark: LandmarkId,
+    votes: BTreeMap<Label, f64>,
+    shown: Option<Label>,
+    contributors: Vec<NodeName>,
+) -> Verdict {
+    let label = shown.or_else(|| best(&votes).cloned());
+    let score = label.as_ref().and_then(|l| votes.get(l)).copied().unwrap_or(0.0);
+    let others = votes.iter().filter(|(l, _)| Some(*l) != label.as_ref()).map(|(_, s)| *s);
+    let margin = score - others.fold(0.0, f64::max);
+    Verdict { landmark, label, score, margin, votes, contributors }
+}
+
+/// The label of the highest score, the first in alphabetical order on a tie.
+fn best(votes: &BTreeMap<Label, f64>) -> Option<&Label> {
+    let mut best: Option<(&Label, f64)> = None;
+    for (label, &score) in votes {
+        if best.is_none_or(|(_, most)| score > most) {
+            best = Some((label, score));
+        }
+    }
+    best.map(|(label, _)| label)
+}

@@ -1,0 +1,171 @@
+//! Settings of VOTE.
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::{ConfigError, check_range};
+
+/// How votes become verdicts.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum VoteMode {
+    /// Learned reputation × calibrated confidence × visibility; the default.
+    #[default]
+    Weighted,
+    /// The paper's formulas to the letter.
+    Paper,
+}
+
+/// Settings of VOTE.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct VoteConfig {
+    /// Which tally; default `weighted`.
+    pub mode: VoteMode,
+    /// Distance in metres beyond which a vote is ignored; default 2.54 (100 in, the paper's d_max).
+    pub max_range_m: f64,
+    /// Settings of `paper` mode.
+    pub paper: PaperConfig,
+    /// Settings of `weighted` mode.
+    pub weighted: WeightedConfig,
+    /// Most landmarks; an open cell forgets the oldest beyond it. Default 1024. Bounds memory.
+    pub max_landmarks: usize,
+    /// Most vehicles; reports of others are rejected. Default 256. Bounds memory.
+    pub max_vehicles: usize,
+    /// Most distinct labels of the cell; votes for others are ignored. Default 256. Bounds memory.
+    pub max_labels: usize,
+}
+
+impl Default for VoteConfig {
+    fn default() -> Self {
+        Self {
+            mode: VoteMode::Weighted,
+            max_range_m: 2.54,
+            paper: PaperConfig::default(),
+            weighted: WeightedConfig::default(),
+            max_landmarks: 1024,
+            max_vehicles: 256,
+            max_labels: 256,
+        }
+    }
+}
+
+impl VoteConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the first value out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
+        check_range("max_landmarks", self.max_landmarks as f64, 1.0, 1e6)?;
+        check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e5)?;
+        check_range("max_labels", self.max_labels as f64, 1.0, 65_535.0)?;
+        self.paper.validate().map_err(|e| e.within("paper"))?;
+        self.weighted.validate().map_err(|e| e.within("weighted"))
+    }
+}
+
+/// Settings of `paper` mode.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PaperConfig {
+    /// Weight p_d of distance against angle, 0 to 1; default 0.7.
+    pub distance_weight: f64,
+    /// Reputation r_v at the start; default 0.5.
+    pub initial_reputation: f64,
+    /// Change of r_v after a verdict in which every vote was right; default 0.01.
+    pub step: f64,
+    /// Frames of each vehicle between verdicts; default 5. A driver closes a round when a vehicle has sent so many.
+    pub frames_per_verdict: u32,
+}
+
+impl Default for PaperConfig {
+    fn default() -> Self {
+        Self { distance_weight: 0.7, initial_reputation: 0.5, step: 0.01, frames_per_verdict: 5 }
+    }
+}
+
+impl PaperConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        check_range("distance_weight", self.distance_weight, 0.0, 1.0)?;
+        check_range("initial_reputation", self.initial_reputation, 0.3, 1.0)?;
+        check_range("step", self.step, 0.0, 1.0)?;
+        check_range("frames_per_verdict", f64::from(self.frames_per_verdict), 1.0, 1e6)
+    }
+}
+
+/// Settings of `weighted` mode. Counts of votes are pseudo-counts: how much data it takes to outweigh an assumption.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct WeightedConfig {
+    /// Seconds that a vote counts; default 2. Longer survives gaps, shorter follows change. A vehicle adds to its
+    /// evidence about a landmark once in so many seconds however fast it publishes.
+    pub freshness_s: f64,
+    /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion against its own record of one
+    /// class; default 5. Less learns classes faster from noise.
+    pub class_prior_votes: f64,
+    /// Weight, in votes, of the fleet's reliability against the vehicle's own; default 8.
+    pub vehicle_prior_votes: f64,
+    /// How often a vehicle is assumed right before there is any evidence, 0.5 to 1; default 0.7.
+    pub assumed_accuracy: f64,
+    /// Share of the fleet's confusion, against all wrong labels alike, in what is assumed of an error; default 0.5.
+    pub confusion_sharing: f64,
+    /// Number of verdicts that the shares of the classes are trusted like; default 100. More favours frequent labels.
+    pub class_share_verdicts: f64,
+    /// Votes over which the memory of a vehicle fades to 1/e; default 500. Shorter notices a change of mind sooner.
+    pub memory_votes: f64,
+    /// Votes until a vehicle counts as proven; default 10.
+    pub probation_votes: f64,
+    /// Most that newcomers together weigh against the proven vehicles at a landmark; default 0.5. Bounds what an
+    /// attacker gains by rejoining under new names; larger lets newcomers in sooner.
+    pub newcomer_share: f64,
+    /// Probability by which a label must lead the one shown to replace it; default 0.1. More flickers less, reacts later.
+    pub hysteresis: f64,
+    /// Angle off the camera's axis in radians at which visibility has halved; default 0.8.
+    pub half_visibility_rad: f64,
+    /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the square of the distance.
+    pub visibility_at_max_range: f64,
+    /// Older landmarks that are judged again per fresh vote, in votes; default 8. More settles sooner, costs more.
+    pub revisit_votes: f64,
+    /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 50.
+    pub calibration_votes: f64,
+}
+
+impl Default for WeightedConfig {
+    fn default() -> Self {
+        Self {
+            freshness_s: 2.0,
+            class_prior_votes: 5.0,
+            vehicle_prior_votes: 8.0,
+            assumed_accuracy: 0.7,
+            confusion_sharing: 0.5,
+            class_share_verdicts: 100.0,
+            memory_votes: 500.0,
+            probation_votes: 10.0,
+            newcomer_share: 0.5,
+            hysteresis: 0.1,
+            half_visibility_rad: 0.8,
+            visibility_at_max_range: 0.3,
+            revisit_votes: 8.0,
+            calibration_votes: 50.0,
+        }
+    }
+}
+
+impl WeightedConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        check_range("freshness_s", self.freshness_s, 1e-3, 1e12)?;
+        check_range("class_prior_votes", self.class_prior_votes, 1e-3, 1e6)?;
+        check_range("vehicle_prior_votes", self.vehicle_prior_votes, 1e-3, 1e6)?;
+        check_range("assumed_accuracy", self.assumed_accuracy, 0.5, 0.999)?;
+        check_range("confusion_sharing", self.confusion_sharing, 0.0, 1.0)?;
+        check_range("class_share_verdicts", self.class_share_verdicts, 2.0, 1e9)?;
+        check_range("memory_votes", self.memory_votes, 1.0, 1e9)?;
+        check_range("probation_votes", self.probation_votes, 0.0, 1e6)?;
+        check_range("newcomer_share", self.newcomer_share, 0.0, 1e9)?;
+        check_range("hysteresis", self.hysteresis, 0.0, 0.99)?;
+        check_range("half_visibility_rad", self.half_visibility_rad, 1e-3, 10.0)?;
+        check_range("visibility_at_max_range", self.visibility_at_max_range, 1e-3, 1.0)?;
+        check_range("revisit_votes", self.revisit_votes, 0.0, 1e6)?;
+        check_range("calibration_votes", self.calibration_votes, 1e-3, 1e9)
+    }
+}

@@ -1,0 +1,100 @@
+//! The paper's tally, to the letter.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::config::PaperConfig;
+use crate::names::{Label, LandmarkId, NodeName};
+use crate::wire::{Reputation, Verdict};
+
+/// Lowest and highest reputation: `cap(…, 30, 100)` read as percent, on r_v after the change was added.
+///
+/// As printed the cap is on Δr_v, so that every verdict would add at least 30 to a reputation that starts at 0.5;
+/// the text says that the *scores* remain between 30 and 100.
+pub const REPUTATION_RANGE: (f64, f64) = (0.30, 1.00);
+
+#[derive(Debug, Clone)]
+struct Vehicle {
+    reputation: f64,
+    correct: u64,
+    incorrect: u64,
+    votes: Vec<(LandmarkId, Label)>,
+}
+
+/// S(ρ,l) = Σ_v Σ_ω [l_ω = l] r_v c_ω k(ρ,v), never cleared; λ_ρ = argmax_l S(ρ,l); r_v += Δr_v after each verdict.
+#[derive(Debug, Clone)]
+pub struct PaperTally {
+    config: PaperConfig,
+    scores: BTreeMap<LandmarkId, (BTreeMap<Label, f64>, BTreeSet<NodeName>)>,
+    vehicles: BTreeMap<NodeName, Vehicle>,
+    touched: BTreeSet<LandmarkId>,
+}
+
+impl PaperTally {
+    /// An empty tally.
+    pub fn new(config: PaperConfig) -> Self {
+        Self { config, scores: BTreeMap::new(), vehicles: BTreeMap::new(), touched: BTreeSet::new() }
+    }
+
+    /// Makes a location known, so that it has a verdict even without votes.
+    pub fn expect(&mut self, landmark: LandmarkId) {
+        self.scores.entry(landmark).or_default();
+    }
+
+    /// Forgets a location.
+    pub fn forget(&mut self, landmark: &LandmarkId) {
+        self.scores.remove(landmark);
+    }
+
+    /// Adds r_v · c_ω · k for one detection.
+    pub fn add(&mut self, landmark: &LandmarkId, node: &NodeName, label: &Label, confidence: f64, visibility: f64) {
+        let initial = self.config.initial_reputation;
+        let vehicle = self.vehicles.entry(node.clone()).or_insert_with(|| Vehicle {
+            reputation: initial,
+            correct: 0,
+            incorrect: 0,
+            votes: Vec::new(),
+        });
+        let (scores, contributors) = self.scores.entry(landmark.clone()).or_default();
+        *scores.entry(label.clone()).or_insert(0.0) += vehicle.reputation * confidence * visibility;
+        contributors.insert(node.clone());
+        self.touched.insert(landmark.clone());
+        vehicle.votes.push((landmark.clone(), label.clone()));
+    }
+
+    /// The label with the most score at a location, the first in alphabetical order on a tie.
+    pub fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
+        let (scores, contributors) = self.scores.get(landmark)?;
+        Some(super::verdict(landmark.clone(), scores.clone(), None, contributors.iter().cloned().collect()))
+    }
+
+    /// Ends a round: changes every vehicle's reputation by step · (correct − incorrect) / objects over its votes since
+    /// the last verdict, and returns the locations that were voted on.
+    pub fn close(&mut self) -> BTreeSet<LandmarkId> {
+        let touched = std::mem::take(&mut self.touched);
+        let labels: BTreeMap<_, _> = touched
+            .iter()
+            .filter_map(|landmark| {
+                self.scores.get(landmark).map(|(scores, _)| (landmark, super::best(scores).cloned()))
+            })
+            .collect();
+        for vehicle in self.vehicles.values_mut().filter(|v| !v.votes.is_empty()) {
+            let objects = vehicle.votes.len() as u64;
+            let right =
+                |(landmark, label): &&(LandmarkId, Label)| labels.get(landmark).and_then(Option::as_ref) == Some(label);
+            let correct = vehicle.votes.iter().filter(right).count() as u64;
+            let balance = (2.0 * correct as f64 - objects as f64) / objects as f64;
+            let (low, high) = REPUTATION_RANGE;
+            vehicle.reputation = (vehicle.reputation + self.config.step * balance).clamp(low, high);
+            vehicle.correct += correct;
+            vehicle.incorrect += objects - correct;
+            vehicle.votes.clear();
+        }
+        touched
+    }
+
+    /// Every vehicle's reputation.
+    pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
+        let entry = |v: &Vehicle| Reputation { score: v.reputation, correct: v.correct, incorrect: v.incorrect };
+        self.vehicles.iter().map(|(node, v)| (node.clone(), entry(v))).collect()
+    }
+}

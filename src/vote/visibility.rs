@@ -1,0 +1,42 @@
+//! How well a vehicle sees a landmark.
+
+use std::f64::consts::{LN_2, TAU};
+
+use super::config::{PaperConfig, WeightedConfig};
+
+/// The paper's visibility, equation k(ρ,v) = p_d (1 − d/d_max) + (1 − p_d) θ/360°: it *grows* off-axis, as printed.
+///
+/// `angle_rad` is the deviation from the camera's axis; its sign is ignored.
+pub fn paper(config: &PaperConfig, max_range_m: f64, distance_m: f64, angle_rad: f64) -> f64 {
+    let p = config.distance_weight;
+    p * (1.0 - distance_m / max_range_m) + (1.0 - p) * (angle_rad.abs() / TAU)
+}
+
+/// Visibility in 0 to 1 that falls with the squared distance and, as a bell, off-axis.
+pub fn falling(config: &WeightedConfig, max_range_m: f64, distance_m: f64, angle_rad: f64) -> f64 {
+    let distance = (distance_m / max_range_m).clamp(0.0, 1.0);
+    let angle = angle_rad / config.half_visibility_rad;
+    (1.0 - (1.0 - config.visibility_at_max_range) * distance * distance) * (-LN_2 * angle * angle).exp()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_papers_visibility_is_the_printed_formula() {
+        let config = PaperConfig::default();
+        let k = paper(&config, 2.54, 1.27, -90f64.to_radians());
+        assert!((k - (0.7 * 0.5 + 0.3 * 0.25)).abs() < 1e-12);
+    }
+
+    #[test]
+    fn visibility_falls_off_axis_and_with_distance() {
+        let config = WeightedConfig::default();
+        assert_eq!(falling(&config, 2.0, 0.0, 0.0), 1.0);
+        assert!((falling(&config, 2.0, 0.0, 0.8) - 0.5).abs() < 1e-12);
+        assert!((falling(&config, 2.0, 2.0, 0.0) - 0.3).abs() < 1e-12);
+        assert!(falling(&config, 2.0, 1.0, 0.3) < falling(&config, 2.0, 0.5, 0.3));
+        assert_eq!(falling(&config, 2.0, 1.0, 0.3), falling(&config, 2.0, 1.0, -0.3));
+    }
+}
