@@ -74,6 +74,9 @@ const CONFIDENCES: (f64, f64) = (0.5, 0.99);
 /// says how far to trust its corners: it rises from 0.5 for modules of one pixel along the code's shortest side to 0.99
 /// for modules of four pixels.
 ///
+/// The lower right corner has no finder pattern and is extrapolated by the decoder: in codes of version 1 it is typically
+/// off by 0.45 modules, the other corners by 0.2.
+///
 /// Texts that could not be a label are left out: empty, longer than 64 bytes, not UTF-8, or with control characters.
 pub struct PlacardDetector {
     config: PlacardConfig,
@@ -184,7 +187,7 @@ fn gray(frame: &Frame) -> Result<Mat, DetectError> {
 
 fn enlarge(image: &Mat, pass: Pass) -> opencv::Result<Mat> {
     if pass.stretch_x == 1.0 && pass.stretch_y == 1.0 {
-        return Ok(image.clone());
+        return image.try_clone();
     }
     let mut enlarged = Mat::default();
     let (size, interpolation) = (Size::default(), imgproc::INTER_CUBIC);
@@ -197,3 +200,6 @@ fn paint_over(image: &mut Mat, code: &Code) -> opencv::Result<()> {
         code.corners.iter().map(|c| Point::new(c.x.round() as i32, c.y.round() as i32)).collect();
     imgproc::fill_convex_poly_def(image, &corners, Scalar::all(255.0))
 }
+
+#[cfg(test)]
+mod tests;
