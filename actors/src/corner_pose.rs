@@ -31,6 +31,20 @@ pub fn locate_target(
     side_m: f64,
     intrinsics: &Intrinsics,
 ) -> Result<Point3<f64>, CornerPoseError> {
+    match solve(corners, side_m, intrinsics) {
+        Err(CornerPoseError::NoSolution) => solve(&unsymmetric(corners), side_m, intrinsics),
+        outcome => outcome,
+    }
+}
+
+/// The corners with one moved by a thousandth of a pixel: OpenCV finds no finite pose for many that mirror each other,
+/// which corners in whole pixels often do.
+fn unsymmetric(corners: &[Point2<f64>; 4]) -> [Point2<f64>; 4] {
+    let [first, second, third, fourth] = *corners;
+    [Point2::new(first.x + 1e-3, first.y + 2e-3), second, third, fourth]
+}
+
+fn solve(corners: &[Point2<f64>; 4], side_m: f64, intrinsics: &Intrinsics) -> Result<Point3<f64>, CornerPoseError> {
     let half = side_m / 2.0;
     // The target's frame: x right, y up, z out of its front.
     let target: Vector<Point3d> = [(-half, half), (half, half), (half, -half), (-half, -half)]
@@ -102,6 +116,17 @@ mod tests {
         seen[2].y -= 0.5;
         let found = locate_target(&seen, 0.05, &camera()).unwrap();
         assert!((found.z - middle.z).abs() < 0.01, "{found}");
+    }
+
+    #[test]
+    fn corners_that_mirror_each_other_have_a_position() {
+        for square in [
+            [(154.0, 210.0), (216.0, 210.0), (216.0, 270.0), (154.0, 270.0)],
+            [(326.0, 210.0), (380.0, 211.0), (380.0, 269.0), (326.0, 270.0)],
+        ] {
+            let found = locate_target(&square.map(|(x, y)| Point2::new(x, y)), 0.05, &camera()).unwrap();
+            assert!((0.4..0.5).contains(&found.z), "{found}");
+        }
     }
 
     #[test]

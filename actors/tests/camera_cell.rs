@@ -56,10 +56,10 @@ async fn a_plate_goes_from_pixels_to_the_map_though_detector_and_projector_are_k
 
     let plate = scene.spots[0].truth.as_deref().unwrap();
     plate_on_a_new_map(&vehicle, plate).await;
-    for kill in [&(|| vehicle.seats().detector.holder().unwrap().kill()) as &dyn Fn(), &|| {
-        vehicle.seats().projector.holder().unwrap().kill()
-    }] {
-        kill();
+    let detector = vehicle.seats().detector.holder().unwrap().get_cell();
+    let projector = vehicle.seats().projector.holder().unwrap().get_cell();
+    for part in [detector, projector] {
+        part.kill();
         more_frames(&vehicle).await;
         plate_on_a_new_map(&vehicle, plate).await;
     }

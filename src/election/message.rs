@@ -21,7 +21,7 @@ pub const MAX_MESSAGE_BYTES: usize = 1200;
 /// Who sent it must be proven by the transport: the election believes [`Self::from`].
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 pub struct ElectionMessage {
-    /// Major version of the message, [`SCHEMA_VERSION`].
+    /// Major version of the message, [`wire::SCHEMA_VERSION`].
     pub schema: u32,
     /// The sender.
     pub from: NodeName,
