@@ -68,6 +68,7 @@ pub fn main() -> ExitCode {
         Some(Command::Demo(arguments)) => demo::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
+        #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
         Some(Command::Schema) => schema::print(),
     };

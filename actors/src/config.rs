@@ -24,7 +24,7 @@ use crate::gateway::MqttConfig;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NodeConfig {
-    /// Name of the node, unique in its cell. Default: none, and it must be given.
+    /// Name of the node, unique in its cell. Default `edge` for an edge; a vehicle's must be given.
     pub name: Option<NodeName>,
     /// Name of the cell; nodes of other cells are not heard. Default `cell`.
     pub cell: NodeName,
@@ -113,7 +113,10 @@ impl NodeConfig {
             figment = figment.merge(Toml::file_exact(path));
         }
         let figment = figment.merge(Env::prefixed("ECOD_").split("__")).merge(Serialized::defaults(flags));
-        let config: Self = figment.extract().map_err(|errors| LoadError::Malformed(describe(errors)))?;
+        let mut config: Self = figment.extract().map_err(|errors| LoadError::Malformed(describe(errors)))?;
+        if config.role == Role::Edge && config.name.is_none() {
+            config.name = Some(NodeName::from_static("edge"));
+        }
         config.validate()?;
         Ok(config)
     }

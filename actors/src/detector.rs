@@ -118,8 +118,9 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
     let mut skipped = 0;
     while let Ok(turn) = Arc::clone(&turns).acquire_owned().await {
         let Some(frame) = capture.next_frame().await else { return };
-        counters.add(Event::FrameSkipped, capture.skipped() - skipped);
-        skipped = capture.skipped();
+        let total = capture.skipped();
+        counters.add(Event::FrameSkipped, total - skipped);
+        skipped = total;
         if detector.cast(DetectorMessage::Look { frame, turn }).is_err() {
             return;
         }

@@ -8,6 +8,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
@@ -99,7 +100,10 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn take(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) {
-        let superseded = self.newest.borrow().as_ref().is_some_and(|newest| order(map) <= order(&newest.map));
+        let superseded =
+            self.newest.borrow().as_ref().is_some_and(|newest| {
+                order(map) <= order(&newest.map) && received_at.since(newest.received_at) < MEMORY
+            });
         if superseded {
             self.counters.reject(RejectReason::Superseded);
             return;
@@ -130,6 +134,10 @@ impl FollowerState {
         }
     }
 }
+
+/// How long a newest map outranks others after it came: an aggregator that starts anew with a clock set back, or a map
+/// from a stranger with a huge epoch, silences the rest for no longer than this.
+const MEMORY: Duration = Duration::from_secs(3);
 
 /// Maps are ordered by epoch, then aggregator, then round.
 fn order(map: &GlobalMap) -> (u64, &NodeName, u64) {

@@ -12,6 +12,7 @@ use ecod::aggregator::Aggregator;
 use ecod::time::Timestamp;
 use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::task::AbortHandle;
 
 use crate::clock;
 use crate::counters::Counters;
@@ -50,6 +51,7 @@ pub struct FuserState {
     gateway: Seat<GatewayMessage>,
     counters: Arc<Counters>,
     alarm: Timestamp,
+    timer: Option<AbortHandle>,
 }
 
 impl Actor for Fuser {
@@ -63,7 +65,7 @@ impl Actor for Fuser {
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let FuserArguments { aggregator, gateway, counters } = arguments;
-        let mut state = FuserState { aggregator, gateway, counters, alarm: Timestamp(u64::MAX) };
+        let mut state = FuserState { aggregator, gateway, counters, alarm: Timestamp(u64::MAX), timer: None };
         state.set_alarm(&myself);
         Ok(state)
     }
@@ -110,7 +112,10 @@ impl FuserState {
         let deadline = self.aggregator.deadline();
         if deadline < self.alarm {
             self.alarm = deadline;
-            myself.send_after(deadline.since(clock::now()), || FuserMessage::CloseRound);
+            let timer = myself.send_after(deadline.since(clock::now()), || FuserMessage::CloseRound);
+            if let Some(superseded) = self.timer.replace(timer.abort_handle()) {
+                superseded.abort();
+            }
         }
     }
 }

@@ -4,10 +4,11 @@ use std::fs;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Args;
 use ecod::testbed::Scene;
 use nalgebra::Point2;
+use tokio::signal::unix::{SignalKind, signal};
 
 use super::Failure;
 use super::testbed::{Results, read, select, write};
@@ -42,7 +43,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let mut results = Vec::with_capacity(scenes.len());
     let count = scenes.len();
     for (index, scene) in scenes.into_iter().enumerate() {
-        let directory = arguments.out.join(&scene.name);
+        let directory = arguments.out.join(file_name(&scene.name));
         let demo = Demo {
             program: &program,
             file: &file,
@@ -52,9 +53,9 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             directory: &directory,
         };
         println!("[{}/{count}] {}: starting {} processes", index + 1, scene.name, scene.cavs.len() + 1);
-        let outcome = runtime.block_on(demo.run(|progress| {
+        let outcome = runtime.block_on(until_signalled(demo.run(|progress| {
             println!("        {:2.0} s, {} reports", progress.elapsed.as_secs_f64(), progress.reports);
-        }));
+        })));
         let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
         println!(
             "        {} maps, {} missed by a vehicle, {:.1} ms from the oldest capture in a map to its receipt (median)",
@@ -62,7 +63,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             outcome.missed,
             outcome.median_age.as_secs_f64() * 1e3,
         );
-        let picture = arguments.out.join(format!("{}.svg", scene.name));
+        let picture = arguments.out.join(format!("{}.svg", file_name(&scene.name)));
         let svg = birdseye(&testbed, scene, &detections(&outcome), outcome.last_map.as_ref()).context("picture")?;
         fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
         results.push(outcome.result);
@@ -71,6 +72,22 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     write(&arguments.out.join("result.json"), &Results { scenes: &results })?;
     println!("pictures, results, configurations and logs: {}", arguments.out.display());
     Ok(())
+}
+
+/// Runs a scene; SIGINT and SIGTERM end it and, with it, its processes.
+async fn until_signalled(scene: impl Future<Output = anyhow::Result<DemoResult>>) -> anyhow::Result<DemoResult> {
+    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    tokio::select! {
+        outcome = scene => outcome,
+        _ = interrupt.recv() => bail!("interrupted"),
+        _ = terminate.recv() => bail!("terminated"),
+    }
+}
+
+/// A scene's name as the name of a file.
+fn file_name(scene: &str) -> String {
+    let allowed = |c: char| if c.is_alphanumeric() || c == '-' { c } else { '_' };
+    scene.chars().map(allowed).collect()
 }
 
 fn vehicles(scenes: &[&Scene]) -> String {

@@ -31,7 +31,12 @@ impl NodeProcess {
         let text = toml::to_string(config).context("the configuration cannot be written as TOML")?;
         fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))?;
         let output = File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
-        let child = Command::new(program)
+        let mut command = Command::new(program);
+        // The node is what its file says, whatever the environment says to others.
+        for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+            command.env_remove(key);
+        }
+        let child = command
             .arg("--config")
             .arg(&file)
             .stdin(Stdio::null())

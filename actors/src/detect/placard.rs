@@ -23,7 +23,7 @@ pub struct PlacardConfig {
     /// Enlargements of the frame to read, cheapest first; default 1x1, 2x2 and 4x2. More passes read smaller and more
     /// slanted codes; the time of a pass grows with its area.
     pub passes: Vec<Pass>,
-    /// Most codes to read in one frame, 1 to 255; default 8. The passes end early once they are found.
+    /// Most codes to read in one frame, 1 to 255; default 32. The passes end early once they are found.
     pub max_codes: u8,
 }
 
@@ -40,7 +40,7 @@ pub struct Pass {
 impl Default for PlacardConfig {
     fn default() -> Self {
         let pass = |stretch_x, stretch_y| Pass { stretch_x, stretch_y };
-        Self { passes: vec![pass(1.0, 1.0), pass(2.0, 2.0), pass(4.0, 2.0)], max_codes: 8 }
+        Self { passes: vec![pass(1.0, 1.0), pass(2.0, 2.0), pass(4.0, 2.0)], max_codes: 32 }
     }
 }
 
