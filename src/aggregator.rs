@@ -70,7 +70,7 @@ impl Aggregator {
     /// Takes a report received at `now`; returns the map if the round closes with it.
     ///
     /// # Errors
-    /// The reason for which the report was not used; nothing was changed by it.
+    /// The reason for which the report was not used; no map is changed by it, at most the estimate of its vehicle's clock.
     pub fn report(&mut self, report: &ObjectReport, now: Timestamp) -> Result<Option<GlobalMap>, RejectReason> {
         let captured_at = self.window.admit(report, now)?;
         self.pace.observe(report, captured_at);

@@ -9,7 +9,8 @@ use ecod::time::Timestamp;
 ///
 /// The wall clock is read once, at the first call; from then on time passes by the monotonic clock. A step of the wall
 /// clock after that (NTP's first synchronisation, a daylight change by hand) is therefore not followed until the node
-/// restarts; aggregators estimate each vehicle's offset, so that a constant error does not matter to them.
+/// restarts; aggregators estimate each vehicle's offset, so that a
+/// constant error up to their `max_clock_offset_s` does not matter to them.
 pub fn now() -> Timestamp {
     static ANCHOR: OnceLock<(Instant, Timestamp)> = OnceLock::new();
     let (started, wall) = ANCHOR.get_or_init(|| {

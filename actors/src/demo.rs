@@ -53,7 +53,7 @@ pub struct Demo<'a> {
 pub struct DemoResult {
     /// Accuracies.
     pub result: SceneResult,
-    /// Every map that at least one vehicle got, by epoch and round, with the vehicles that got it.
+    /// Maps that at least one vehicle got.
     pub maps: usize,
     /// Maps that a vehicle of the cell did not get.
     pub missed: usize,

@@ -36,7 +36,7 @@ impl ReportKind {
 
 /// A checked message of the cell, or news about a link.
 ///
-/// The same message may arrive over several links. Who drops the second: the report window, by node and `seq`; receivers
+/// The same message may arrive over several links. Who drops the second: the report window, by node and capture time; receivers
 /// of maps, verdicts and reputations, by epoch and round; a status says the same twice.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Incoming {

@@ -4,8 +4,6 @@ mod sheet;
 #[cfg(test)]
 mod tests;
 
-use std::f64::consts::FRAC_PI_2;
-
 use ecod::geometry::Pose;
 use ecod::names::{Label, LandmarkId, NodeName};
 use ecod::testbed::{Cav, Scene, Spot, Testbed};
@@ -109,7 +107,7 @@ impl Judgement {
             Self::Right => group.add(ring()),
             Self::Wrong => {
                 let cross = format!("M{} {}l14 14m0 -14l-14 14", round(x - 7.0), round(y - 7.0));
-                group.set("class", "wrong").add(Path::new().set("d", cross))
+                group.add(Path::new().set("d", cross))
             }
             Self::Unknown => group.add(ring().set("stroke-dasharray", "3 3").set("stroke-width", 2)),
         }
@@ -222,9 +220,9 @@ impl Picture<'_> {
                 self.sheet.at(&pose.transform(range_m, 0.0))
             };
             let ((x, y), (x1, y1), (x2, y2)) = (self.sheet.at(&cav.pose.position), edge(half_rad), edge(-half_rad));
-            let (radius, large) = (round(self.sheet.length(range_m)), u8::from(half_rad > FRAC_PI_2));
+            let radius = round(self.sheet.length(range_m));
             let [x, y, x1, y1, x2, y2] = [x, y, x1, y1, x2, y2].map(round);
-            let outline = format!("M{x} {y}L{x1} {y1}A{radius} {radius} 0 {large} 1 {x2} {y2}Z");
+            let outline = format!("M{x} {y}L{x1} {y1}A{radius} {radius} 0 0 1 {x2} {y2}Z");
             Path::new().set("d", outline).set("fill", color).set("stroke", color)
         };
         let group = Group::new().set("fill-opacity", 0.09).set("stroke-opacity", 0.35);
