@@ -148,3 +148,54 @@ fn open(path: &Path) -> Result<BufWriter<File>, ActorProcessingErr> {
     let file = File::options().create(true).append(true).open(path);
     file.map(BufWriter::new).map_err(|error| format!("cannot open map log {}: {error}", path.display()).into())
 }
+
+#[cfg(test)]
+mod tests {
+    use ecod::wire::{NodeState, Role, SCHEMA_VERSION};
+    use uuid::Uuid;
+
+    use super::*;
+
+    fn follower() -> FollowerState {
+        let status = NodeStatus {
+            schema: SCHEMA_VERSION,
+            node: NodeName::from_static("euclid"),
+            id: Uuid::nil(),
+            role: Role::Cav,
+            state: NodeState::Following,
+            epoch: 0,
+            aggregator: None,
+            version: String::new(),
+        };
+        let newest = watch::Sender::new(None);
+        FollowerState { newest, log: None, status, gateway: Seat::default(), counters: Arc::default() }
+    }
+
+    fn map(epoch: u64, round: u64) -> Arc<GlobalMap> {
+        Arc::new(GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("edge"),
+            epoch,
+            round,
+            fused_at_us: Timestamp(0),
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+        })
+    }
+
+    #[test]
+    fn a_huge_epoch_silences_the_others_for_a_moment_only() {
+        let mut follower = follower();
+        let second = |n: u64| Timestamp(n * 1_000_000);
+        let accepted = |follower: &FollowerState| follower.newest.borrow().as_ref().map(|newest| newest.map.epoch);
+        follower.take(&map(u64::MAX, 1), second(0));
+        follower.take(&map(7, 1), second(1));
+        assert_eq!(accepted(&follower), Some(u64::MAX));
+        assert_eq!(follower.counters.rejects(RejectReason::Superseded), 1);
+        follower.take(&map(7, 2), second(4));
+        assert_eq!(accepted(&follower), Some(7));
+        follower.take(&map(7, 2), second(5));
+        assert_eq!(follower.counters.rejects(RejectReason::Superseded), 2, "the same map is not taken twice");
+    }
+}
