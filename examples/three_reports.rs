@@ -6,7 +6,7 @@ use ecod::aggregator::{Aggregator, FusionConfig};
 use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{ObjectReport, decode_report};
+use ecod::wire::{ObjectReport, ReportKind, decode_report};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let slot = |id: &str, x_m: f64| LandmarkConfig {
@@ -37,7 +37,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 now = now.micros(),
             );
             let report: ObjectReport = decode_report(json.as_bytes(), &NodeName::new(node)?, &Default::default())?;
-            if let Some(map) = cell.report(&report, now)? {
+            let fused = cell.report(ReportKind::Detections, &report, now)?;
+            if let Some(map) = fused.and_then(|fused| fused.map) {
                 println!("round {}", map.round);
                 for place in map.landmarks {
                     let known = if place.observers.is_empty() { "unknown" } else { "empty" };

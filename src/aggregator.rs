@@ -1,85 +1,133 @@
-//! The aggregator of a cell, without its sockets and clocks: reports go in, maps come out.
+//! The aggregator of a cell, without its sockets and clocks: reports go in, maps and verdicts come out.
 //!
 //! Call [`Aggregator::report`] with every decoded report and [`Aggregator::tick`] at the latest at
 //! [`Aggregator::deadline`]; either may close a round and return what it made. The live node and the replay of a log
 //! run this same machine.
+//!
+//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time. In
+//! VOTE's `paper` mode verdicts come with the rounds in which a packet of frames is complete, and only with them.
+//!
+//! A standby runs the machine without leading: it takes reports and closes rounds, but nothing comes out. From
+//! [`Aggregator::lead`] on its rounds count, with all the evidence it has gathered.
 
+mod config;
+
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+pub use config::{Algorithms, FusionConfig};
 
-use crate::config::ConfigError;
+use crate::epoch::Epoch;
 use crate::landmark::{Landmark, LandmarkIndex};
 use crate::names::NodeName;
-use crate::pace::{Pace, PaceConfig};
-use crate::round::{RoundConfig, RoundTrigger};
+use crate::pace::Pace;
+use crate::reputation::{Evidence, ReputationLedger};
+use crate::round::RoundTrigger;
 use crate::time::Timestamp;
-use crate::window::{ReportWindow, WindowConfig};
-use crate::wire::{GlobalMap, ObjectReport, RejectReason, SCHEMA_VERSION};
+use crate::vote::{Vote, VoteMode};
+use crate::window::ReportWindow;
+use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
 
-/// How a cell's reports are fused.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct FusionConfig {
-    /// Which reports are fresh enough.
-    pub window: WindowConfig,
-    /// The rhythm of rounds.
-    pub round: RoundConfig,
-    /// Parameters of PACE.
-    pub pace: PaceConfig,
-}
-
-impl FusionConfig {
-    /// Checks all values.
-    ///
-    /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        self.window.validate().map_err(|error| error.within("window"))?;
-        self.round.validate().map_err(|error| error.within("round"))?;
-        self.pace.validate().map_err(|error| error.within("pace"))
-    }
+/// What a round came to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fused {
+    /// The leadership in which it was closed.
+    pub epoch: Epoch,
+    /// Its number.
+    pub round: u64,
+    /// What PACE made of it, if the cell runs PACE.
+    pub map: Option<GlobalMap>,
+    /// What VOTE made of it, if the cell runs VOTE; in `paper` mode only when a packet of frames is complete.
+    pub verdicts: Option<Verdicts>,
+    /// Votes of which it has been settled whether they were right.
+    pub evidence: Vec<Evidence>,
 }
 
 /// Admits reports, fuses them and numbers the rounds.
 #[derive(Debug, Clone)]
 pub struct Aggregator {
-    name: NodeName,
-    epoch: u64,
-    round: u64,
-    window: ReportWindow,
+    leads: Option<Epoch>,
+    next_round: u64,
+    windows: [ReportWindow; ReportKind::COUNT],
     rounds: RoundTrigger,
-    pace: Pace,
+    pace: Option<Pace>,
+    vote: Option<Vote>,
+    by_packets: bool,
 }
 
 impl Aggregator {
-    /// An aggregator without evidence that leads in `epoch`; `config` is taken as valid.
-    pub fn new(name: NodeName, epoch: u64, config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let landmarks = Arc::new(LandmarkIndex::new(landmarks, config.pace.gate_m));
+    /// An aggregator without evidence that does not lead; `config` is taken as valid.
+    pub fn standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
+        let FusionConfig { algorithms, window, round, pace, vote, reputation: _ } = config;
+        let by_packets = vote.mode == VoteMode::Paper;
+        let vote = algorithms.vote().then(|| Vote::new(vote, landmarks.clone()));
+        let gate_m = pace.gate_m;
+        let pace = algorithms.pace().then(|| Pace::new(pace, Arc::new(LandmarkIndex::new(landmarks, gate_m))));
         Self {
-            name,
-            epoch,
-            round: 0,
-            window: ReportWindow::new(config.window),
-            rounds: RoundTrigger::new(config.round, now),
-            pace: Pace::new(config.pace, landmarks),
+            leads: None,
+            next_round: 1,
+            windows: [ReportWindow::new(window.clone()), ReportWindow::new(window)],
+            rounds: RoundTrigger::new(round, now),
+            pace,
+            vote,
+            by_packets,
         }
     }
 
-    /// Takes a report received at `now`; returns the map if the round closes with it.
+    /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
+    pub fn new(name: NodeName, epoch: u64, config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
+        let mut aggregator = Self::standby(config, landmarks, now);
+        aggregator.lead(Epoch::new(epoch, name), 1, true, now);
+        aggregator
+    }
+
+    /// Leads from `now` on: the next round is number `first_round` of `epoch`, due a period later if the round before
+    /// it was closed `on_time`, else at once.
+    pub fn lead(&mut self, epoch: Epoch, first_round: u64, on_time: bool, now: Timestamp) {
+        self.leads = Some(epoch);
+        self.next_round = first_round;
+        self.rounds.start(on_time, now);
+    }
+
+    /// Goes on as a standby.
+    pub fn stand_by(&mut self) {
+        self.leads = None;
+    }
+
+    /// The leadership, if it leads.
+    pub fn leads(&self) -> Option<&Epoch> {
+        self.leads.as_ref()
+    }
+
+    /// Takes a report received at `now`; returns what came of the round if it closes with it.
     ///
     /// # Errors
-    /// The reason for which the report was not used; no map is changed by it, at most the estimate of its vehicle's clock.
-    pub fn report(&mut self, report: &ObjectReport, now: Timestamp) -> Result<Option<GlobalMap>, RejectReason> {
-        let captured_at = self.window.admit(report, now)?;
-        self.pace.observe(report, captured_at);
-        Ok(if self.rounds.report(&report.node, now) { Some(self.close(now)) } else { None })
+    /// The reason for which the report was not used; nothing is fused of it, at most the estimate of its vehicle's
+    /// clock changes.
+    pub fn report(
+        &mut self,
+        kind: ReportKind,
+        report: &ObjectReport,
+        now: Timestamp,
+    ) -> Result<Option<Fused>, RejectReason> {
+        let window = &mut self.windows[kind as usize];
+        match kind {
+            ReportKind::Detections => {
+                let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
+                pace.observe(report, window.admit(report, now)?);
+            }
+            ReportKind::VoteDetections => {
+                let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
+                window.admit(report, now)?;
+                vote.observe(report, now)?;
+            }
+        }
+        Ok(if self.rounds.report(kind, &report.node, now) { self.close(now) } else { None })
     }
 
     /// Closes the round if it is due at `now`.
-    pub fn tick(&mut self, now: Timestamp) -> Option<GlobalMap> {
-        if self.rounds.tick(now) { Some(self.close(now)) } else { None }
+    pub fn tick(&mut self, now: Timestamp) -> Option<Fused> {
+        if self.rounds.tick(now) { self.close(now) } else { None }
     }
 
     /// When the round closes without a further report.
@@ -87,18 +135,213 @@ impl Aggregator {
         self.rounds.deadline()
     }
 
-    fn close(&mut self, now: Timestamp) -> GlobalMap {
-        self.round += 1;
-        let round = self.pace.close(now);
-        GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: self.name.clone(),
-            epoch: self.epoch,
-            round: self.round,
-            fused_at_us: now,
-            oldest_capture_us: round.oldest_capture,
-            landmarks: round.landmarks,
-            objects: Vec::new(),
+    /// How far VOTE trusts each vehicle by what it has seen itself.
+    pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
+        self.vote.as_ref().map(Vote::reputations).unwrap_or_default()
+    }
+
+    /// Starts from what a ledger knows, after a restart or a change of aggregator.
+    pub fn adopt(&mut self, ledger: &ReputationLedger) {
+        if let Some(vote) = &mut self.vote {
+            vote.adopt(ledger);
         }
+    }
+
+    /// Objects that voted for nothing so far; see [`crate::vote`].
+    pub fn ignored_votes(&self) -> u64 {
+        self.vote.as_ref().map_or(0, Vote::ignored)
+    }
+
+    fn close(&mut self, now: Timestamp) -> Option<Fused> {
+        let pace = self.pace.as_mut().map(|pace| pace.close(now));
+        let by_packets = self.by_packets;
+        let is_due = |vote: &&mut Vote| !by_packets || vote.is_packet_complete();
+        let vote = self.vote.as_mut().filter(is_due).map(|vote| vote.close(now));
+        let epoch = self.leads.clone()?;
+        if pace.is_none() && vote.is_none() {
+            return None;
+        }
+        let round = self.next_round;
+        self.next_round = round.saturating_add(1);
+        let (verdicts, evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
+        let map = pace.map(|pace| GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader.clone(),
+            epoch: epoch.term,
+            round,
+            fused_at_us: now,
+            oldest_capture_us: pace.oldest_capture,
+            landmarks: pace.landmarks,
+            objects: Vec::new(),
+        });
+        let verdicts = verdicts.map(|verdicts: Vec<Verdict>| Verdicts {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader.clone(),
+            epoch: epoch.term,
+            round,
+            fused_at_us: now,
+            verdicts,
+        });
+        Some(Fused { epoch, round, map, verdicts, evidence })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::round::{RoundClose, RoundConfig};
+    use crate::vote::VoteConfig;
+    use crate::wire::PerceivedObject;
+    use ReportKind::{Detections, VoteDetections};
+    use nalgebra::Point2;
+
+    const START: u64 = 1_732_154_400_000_000;
+
+    fn at(ms: u64) -> Timestamp {
+        Timestamp(START + ms * 1000)
+    }
+
+    fn landmarks() -> Vec<Landmark> {
+        let ball = Point2::new(1.0, 0.0);
+        vec![Landmark { id: "ball".into(), position: ball, facing_rad: None, vacancy: None, synonyms: vec![] }]
+    }
+
+    fn report(node: &str, label: &str, captured_ms: u64) -> ObjectReport {
+        ObjectReport {
+            schema: SCHEMA_VERSION,
+            node: NodeName::new(node).unwrap(),
+            seq: captured_ms,
+            captured_at_us: at(captured_ms),
+            pose: None,
+            objects: vec![PerceivedObject {
+                label: label.into(),
+                confidence: 0.9,
+                x_m: 1.0,
+                y_m: 0.0,
+                covariance_m2: None,
+                landmark: Some("ball".into()),
+            }],
+            seen: None,
+        }
+    }
+
+    fn leader(config: FusionConfig) -> Aggregator {
+        Aggregator::new(NodeName::from_static("edge"), 7, config, landmarks(), at(0))
+    }
+
+    fn shown(fused: &Fused) -> (Option<&str>, Option<&str>) {
+        let map = fused.map.as_ref().and_then(|map| map.landmarks[0].label.as_deref());
+        (map, fused.verdicts.as_ref().and_then(|verdicts| verdicts.verdicts[0].label.as_deref()))
+    }
+
+    #[test]
+    fn a_round_is_closed_for_map_and_verdicts_together() {
+        let round = RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() };
+        let mut cell = leader(FusionConfig { round, ..FusionConfig::default() });
+        for round in 1..=3 {
+            let now = at(round * 100);
+            for kind in [Detections, VoteDetections] {
+                cell.report(
+                    kind,
+                    &report("euclid", "cup", round * 100 - 10),
+                    now - std::time::Duration::from_millis(5),
+                )
+                .unwrap();
+            }
+            let fused = cell.tick(now).unwrap();
+            let (map, verdicts) = (fused.map.clone().unwrap(), fused.verdicts.clone().unwrap());
+            assert_eq!((map.epoch, map.round, map.fused_at_us), (7, round, now));
+            assert_eq!((verdicts.epoch, verdicts.round, verdicts.fused_at_us), (7, round, now));
+            assert_eq!((verdicts.aggregator.as_str(), shown(&fused).1), ("edge", Some("cup")));
+            assert_eq!(verdicts.verdicts[0].contributors, [NodeName::from_static("euclid")]);
+        }
+    }
+
+    #[test]
+    fn one_frame_may_go_out_as_both_kinds_but_each_only_once() {
+        let mut cell = leader(FusionConfig::default());
+        let frame = report("euclid", "cup", 10);
+        assert_eq!(cell.report(Detections, &frame, at(12)), Ok(None));
+        assert_eq!(cell.report(VoteDetections, &frame, at(12)), Ok(None));
+        for kind in [Detections, VoteDetections] {
+            assert_eq!(cell.report(kind, &frame, at(13)), Err(RejectReason::OutOfOrder));
+        }
+        let old = report("gauss", "cup", 10);
+        assert_eq!(cell.report(VoteDetections, &old, at(9000)), Err(RejectReason::Stale));
+    }
+
+    #[test]
+    fn a_cell_refuses_reports_for_what_it_does_not_run() {
+        for (algorithms, kind, other) in
+            [(Algorithms::Pace, Detections, VoteDetections), (Algorithms::Vote, VoteDetections, Detections)]
+        {
+            let mut cell = leader(FusionConfig { algorithms, ..FusionConfig::default() });
+            assert_eq!(cell.report(kind, &report("euclid", "cup", 10), at(11)), Ok(None));
+            assert_eq!(cell.report(other, &report("euclid", "cup", 10), at(11)), Err(RejectReason::NotFused));
+            let fused = cell.tick(at(100)).unwrap();
+            assert_eq!(fused.map.is_some(), algorithms.pace());
+            assert_eq!(fused.verdicts.is_some(), algorithms.vote());
+        }
+    }
+
+    #[test]
+    fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
+        let mut cell = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
+        for step in 1..=20 {
+            for kind in [Detections, VoteDetections] {
+                assert_eq!(cell.report(kind, &report("euclid", "cup", step * 50), at(step * 50)), Ok(None));
+            }
+            assert_eq!(cell.tick(at(step * 50 + 20)), None);
+        }
+        let epoch = Epoch::new(3, NodeName::from_static("gauss"));
+        cell.lead(epoch.clone(), 88, false, at(1030));
+        let first = cell.tick(at(1030)).expect("due at once");
+        assert_eq!((first.epoch.clone(), first.round, shown(&first)), (epoch.clone(), 88, (Some("cup"), Some("cup"))));
+        cell.lead(epoch, 89, true, at(1040));
+        assert_eq!(cell.tick(at(1139)), None);
+        assert_eq!(cell.tick(at(1140)).map(|fused| fused.round), Some(89));
+        cell.stand_by();
+        assert_eq!(cell.tick(at(1300)), None);
+    }
+
+    #[test]
+    fn paper_verdicts_come_by_packets_and_rounds_without_result_are_not_counted() {
+        let vote = VoteConfig { mode: VoteMode::Paper, ..VoteConfig::default() };
+        let config = FusionConfig { algorithms: Algorithms::Vote, vote, ..FusionConfig::default() };
+        let mut cell = leader(config);
+        let rounds: Vec<_> = (1..=10)
+            .filter_map(|frame| {
+                let now = at(frame * 100);
+                cell.report(VoteDetections, &report("euclid", "cup", frame * 100), now)
+                    .unwrap()
+                    .or_else(|| cell.tick(now))
+            })
+            .map(|fused| (fused.round, fused.verdicts.unwrap().verdicts[0].votes["cup"]))
+            .collect();
+        assert_eq!(rounds.iter().map(|(round, _)| *round).collect::<Vec<_>>(), [1, 2]);
+        assert!(rounds[1].1 > rounds[0].1, "the paper's scores are sums");
+    }
+
+    #[test]
+    fn settled_votes_become_evidence_that_another_aggregator_adopts() {
+        let config =
+            FusionConfig { round: RoundConfig { period_s: 0.5, ..RoundConfig::default() }, ..Default::default() };
+        let mut cell = leader(config.clone());
+        let mut ledger = ReputationLedger::default();
+        for step in 1..=60u64 {
+            for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
+                let fused = cell.report(VoteDetections, &report(node, label, step * 500), at(step * 500)).unwrap();
+                for (fused, evidence) in fused.iter().flat_map(|f| f.evidence.iter().map(move |e| (f, e))) {
+                    ledger.record(fused.epoch.term, &fused.epoch.leader, evidence);
+                }
+            }
+        }
+        assert!(ledger.totals()[&NodeName::from_static("liar")].1 > 5);
+        let mut other = leader(config);
+        other.adopt(&ledger);
+        let reputations = other.reputations();
+        assert!(
+            reputations[&NodeName::from_static("euclid")].score > reputations[&NodeName::from_static("liar")].score
+        );
     }
 }

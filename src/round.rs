@@ -1,5 +1,7 @@
 //! When a round closes: every period, or as soon as every live vehicle has reported.
 //!
+//! A vehicle that sends both kinds of reports is waited for with both.
+//!
 //! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at [`RoundTrigger::deadline`];
 //! either says when to close the round.
 
@@ -12,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::config::{ConfigError, check_range};
 use crate::names::NodeName;
 use crate::time::Timestamp;
+use crate::wire::ReportKind;
 
 /// The rhythm of rounds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -58,7 +61,7 @@ impl RoundConfig {
 pub struct RoundTrigger {
     config: RoundConfig,
     last_close: Timestamp,
-    live: BTreeMap<NodeName, Vehicle>,
+    live: [BTreeMap<NodeName, Vehicle>; ReportKind::COUNT],
     missing: usize,
 }
 
@@ -77,18 +80,19 @@ const MAX_RATE: u32 = 5;
 impl RoundTrigger {
     /// Starts counting at `now`.
     pub fn new(config: RoundConfig, now: Timestamp) -> Self {
-        Self { config, last_close: now, live: BTreeMap::new(), missing: 0 }
+        Self { config, last_close: now, live: Default::default(), missing: 0 }
     }
 
     /// Takes note of a report; true when the round closes now.
-    pub fn report(&mut self, node: &NodeName, now: Timestamp) -> bool {
-        if let Some(vehicle) = self.live.get_mut(node) {
+    pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
+        let live = &mut self.live[kind as usize];
+        if let Some(vehicle) = live.get_mut(node) {
             vehicle.last_report = now;
             if !std::mem::replace(&mut vehicle.reported, true) {
                 self.missing -= 1;
             }
         } else {
-            self.live.insert(node.clone(), Vehicle { last_report: now, reported: true });
+            live.insert(node.clone(), Vehicle { last_report: now, reported: true });
         }
         self.tick(now)
     }
@@ -99,18 +103,24 @@ impl RoundTrigger {
             return false;
         }
         let limit = self.config.period() * LIVE_PERIODS;
-        self.live.retain(|_, vehicle| now.since(vehicle.last_report) < limit);
-        for vehicle in self.live.values_mut() {
-            vehicle.reported = false;
+        for live in &mut self.live {
+            live.retain(|_, vehicle| now.since(vehicle.last_report) < limit);
+            live.values_mut().for_each(|vehicle| vehicle.reported = false);
         }
-        self.missing = self.live.len();
+        self.missing = self.live.iter().map(BTreeMap::len).sum();
         self.last_close = now;
         true
     }
 
+    /// Starts a run of rounds: the first is due a period after `now` if the one before was closed in time, else at once.
+    pub fn start(&mut self, on_time: bool, now: Timestamp) {
+        self.last_close = if on_time { now } else { now - self.config.period() };
+    }
+
     /// When the round closes without a further report.
     pub fn deadline(&self) -> Timestamp {
-        let complete = self.config.close == RoundClose::WhenComplete && self.missing == 0 && !self.live.is_empty();
+        let anyone = self.live.iter().any(|live| !live.is_empty());
+        let complete = self.config.close == RoundClose::WhenComplete && self.missing == 0 && anyone;
         let wait = if complete { self.config.period() / MAX_RATE } else { self.config.period() };
         self.last_close + wait
     }
@@ -119,6 +129,7 @@ impl RoundTrigger {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::ReportKind::{Detections, VoteDetections};
 
     const MS: u64 = 1_000;
 
@@ -137,19 +148,41 @@ mod tests {
     #[test]
     fn closes_with_the_last_of_the_live_vehicles() {
         let mut rounds = trigger(RoundClose::WhenComplete);
-        assert!(!rounds.report(&node("a"), at(10)));
-        assert!(rounds.report(&node("b"), at(20)), "both known vehicles have reported, a fifth of the period is over");
-        assert!(!rounds.report(&node("a"), at(110)));
-        assert!(rounds.report(&node("b"), at(115)));
+        assert!(!rounds.report(Detections, &node("a"), at(10)));
+        assert!(
+            rounds.report(Detections, &node("b"), at(20)),
+            "both known vehicles have reported, a fifth of the period is over"
+        );
+        assert!(!rounds.report(Detections, &node("a"), at(110)));
+        assert!(rounds.report(Detections, &node("b"), at(115)));
+    }
+
+    #[test]
+    fn a_vehicle_that_sends_both_kinds_is_waited_for_with_both() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        rounds.report(Detections, &node("a"), at(10));
+        rounds.report(VoteDetections, &node("a"), at(11));
+        assert!(rounds.tick(at(20)));
+        assert!(!rounds.report(Detections, &node("a"), at(110)), "its vote is on the way");
+        assert!(rounds.report(VoteDetections, &node("a"), at(111)));
+    }
+
+    #[test]
+    fn a_run_of_rounds_starts_at_once_or_a_period_later() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        rounds.start(true, at(50));
+        assert_eq!(rounds.deadline(), at(150));
+        rounds.start(false, at(50));
+        assert!(rounds.tick(at(50)));
     }
 
     #[test]
     fn the_period_bounds_the_wait_for_a_silent_vehicle() {
         let mut rounds = trigger(RoundClose::WhenComplete);
-        rounds.report(&node("a"), at(1));
-        rounds.report(&node("b"), at(2));
+        rounds.report(Detections, &node("a"), at(1));
+        rounds.report(Detections, &node("b"), at(2));
         assert!(rounds.tick(at(20)));
-        assert!(!rounds.report(&node("a"), at(100)));
+        assert!(!rounds.report(Detections, &node("a"), at(100)));
         assert_eq!(rounds.deadline(), at(120));
         assert!(rounds.tick(at(120)));
     }
@@ -157,18 +190,18 @@ mod tests {
     #[test]
     fn a_vehicle_that_left_is_not_waited_for() {
         let mut rounds = trigger(RoundClose::WhenComplete);
-        rounds.report(&node("gone"), at(0));
+        rounds.report(Detections, &node("gone"), at(0));
         for round in 1..=4 {
-            rounds.report(&node("a"), at(round * 100));
+            rounds.report(Detections, &node("a"), at(round * 100));
             rounds.tick(at(round * 100 + 99));
         }
-        assert!(rounds.report(&node("a"), at(600)), "closes without the vehicle that left");
+        assert!(rounds.report(Detections, &node("a"), at(600)), "closes without the vehicle that left");
     }
 
     #[test]
     fn periodic_rounds_ignore_completeness() {
         let mut rounds = trigger(RoundClose::Periodic);
-        assert!(!rounds.report(&node("a"), at(50)));
+        assert!(!rounds.report(Detections, &node("a"), at(50)));
         assert!(!rounds.tick(at(99)));
         assert!(rounds.tick(at(100)));
     }
@@ -176,7 +209,7 @@ mod tests {
     #[test]
     fn one_fast_vehicle_does_not_drive_the_rate() {
         let mut rounds = trigger(RoundClose::WhenComplete);
-        let closed = (0..1000).filter(|ms| rounds.report(&node("a"), at(*ms))).count();
+        let closed = (0..1000).filter(|ms| rounds.report(Detections, &node("a"), at(*ms))).count();
         assert!((45..=50).contains(&closed), "{closed} rounds in a second at a period of 100 ms");
     }
 }

@@ -58,6 +58,7 @@ pub struct ReportWindow {
 #[derive(Debug, Clone)]
 struct VehicleClock {
     last_captured: Timestamp,
+    last_seq: Option<u64>,
     last_received: Timestamp,
     delay: MinimumDelay,
 }
@@ -87,13 +88,14 @@ impl ReportWindow {
         }
         let vehicle = self.vehicles.entry(report.node.clone()).or_insert_with(|| VehicleClock {
             last_captured: Timestamp(0),
+            last_seq: None,
             last_received: received_at,
             delay: MinimumDelay::new(received_at),
         });
         let stepped_back = vehicle.last_captured.micros_from(report.captured_at_us) > reach;
         if stepped_back {
             vehicle.delay = MinimumDelay::new(received_at);
-        } else if report.captured_at_us <= vehicle.last_captured {
+        } else if (report.captured_at_us, Some(report.seq)) <= (vehicle.last_captured, vehicle.last_seq) {
             return Err(RejectReason::OutOfOrder);
         }
         vehicle.delay.observe(delay, received_at);
@@ -102,6 +104,7 @@ impl ReportWindow {
             return Err(RejectReason::Stale);
         }
         vehicle.last_captured = report.captured_at_us;
+        vehicle.last_seq = Some(report.seq);
         vehicle.last_received = received_at;
         Ok(report.captured_at_us.shifted(offset))
     }

@@ -25,7 +25,7 @@ use uuid::Uuid;
 
 pub use codec::{Encoding, Limits, Payload, decode, decode_report, encode};
 pub use reject::RejectReason;
-pub use topic::{Topic, Topics};
+pub use topic::{ReportKind, Topic, Topics};
 
 use crate::geometry::{Covariance, Pose};
 use crate::names::{Label, LandmarkId, NodeName};

@@ -16,11 +16,11 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use ecod::aggregator::Aggregator;
+use ecod::aggregator::{Aggregator, Fused};
 use ecod::names::NodeName;
 use ecod::testbed::{Cav, Scene, Testbed};
 use ecod::time::Timestamp;
-use ecod::wire::GlobalMap;
+use ecod::wire::{GlobalMap, ReportKind};
 
 pub use self::observer::ObservedReport;
 use self::observer::Observer;
@@ -163,7 +163,8 @@ impl Demo<'_> {
             let mut aggregator = Aggregator::new(cav.name.clone(), 1, setup::fusion(self.testbed), landmarks, start);
             let mut score = Score::default();
             for observed in reports.iter().filter(|observed| observed.report.node == cav.name) {
-                if let Ok(Some(map)) = aggregator.report(&observed.report, observed.received_at)
+                let fused = aggregator.report(ReportKind::Detections, &observed.report, observed.received_at);
+                if let Ok(Some(Fused { map: Some(map), .. })) = fused
                     && map.fused_at_us >= from
                 {
                     score.judge(self.testbed, self.scene, &map);

@@ -8,15 +8,14 @@
 
 use std::sync::Arc;
 
-use ecod::aggregator::Aggregator;
+use ecod::aggregator::{Aggregator, Fused};
 use ecod::time::Timestamp;
-use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
 use crate::clock;
 use crate::counters::Counters;
-use crate::gateway::{Delivery, GatewayMessage, Incoming, ReportKind};
+use crate::gateway::{Delivery, GatewayMessage, Incoming};
 use crate::seat::Seat;
 
 /// What the fuser is asked to do.
@@ -80,8 +79,8 @@ impl Actor for Fuser {
             FuserMessage::TakeReport { delivery } => state.take(&delivery),
             FuserMessage::CloseRound => {
                 state.alarm = Timestamp(u64::MAX);
-                let map = state.aggregator.tick(clock::now());
-                state.publish(map);
+                let fused = state.aggregator.tick(clock::now());
+                state.publish(fused);
             }
         }
         state.set_alarm(&myself);
@@ -91,9 +90,9 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn take(&mut self, delivery: &Delivery) {
-        let Incoming::Report { kind: ReportKind::Detections, report } = &delivery.message else { return };
-        match self.aggregator.report(report, delivery.received_at) {
-            Ok(map) => self.publish(map),
+        let Incoming::Report { kind, report } = &delivery.message else { return };
+        match self.aggregator.report(*kind, report, delivery.received_at) {
+            Ok(fused) => self.publish(fused),
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, %reason, "report not used");
                 self.counters.reject(reason);
@@ -101,9 +100,13 @@ impl FuserState {
         }
     }
 
-    fn publish(&self, map: Option<GlobalMap>) {
-        if let Some(map) = map {
+    fn publish(&self, fused: Option<Fused>) {
+        let Some(fused) = fused else { return };
+        if let Some(map) = fused.map {
             self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });
+        }
+        if let Some(verdicts) = fused.verdicts {
+            self.gateway.send(GatewayMessage::PublishVerdicts { verdicts: Arc::new(verdicts) });
         }
     }
 

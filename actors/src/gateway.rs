@@ -34,7 +34,8 @@ use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
 
 pub use address::{BrokerAddress, InvalidAddress};
 pub use config::{MqttConfig, MqttVersion, Secret};
-pub use inbox::{Delivery, Incoming, LinkState, ReportKind, Subscriber};
+pub use ecod::wire::ReportKind;
+pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
 
 use crate::counters::{Counters, Event};

@@ -33,11 +33,13 @@ pub enum RejectReason {
     UnknownTopic,
     /// From an aggregator or epoch that has been superseded.
     Superseded,
+    /// A report for an algorithm that the cell does not run.
+    NotFused,
 }
 
 impl RejectReason {
     /// All reasons, for counters.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::TooLarge,
         Self::Malformed,
         Self::UnknownSchema,
@@ -52,6 +54,7 @@ impl RejectReason {
         Self::TooManyVehicles,
         Self::UnknownTopic,
         Self::Superseded,
+        Self::NotFused,
     ];
 
     /// The reason as a counter's label.
@@ -71,6 +74,7 @@ impl RejectReason {
             Self::TooManyVehicles => "too_many_vehicles",
             Self::UnknownTopic => "unknown_topic",
             Self::Superseded => "superseded",
+            Self::NotFused => "not_fused",
         }
     }
 }

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use serde::{Deserialize, Serialize};
+
 use crate::names::NodeName;
 
 /// What a topic carries.
@@ -19,6 +21,30 @@ pub enum Topic {
     Reputations,
     /// A node's status, retained.
     Nodes(NodeName),
+}
+
+/// What a vehicle's report is for, told by the topic that it came on.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ReportKind {
+    /// PACE, on `detections/<node>`.
+    #[default]
+    Detections,
+    /// VOTE, on `vote_detections/<node>`.
+    VoteDetections,
+}
+
+impl ReportKind {
+    /// How many kinds there are; `kind as usize` is below it.
+    pub const COUNT: usize = 2;
+
+    /// The topic of a node's reports of this kind.
+    pub fn topic(self, node: NodeName) -> Topic {
+        match self {
+            Self::Detections => Topic::Detections(node),
+            Self::VoteDetections => Topic::VoteDetections(node),
+        }
+    }
 }
 
 /// Builds and takes apart the topics below `ecod/v1/<cell>`.

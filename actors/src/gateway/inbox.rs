@@ -7,32 +7,14 @@ use bytes::Bytes;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{
-    GlobalMap, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, Reputations, Topic, Topics, Verdicts, decode,
-    decode_report,
+    GlobalMap, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind, Reputations, Topic, Topics,
+    Verdicts, decode, decode_report,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::address::BrokerAddress;
 use crate::clock;
 use crate::counters::{Counters, Event};
-
-/// What a report is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum ReportKind {
-    /// PACE, on `detections/<node>`.
-    Detections,
-    /// VOTE, on `vote_detections/<node>`.
-    VoteDetections,
-}
-
-impl ReportKind {
-    pub(super) fn topic(self, node: NodeName) -> Topic {
-        match self {
-            Self::Detections => Topic::Detections(node),
-            Self::VoteDetections => Topic::VoteDetections(node),
-        }
-    }
-}
 
 /// A checked message of the cell, or news about a link.
 ///

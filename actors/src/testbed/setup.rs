@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use ecod::aggregator::FusionConfig;
+use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::camera::Mount;
 use ecod::landmark::{LandmarkConfig, LandmarkIndex};
 use ecod::names::NodeName;
@@ -79,6 +79,7 @@ pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
 pub fn fusion(testbed: &Testbed) -> FusionConfig {
     let period_s = testbed.camera.capture_interval.as_secs_f64();
     FusionConfig {
+        algorithms: Algorithms::Pace,
         round: RoundConfig { period_s, ..RoundConfig::default() },
         pace: PaceConfig { gate_m: GATE_M, position_floor_m: 0.01, ..PaceConfig::default() },
         ..FusionConfig::default()

@@ -11,7 +11,7 @@ use ecod::aggregator::Aggregator;
 use ecod::names::NodeName;
 use ecod::testbed::{Cav, Scene, Testbed};
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, ObjectReport};
+use ecod::wire::{GlobalMap, ObjectReport, ReportKind};
 
 use super::TestbedCamera;
 use super::score::{SceneResult, Score};
@@ -121,11 +121,11 @@ fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<G
     let last = reports.last()?.captured_at_us;
     let mut map = None;
     for report in &reports {
-        match aggregator.report(report, report.captured_at_us) {
-            Ok(closed) => map = closed.or(map),
+        match aggregator.report(ReportKind::Detections, report, report.captured_at_us) {
+            Ok(closed) => map = closed.and_then(|fused| fused.map).or(map),
             Err(reason) => tracing::warn!(node = %report.node, %reason, "report not used"),
         }
     }
     let deadline = aggregator.deadline();
-    aggregator.tick(deadline.max(last)).or(map)
+    aggregator.tick(deadline.max(last)).and_then(|fused| fused.map).or(map)
 }

@@ -1,0 +1,68 @@
+//! How a cell's reports are fused.
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::ConfigError;
+use crate::pace::PaceConfig;
+use crate::reputation::ReputationConfig;
+use crate::round::RoundConfig;
+use crate::vote::VoteConfig;
+use crate::window::WindowConfig;
+
+/// Which algorithms a cell runs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Algorithms {
+    /// Maps only.
+    Pace,
+    /// Verdicts only.
+    Vote,
+    /// Maps and verdicts.
+    #[default]
+    Both,
+}
+
+impl Algorithms {
+    /// Whether PACE is among them.
+    pub fn pace(self) -> bool {
+        self != Self::Vote
+    }
+
+    /// Whether VOTE is among them.
+    pub fn vote(self) -> bool {
+        self != Self::Pace
+    }
+}
+
+/// How a cell's reports are fused.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FusionConfig {
+    /// Which algorithms run: `pace`, `vote` or `both`, the default. One that nobody reports to costs an empty message
+    /// a round; reports for one that does not run are rejected.
+    pub algorithms: Algorithms,
+    /// Which reports are fresh enough.
+    pub window: WindowConfig,
+    /// The rhythm of rounds.
+    pub round: RoundConfig,
+    /// Parameters of PACE.
+    pub pace: PaceConfig,
+    /// Parameters of VOTE.
+    pub vote: VoteConfig,
+    /// How evidence becomes the reputations that are published.
+    pub reputation: ReputationConfig,
+}
+
+impl FusionConfig {
+    /// Checks all values.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the key, the value and the allowed range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.window.validate().map_err(|error| error.within("window"))?;
+        self.round.validate().map_err(|error| error.within("round"))?;
+        self.pace.validate().map_err(|error| error.within("pace"))?;
+        self.vote.validate().map_err(|error| error.within("vote"))?;
+        self.reputation.validate().map_err(|error| error.within("reputation"))
+    }
+}
