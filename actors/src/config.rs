@@ -137,6 +137,13 @@ impl NodeConfig {
         check_range("pose.heading_deg", self.pose.heading_deg, -360.0, 360.0)?;
         self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
         self.broker.validate().map_err(|error| error.within("broker"))?;
+        let needed = self.mqtt.max_packet_bytes();
+        if let Some(bytes) = self.broker.max_packet_bytes
+            && (bytes as usize) < needed
+        {
+            let allowed = format!("at least {needed}, so that `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` fit");
+            return Err(ConfigError::new("broker.max_packet_bytes", bytes, allowed));
+        }
         self.fusion.validate().map_err(|error| error.within("fusion"))?;
         #[cfg(feature = "camera")]
         if let Some(camera) = &self.camera {
@@ -147,6 +154,29 @@ impl NodeConfig {
             return Err(ConfigError::new("mqtt.broker", "nothing", allowed));
         }
         LandmarkConfig::validate_all(&self.landmarks)
+    }
+
+    /// The configuration as TOML that can be read back; secrets are left out, and a comment says so.
+    ///
+    /// # Errors
+    /// When a value has no form in TOML.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        let mut shown = self.clone();
+        let mut comment = String::new();
+        if shown.mqtt.password.take().is_some() {
+            comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
+        }
+        #[cfg(feature = "camera")]
+        if shown.camera.as_mut().is_some_and(|camera| camera.source.forget_credentials()) {
+            comment.push_str("# user and password of `camera.source.url` are set but not shown: add them\n");
+        }
+        Ok(comment + &toml::to_string(&shown)?)
+    }
+
+    /// The embedded broker's limits; its packets hold the cell's maps.
+    pub fn broker(&self) -> BrokerConfig {
+        let needed = u32::try_from(self.mqtt.max_packet_bytes()).ok();
+        BrokerConfig { max_packet_bytes: self.broker.max_packet_bytes.or(needed), ..self.broker.clone() }
     }
 
     /// The vehicle's pose.
@@ -228,3 +258,7 @@ mod tests {
         assert_eq!(load(&toml::to_string(&config).unwrap()).unwrap(), config);
     }
 }
+            (
+                "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",
+                ["`broker.max_packet_bytes`", "1048576", "8392704"],
+            ),

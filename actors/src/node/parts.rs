@@ -185,8 +185,8 @@ impl Assembly {
     /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
     /// leave it.
     async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let embedded = Box::new(EmbeddedBroker::new(self.config.broker.clone()));
-        let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await?;
+        let embedded = Box::new(EmbeddedBroker::new(self.config.broker()));
+        let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await.map_err(cause)?;
         let before = *self.broker_address.borrow();
         let address = before.unwrap_or(self.config.listen);
         let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
