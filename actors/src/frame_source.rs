@@ -22,7 +22,8 @@ pub trait FrameSource: Send {
     /// Waits for the next frame; may block for as long as the camera does.
     ///
     /// # Errors
-    /// [`FrameError`]; the source is of no further use and is to be opened again, unless it ended.
+    /// [`FrameError`]; the source is of no further use and is to be opened again, unless it ended or the error is
+    /// [`FrameError::Unusable`], after which it goes on.
     fn next_frame(&mut self) -> Result<Frame, FrameError>;
 }
 
@@ -33,6 +34,14 @@ pub enum FrameError {
     #[error("cannot open {origin}: {reason}")]
     Open {
         /// Device, pipeline, address or path.
+        origin: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// One frame of a recording is no image; the next may well be one.
+    #[error("cannot use {origin}: {reason}")]
+    Unusable {
+        /// Path of the frame.
         origin: String,
         /// What is wrong.
         reason: String,

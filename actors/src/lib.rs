@@ -28,6 +28,8 @@ pub mod frame_source;
 pub mod fuser;
 pub mod gateway;
 #[cfg(feature = "camera")]
+pub mod image_size;
+#[cfg(feature = "camera")]
 pub mod latest_slot;
 #[cfg(feature = "camera")]
 pub mod lens;

@@ -54,6 +54,24 @@ fn images_come_in_order_from_a_directory_and_from_a_pattern() {
 }
 
 #[test]
+fn a_bad_image_is_passed_over_and_the_rest_is_played() {
+    let directory = tempfile::tempdir().unwrap();
+    write_images(directory.path());
+    std::fs::write(directory.path().join("f001.png"), "half a fi").unwrap();
+    let mut source = open(&format!("kind = 'images'\npath = {:?}\nfps = 500.0", directory.path())).unwrap();
+    let mut played = Vec::new();
+    loop {
+        match source.next_frame() {
+            Ok(frame) => played.push(brightness(&frame).to_string()),
+            Err(FrameError::Ended { .. }) => break,
+            Err(error) => played.push(error.to_string()),
+        }
+    }
+    assert_eq!((&*played[0], &*played[2], played.len()), ("50", "150", 3));
+    assert!(played[1].contains("f001.png") && played[1].contains("not an image"), "{}", played[1]);
+}
+
+#[test]
 fn images_keep_their_rate() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
