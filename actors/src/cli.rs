@@ -9,9 +9,10 @@ mod schema;
 #[cfg(feature = "camera")]
 mod testbed;
 
-use std::io::IsTerminal;
+use std::io::{ErrorKind, IsTerminal, Write};
 use std::process::ExitCode;
 
+use anyhow::Context;
 use clap::{Parser, Subcommand};
 use tracing_subscriber::EnvFilter;
 
@@ -70,7 +71,7 @@ pub fn main() -> ExitCode {
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
-        Some(Command::Schema) => schema::print(),
+        Some(Command::Schema) => schema::run(),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -78,6 +79,15 @@ pub fn main() -> ExitCode {
             eprintln!("ecod-node: {error:#}");
             ExitCode::from(code)
         }
+    }
+}
+
+/// Writes to standard output. A reader that has seen enough, such as `head`, is no failure.
+fn print(text: &str) -> anyhow::Result<()> {
+    let mut output = std::io::stdout().lock();
+    match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+        written => written.context("cannot write to standard output"),
     }
 }
 

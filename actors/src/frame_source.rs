@@ -145,6 +145,15 @@ impl SourceConfig {
         }
     }
 
+    /// Takes user and password out of an address; true when there were some.
+    pub(crate) fn forget_credentials(&mut self) -> bool {
+        let Self::Url { url } = self else { return false };
+        let bare = video::without_credentials(url);
+        let had = bare != *url;
+        *url = bare;
+        had
+    }
+
     /// Checks every value; whether the source exists is found when it is opened.
     ///
     /// # Errors

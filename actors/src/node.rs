@@ -33,7 +33,7 @@ use crate::follower::ReceivedMap;
 pub use parts::{Part, Seats};
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
 
-use parts::Assembly;
+use parts::{Assembly, cause};
 use restarts::Restarts;
 
 /// What the supervisor is asked to do; it stops by [`NodeHandle::stop`].
@@ -86,7 +86,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (newest, broker) = (assembly.newest(), assembly.broker_address());
     let (seats, counters) = (assembly.seats().clone(), assembly.counters());
     let started = Actor::spawn(None, Node, assembly).await;
-    let (supervisor, ended) = started.map_err(|error| NodeError::Failed(error.to_string()))?;
+    let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
     Ok(NodeHandle { supervisor, ended, failure, newest, broker, seats, counters })
 }

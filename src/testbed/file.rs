@@ -15,6 +15,11 @@ use crate::geometry::{Pose, wrap_angle};
 use crate::names::{Label, MAX_NAME_BYTES, NodeName};
 
 const METRES_PER_INCH: f64 = 0.0254;
+/// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is rendered.
+const LEAST_INTERVAL_S: f64 = 1e-4;
+const MOST_INTERVAL_S: f64 = 3600.0;
+/// Most frames that are rendered for one submission.
+const MOST_FRAMES_PER_SUBMISSION: f64 = 1000.0;
 /// Farthest coordinate, to keep squares and quotients finite.
 const MAX_COORDINATE_IN: f64 = 1e6;
 
@@ -41,6 +46,9 @@ pub(super) fn read(text: &str) -> Result<Testbed, TestbedError> {
     let file = Place("scene file".into());
     let head: FileFields = file.parse(value)?;
     head.units.check(&file)?;
+    if head.scenes.is_empty() {
+        return Err(file.error("scenes", "is empty, must have at least one scene"));
+    }
     let camera = head.camera.check(&file)?;
     let placard = head.placard.check(&file)?;
     let mut scenes: Vec<Scene> = Vec::with_capacity(head.scenes.len());
@@ -150,7 +158,11 @@ impl CameraFields {
         place.number("camera.image_height", self.image_height.into(), 0.0, 8192.0)?;
         let horizontal = place.number("camera.horizontal_fov_deg", self.horizontal_fov_deg, 0.0, 170.0)?;
         let vertical = place.number("camera.vertical_fov_deg", self.vertical_fov_deg, 0.0, 170.0)?;
-        let interval = |key, seconds| place.number(key, seconds, 0.0, 3600.0).map(Duration::from_secs_f64);
+        let capture_s =
+            place.number("camera.capture_interval_s", self.capture_interval_s, LEAST_INTERVAL_S, MOST_INTERVAL_S)?;
+        let most_s = (MOST_FRAMES_PER_SUBMISSION * capture_s).min(MOST_INTERVAL_S);
+        let submission_s =
+            place.number("camera.submission_interval_s", self.submission_interval_s, LEAST_INTERVAL_S, most_s)?;
         Ok(Camera {
             intrinsics: Intrinsics::from_field_of_view(
                 self.image_width,
@@ -158,8 +170,8 @@ impl CameraFields {
                 horizontal.to_radians(),
                 vertical.to_radians(),
             ),
-            capture_interval: interval("camera.capture_interval_s", self.capture_interval_s)?,
-            submission_interval: interval("camera.submission_interval_s", self.submission_interval_s)?,
+            capture_interval: Duration::from_secs_f64(capture_s),
+            submission_interval: Duration::from_secs_f64(submission_s),
         })
     }
 }

@@ -9,7 +9,7 @@ use ecod::testbed::{Scene, Testbed};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
-use super::Failure;
+use super::{Failure, print};
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 use crate::testbed::trial::Trial;
@@ -43,6 +43,9 @@ pub(super) struct Results<'a> {
 pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
     let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;
+    if let Some(out) = &arguments.out {
+        check_writable(out)?;
+    }
     let mut results = Vec::with_capacity(scenes.len());
     for scene in scenes {
         let trial = Trial { testbed: &testbed, scene, verdicts: arguments.verdicts, seed: arguments.seed };
@@ -51,7 +54,7 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
         results.push(trial.run(|| bar.inc(1)).with_context(|| format!("scene {}", scene.name))?);
         bar.finish_and_clear();
     }
-    print!("{}", table(&results));
+    print(&table(&results).to_string())?;
     if let Some(out) = &arguments.out {
         write(out, &Results { scenes: &results })?;
     }
@@ -69,6 +72,14 @@ pub(super) fn select<'a>(testbed: &'a Testbed, name: Option<&str>) -> anyhow::Re
     let Some(name) = name else { return Ok(testbed.scenes.iter().collect()) };
     let known = || testbed.scenes.iter().map(|scene| scene.name.as_str()).collect::<Vec<_>>().join(", ");
     Ok(vec![testbed.scene(name).with_context(|| format!("no scene {name:?}; there are {}", known()))?])
+}
+
+/// Finds out before a long run that its results cannot be written; leaves nothing behind.
+pub(super) fn check_writable(path: &Path) -> anyhow::Result<()> {
+    let was_there = path.exists();
+    let opened = fs::File::options().create(true).append(true).open(path).map(drop);
+    let checked = opened.and_then(|()| if was_there { Ok(()) } else { fs::remove_file(path) });
+    checked.with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Writes JSON for programs.

@@ -157,6 +157,7 @@ impl Assembly {
                 let arguments = ProjectorArguments {
                     perception: camera::perception(&self.config).map_err(in_full)?,
                     gateway: self.seats.gateway.clone(),
+                    counters: self.counters(),
                 };
                 seat(&self.seats.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
             }
@@ -194,7 +195,7 @@ impl Assembly {
             attempts -= 1;
             match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
                 Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
-                outcome => break outcome?,
+                outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
             }
         };
         self.broker_address.send_replace(Some(bound));
@@ -214,7 +215,7 @@ impl Assembly {
             subscriber: self.subscriber(),
             seed: self.run.as_u64_pair().1,
         };
-        let (actor, _) = Actor::spawn_linked(None, Gateway, arguments, supervisor).await?;
+        let (actor, _) = Actor::spawn_linked(None, Gateway, arguments, supervisor).await.map_err(cause)?;
         let embedded = *self.broker_address.borrow();
         let addresses = self.config.mqtt.broker.clone().or(embedded.map(BrokerAddress::from)).into_iter().collect();
         actor.cast(GatewayMessage::SetBrokers { addresses })?;
@@ -247,16 +248,19 @@ impl Assembly {
         }
     }
 
+    /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
     fn status(&self) -> NodeStatus {
         let aggregates = self.config.role == Role::Edge;
+        let newest = self.newest.borrow();
+        let followed = newest.as_ref().map(|received| received.map.aggregator.clone());
         NodeStatus {
             schema: SCHEMA_VERSION,
             node: self.name.clone(),
             id: self.run,
             role: self.config.role,
             state: if aggregates { NodeCondition::Aggregating } else { NodeCondition::Following },
-            epoch: self.last_epoch,
-            aggregator: aggregates.then(|| self.name.clone()),
+            epoch: self.last_epoch.max(newest.as_ref().map_or(0, |received| received.map.epoch)),
+            aggregator: if aggregates { Some(self.name.clone()) } else { followed },
             version: env!("CARGO_PKG_VERSION").into(),
         }
     }
@@ -266,10 +270,18 @@ fn seat<M: Message>(
     seat: &Seat<M>,
     spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
 ) -> Result<ActorId, ActorProcessingErr> {
-    let (actor, _) = spawned?;
+    let (actor, _) = spawned.map_err(cause)?;
     let id = actor.get_id();
     seat.take(actor);
     Ok(id)
+}
+
+/// Why an actor did not start, without the framework's own words around it.
+pub(super) fn cause(error: SpawnErr) -> ActorProcessingErr {
+    match error {
+        SpawnErr::StartupFailed(cause) => cause,
+        other => other.into(),
+    }
 }
 
 /// An error with all its causes, which the actor framework would leave out.
@@ -284,5 +296,35 @@ async fn stop<M: Message>(seat: &Seat<M>) {
     if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT)).await {
         tracing::debug!(%error, "part did not stop in time");
         actor.kill();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::time::Timestamp;
+    use ecod::wire::GlobalMap;
+
+    use super::*;
+
+    #[test]
+    fn a_part_started_anew_still_says_whom_the_node_follows() {
+        let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
+        let assembly = Assembly::new(config, watch::Sender::new(None));
+        assert_eq!((assembly.status().epoch, assembly.status().aggregator), (0, None));
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("edge"),
+            epoch: 7,
+            round: 1,
+            fused_at_us: Timestamp(0),
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+        };
+        assembly.newest.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
+        assert_eq!(
+            (assembly.status().epoch, assembly.status().aggregator.as_ref().map(NodeName::as_str)),
+            (7, Some("edge"))
+        );
     }
 }
