@@ -39,7 +39,7 @@ doc: setup ## API documentation in target/doc
 audit: ## licences, sources and duplicate policies of all dependencies; known vulnerabilities where the database is reachable
 	packaging/audit
 
-core-only: ## prove that the core needs no runtime: its dependency tree has no tokio, socket or OpenCV crate
+core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
 	packaging/check-core
 
 edge-only: setup ## an aggregator without camera and OpenCV
