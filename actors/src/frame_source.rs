@@ -160,7 +160,13 @@ impl SourceConfig {
     /// [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match self {
-            Self::V4l2 { fps: Some(fps), .. } | Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
+            Self::V4l2 { width, height, fps, .. } => {
+                for (key, wish) in [("width", width), ("height", height)] {
+                    wish.map_or(Ok(()), |pixels| check_range(key, f64::from(pixels), 1.0, 16_384.0))?;
+                }
+                fps.map_or(Ok(()), |fps| check_range("fps", fps, 0.01, 1000.0))
+            }
+            Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
             Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => {
                 Err(ConfigError::new("pipeline", pipeline, "a pipeline that ends in appsink"))
             }

@@ -57,6 +57,15 @@ fn errors_in_the_environment_name_the_variable_and_show_no_password() {
 }
 
 #[test]
+fn a_listening_address_without_ip_is_told_what_is_missing() {
+    for listen in ["1883", "localhost:1883", "127.0.0.1:80000"] {
+        let output = ecod_node().args(["--role", "edge", "--listen", listen]).output().unwrap();
+        let error = stderr(&output);
+        assert!(output.status.code() == Some(2) && error.contains("0.0.0.0:1883") && error.contains(listen), "{error}");
+    }
+}
+
+#[test]
 fn a_reader_that_has_seen_enough_is_no_failure() {
     for arguments in [&["schema"][..], &["--role", "edge", "--print-config"]] {
         let mut node = ecod_node().args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();

@@ -38,7 +38,7 @@ pub struct RunArguments {
     #[serde(skip_serializing_if = "Option::is_none")]
     cell: Option<NodeName>,
     /// Where the embedded broker of an aggregator listens
-    #[arg(long, value_name = "IP:PORT")]
+    #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     #[serde(skip_serializing_if = "Option::is_none")]
     listen: Option<SocketAddr>,
     /// The broker to connect to, for a node without an embedded one
@@ -57,6 +57,10 @@ pub struct RunArguments {
     #[arg(long, hide = true)]
     #[serde(skip)]
     stop_at_eof: bool,
+}
+
+fn ip_and_port(text: &str) -> Result<SocketAddr, &'static str> {
+    text.parse().map_err(|_| "must be an IP address and a port, such as 0.0.0.0:1883")
 }
 
 /// Flags as they are laid over the configuration.

@@ -139,6 +139,8 @@ fn bad_configuration_is_refused() {
     assert!(toml::from_str::<SourceConfig>("kind = 'video'\npath = 'a'\nspeed = 2").is_err(), "unknown key");
     let pipeline: SourceConfig = toml::from_str("kind = 'gstreamer'\npipeline = 'videotestsrc'").unwrap();
     assert_eq!(pipeline.validate().expect_err("no appsink").key, "pipeline");
+    let camera: SourceConfig = toml::from_str("kind = 'v4l2'\nwidth = 0").unwrap();
+    assert_eq!(camera.validate().expect_err("no width").key, "width");
     let images: SourceConfig = toml::from_str("kind = 'images'\npath = 'a'\nfps = 0.0").unwrap();
     assert_eq!(images.validate().expect_err("no rate").key, "fps");
 }
