@@ -5,6 +5,7 @@
 //! default, keeps the evidence of each vehicle as log-odds. `docs/algorithms.md` compares them.
 
 mod bayes;
+mod grouping;
 mod paper;
 
 use std::sync::Arc;

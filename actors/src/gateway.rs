@@ -178,8 +178,11 @@ impl Actor for Gateway {
                 }
             }
             GatewayMessage::PublishMap { map } => {
-                state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
+                // In this order: the task that is woken last, which sends the map, runs first.
+                let payload = Bytes::from(encode(&*map, state.encoding));
+                inbox.expect_map(payload.clone());
                 inbox.deliver_local(Incoming::Map(map));
+                state.send(&state.topics.path(&Topic::GlobalDetections), &payload, Handling::Stream);
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
                 state.publish(&Topic::GlobalVerdicts, &*verdicts, Handling::Stream);
