@@ -113,7 +113,7 @@ impl PaceConfig {
 
     /// The reported covariance; a position without one counts as known to the gate.
     fn covariance(&self, object: &PerceivedObject) -> Covariance {
-        object.covariance().unwrap_or(Covariance::isotropic(self.gate_m / self.gate_sigmas))
+        object.covariance().unwrap_or_else(|| Covariance::isotropic(self.gate_m / self.gate_sigmas))
     }
 
     fn max_age(&self) -> Duration {

@@ -12,19 +12,16 @@ pub(super) struct GridPoint {
     pub(super) has_sign: bool,
 }
 
-/// Points grouped by cell, and cells by bucket. Neighbouring cells of a row lie side by side in memory: what one vehicle
-/// asks for is near what it asked for before.
+/// Points grouped by cell, and cells by bucket. The cells of a row have successive buckets: a query reads one stretch of
+/// memory for each row, and what one vehicle asks for is near what it asked for before.
 #[derive(Debug, Clone)]
 pub(super) struct Grid {
     cell_m: f64,
-    /// Ascending by bucket, then by cell.
-    points: Vec<(Cell, GridPoint)>,
+    /// Ascending by bucket, each with its row.
+    points: Vec<(i32, GridPoint)>,
     /// Where the points of each bucket end; as many as a power of two.
     ends: Vec<u32>,
 }
-
-/// Column and row.
-type Cell = (i32, i32);
 
 /// Keeps the rows of a grid apart: the fraction of the golden ratio in 64 bits (Knuth, "The Art of Computer Programming",
 /// volume 3, section 6.4).
@@ -33,18 +30,24 @@ const ROW_STEP: u64 = 0x9e37_79b9_7f4a_7c15;
 impl Grid {
     /// Groups the points into cells of `cell_m` metres; a query looks at one to four cells for radii up to half of that.
     pub(super) fn new(points: impl IntoIterator<Item = GridPoint>, cell_m: f64) -> Self {
-        let with_cell = |point: GridPoint| ((line(point.position.x, cell_m), line(point.position.y, cell_m)), point);
-        let mut points: Vec<(Cell, GridPoint)> = points.into_iter().map(with_cell).collect();
+        let mut points: Vec<_> = points.into_iter().collect();
         let buckets = (2 * points.len()).next_power_of_two();
-        points.sort_by_key(|(cell, point)| (bucket(*cell, buckets), *cell, point.landmark));
+        let bucket_of = |at: Point2<f64>| bucket(line(at.x, cell_m), line(at.y, cell_m), buckets);
+        points.sort_by_key(|point| (bucket_of(point.position), point.landmark));
         let mut ends = vec![0; buckets];
-        for (index, (cell, _)) in points.iter().enumerate() {
-            ends[bucket(*cell, buckets)] = index as u32 + 1;
+        for (index, point) in points.iter().enumerate() {
+            ends[bucket_of(point.position)] = index as u32 + 1;
         }
-        for bucket in 1..ends.len() {
+        for bucket in 1..buckets {
             ends[bucket] = ends[bucket].max(ends[bucket - 1]);
         }
+        let points = points.into_iter().map(|point| (line(point.position.y, cell_m), point)).collect();
         Self { cell_m, points, ends }
+    }
+
+    /// Whether there are no points.
+    pub(super) fn is_empty(&self) -> bool {
+        self.points.is_empty()
     }
 
     /// The points within `radius_m` of a point, with the vector to the point from each.
@@ -52,26 +55,29 @@ impl Grid {
         &self,
         point: Point2<f64>,
         radius_m: f64,
-    ) -> impl Iterator<Item = (GridPoint, Vector2<f64>)> + '_ {
-        let span = |middle: f64| line(middle - radius_m, self.cell_m)..=line(middle + radius_m, self.cell_m);
-        let columns = span(point.x);
-        // A grid of no points is asked nothing.
-        let rows = span(point.y).filter(|_| !self.points.is_empty());
-        rows.flat_map(move |row| columns.clone().map(move |column| (column, row)))
-            .flat_map(|cell| self.bucket(cell).iter().filter(move |(at, _)| *at == cell))
-            .map(move |(_, candidate)| (*candidate, point - candidate.position))
+    ) -> impl Iterator<Item = (&GridPoint, Vector2<f64>)> + '_ {
+        let first = line(point.x - radius_m, self.cell_m);
+        let columns = line(point.x + radius_m, self.cell_m).abs_diff(first) as usize;
+        let rows = line(point.y - radius_m, self.cell_m)..=line(point.y + radius_m, self.cell_m);
+        rows.flat_map(move |row| self.stretch(first, columns, row).filter(move |(at, _)| *at == row))
+            .map(move |(_, candidate)| (candidate, point - candidate.position))
             .filter(move |(_, offset)| offset.norm_squared() <= radius_m * radius_m)
     }
 
-    /// The points of all cells that share the cell's bucket.
-    fn bucket(&self, cell: Cell) -> &[(Cell, GridPoint)] {
-        let bucket = bucket(cell, self.ends.len());
-        let start = if bucket == 0 { 0 } else { self.ends[bucket - 1] };
-        &self.points[start as usize..self.ends[bucket] as usize]
+    /// The points in the buckets of a cell and of so many more of its row, and whatever shares the buckets.
+    fn stretch(&self, first: i32, more: usize, row: i32) -> impl Iterator<Item = &(i32, GridPoint)> {
+        let buckets = self.ends.len();
+        let first = bucket(first, row, buckets);
+        let last = first + more.min(buckets - 1);
+        let start = |bucket: usize| if bucket == 0 { 0 } else { self.ends[bucket - 1] as usize };
+        let straight = &self.points[start(first)..self.ends[last.min(buckets - 1)] as usize];
+        // Beyond the last bucket comes the first.
+        let around = if last < buckets { 0 } else { self.ends[last - buckets] as usize };
+        straight.iter().chain(&self.points[..around])
     }
 }
 
-fn bucket((column, row): Cell, buckets: usize) -> usize {
+fn bucket(column: i32, row: i32, buckets: usize) -> usize {
     let spread = ((row as u64).wrapping_mul(ROW_STEP) >> 32).wrapping_add(column as u64);
     spread as usize & (buckets - 1)
 }

@@ -14,6 +14,8 @@ use crate::names::{Label, LandmarkId};
 #[derive(Debug, Clone)]
 pub struct LandmarkIndex {
     landmarks: Vec<Landmark>,
+    /// Side by side, for [`Self::position_near`].
+    ids: Vec<LandmarkId>,
     by_id: HashMap<LandmarkId, usize>,
     objects: Grid,
     vacancy_signs: Grid,
@@ -53,6 +55,7 @@ impl LandmarkIndex {
         let objects = landmarks.iter().map(|l| l.position).enumerate().map(point);
         let signs = landmarks.iter().enumerate().filter_map(|(index, l)| Some((index, l.vacancy.as_ref()?.position)));
         Self {
+            ids: landmarks.iter().map(|l| l.id.clone()).collect(),
             by_id: landmarks.iter().enumerate().map(|(index, l)| (l.id.clone(), index)).collect(),
             objects: Grid::new(objects, 4.0 * radius_m),
             vacancy_signs: Grid::new(signs.map(point), 4.0 * radius_m),
@@ -72,8 +75,7 @@ impl LandmarkIndex {
 
     /// The same for ids that mostly come in configuration order: `expected` is tried first.
     pub fn position_near(&self, id: &LandmarkId, expected: usize) -> Option<usize> {
-        let is_expected = self.landmarks.get(expected).is_some_and(|landmark| landmark.id == *id);
-        if is_expected { Some(expected) } else { self.position_of(id) }
+        if self.ids.get(expected) == Some(id) { Some(expected) } else { self.position_of(id) }
     }
 
     /// Landmarks whose object would stand within `radius_m` of a point in metres, in no particular order.
@@ -86,7 +88,7 @@ impl LandmarkIndex {
     /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
     /// with where objects stand.
     pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
-        let reads_sign_of = |near: &GridPoint| {
+        let reads_sign_of = |near: &GridPoint| -> bool {
             let sign = || self.landmarks[near.landmark as usize].vacancy.as_ref();
             near.has_sign && sign().is_some_and(|sign| sign.label == *label)
         };
@@ -101,8 +103,11 @@ impl LandmarkIndex {
                 .filter(|candidate| candidate.mahalanobis_squared <= gate.sigmas * gate.sigmas)
                 .min_by(Candidate::compare)
         };
-        let (object, sign) = (near(&self.objects, false), near(&self.vacancy_signs, true));
-        object.into_iter().chain(sign).min_by(Candidate::compare)
+        let object = near(&self.objects, false);
+        if self.vacancy_signs.is_empty() {
+            return object;
+        }
+        object.into_iter().chain(near(&self.vacancy_signs, true)).min_by(Candidate::compare)
     }
 }
 

@@ -24,7 +24,7 @@ use nalgebra::Point2;
 use smallvec::SmallVec;
 
 use self::evidence::{Look, Sighting, Vehicle, Worth};
-use self::tally::{NamedLook, Tally, weighted_mean};
+use self::tally::{NamedLook, Tally, WeightedMean};
 use super::grouping::{ByPlace, Grouping, Place};
 use super::{PaceConfig, PaceRound};
 use crate::landmark::{Candidate, Landmark, LandmarkIndex};
@@ -158,11 +158,15 @@ impl BayesPace {
         observers: &[NamedLook<'_>],
     ) -> Option<LandmarkState> {
         let winner = Tally::of(looks).winner(published, self.config.switch_lead)?;
-        let contributions = looks.iter().filter(|(_, look)| look.nats_for(winner.label) > 0.0);
-        let positions = contributions.clone().filter_map(|(_, look)| look.position);
-        let position = weighted_mean(positions, self.config.position_floor_m).unwrap_or(landmark.position);
         let mut contributors = Vec::with_capacity(looks.len());
-        contributors.extend(contributions.map(|(node, _)| (*node).clone()));
+        let mut mean = WeightedMean::default();
+        for (node, look) in looks.iter().filter(|(_, look)| look.nats_for(winner.label) > 0.0) {
+            contributors.push((*node).clone());
+            if let Some((position, covariance)) = &look.position {
+                mean.add(position, covariance, self.config.position_floor_m);
+            }
+        }
+        let position = mean.position().unwrap_or(landmark.position);
         Some(LandmarkState {
             id: landmark.id.clone(),
             label: Some(winner.label.clone()),

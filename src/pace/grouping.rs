@@ -13,9 +13,9 @@ impl Place {
 }
 
 /// What one vehicle holds: items, and the place of each beside them, so that regrouping reads nothing but places.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct Held<'a, T> {
-    pub(super) node: &'a NodeName,
+    pub(super) node: NodeName,
     pub(super) places: &'a [Place],
     pub(super) items: &'a [T],
 }
@@ -66,7 +66,7 @@ impl<'a, T> ByPlace<'a, T> {
         let start = if place.index() == 0 { 0 } else { ends[place.index() - 1] };
         entries[start as usize..ends[place.index()] as usize].iter().map(|&(vehicle, item)| {
             let vehicle = &self.vehicles[vehicle as usize];
-            (vehicle.node, &vehicle.items[item as usize])
+            (&vehicle.node, &vehicle.items[item as usize])
         })
     }
 }

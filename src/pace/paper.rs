@@ -74,7 +74,7 @@ impl PaperPace {
         let held: Vec<_> = self
             .vehicles
             .iter()
-            .map(|(node, freshest)| Held { node, places: &freshest.places, items: &freshest.objects })
+            .map(|(node, freshest)| Held { node: node.clone(), places: &freshest.places, items: &freshest.objects })
             .collect();
         let by_place = self.grouping.group(&held, self.landmarks.landmarks().len());
         let landmarks = self.landmarks.landmarks().iter().enumerate();
@@ -86,15 +86,21 @@ impl PaperPace {
 }
 
 /// The map's entry for a location, given O_ρ by vehicle.
-fn agree<'a>(landmark: &Landmark, near: impl ExactSizeIterator<Item = (&'a NodeName, &'a Near)>) -> LandmarkState {
+fn agree<'a>(
+    landmark: &Landmark,
+    near: impl ExactSizeIterator<Item = (&'a NodeName, &'a Near)> + Clone,
+) -> LandmarkState {
     let count = near.len();
     let (mut position_sum, mut confidence_sum, mut confidence_square_sum) = (Vector2::zeros(), 0.0, 0.0);
-    let mut labels: SmallVec<[(&Label, f64); 4]> = SmallVec::new();
-    let mut contributors: Vec<NodeName> = Vec::with_capacity(count);
-    for (node, Near { label, confidence, position }) in near {
+    // A pass of its own: its loads do not wait for each other, and most of the time goes into them.
+    for (_, Near { confidence, position, .. }) in near.clone() {
         position_sum += position;
         confidence_sum += confidence;
         confidence_square_sum += confidence * confidence;
+    }
+    let mut labels: SmallVec<[(&Label, f64); 4]> = SmallVec::new();
+    let mut contributors: Vec<NodeName> = Vec::with_capacity(count);
+    for (node, Near { label, confidence, .. }) in near {
         match labels.iter_mut().find(|(known, _)| *known == label) {
             Some((_, sum)) => *sum += confidence,
             None => labels.push((label, *confidence)),

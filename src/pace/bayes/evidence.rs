@@ -136,8 +136,8 @@ impl Vehicle {
     }
 
     /// The vehicle's looks under its name.
-    pub(super) fn held_by<'a>(&'a self, node: &'a NodeName) -> Held<'a, Look> {
-        Held { node, places: &self.places, items: &self.looks }
+    pub(super) fn held_by(&self, node: &NodeName) -> Held<'_, Look> {
+        Held { node: node.clone(), places: &self.places, items: &self.looks }
     }
 }
 
@@ -152,12 +152,14 @@ impl Look {
 
     fn hit(&mut self, object: &PerceivedObject, worth: Worth, config: &PaceConfig) {
         let nats = worth.hit_nats * object.confidence;
-        if !self.labels.iter().any(|evidence| evidence.label == object.label) {
-            self.labels.push(LabelEvidence { label: object.label.clone(), nats: 0.0 });
-        }
+        let mut is_known = false;
         for evidence in &mut self.labels {
-            let signed = if evidence.label == object.label { nats } else { -nats };
-            evidence.nats = (evidence.nats + signed).min(config.evidence_limit);
+            let is_same = evidence.label == object.label;
+            is_known |= is_same;
+            evidence.nats = (evidence.nats + if is_same { nats } else { -nats }).min(config.evidence_limit);
+        }
+        if !is_known {
+            self.labels.push(LabelEvidence { label: object.label.clone(), nats: nats.min(config.evidence_limit) });
         }
         self.anything = (self.anything + nats).min(config.evidence_limit);
         self.position = Some((Point2::new(object.x_m, object.y_m), config.covariance(object)));

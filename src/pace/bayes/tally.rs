@@ -1,6 +1,6 @@
 //! The vehicles' evidence about one place, added up.
 
-use nalgebra::{Matrix2, Point2, Vector2};
+use nalgebra::{Point2, Vector2};
 use smallvec::SmallVec;
 
 use super::evidence::Look;
@@ -51,17 +51,34 @@ impl<'a> Tally<'a> {
     }
 }
 
-/// Mean weighted by the inverse covariances, each with the floor added; `None` without positions.
-pub(super) fn weighted_mean(
-    positions: impl Iterator<Item = (Point2<f64>, Covariance)>,
-    floor_m: f64,
-) -> Option<Point2<f64>> {
-    let floor = Covariance::isotropic(floor_m);
-    let (mut information, mut sum) = (Matrix2::zeros(), Vector2::zeros());
-    for (position, covariance) in positions {
-        let weight = (covariance + floor).matrix().try_inverse()?;
-        information += weight;
-        sum += weight * position.coords;
+/// Mean of positions weighted by the inverse of their covariances.
+#[derive(Default)]
+pub(super) struct WeightedMean {
+    /// Sum of the inverse covariances.
+    xx: f64,
+    xy: f64,
+    yy: f64,
+    /// Sum of the weighted positions.
+    sum: Vector2<f64>,
+}
+
+impl WeightedMean {
+    /// Takes a position whose errors have the covariance and, beside it, the floor as standard deviation.
+    pub(super) fn add(&mut self, position: &Point2<f64>, covariance: &Covariance, floor_m: f64) {
+        let Covariance { xx, xy, yy } = *covariance + Covariance::isotropic(floor_m);
+        let per_determinant = 1.0 / (xx * yy - xy * xy);
+        let (xx, xy, yy) = (yy * per_determinant, -xy * per_determinant, xx * per_determinant);
+        self.xx += xx;
+        self.xy += xy;
+        self.yy += yy;
+        self.sum += Vector2::new(xx * position.x + xy * position.y, xy * position.x + yy * position.y);
     }
-    information.try_inverse().map(|covariance| Point2::from(covariance * sum))
+
+    /// The mean; `None` without positions, or when their covariances are so large that nothing is known.
+    pub(super) fn position(&self) -> Option<Point2<f64>> {
+        let Self { xx, xy, yy, sum } = self;
+        let determinant = xx * yy - xy * xy;
+        let position = Point2::new(yy * sum.x - xy * sum.y, xx * sum.y - xy * sum.x) / determinant;
+        (position.x.is_finite() && position.y.is_finite()).then_some(position)
+    }
 }
