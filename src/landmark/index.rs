@@ -88,7 +88,7 @@ impl LandmarkIndex {
     /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
     /// with where objects stand.
     pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
-        let reads_sign_of = |near: &GridPoint| -> bool {
+        let reads_sign_of = |near: &GridPoint| {
             let sign = || self.landmarks[near.landmark as usize].vacancy.as_ref();
             near.has_sign && sign().is_some_and(|sign| sign.label == *label)
         };

@@ -19,7 +19,7 @@ pub struct Traffic {
     pub rounds: u32,
     /// Time from one round to the next.
     pub interval: Duration,
-    /// Clients that send a message a round and receive the answer.
+    /// Clients that send a message a round and receive the answer, at least 1.
     pub vehicles: usize,
     /// Time between the messages of a round.
     pub stagger: Duration,
