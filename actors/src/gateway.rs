@@ -178,11 +178,8 @@ impl Actor for Gateway {
                 }
             }
             GatewayMessage::PublishMap { map } => {
-                // In this order: the task that is woken last, which sends the map, runs first.
-                let payload = Bytes::from(encode(&*map, state.encoding));
-                inbox.expect_map(payload.clone());
+                state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
                 inbox.deliver_local(Incoming::Map(map));
-                state.send(&state.topics.path(&Topic::GlobalDetections), &payload, Handling::Stream);
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
                 state.publish(&Topic::GlobalVerdicts, &*verdicts, Handling::Stream);

@@ -80,7 +80,6 @@ pub(super) struct Inbox {
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
     places: Arc<Semaphore>,
-    own_map: Mutex<Bytes>,
     own_reputations: Mutex<Bytes>,
 }
 
@@ -113,18 +112,12 @@ impl Inbox {
             counters,
             subscriber: RwLock::new(subscriber),
             places: Arc::new(Semaphore::new(places)),
-            own_map: Mutex::default(),
             own_reputations: Mutex::default(),
         }
     }
 
     pub(super) fn set_subscriber(&self, subscriber: Subscriber) {
         *self.subscriber.write().unwrap_or_else(PoisonError::into_inner) = subscriber;
-    }
-
-    /// The echo of a map as it was sent need not be decoded to be known.
-    pub(super) fn expect_map(&self, payload: Bytes) {
-        *self.own_map.lock().unwrap_or_else(PoisonError::into_inner) = payload;
     }
 
     /// Reputations carry no aggregator, so that their echo is known by its bytes.
@@ -187,9 +180,6 @@ impl Inbox {
             Topic::VoteDetections(node) => return self.read_report(ReportKind::VoteDetections, &node, payload),
             Topic::Nodes(node) => return self.read_status(&node, payload),
             Topic::GlobalDetections => {
-                if *self.own_map.lock().unwrap_or_else(PoisonError::into_inner) == payload {
-                    return Ok(Read::Echo);
-                }
                 let map: GlobalMap = decode(payload, &self.limits)?;
                 if map.aggregator == self.node {
                     return Ok(Read::Echo);
