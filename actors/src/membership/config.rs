@@ -144,7 +144,7 @@ impl MulticastConfig {
 }
 
 /// Shortest key.
-const MIN_KEY_BYTES: usize = 12;
+pub(super) const MIN_KEY_BYTES: usize = 12;
 
 fn is_host_and_port(text: &str) -> bool {
     text.rsplit_once(':').is_some_and(|(host, port)| {
