@@ -243,7 +243,12 @@ impl Machine {
                     self.hello_at = self.hello_at.min(at + self.hello);
                     continue;
                 }
-                Rumour::Alive(id) => MembershipEvent::Alive { member: self.member(&id) },
+                Rumour::Alive(id) => {
+                    if self.sessions.outdate(&id.name, id.run, at) {
+                        self.greet(id.gossip, at);
+                    }
+                    MembershipEvent::Alive { member: self.member(&id) }
+                }
                 Rumour::Changed(id) => MembershipEvent::Changed { member: self.member(&id) },
                 Rumour::Suspected(name) => MembershipEvent::Suspected { name },
                 Rumour::Down(name) => MembershipEvent::Down { name },
@@ -271,7 +276,7 @@ impl Machine {
     }
 
     fn greet(&mut self, to: SocketAddr, at: Timestamp) {
-        if self.sessions.may_answer(at) {
+        if self.sessions.may_greet(at) {
             let frame = self.sessions.hello(self.gossip.own());
             self.outputs.push_back(Output::Send { to, frame });
         }

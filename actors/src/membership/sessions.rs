@@ -20,7 +20,7 @@ use super::frame::{HEAD_BYTES, Handshake, Head, HeadError, Hello, Kind, NameStan
 use super::key::{CellKey, Cookie, CookieJar, EVERYBODY, Seal, SessionId};
 use super::node_id::NodeId;
 use super::replay_window::ReplayWindow;
-use super::throttle::Throttle;
+use super::throttle::{Answers, Throttle};
 
 /// All sessions of a node.
 pub(super) struct Sessions {
@@ -33,13 +33,17 @@ pub(super) struct Sessions {
     peers: HashMap<SessionId, Peer>,
     /// The session that speaks for a name.
     speakers: HashMap<NodeName, SessionId>,
-    answers: Throttle,
+    /// Answers to greetings, to challenges, and greetings of strangers.
+    challenges: Answers,
+    proofs: Answers,
+    greetings: Throttle,
     max_peers: usize,
     counters: Arc<FrameCounters>,
 }
 
 struct Peer {
     name: NodeName,
+    run: u64,
     address: SocketAddr,
     to: Seal,
     from: Seal,
@@ -103,7 +107,9 @@ impl Sessions {
             counter: 0,
             peers: HashMap::new(),
             speakers: HashMap::new(),
-            answers: Throttle::new(BURST, STEADY, now),
+            challenges: Answers::new(now),
+            proofs: Answers::new(now),
+            greetings: Throttle::new(GREETINGS, STEADY, now),
             max_peers,
             counters,
         }
@@ -127,13 +133,18 @@ impl Sessions {
         Some(self.peers.get(self.speakers.get(name)?)?.address)
     }
 
-    /// Whether a stranger may be greeted now.
-    pub(super) fn may_answer(&mut self, now: Timestamp) -> bool {
-        let allowed = self.answers.allow(now);
-        if !allowed {
-            self.counters.count(FrameEvent::Throttled);
-        }
-        allowed
+    /// Whether a node may be greeted now that was heard of or from.
+    pub(super) fn may_greet(&mut self, now: Timestamp) -> bool {
+        self.greetings.allow(now) || self.throttled()
+    }
+
+    /// Forgets who spoke for a name in an earlier run; whether it did.
+    pub(super) fn outdate(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
+        let speaker = self.speakers.get(name).and_then(|session| self.peers.get_mut(session));
+        let Some(peer) = speaker.filter(|peer| peer.run != run) else { return false };
+        peer.superseded = Some(now);
+        self.speakers.remove(name);
+        true
     }
 
     /// Takes a datagram. An error is junk, and changed nothing.
@@ -193,7 +204,8 @@ impl Sessions {
         if speaks && there && (roster.known)(&hello.name).is_some_and(|known| known.alive) {
             return Ok(Opened::Nothing);
         }
-        if !self.may_answer(now) {
+        if !self.challenges.allow(&head.sender, now) {
+            self.throttled();
             return Ok(Opened::Nothing);
         }
         let cookie = self.cookies.bake(&head.sender, from, slot(now));
@@ -211,7 +223,8 @@ impl Sessions {
     ) -> Result<Opened, FrameEvent> {
         let (echo, cookie, word) = match message {
             Handshake::Challenge { cookie: echo, name } => {
-                if !self.may_answer(now) {
+                if !self.proofs.allow(&head.sender, now) {
+                    self.throttled();
                     return Ok(Opened::Nothing);
                 }
                 let cookie = self.cookies.bake(&head.sender, from, slot(now));
@@ -263,7 +276,8 @@ impl Sessions {
             let (to, from) = (self.key.seal(&self.own, &head.sender), self.key.seal(&head.sender, &self.own));
             let window = ReplayWindow::after(head.counter);
             let name = id.name.clone();
-            self.peers.insert(head.sender, Peer { name, address, to, from, window, heard: now, superseded: None });
+            let run = id.run;
+            self.peers.insert(head.sender, Peer { name, run, address, to, from, window, heard: now, superseded: None });
         }
         let taken = standing == NameStanding::Taken;
         if let Some(peer) = self.peers.get_mut(&head.sender) {
@@ -319,6 +333,11 @@ impl Sessions {
         head.write(self.key.tag(), &encode(message), &self.key.seal(&self.own, to))
     }
 
+    fn throttled(&self) -> bool {
+        self.counters.count(FrameEvent::Throttled);
+        false
+    }
+
     fn head(&mut self, kind: Kind) -> Head {
         self.counter += 1;
         Head { kind, sender: self.own, counter: self.counter }
@@ -335,8 +354,8 @@ impl From<HeadError> for FrameEvent {
     }
 }
 
-/// Most answers to strangers at once, and time until one more: a cell of 64 that starts together meets unhindered.
-const BURST: u32 = 256;
+/// Most greetings of single nodes at once, and time until one more.
+const GREETINGS: u32 = 256;
 const STEADY: Duration = Duration::from_millis(10);
 
 /// A session that has been silent for so long gives way to a new one.
