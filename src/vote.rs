@@ -11,6 +11,7 @@
 mod calibration;
 mod config;
 mod confusion;
+mod dependence;
 mod model;
 mod paper;
 mod visibility;

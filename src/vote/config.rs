@@ -113,6 +113,9 @@ pub struct WeightedConfig {
     pub class_share_verdicts: f64,
     /// Votes over which the memory of a vehicle fades to 1/e; default 500. Shorter notices a change of mind sooner.
     pub memory_votes: f64,
+    /// Comparisons over which the memory of two vehicles' agreement fades to 1/e; default 100. Shorter notices sooner
+    /// that vehicles begin to copy each other, longer finds fainter dependence.
+    pub pair_memory_votes: f64,
     /// Votes until a vehicle counts as proven; default 10.
     pub probation_votes: f64,
     /// Most that newcomers together weigh against the proven vehicles at a landmark; default 0.5. Bounds what an
@@ -140,6 +143,7 @@ impl Default for WeightedConfig {
             confusion_sharing: 0.5,
             class_share_verdicts: 100.0,
             memory_votes: 500.0,
+            pair_memory_votes: 100.0,
             probation_votes: 10.0,
             newcomer_share: 0.5,
             hysteresis: 0.1,
@@ -160,6 +164,7 @@ impl WeightedConfig {
         check_range("confusion_sharing", self.confusion_sharing, 0.0, 1.0)?;
         check_range("class_share_verdicts", self.class_share_verdicts, 2.0, 1e9)?;
         check_range("memory_votes", self.memory_votes, 1.0, 1e9)?;
+        check_range("pair_memory_votes", self.pair_memory_votes, 2.0, 1e9)?;
         check_range("probation_votes", self.probation_votes, 0.0, 1e6)?;
         check_range("newcomer_share", self.newcomer_share, 0.0, 1e9)?;
         check_range("hysteresis", self.hysteresis, 0.0, 0.99)?;

@@ -36,6 +36,8 @@ pub(super) struct Word {
     pub(super) label: LabelIndex,
     /// Calibrated confidence × visibility, 1 for a plain vote.
     pub(super) weight: f64,
+    /// Part of the vote that is the vehicle's own.
+    pub(super) own: f64,
 }
 
 /// Vehicles' and the fleet's confusion and the shares of the classes.
@@ -145,7 +147,7 @@ impl Model {
         let others: Vec<_> = posterior
             .iter()
             .map(|&(label, p)| {
-                let lead = word.weight * (own - self.log_likelihood(word, label, accuracy));
+                let lead = word.weight * word.own * (own - self.log_likelihood(word, label, accuracy));
                 (label, p * lead.min(500.0).exp())
             })
             .collect();
@@ -180,7 +182,7 @@ impl Model {
             .map(|&truth| {
                 let said = |word: &Word| {
                     let factor = if self.is_newcomer(word.vehicle) { newcomer } else { 1.0 };
-                    factor * word.weight * self.log_likelihood(word, truth, accuracy)
+                    factor * word.weight * word.own * self.log_likelihood(word, truth, accuracy)
                 };
                 self.log_shares[usize::from(truth)] + words.iter().map(said).sum::<f64>()
             })
@@ -199,7 +201,7 @@ impl Model {
     pub(super) fn newcomer_factor(&self, words: &[Word]) -> f64 {
         let (mut newcomers, mut proven) = (0.0, 0.0);
         for word in words {
-            *(if self.is_newcomer(word.vehicle) { &mut newcomers } else { &mut proven }) += word.weight;
+            *(if self.is_newcomer(word.vehicle) { &mut newcomers } else { &mut proven }) += word.weight * word.own;
         }
         let most = self.config.newcomer_share * proven;
         if proven > 0.0 && newcomers > most { most / newcomers } else { 1.0 }

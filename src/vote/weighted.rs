@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::calibration::{Calibration, Weights};
 use super::config::WeightedConfig;
 use super::confusion::LabelIndex;
+use super::dependence::Dependence;
 use super::model::{Model, Witness, Word};
 use super::paper::REPUTATION_RANGE;
 use crate::names::{Label, LandmarkId, NodeName};
@@ -21,16 +22,20 @@ struct Cast {
     confidence: f64,
     visibility: f64,
     weight: f64,
+    /// Part of it that is the vehicle's own.
+    own: f64,
     at: Timestamp,
     /// When it began to count once more as evidence.
     since: Timestamp,
     /// Whether a posterior rests on it.
     judged: bool,
+    /// Whether it has been compared with the other vehicles' since it began to count.
+    compared: bool,
 }
 
 impl Cast {
     fn word(&self) -> Word {
-        Word { vehicle: self.vehicle, label: self.label, weight: self.weight }
+        Word { vehicle: self.vehicle, label: self.label, weight: self.weight, own: self.own }
     }
 }
 
@@ -54,6 +59,26 @@ impl Ballot {
         self.casts.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
     }
 
+    fn compare(&mut self, dependence: &mut Dependence) {
+        if self.casts.iter().any(|c| !c.compared) {
+            let votes: Vec<_> = self.casts.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
+            dependence.compare(&votes);
+            self.casts.iter_mut().for_each(|c| c.compared = true);
+        }
+    }
+
+    fn weigh(&mut self, dependence: &Dependence, weights: &Weights) {
+        for place in 0..self.casts.len() {
+            let Cast { vehicle, label, confidence, visibility, .. } = self.casts[place];
+            let says_the_same = |other: usize| {
+                self.casts.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.casts[at].label == label)
+            };
+            let own = dependence.own_part(vehicle, says_the_same);
+            self.casts[place].weight = weights.of(confidence) * visibility;
+            self.casts[place].own = own;
+        }
+    }
+
     fn probability(&self, label: LabelIndex) -> f64 {
         self.posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
     }
@@ -65,6 +90,7 @@ pub(super) struct WeightedTally {
     config: WeightedConfig,
     model: Model,
     calibration: Calibration,
+    dependence: Dependence,
     vehicles: BTreeMap<NodeName, usize>,
     names: Vec<NodeName>,
     records: Vec<(u64, u64)>,
@@ -83,6 +109,7 @@ impl WeightedTally {
         Self {
             model: Model::new(config.clone()),
             calibration: Calibration::new(config.calibration_votes),
+            dependence: Dependence::new(config.pair_memory_votes),
             config,
             vehicles: BTreeMap::new(),
             names: Vec::new(),
@@ -150,18 +177,18 @@ impl WeightedTally {
         let (vehicle, label) = (self.vehicle(node), self.label(label));
         let freshness = Duration::from_secs_f64(self.config.freshness_s);
         let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
-        let mut since = at;
+        let (mut since, mut compared) = (at, false);
         if let Some(earlier) = earlier {
             if at.since(earlier.since) >= freshness {
                 self.retire(landmark, |c| c.vehicle == vehicle);
             } else {
-                since = earlier.since;
+                (since, compared) = (earlier.since, earlier.compared);
                 self.uncount(landmark);
             }
         } else {
             self.uncount(landmark);
         }
-        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, at, since, judged: false };
+        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, own: 1.0, at, since, judged: false, compared };
         let ballot = self.ballots.entry(landmark.clone()).or_default();
         match ballot.casts.binary_search_by_key(&vehicle, |c| c.vehicle) {
             Ok(place) => ballot.casts[place] = cast,
@@ -229,10 +256,9 @@ impl WeightedTally {
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
         self.uncount(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        for cast in &mut ballot.casts {
-            cast.weight = weights.of(cast.confidence) * cast.visibility;
-            cast.judged = true;
-        }
+        ballot.compare(&mut self.dependence);
+        ballot.weigh(&self.dependence, weights);
+        ballot.casts.iter_mut().for_each(|cast| cast.judged = true);
         let words = ballot.words();
         self.model.prepare(words.iter().map(|w| w.vehicle));
         let posterior = self.model.posterior(&words, &ballot.candidates());
@@ -259,6 +285,9 @@ impl WeightedTally {
     pub(super) fn close(&mut self, now: Timestamp) -> BTreeSet<LandmarkId> {
         self.expire(now);
         let weights = self.calibration.weights();
+        if self.dependence.is_due() {
+            self.dependence.fit(self.names.len());
+        }
         let mut changed = std::mem::take(&mut self.touched);
         for landmark in &changed {
             self.judge(landmark, &weights);
@@ -292,21 +321,26 @@ impl WeightedTally {
     /// Judges all stored votes `passes` times over, starting from majorities (Dawid & Skene 1979).
     pub(super) fn refine(&mut self, passes: u32) {
         let weights = self.calibration.weights();
+        let mut dependence = Dependence::new(self.config.pair_memory_votes);
+        for ballot in self.ballots.values() {
+            let votes: Vec<_> = ballot.casts.iter().map(|c| (c.vehicle, c.label, true)).collect();
+            dependence.compare(&votes);
+        }
+        dependence.fit(self.names.len());
         self.model.clear_live();
         for ballot in self.ballots.values_mut() {
             ballot.shown = None;
             ballot.counted = true;
-            let total: f64 = ballot.casts.iter().map(|c| c.weight).sum();
-            let share = |label| ballot.casts.iter().filter(|c| c.label == label).map(|c| c.weight).sum::<f64>() / total;
+            ballot.weigh(&dependence, &weights);
+            let total: f64 = ballot.casts.iter().map(|c| c.weight * c.own).sum();
+            let of_label = |label| ballot.casts.iter().filter(move |c| c.label == label);
+            let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
             ballot.posterior = ballot.candidates().into_iter().map(|label| (label, share(label))).collect();
             self.model.count(&ballot.words(), &ballot.posterior, 1.0);
         }
         for _ in 0..passes {
             self.model.prepare(0..self.names.len());
             for ballot in self.ballots.values_mut() {
-                for cast in &mut ballot.casts {
-                    cast.weight = weights.of(cast.confidence) * cast.visibility;
-                }
                 ballot.posterior = self.model.posterior(&ballot.words(), &ballot.candidates());
             }
             self.model.clear_live();
@@ -319,7 +353,7 @@ impl WeightedTally {
 
     pub(super) fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
         let ballot = self.ballots.get(landmark)?;
-        let mass: f64 = ballot.casts.iter().map(|c| self.score(c.vehicle) * c.weight).sum();
+        let mass: f64 = ballot.casts.iter().map(|c| self.score(c.vehicle) * c.weight * c.own).sum();
         let name = |label: LabelIndex| self.labels[usize::from(label)].clone();
         let votes = ballot.posterior.iter().map(|&(label, p)| (name(label), p * mass)).collect();
         let mut contributors: Vec<_> = ballot.casts.iter().map(|c| self.names[c.vehicle].clone()).collect();
