@@ -16,11 +16,13 @@ use super::confusion::LabelIndex;
 /// Most others on a landmark that a vote is compared with; bounds the cost of a vote.
 const MOST_COMPARED: usize = 8;
 /// Standard deviations by which agreement must exceed what is explained.
-const SIGNIFICANCE: f64 = 3.0;
+const SIGNIFICANCE: f64 = 4.0;
 /// Agreement κ from which two vehicles belong to one group as much as they can: more closeness earns no more say.
 const SAME_GROUP: f64 = 0.3;
 /// Weight, in comparisons, of doubt about two vehicles' agreement and of the typical reliability against a vehicle's.
 const PRIOR_COMPARISONS: f64 = 10.0;
+/// Votes after which a vehicle has half a say in which group is the main one; bounds what new names gain.
+const TENURE_VOTES: f64 = 50.0;
 const GROUPING_STEPS: u32 = 30;
 const FACTOR_STEPS: u32 = 15;
 /// Comparisons after which the shares of the labels count half.
@@ -52,6 +54,15 @@ impl Pair {
     }
 }
 
+/// What a fit came to: vehicles by group.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct Groups {
+    /// Surely in the largest group that agrees.
+    pub(super) main: Vec<usize>,
+    /// Outside it, with a voice that is at most half their own.
+    pub(super) copies: Vec<usize>,
+}
+
 /// Pairwise agreement of vehicles and what follows from it.
 #[derive(Debug, Clone)]
 pub(super) struct Dependence {
@@ -61,6 +72,8 @@ pub(super) struct Dependence {
     total: f64,
     squares: f64,
     compared: usize,
+    /// By vehicle, votes that were compared.
+    tenure: Vec<f64>,
     /// By vehicle, those that it depends on or that depend on it, with ρ.
     partners: Vec<Vec<(usize, f64)>>,
 }
@@ -75,12 +88,19 @@ impl Dependence {
             total: 0.0,
             squares: 0.0,
             compared: 0,
+            tenure: Vec::new(),
             partners: Vec::new(),
         }
     }
 
     /// Compares the votes on a landmark, (vehicle, label, whether new) in order of vehicle, where one of a pair is new.
     pub(super) fn compare(&mut self, votes: &[(usize, LabelIndex, bool)]) {
+        for &(vehicle, _, is_new) in votes {
+            if self.tenure.len() <= vehicle {
+                self.tenure.resize(vehicle + 1, 0.0);
+            }
+            self.tenure[vehicle] += f64::from(is_new);
+        }
         let distances = votes.len() / 2;
         for step in 0..distances.min(MOST_COMPARED) {
             let distance = 1 + (self.compared / votes.len() + step) % distances;
@@ -133,11 +153,17 @@ impl Dependence {
         self.compared >= self.pairs.len().max(64)
     }
 
-    /// Finds the dependent pairs anew.
-    pub(super) fn fit(&mut self, vehicles: usize) {
+    /// Finds the dependent pairs anew; the main group is sought among those that are `present`.
+    pub(super) fn fit(&mut self, present: &[bool]) -> Groups {
         self.compared = 0;
+        let vehicles = present.len();
+        let say = |vehicle: usize| {
+            let tenure = self.tenure.get(vehicle).copied().unwrap_or(0.0);
+            if present[vehicle] { tenure / (tenure + TENURE_VOTES) } else { 0.0 }
+        };
+        let says: Vec<f64> = (0..vehicles).map(say).collect();
         let pairs: Vec<_> = self.pairs.iter().map(|(&(one, other), &pair)| (one, other, pair)).collect();
-        let belonging = main_group(vehicles, &pairs);
+        let belonging = main_group(&says, &pairs);
         let mut rhos = vec![0.0; pairs.len()];
         let mut factors = vec![0.5; vehicles];
         for _ in 0..FACTOR_STEPS {
@@ -151,15 +177,20 @@ impl Dependence {
             self.partners[one].push((other, rho));
             self.partners[other].push((one, rho));
         }
+        let is_copy = |v: usize| present[v] && belonging[v] < 0.1 && self.own_part(v, |other| present[other]) <= 0.5;
+        Groups {
+            main: (0..vehicles).filter(|&v| belonging[v] >= 0.5).collect(),
+            copies: (0..vehicles).filter(|&v| is_copy(v)).collect(),
+        }
     }
 }
 
 /// How far each vehicle, 0 to 1, belongs to the largest group of vehicles that agree: a dominant set (Pavan & Pelillo
 /// 2007) by power iteration without negative parts.
-fn main_group(vehicles: usize, pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
-    let mut belonging = vec![1.0; vehicles];
+fn main_group(says: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
+    let mut belonging = says.to_vec();
     for _ in 0..GROUPING_STEPS {
-        let mut support = vec![0.0; vehicles];
+        let mut support = vec![0.0; says.len()];
         for (one, other, pair) in pairs {
             let affinity =
                 (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.met / (pair.met + PRIOR_COMPARISONS);
@@ -170,7 +201,7 @@ fn main_group(vehicles: usize, pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
         if most <= 0.0 {
             break;
         }
-        belonging = support.into_iter().map(|s| s.max(0.0) / most).collect();
+        belonging = support.iter().zip(says).map(|(s, say)| say * s.max(0.0) / most).collect();
     }
     belonging
 }

@@ -233,6 +233,15 @@ impl Model {
         }
     }
 
+    /// Forgets all past evidence.
+    pub(super) fn clear_settled(&mut self) {
+        self.settled = Confusion::default();
+        for witness in &mut self.witnesses {
+            witness.settled = Confusion::default();
+            witness.inherited = (0.0, 0.0);
+        }
+    }
+
     /// Forgets all live evidence.
     pub(super) fn clear_live(&mut self) {
         self.live = Confusion::default();

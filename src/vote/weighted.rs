@@ -281,12 +281,28 @@ impl WeightedTally {
         }
     }
 
+    /// Finds who depends on whom. If the main group is thought wrong more often than right and those who copy right,
+    /// then verdicts of the copies' own making taught it: that evidence is void, and learning starts again.
+    fn fit_dependence(&mut self, weights: &Weights) {
+        let mut present = vec![false; self.names.len()];
+        self.ballots.values().flat_map(|b| &b.casts).for_each(|c| present[c.vehicle] = true);
+        let groups = self.dependence.fit(&present);
+        let trust = |vehicles: &[usize]| {
+            vehicles.iter().map(|&v| self.model.reliability(v)).sum::<f64>() / vehicles.len().max(1) as f64
+        };
+        if trust(&groups.copies) > 0.5 && trust(&groups.main) < 0.5 && !groups.main.is_empty() {
+            self.model.clear_settled();
+            let dependence = self.dependence.clone();
+            self.start_from_majorities(&dependence, weights);
+        }
+    }
+
     /// Judges the landmarks that changed, then some older ones in turn; returns those of which something is new.
     pub(super) fn close(&mut self, now: Timestamp) -> BTreeSet<LandmarkId> {
         self.expire(now);
         let weights = self.calibration.weights();
         if self.dependence.is_due() {
-            self.dependence.fit(self.names.len());
+            self.fit_dependence(&weights);
         }
         let mut changed = std::mem::take(&mut self.touched);
         for landmark in &changed {
@@ -326,18 +342,8 @@ impl WeightedTally {
             let votes: Vec<_> = ballot.casts.iter().map(|c| (c.vehicle, c.label, true)).collect();
             dependence.compare(&votes);
         }
-        dependence.fit(self.names.len());
-        self.model.clear_live();
-        for ballot in self.ballots.values_mut() {
-            ballot.shown = None;
-            ballot.counted = true;
-            ballot.weigh(&dependence, &weights);
-            let total: f64 = ballot.casts.iter().map(|c| c.weight * c.own).sum();
-            let of_label = |label| ballot.casts.iter().filter(move |c| c.label == label);
-            let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
-            ballot.posterior = ballot.candidates().into_iter().map(|label| (label, share(label))).collect();
-            self.model.count(&ballot.words(), &ballot.posterior, 1.0);
-        }
+        dependence.fit(&vec![true; self.names.len()]);
+        self.start_from_majorities(&dependence, &weights);
         for _ in 0..passes {
             self.model.prepare(0..self.names.len());
             for ballot in self.ballots.values_mut() {
@@ -348,6 +354,20 @@ impl WeightedTally {
                 self.model.count(&ballot.words(), &ballot.posterior, 1.0);
                 Self::show(ballot, self.config.hysteresis);
             }
+        }
+    }
+
+    fn start_from_majorities(&mut self, dependence: &Dependence, weights: &Weights) {
+        self.model.clear_live();
+        for ballot in self.ballots.values_mut() {
+            ballot.shown = None;
+            ballot.counted = true;
+            ballot.weigh(dependence, weights);
+            let total: f64 = ballot.casts.iter().map(|c| c.weight * c.own).sum();
+            let of_label = |label| ballot.casts.iter().filter(move |c| c.label == label);
+            let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
+            ballot.posterior = ballot.candidates().into_iter().map(|label| (label, share(label))).collect();
+            self.model.count(&ballot.words(), &ballot.posterior, 1.0);
         }
     }
 
