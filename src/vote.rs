@@ -19,7 +19,6 @@ mod weighted;
 
 use std::collections::BTreeMap;
 
-pub use calibration::{Calibration, Weights};
 pub use config::{PaperConfig, VoteConfig, VoteMode, WeightedConfig};
 pub use paper::{PaperTally, REPUTATION_RANGE};
 pub use visibility::{falling as falling_visibility, paper as paper_visibility};

@@ -12,6 +12,8 @@ pub(super) struct Witness {
     pub(super) settled: Confusion,
     /// Right and wrong votes told by another aggregator.
     pub(super) inherited: (f64, f64),
+    /// Cumulative sum of how much less often than before the vehicle was right.
+    shortfall: f64,
     /// Log-odds of being right, against what the fleet would be on the same classes.
     advantage: f64,
 }
@@ -19,6 +21,18 @@ pub(super) struct Witness {
 impl Witness {
     fn correct(&self) -> f64 {
         self.live.correct() + self.settled.correct() + self.inherited.0
+    }
+
+    /// Page's (1954) cumulative sum: a vehicle that is suddenly right less often loses most of its past.
+    fn watch(&mut self, right: f64) {
+        let past = self.settled.total() + self.inherited.0 + self.inherited.1;
+        let usual = (self.settled.correct() + self.inherited.0) / past.max(1.0);
+        self.shortfall = (self.shortfall + usual - right - SHORTFALL_SLACK).max(0.0);
+        if self.shortfall > SHORTFALL_ALARM {
+            self.shortfall = 0.0;
+            self.settled.fade(KEPT_AFTER_ALARM);
+            self.inherited = (self.inherited.0 * KEPT_AFTER_ALARM, self.inherited.1 * KEPT_AFTER_ALARM);
+        }
     }
 
     /// Votes of evidence.
@@ -58,6 +72,12 @@ pub(super) struct Model {
 
 /// Weight, in votes, of the assumed accuracy against the fleet's record of a class.
 const FLEET_PRIOR_VOTES: f64 = 1.0;
+/// Fall in the rate of right votes that is not taken for a change.
+const SHORTFALL_SLACK: f64 = 0.2;
+/// Votes that must be missing beyond it: about seven wrong ones of a vehicle that was right 80 % of the time.
+const SHORTFALL_ALARM: f64 = 4.0;
+/// Part of a vehicle's past that still counts after a change.
+const KEPT_AFTER_ALARM: f64 = 0.1;
 
 impl Model {
     pub(super) fn new(config: WeightedConfig) -> Self {
@@ -207,11 +227,12 @@ impl Model {
         if proven > 0.0 && newcomers > most { most / newcomers } else { 1.0 }
     }
 
-    /// Adds the words as live evidence, `sign` −1 to take them back.
+    /// Adds the words as live evidence, `sign` −1 to take them back. A vote that stands alone is no evidence of who is
+    /// right.
     pub(super) fn count(&mut self, words: &[Word], posterior: &[(LabelIndex, f64)], sign: f64) {
         for &(truth, p) in posterior {
             self.shares[usize::from(truth)] += sign * p;
-            for word in words {
+            for word in words.iter().filter(|_| words.len() > 1) {
                 let weight = sign * p * word.weight.min(1.0);
                 self.witnesses[word.vehicle].live.add(truth, word.label, weight);
                 self.live.add(truth, word.label, weight);
@@ -224,6 +245,8 @@ impl Model {
         let fade = 1.0 - 1.0 / self.config.memory_votes;
         let fleet_fade = 1.0 - 1.0 / (self.config.memory_votes * self.witnesses.len().max(1) as f64);
         let witness = &mut self.witnesses[word.vehicle];
+        let right = posterior.iter().find(|(truth, _)| *truth == word.label).map_or(0.0, |(_, p)| *p);
+        witness.watch(right);
         witness.settled.fade(fade);
         witness.inherited = (witness.inherited.0 * fade, witness.inherited.1 * fade);
         self.settled.fade(fleet_fade);

@@ -27,6 +27,10 @@ struct Cast {
     at: Timestamp,
     /// When it began to count once more as evidence.
     since: Timestamp,
+    /// Rank of its confidence as of the last judgement.
+    band: usize,
+    /// How far the others agreed, if that is in the live evidence on confidences.
+    agreement: Option<f64>,
     /// Whether a posterior rests on it.
     judged: bool,
     /// Whether it has been compared with the other vehicles' since it began to count.
@@ -59,29 +63,51 @@ impl Ballot {
         self.casts.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
     }
 
-    fn compare(&mut self, dependence: &mut Dependence) {
+    /// Takes in what is new about who agrees with whom, and who states which confidences.
+    fn compare(&mut self, dependence: &mut Dependence, calibration: &mut Calibration) {
         if self.casts.iter().any(|c| !c.compared) {
             let votes: Vec<_> = self.casts.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
             dependence.compare(&votes);
-            self.casts.iter_mut().for_each(|c| c.compared = true);
+            for cast in self.casts.iter_mut().filter(|c| !c.compared) {
+                calibration.state(cast.vehicle, cast.confidence);
+                cast.compared = true;
+            }
         }
     }
 
-    fn weigh(&mut self, dependence: &Dependence, weights: &Weights) {
+    fn weigh(&mut self, dependence: &Dependence, calibration: &Calibration, weights: &Weights) {
         for place in 0..self.casts.len() {
             let Cast { vehicle, label, confidence, visibility, .. } = self.casts[place];
             let says_the_same = |other: usize| {
                 self.casts.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.casts[at].label == label)
             };
             let own = dependence.own_part(vehicle, says_the_same);
-            self.casts[place].weight = weights.of(confidence) * visibility;
-            self.casts[place].own = own;
+            let band = calibration.band(vehicle, confidence);
+            let cast = &mut self.casts[place];
+            (cast.own, cast.band, cast.weight) = (own, band, weights.of(band, confidence) * visibility);
         }
     }
 
-    fn probability(&self, label: LabelIndex) -> f64 {
-        self.posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
+    /// Adds to the evidence on confidences how far the others agree with each vote.
+    fn agree(&mut self, model: &Model, calibration: &mut Calibration) {
+        if self.is_witnessed() {
+            for cast in &mut self.casts {
+                let agreement = probability(&model.without(&self.posterior, &cast.word()), cast.label);
+                calibration.count(cast.band, agreement, 1.0);
+                cast.agreement = Some(agreement);
+            }
+        }
     }
+
+    /// Whether several vehicles voted, so that they can judge each other.
+    fn is_witnessed(&self) -> bool {
+        self.casts.len() > 1
+    }
+
+}
+
+fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
+    posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
 }
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the votes that are fresh.
@@ -188,7 +214,7 @@ impl WeightedTally {
         } else {
             self.uncount(landmark);
         }
-        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, own: 1.0, at, since, judged: false, compared };
+        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, own: 1.0, at, since, band: 0, agreement: None, judged: false, compared };
         let ballot = self.ballots.entry(landmark.clone()).or_default();
         match ballot.casts.binary_search_by_key(&vehicle, |c| c.vehicle) {
             Ok(place) => ballot.casts[place] = cast,
@@ -205,6 +231,11 @@ impl WeightedTally {
             && std::mem::take(&mut ballot.counted)
         {
             self.model.count(&ballot.words(), &ballot.posterior, -1.0);
+            for cast in &mut ballot.casts {
+                if let Some(agreement) = cast.agreement.take() {
+                    self.calibration.count(cast.band, agreement, -1.0);
+                }
+            }
         }
     }
 
@@ -215,7 +246,7 @@ impl WeightedTally {
         }
         self.uncount(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        let posterior = ballot.posterior.clone();
+        let (posterior, is_witnessed) = (ballot.posterior.clone(), ballot.is_witnessed());
         let (past, casts) = std::mem::take(&mut ballot.casts).into_iter().partition(is_past);
         ballot.casts = casts;
         let shown = ballot.shown;
@@ -224,12 +255,11 @@ impl WeightedTally {
             ballot.shown = None;
             ballot.posterior.clear();
         }
-        for cast in past.iter().filter(|cast| cast.judged) {
+        for cast in past.iter().filter(|cast| cast.judged && is_witnessed) {
             // Judged by the others: a vehicle that decides alone must not prove itself right.
             let others = self.model.without(&posterior, &cast.word());
             self.model.settle(&cast.word(), &others);
-            let agreement = posterior.iter().find(|(l, _)| *l == cast.label).map_or(0.0, |(_, p)| *p);
-            self.calibration.observe(cast.confidence, agreement);
+            self.calibration.settle(cast.band, probability(&others, cast.label));
             let correct = shown == Some(cast.label);
             let record = &mut self.records[cast.vehicle];
             *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
@@ -256,14 +286,14 @@ impl WeightedTally {
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
         self.uncount(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        ballot.compare(&mut self.dependence);
-        ballot.weigh(&self.dependence, weights);
+        ballot.compare(&mut self.dependence, &mut self.calibration);
+        ballot.weigh(&self.dependence, &self.calibration, weights);
         ballot.casts.iter_mut().for_each(|cast| cast.judged = true);
         let words = ballot.words();
         self.model.prepare(words.iter().map(|w| w.vehicle));
-        let posterior = self.model.posterior(&words, &ballot.candidates());
-        self.model.count(&words, &posterior, 1.0);
-        ballot.posterior = posterior;
+        ballot.posterior = self.model.posterior(&words, &ballot.candidates());
+        ballot.agree(&self.model, &mut self.calibration);
+        self.model.count(&words, &ballot.posterior, 1.0);
         ballot.counted = true;
         Self::show(ballot, self.config.hysteresis);
     }
@@ -275,7 +305,7 @@ impl WeightedTally {
                 best = Some((label, p));
             }
         }
-        let kept = ballot.shown.map_or(0.0, |shown| ballot.probability(shown));
+        let kept = ballot.shown.map_or(0.0, |shown| probability(&ballot.posterior, shown));
         if kept == 0.0 || best.is_some_and(|(_, p)| p > kept + hysteresis) {
             ballot.shown = best.map(|(label, _)| label);
         }
@@ -283,7 +313,7 @@ impl WeightedTally {
 
     /// Finds who depends on whom. If the main group is thought wrong more often than right and those who copy right,
     /// then verdicts of the copies' own making taught it: that evidence is void, and learning starts again.
-    fn fit_dependence(&mut self, weights: &Weights) {
+    fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
         self.ballots.values().flat_map(|b| &b.casts).for_each(|c| present[c.vehicle] = true);
         let groups = self.dependence.fit(&present);
@@ -292,8 +322,8 @@ impl WeightedTally {
         };
         if trust(&groups.copies) > 0.5 && trust(&groups.main) < 0.5 && !groups.main.is_empty() {
             self.model.clear_settled();
-            let dependence = self.dependence.clone();
-            self.start_from_majorities(&dependence, weights);
+            let (dependence, calibration) = (self.dependence.clone(), self.calibration.clone());
+            self.start_from_majorities(&dependence, &calibration);
         }
     }
 
@@ -302,7 +332,7 @@ impl WeightedTally {
         self.expire(now);
         let weights = self.calibration.weights();
         if self.dependence.is_due() {
-            self.fit_dependence(&weights);
+            self.fit_dependence();
         }
         let mut changed = std::mem::take(&mut self.touched);
         for landmark in &changed {
@@ -336,33 +366,42 @@ impl WeightedTally {
 
     /// Judges all stored votes `passes` times over, starting from majorities (Dawid & Skene 1979).
     pub(super) fn refine(&mut self, passes: u32) {
-        let weights = self.calibration.weights();
         let mut dependence = Dependence::new(self.config.pair_memory_votes);
-        for ballot in self.ballots.values() {
-            let votes: Vec<_> = ballot.casts.iter().map(|c| (c.vehicle, c.label, true)).collect();
-            dependence.compare(&votes);
+        let mut calibration = Calibration::new(self.config.calibration_votes);
+        for ballot in self.ballots.values_mut() {
+            ballot.casts.iter_mut().for_each(|cast| cast.compared = false);
+            ballot.compare(&mut dependence, &mut calibration);
         }
         dependence.fit(&vec![true; self.names.len()]);
-        self.start_from_majorities(&dependence, &weights);
+        self.start_from_majorities(&dependence, &calibration);
         for _ in 0..passes {
             self.model.prepare(0..self.names.len());
+            let weights = calibration.weights();
             for ballot in self.ballots.values_mut() {
+                ballot.weigh(&dependence, &calibration, &weights);
                 ballot.posterior = self.model.posterior(&ballot.words(), &ballot.candidates());
             }
+            calibration.clear_live();
+            self.ballots.values_mut().for_each(|ballot| ballot.agree(&self.model, &mut calibration));
             self.model.clear_live();
             for ballot in self.ballots.values_mut() {
                 self.model.count(&ballot.words(), &ballot.posterior, 1.0);
-                Self::show(ballot, self.config.hysteresis);
+                ballot.shown = None;
+                Self::show(ballot, 0.0);
             }
         }
+        self.calibration.take_live(calibration);
     }
 
-    fn start_from_majorities(&mut self, dependence: &Dependence, weights: &Weights) {
+    fn start_from_majorities(&mut self, dependence: &Dependence, calibration: &Calibration) {
+        let weights = calibration.weights();
         self.model.clear_live();
+        self.calibration.clear_live();
         for ballot in self.ballots.values_mut() {
             ballot.shown = None;
             ballot.counted = true;
-            ballot.weigh(dependence, weights);
+            ballot.weigh(dependence, calibration, &weights);
+            ballot.casts.iter_mut().for_each(|cast| cast.agreement = None);
             let total: f64 = ballot.casts.iter().map(|c| c.weight * c.own).sum();
             let of_label = |label| ballot.casts.iter().filter(move |c| c.label == label);
             let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
