@@ -4,6 +4,8 @@ const BANDS: usize = 10;
 const STEPS: usize = 20;
 /// Weight, in votes, of the middle rank against a vehicle's own record of confidences.
 const RANK_PRIOR_VOTES: f64 = 5.0;
+/// Weight, in votes, of the overall rate of agreement against a band's own.
+const BAND_PRIOR_VOTES: f64 = 20.0;
 /// Votes over which the memory of what confidences are worth fades to 1/e.
 const MEMORY_VOTES: f64 = 20_000.0;
 /// Least and most that a vote weighs for its confidence.
@@ -55,13 +57,7 @@ pub(super) struct Calibration {
 impl Calibration {
     /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in votes.
     pub(super) fn new(prior_votes: f64) -> Self {
-        Self {
-            live: Bands::default(),
-            settled: Bands::default(),
-            scales: Vec::new(),
-            stated: (0.0, 0.0),
-            prior_votes,
-        }
+        Self { live: Bands::default(), settled: Bands::default(), scales: Vec::new(), stated: (0.0, 0.0), prior_votes }
     }
 
     /// Takes in that a vehicle stated a confidence.
@@ -113,17 +109,23 @@ impl Calibration {
             bands.votes[band] = (bands.votes[band] + self.live.votes[band]).max(0.0);
             bands.agreed[band] = (bands.agreed[band] + self.live.agreed[band]).max(0.0);
         }
-        let overall = odds_of(bands.agreed.iter().sum(), bands.votes.iter().sum());
+        let rate = (bands.agreed.iter().sum::<f64>() + 0.7) / (bands.votes.iter().sum::<f64>() + 1.0);
+        let overall = odds(rate);
         let mut ratios = [1.0; BANDS];
         if overall > 0.1 {
             let mut band = 0;
             for (agreed, votes, width) in pooled(&bands) {
-                let ratio = odds_of(agreed, votes) / overall;
+                let ratio = odds((agreed + BAND_PRIOR_VOTES * rate) / (votes + BAND_PRIOR_VOTES)) / overall;
                 ratios[band..band + width].fill(ratio.clamp(WEIGHT_RANGE.0, WEIGHT_RANGE.1));
                 band += width;
             }
         }
-        Weights { ratios, votes: bands.votes, mean: self.stated.0 / self.stated.1.max(1.0), prior_votes: self.prior_votes }
+        Weights {
+            ratios,
+            votes: bands.votes,
+            mean: self.stated.0 / self.stated.1.max(1.0),
+            prior_votes: self.prior_votes,
+        }
     }
 }
 
@@ -143,9 +145,8 @@ fn pooled(bands: &Bands) -> Vec<(f64, f64, usize)> {
     pools
 }
 
-/// Log-odds of agreement, shrunk towards 0.7 with the weight of ten votes.
-fn odds_of(agreed: f64, votes: f64) -> f64 {
-    let rate = ((agreed + 7.0) / (votes + 10.0)).clamp(1e-6, 1.0 - 1e-6);
+fn odds(rate: f64) -> f64 {
+    let rate = rate.clamp(1e-6, 1.0 - 1e-6);
     (rate / (1.0 - rate)).ln()
 }
 

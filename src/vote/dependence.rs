@@ -192,8 +192,7 @@ fn main_group(says: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
     for _ in 0..GROUPING_STEPS {
         let mut support = vec![0.0; says.len()];
         for (one, other, pair) in pairs {
-            let affinity =
-                (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.met / (pair.met + PRIOR_COMPARISONS);
+            let affinity = (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.met / (pair.met + PRIOR_COMPARISONS);
             support[*one] += affinity * belonging[*other];
             support[*other] += affinity * belonging[*one];
         }

@@ -10,8 +10,8 @@ pub(super) struct Witness {
     pub(super) live: Confusion,
     /// Evidence of votes that are past, fading.
     pub(super) settled: Confusion,
-    /// Right and wrong votes told by another aggregator.
-    pub(super) inherited: (f64, f64),
+    /// Evidence told by another aggregator, fading.
+    pub(super) inherited: Confusion,
     /// Cumulative sum of how much less often than before the vehicle was right.
     shortfall: f64,
     /// Log-odds of being right, against what the fleet would be on the same classes.
@@ -20,24 +20,24 @@ pub(super) struct Witness {
 
 impl Witness {
     fn correct(&self) -> f64 {
-        self.live.correct() + self.settled.correct() + self.inherited.0
+        self.live.correct() + self.settled.correct() + self.inherited.correct()
     }
 
     /// Page's (1954) cumulative sum: a vehicle that is suddenly right less often loses most of its past.
     fn watch(&mut self, right: f64) {
-        let past = self.settled.total() + self.inherited.0 + self.inherited.1;
-        let usual = (self.settled.correct() + self.inherited.0) / past.max(1.0);
+        let past = self.settled.total() + self.inherited.total();
+        let usual = (self.settled.correct() + self.inherited.correct()) / past.max(1.0);
         self.shortfall = (self.shortfall + usual - right - SHORTFALL_SLACK).max(0.0);
         if self.shortfall > SHORTFALL_ALARM {
             self.shortfall = 0.0;
             self.settled.fade(KEPT_AFTER_ALARM);
-            self.inherited = (self.inherited.0 * KEPT_AFTER_ALARM, self.inherited.1 * KEPT_AFTER_ALARM);
+            self.inherited.fade(KEPT_AFTER_ALARM);
         }
     }
 
     /// Votes of evidence.
     pub(super) fn evidence(&self) -> f64 {
-        self.live.total() + self.settled.total() + self.inherited.0 + self.inherited.1
+        self.live.total() + self.settled.total() + self.inherited.total()
     }
 }
 
@@ -126,9 +126,10 @@ impl Model {
         for vehicle in vehicles {
             let witness = &self.witnesses[vehicle];
             let expected = |rows: &Confusion| -> f64 { rows.rows().map(|(t, n)| n * self.fleet(t, t, accuracy)).sum() };
-            let counted = witness.live.total() + witness.settled.total();
+            let counted = witness.evidence();
             let fleet = if counted > 1e-9 {
-                ((expected(&witness.live) + expected(&witness.settled)) / counted).clamp(1e-6, 1.0 - 1e-6)
+                ((expected(&witness.live) + expected(&witness.settled) + expected(&witness.inherited)) / counted)
+                    .clamp(1e-6, 1.0 - 1e-6)
             } else {
                 accuracy.clamp(1e-6, 1.0 - 1e-6)
             };
@@ -188,8 +189,9 @@ impl Model {
             (1.0 - assumed_right) * (sharing * shared + (1.0 - sharing) / self.wrong_labels())
         };
         let prior = self.config.class_prior_votes;
-        let count = witness.live.cell(truth, word.label) + witness.settled.cell(truth, word.label);
-        let row = witness.live.row(truth) + witness.settled.row(truth);
+        let evidence = [&witness.live, &witness.settled, &witness.inherited];
+        let count: f64 = evidence.iter().map(|e| e.cell(truth, word.label)).sum();
+        let row: f64 = evidence.iter().map(|e| e.row(truth)).sum();
         ((count + prior * assumed) / (row + prior)).max(1e-12).ln()
     }
 
@@ -248,7 +250,7 @@ impl Model {
         let right = posterior.iter().find(|(truth, _)| *truth == word.label).map_or(0.0, |(_, p)| *p);
         witness.watch(right);
         witness.settled.fade(fade);
-        witness.inherited = (witness.inherited.0 * fade, witness.inherited.1 * fade);
+        witness.inherited.fade(fade);
         self.settled.fade(fleet_fade);
         for &(truth, p) in posterior {
             witness.settled.add(truth, word.label, p * word.weight.min(1.0));
@@ -261,7 +263,7 @@ impl Model {
         self.settled = Confusion::default();
         for witness in &mut self.witnesses {
             witness.settled = Confusion::default();
-            witness.inherited = (0.0, 0.0);
+            witness.inherited = Confusion::default();
         }
     }
 

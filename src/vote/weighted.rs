@@ -3,112 +3,17 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use super::ballot::{Ballot, Cast, probability};
 use super::calibration::{Calibration, Weights};
 use super::config::WeightedConfig;
-use super::confusion::LabelIndex;
+use super::confusion::{Confusion, LabelIndex};
 use super::dependence::Dependence;
-use super::model::{Model, Witness, Word};
+use super::model::{Model, Witness};
 use super::paper::REPUTATION_RANGE;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
-
-/// A vote that counts.
-#[derive(Debug, Clone, Copy)]
-struct Cast {
-    vehicle: usize,
-    label: LabelIndex,
-    confidence: f64,
-    visibility: f64,
-    weight: f64,
-    /// Part of it that is the vehicle's own.
-    own: f64,
-    at: Timestamp,
-    /// When it began to count once more as evidence.
-    since: Timestamp,
-    /// Rank of its confidence as of the last judgement.
-    band: usize,
-    /// How far the others agreed, if that is in the live evidence on confidences.
-    agreement: Option<f64>,
-    /// Whether a posterior rests on it.
-    judged: bool,
-    /// Whether it has been compared with the other vehicles' since it began to count.
-    compared: bool,
-}
-
-impl Cast {
-    fn word(&self) -> Word {
-        Word { vehicle: self.vehicle, label: self.label, weight: self.weight, own: self.own }
-    }
-}
-
-/// The votes on one landmark, at most one of each vehicle, in order of vehicle.
-#[derive(Debug, Clone, Default)]
-struct Ballot {
-    casts: Vec<Cast>,
-    /// As of the last judgement.
-    posterior: Vec<(LabelIndex, f64)>,
-    /// Whether votes and posterior are in the live evidence at present.
-    counted: bool,
-    shown: Option<LabelIndex>,
-}
-
-impl Ballot {
-    fn words(&self) -> Vec<Word> {
-        self.casts.iter().map(Cast::word).collect()
-    }
-
-    fn candidates(&self) -> Vec<LabelIndex> {
-        self.casts.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
-    }
-
-    /// Takes in what is new about who agrees with whom, and who states which confidences.
-    fn compare(&mut self, dependence: &mut Dependence, calibration: &mut Calibration) {
-        if self.casts.iter().any(|c| !c.compared) {
-            let votes: Vec<_> = self.casts.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
-            dependence.compare(&votes);
-            for cast in self.casts.iter_mut().filter(|c| !c.compared) {
-                calibration.state(cast.vehicle, cast.confidence);
-                cast.compared = true;
-            }
-        }
-    }
-
-    fn weigh(&mut self, dependence: &Dependence, calibration: &Calibration, weights: &Weights) {
-        for place in 0..self.casts.len() {
-            let Cast { vehicle, label, confidence, visibility, .. } = self.casts[place];
-            let says_the_same = |other: usize| {
-                self.casts.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.casts[at].label == label)
-            };
-            let own = dependence.own_part(vehicle, says_the_same);
-            let band = calibration.band(vehicle, confidence);
-            let cast = &mut self.casts[place];
-            (cast.own, cast.band, cast.weight) = (own, band, weights.of(band, confidence) * visibility);
-        }
-    }
-
-    /// Adds to the evidence on confidences how far the others agree with each vote.
-    fn agree(&mut self, model: &Model, calibration: &mut Calibration) {
-        if self.is_witnessed() {
-            for cast in &mut self.casts {
-                let agreement = probability(&model.without(&self.posterior, &cast.word()), cast.label);
-                calibration.count(cast.band, agreement, 1.0);
-                cast.agreement = Some(agreement);
-            }
-        }
-    }
-
-    /// Whether several vehicles voted, so that they can judge each other.
-    fn is_witnessed(&self) -> bool {
-        self.casts.len() > 1
-    }
-
-}
-
-fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
-    posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
-}
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the votes that are fresh.
 #[derive(Debug, Clone)]
@@ -214,7 +119,20 @@ impl WeightedTally {
         } else {
             self.uncount(landmark);
         }
-        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, own: 1.0, at, since, band: 0, agreement: None, judged: false, compared };
+        let cast = Cast {
+            vehicle,
+            label,
+            confidence,
+            visibility,
+            weight: 1.0,
+            own: 1.0,
+            at,
+            since,
+            band: 0,
+            agreement: None,
+            judged: false,
+            compared,
+        };
         let ballot = self.ballots.entry(landmark.clone()).or_default();
         match ballot.casts.binary_search_by_key(&vehicle, |c| c.vehicle) {
             Ok(place) => ballot.casts[place] = cast,
@@ -295,20 +213,7 @@ impl WeightedTally {
         ballot.agree(&self.model, &mut self.calibration);
         self.model.count(&words, &ballot.posterior, 1.0);
         ballot.counted = true;
-        Self::show(ballot, self.config.hysteresis);
-    }
-
-    fn show(ballot: &mut Ballot, hysteresis: f64) {
-        let mut best: Option<(LabelIndex, f64)> = None;
-        for &(label, p) in &ballot.posterior {
-            if best.is_none_or(|(_, most)| p > most) {
-                best = Some((label, p));
-            }
-        }
-        let kept = ballot.shown.map_or(0.0, |shown| probability(&ballot.posterior, shown));
-        if kept == 0.0 || best.is_some_and(|(_, p)| p > kept + hysteresis) {
-            ballot.shown = best.map(|(label, _)| label);
-        }
+        ballot.show(self.config.hysteresis);
     }
 
     /// Finds who depends on whom. If the main group is thought wrong more often than right and those who copy right,
@@ -387,7 +292,7 @@ impl WeightedTally {
             for ballot in self.ballots.values_mut() {
                 self.model.count(&ballot.words(), &ballot.posterior, 1.0);
                 ballot.shown = None;
-                Self::show(ballot, 0.0);
+                ballot.show(0.0);
             }
         }
         self.calibration.take_live(calibration);
@@ -402,10 +307,7 @@ impl WeightedTally {
             ballot.counted = true;
             ballot.weigh(dependence, calibration, &weights);
             ballot.casts.iter_mut().for_each(|cast| cast.agreement = None);
-            let total: f64 = ballot.casts.iter().map(|c| c.weight * c.own).sum();
-            let of_label = |label| ballot.casts.iter().filter(move |c| c.label == label);
-            let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
-            ballot.posterior = ballot.candidates().into_iter().map(|label| (label, share(label))).collect();
+            ballot.posterior = ballot.majority();
             self.model.count(&ballot.words(), &ballot.posterior, 1.0);
         }
     }
@@ -442,12 +344,29 @@ impl WeightedTally {
         self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), entry(vehicle))).collect()
     }
 
-    /// Takes over what a ledger knows, each vehicle's at most `memory_votes` strong.
-    pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
-        for (node, (correct, incorrect)) in ledger.totals() {
-            let vehicle = self.vehicle(&node);
+    /// Takes over what a ledger knows of its first `most_vehicles` vehicles, each at most `memory_votes` strong, in
+    /// place of what it took over before.
+    ///
+    /// A ledger counts by stated label; what was right instead of a wrong one is taken to be any other label alike.
+    pub(super) fn adopt(&mut self, ledger: &ReputationLedger, (most_vehicles, most_labels): (usize, usize)) {
+        let known: Vec<_> = ledger.totals().into_iter().take(most_vehicles).collect();
+        for label in known.iter().flat_map(|(node, _)| ledger.by_label(node).into_keys()) {
+            if self.has_room_for(&label, most_labels) {
+                self.label(&label);
+            }
+        }
+        for (node, (correct, incorrect)) in known {
             let scale = (self.config.memory_votes / (correct + incorrect).max(1) as f64).min(1.0);
-            self.model.witnesses[vehicle].inherited = (correct as f64 * scale, incorrect as f64 * scale);
+            let mut inherited = Confusion::default();
+            for (label, counts) in ledger.by_label(&node) {
+                let Some(&label) = self.label_numbers.get(&label) else { continue };
+                inherited.add(label, label, scale * counts.correct as f64);
+                let others: Vec<_> = (0..self.labels.len() as LabelIndex).filter(|l| *l != label).collect();
+                let each = scale * counts.incorrect as f64 / others.len().max(1) as f64;
+                others.into_iter().for_each(|truth| inherited.add(truth, label, each));
+            }
+            let vehicle = self.vehicle(&node);
+            self.model.witnesses[vehicle].inherited = inherited;
         }
     }
 }
