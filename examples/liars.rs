@@ -201,11 +201,19 @@ fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
         let Some(trial) = trials.get(place % columns * LIES.len() + place / columns) else { continue };
         let mut chart = ChartBuilder::on(area)
             .margin(8)
+            .margin_right(24)
             .caption(format!("{:?}, {} vehicles", trial.lie, trial.vehicles), ("sans-serif", 15))
             .x_label_area_size(24)
             .y_label_area_size(32)
             .build_cartesian_2d(0.0..ROUNDS as f64, 0.0..1.0)?;
-        chart.configure_mesh().x_labels(4).y_labels(6).x_desc("round").light_line_style(WHITE).draw()?;
+        chart
+            .configure_mesh()
+            .x_labels(4)
+            .x_label_formatter(&|x| format!("{x:.0}"))
+            .y_labels(6)
+            .x_desc("round")
+            .light_line_style(WHITE)
+            .draw()?;
         let course = |of: fn(&Course, usize) -> f64| {
             (0..(ROUNDS / 10) as usize).map(move |n| (n as f64 * 10.0 + 10.0, trial.mean(|c| of(c, n))))
         };

@@ -5,7 +5,7 @@ const STEPS: usize = 20;
 /// Weight, in votes, of the middle rank against a vehicle's own record of confidences.
 const RANK_PRIOR_VOTES: f64 = 5.0;
 /// Weight, in votes, of the overall rate of agreement against a band's own.
-const BAND_PRIOR_VOTES: f64 = 20.0;
+const BAND_PRIOR_VOTES: f64 = 100.0;
 /// Votes over which the memory of what confidences are worth fades to 1/e.
 const MEMORY_VOTES: f64 = 20_000.0;
 /// Least and most that a vote weighs for its confidence.

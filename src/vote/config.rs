@@ -129,7 +129,7 @@ pub struct WeightedConfig {
     pub visibility_at_max_range: f64,
     /// Older landmarks that are judged again per fresh vote, in votes; default 8. More settles sooner, costs more.
     pub revisit_votes: f64,
-    /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 50.
+    /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 10.
     pub calibration_votes: f64,
 }
 
@@ -150,7 +150,7 @@ impl Default for WeightedConfig {
             half_visibility_rad: 0.8,
             visibility_at_max_range: 0.3,
             revisit_votes: 8.0,
-            calibration_votes: 50.0,
+            calibration_votes: 10.0,
         }
     }
 }
