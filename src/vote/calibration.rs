@@ -105,17 +105,18 @@ impl Calibration {
     pub(super) fn weights(&self) -> Weights {
         let mut bands = self.settled.clone();
         for band in 0..BANDS {
-            bands.add(band, 0.0, 0.0);
             bands.votes[band] = (bands.votes[band] + self.live.votes[band]).max(0.0);
             bands.agreed[band] = (bands.agreed[band] + self.live.agreed[band]).max(0.0);
         }
-        let rate = (bands.agreed.iter().sum::<f64>() + 0.7) / (bands.votes.iter().sum::<f64>() + 1.0);
-        let overall = odds(rate);
+        let (agreed, votes) = (bands.agreed.iter().sum::<f64>(), bands.votes.iter().sum::<f64>());
+        let rate = (agreed + 0.7) / (votes + 1.0);
+        let shrunk = |agreed: f64, votes: f64| odds((agreed + BAND_PRIOR_VOTES * rate) / (votes + BAND_PRIOR_VOTES));
+        let overall = shrunk(agreed, votes);
         let mut ratios = [1.0; BANDS];
         if overall > 0.1 {
             let mut band = 0;
             for (agreed, votes, width) in pooled(&bands) {
-                let ratio = odds((agreed + BAND_PRIOR_VOTES * rate) / (votes + BAND_PRIOR_VOTES)) / overall;
+                let ratio = shrunk(agreed, votes) / overall;
                 ratios[band..band + width].fill(ratio.clamp(WEIGHT_RANGE.0, WEIGHT_RANGE.1));
                 band += width;
             }
