@@ -57,10 +57,17 @@ impl Ballot {
         self.casts.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
     }
 
-    /// Takes in what is new about who agrees with whom, and who states which confidences.
-    pub(super) fn compare(&mut self, dependence: &mut Dependence, calibration: &mut Calibration) {
+    /// Takes in what is new about who agrees with whom, and who states which confidences; of many voters, `order`
+    /// decides who is compared.
+    pub(super) fn compare(
+        &mut self,
+        dependence: &mut Dependence,
+        calibration: &mut Calibration,
+        order: impl Fn(usize) -> usize,
+    ) {
         if self.casts.iter().any(|c| !c.compared) {
-            let votes: Vec<_> = self.casts.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
+            let mut votes: Vec<_> = self.casts.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
+            votes.sort_by_key(|(vehicle, ..)| order(*vehicle));
             dependence.compare(&votes);
             for cast in self.casts.iter_mut().filter(|c| !c.compared) {
                 calibration.state(cast.vehicle, cast.confidence);

@@ -93,7 +93,7 @@ impl Dependence {
         }
     }
 
-    /// Compares the votes on a landmark, (vehicle, label, whether new) in order of vehicle, where one of a pair is new.
+    /// Compares the votes on a landmark, (vehicle, label, whether new) in any fixed order, where one of a pair is new.
     pub(super) fn compare(&mut self, votes: &[(usize, LabelIndex, bool)]) {
         for &(vehicle, _, is_new) in votes {
             if self.tenure.len() <= vehicle {

@@ -204,7 +204,7 @@ impl WeightedTally {
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
         self.uncount(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        ballot.compare(&mut self.dependence, &mut self.calibration);
+        ballot.compare(&mut self.dependence, &mut self.calibration, |vehicle| vehicle);
         ballot.weigh(&self.dependence, &self.calibration, weights);
         ballot.casts.iter_mut().for_each(|cast| cast.judged = true);
         let words = ballot.words();
@@ -273,9 +273,11 @@ impl WeightedTally {
     pub(super) fn refine(&mut self, passes: u32) {
         let mut dependence = Dependence::new(self.config.pair_memory_votes);
         let mut calibration = Calibration::new(self.config.calibration_votes);
+        let mut by_name = vec![0; self.names.len()];
+        self.vehicles.values().enumerate().for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
         for ballot in self.ballots.values_mut() {
             ballot.casts.iter_mut().for_each(|cast| cast.compared = false);
-            ballot.compare(&mut dependence, &mut calibration);
+            ballot.compare(&mut dependence, &mut calibration, |vehicle| by_name[vehicle]);
         }
         dependence.fit(&vec![true; self.names.len()]);
         self.start_from_majorities(&dependence, &calibration);
