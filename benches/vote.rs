@@ -132,7 +132,7 @@ fn reports(votes: usize, round: u64, at: Timestamp) -> Vec<ObjectReport> {
         for witness in 0..WITNESSES {
             let vehicle = group % 32 * WITNESSES + witness;
             let object = |place: usize| {
-                let wrong = (place * 7 + witness * 13 + round as usize * 3) % 5 == 0;
+                let wrong = (place * 7 + witness * 13 + round as usize * 3).is_multiple_of(5);
                 PerceivedObject {
                     label: LABELS[(place + usize::from(wrong) * (1 + witness % 4)) % LABELS.len()].into(),
                     confidence: 0.5 + 0.5 * ((place * 31 + witness * 17) % 97) as f64 / 97.0,
