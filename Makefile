@@ -4,7 +4,7 @@ PACKAGES := build-essential ca-certificates clang cmake gstreamer1.0-plugins-bas
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 SECONDS_PER_SCENE ?= 15
 
-.PHONY: help setup demo testbed test lint doc audit bench core-only edge-only clean
+.PHONY: help setup demo testbed test lint doc audit bench liars core-only edge-only clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,6 +47,10 @@ edge-only: setup ## an aggregator without camera and OpenCV
 
 bench: setup ## speed of the core, the detectors and the path through the broker, in target/bench.json
 	packaging/bench
+
+liars: setup ## what lying vehicles achieve against VOTE: table in target/liars.md, drawing in target/liars.svg
+	mkdir -p target
+	cargo run --release --locked --example liars -- --table target/liars.md --svg target/liars.svg
 
 clean: ## remove everything that was built
 	cargo clean
