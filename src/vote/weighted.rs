@@ -349,11 +349,14 @@ impl WeightedTally {
         self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), entry(vehicle))).collect()
     }
 
-    /// Takes over what a ledger knows, each vehicle's at most `memory_votes` strong.
+    /// Takes over what a ledger knows beyond what was counted here, each vehicle's at most `memory_votes` strong: a
+    /// standby has counted most of it itself.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
         for (node, (correct, incorrect)) in ledger.totals() {
             let vehicle = self.vehicle(&node);
-            let scale = (self.config.memory_votes / (correct + incorrect).max(1) as f64).min(1.0);
+            let (own_correct, own_incorrect) = self.records[vehicle];
+            let (correct, incorrect) = (correct.saturating_sub(own_correct), incorrect.saturating_sub(own_incorrect));
+            let scale = (self.config.memory_votes / correct.saturating_add(incorrect).max(1) as f64).min(1.0);
             self.model.witnesses[vehicle].inherited = (correct as f64 * scale, incorrect as f64 * scale);
         }
     }

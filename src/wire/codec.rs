@@ -3,7 +3,7 @@
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::{GlobalMap, NodeStatus, ObjectReport, RejectReason, Reputations, SCHEMA_VERSION, Verdicts};
+use super::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, RejectReason, Reputations, SCHEMA_VERSION, Verdicts};
 use crate::names::{MAX_NAME_BYTES, NodeName};
 
 /// How a payload is written.
@@ -64,7 +64,7 @@ macro_rules! payloads {
     };
 }
 
-payloads!(ObjectReport, GlobalMap, Verdicts, Reputations, NodeStatus);
+payloads!(ObjectReport, GlobalMap, Verdicts, Reputations, LedgerShare, NodeStatus);
 
 /// Reads any payload whose `schema` is known.
 ///
@@ -157,7 +157,7 @@ fn in_world(coordinate_m: f64) -> bool {
     coordinate_m.abs() <= WORLD_BOUND_M
 }
 
-fn is_label(text: &str) -> bool {
+pub(super) fn is_label(text: &str) -> bool {
     (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
 }
 

@@ -1,0 +1,85 @@
+//! Bounds of the shares in which evidence is replicated.
+
+use super::codec::is_label;
+use super::{LedgerShare, Limits, RejectReason, decode};
+use crate::names::NodeName;
+
+/// Most counts in one share: it stays below the default of [`Limits::payload_bytes`].
+pub const MAX_SHARE_ENTRIES: usize = 512;
+
+/// Largest count: beyond it JSON numbers are no longer exact everywhere.
+const MAX_COUNT: u64 = 1 << 53;
+
+/// Reads a share and checks every value in it; `topic_node` is the node named by its topic.
+///
+/// # Errors
+/// The first reason found; see [`RejectReason`].
+pub fn decode_share(bytes: &[u8], topic_node: &NodeName, limits: &Limits) -> Result<LedgerShare, RejectReason> {
+    let share: LedgerShare = decode(bytes, limits)?;
+    if share.node != *topic_node {
+        return Err(RejectReason::NodeMismatch);
+    }
+    if share.entries.len() > MAX_SHARE_ENTRIES {
+        return Err(RejectReason::TooManyObjects);
+    }
+    share.entries.iter().try_for_each(|entry| {
+        if entry.correct > MAX_COUNT || entry.incorrect > MAX_COUNT {
+            return Err(RejectReason::NotFinite);
+        }
+        if is_label(&entry.label) { Ok(()) } else { Err(RejectReason::InvalidLabel) }
+    })?;
+    Ok(share)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::{Encoding, LedgerEntry, SCHEMA_VERSION, encode};
+
+    fn share() -> LedgerShare {
+        let name = |name: &str| NodeName::new(name).unwrap();
+        let entry = LedgerEntry {
+            epoch: 3,
+            aggregator: name(&"a".repeat(64)),
+            node: name(&"n".repeat(64)),
+            label: "\"".repeat(64).into(),
+            correct: MAX_COUNT,
+            incorrect: MAX_COUNT,
+        };
+        LedgerShare {
+            schema: SCHEMA_VERSION,
+            node: name("edge"),
+            epoch: Some(3),
+            entries: vec![entry; MAX_SHARE_ENTRIES],
+        }
+    }
+
+    fn reason(share: &LedgerShare) -> Option<RejectReason> {
+        let read =
+            |encoding| decode_share(&encode(share, encoding), &NodeName::from_static("edge"), &Limits::default());
+        assert_eq!(read(Encoding::Json), read(Encoding::Cbor));
+        read(Encoding::Json).err()
+    }
+
+    #[test]
+    fn the_largest_share_fits_and_each_flaw_has_its_reason() {
+        assert_eq!(reason(&share()), None);
+        let flaws: [(fn(&mut LedgerShare), RejectReason); 5] = [
+            (|s| s.schema = 2, RejectReason::UnknownSchema),
+            (|s| s.node = NodeName::from_static("gauss"), RejectReason::NodeMismatch),
+            (|s| s.entries.truncate(1), RejectReason::TooManyObjects),
+            (|s| s.entries[7].incorrect += 1, RejectReason::NotFinite),
+            (|s| s.entries[7].label = "".into(), RejectReason::InvalidLabel),
+        ];
+        for (spoil, expected) in flaws {
+            let mut share = share();
+            if expected == RejectReason::TooManyObjects {
+                share.entries.iter_mut().for_each(|entry| entry.label = "cup".into());
+                share.entries.push(share.entries[0].clone());
+            } else {
+                spoil(&mut share);
+            }
+            assert_eq!(reason(&share), Some(expected));
+        }
+    }
+}
