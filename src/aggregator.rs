@@ -41,6 +41,8 @@ pub struct Fused {
     pub verdicts: Option<Verdicts>,
     /// Votes of which it has been settled whether they were right.
     pub evidence: Vec<Evidence>,
+    /// In VOTE's `paper` mode, with the verdicts, how far each vehicle is trusted: no function of the evidence there.
+    pub reputations: Option<BTreeMap<NodeName, Reputation>>,
 }
 
 /// Admits reports, fuses them and numbers the rounds.
@@ -147,6 +149,13 @@ impl Aggregator {
         }
     }
 
+    /// Goes on, in VOTE's `paper` mode, from reputations that were published.
+    pub fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
+        if let Some(vote) = &mut self.vote {
+            vote.resume(reputations);
+        }
+    }
+
     /// Objects that voted for nothing so far; see [`crate::vote`].
     pub fn ignored_votes(&self) -> u64 {
         self.vote.as_ref().map_or(0, Vote::ignored)
@@ -182,7 +191,8 @@ impl Aggregator {
             fused_at_us: now,
             verdicts,
         });
-        Some(Fused { epoch, round, map, verdicts, evidence })
+        let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
+        Some(Fused { epoch, round, map, verdicts, evidence, reputations })
     }
 }
 

@@ -5,7 +5,11 @@
 //! commutative and associative (a state-based grow-only counter, Shapiro et al. 2011); two partitions that each went on
 //! counting merge to the sum of what they saw.
 
+mod share;
+
 use std::collections::BTreeMap;
+
+pub use share::{EntryKey, MAX_ENTRIES, MAX_LANES};
 
 use serde::{Deserialize, Serialize};
 
@@ -49,13 +53,14 @@ pub struct ReputationConfig {
     pub initial: f64,
     /// Weight of the initial score in votes; default 10. More trusts newcomers and new liars later.
     pub initial_votes: f64,
-    /// Factor by which evidence counts less with every epoch that follows, 0 to 1; default 0.9.
-    pub epoch_fade: f64,
+    /// Votes that are remembered of a vehicle; default 500. Of older epochs only as much counts as later ones leave
+    /// room for, so that a change of leadership alone changes no score. Less notices a change of mind sooner.
+    pub memory_votes: f64,
 }
 
 impl Default for ReputationConfig {
     fn default() -> Self {
-        Self { initial: 0.5, initial_votes: 10.0, epoch_fade: 0.9 }
+        Self { initial: 0.5, initial_votes: 10.0, memory_votes: 500.0 }
     }
 }
 
@@ -67,7 +72,7 @@ impl ReputationConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("initial", self.initial, 0.3, 1.0)?;
         check_range("initial_votes", self.initial_votes, 1e-3, 1e6)?;
-        check_range("epoch_fade", self.epoch_fade, 0.0, 1.0)
+        check_range("memory_votes", self.memory_votes, 1.0, 1e9)
     }
 }
 
@@ -84,10 +89,14 @@ pub struct ReputationLedger {
 impl ReputationLedger {
     /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
+        let is_new = !self.lanes.get(&epoch).is_some_and(|aggregators| aggregators.contains_key(aggregator));
         let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
         let counts = lane.entry(evidence.node.clone()).or_default().entry(evidence.label.clone()).or_default();
         let count = if evidence.correct { &mut counts.correct } else { &mut counts.incorrect };
         *count = count.saturating_add(1);
+        if is_new {
+            self.prune();
+        }
     }
 
     /// Takes in all that `other` knows.
@@ -133,18 +142,21 @@ impl ReputationLedger {
         labels
     }
 
-    /// What is published: the mean of a Beta distribution (Jøsang & Ismail 2002) over faded evidence, 0.30 to 1.00.
+    /// What is published: the mean of a Beta distribution (Jøsang & Ismail 2002) over the evidence that is remembered,
+    /// 0.30 to 1.00.
     pub fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
-        let latest = self.lanes.last_key_value().map_or(0, |(epoch, _)| *epoch);
-        let mut faded: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
-        for (epoch, node, _, counts) in self.counts() {
-            let fade = config.epoch_fade.powi(i32::try_from(latest - epoch).unwrap_or(i32::MAX));
-            let entry = faded.entry(node).or_default();
-            entry.0 += fade * counts.correct as f64;
-            entry.1 += fade * counts.incorrect as f64;
+        let mut remembered: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
+        for (node, labels) in self.lanes.values().rev().flat_map(|aggregators| aggregators.values().rev().flatten()) {
+            let (correct, incorrect) = labels.values().fold((0.0, 0.0), |(correct, incorrect), counts| {
+                (correct + counts.correct as f64, incorrect + counts.incorrect as f64)
+            });
+            let sum = remembered.entry(node).or_default();
+            let room = config.memory_votes - (sum.0 + sum.1);
+            let share = (room / f64::max(correct + incorrect, 1.0)).clamp(0.0, 1.0);
+            *sum = (sum.0 + share * correct, sum.1 + share * incorrect);
         }
         let score = |node: &NodeName| {
-            let (correct, incorrect) = faded.get(node).copied().unwrap_or_default();
+            let (correct, incorrect) = remembered.get(node).copied().unwrap_or_default();
             let mean = (correct + config.initial * config.initial_votes) / (correct + incorrect + config.initial_votes);
             mean.clamp(0.30, 1.00)
         };
@@ -199,6 +211,21 @@ mod tests {
             let snapshot = serde_json::to_string(&a).unwrap();
             prop_assert_eq!(serde_json::from_str::<ReputationLedger>(&snapshot).unwrap(), a);
         }
+    }
+
+    #[test]
+    fn a_new_epoch_alone_changes_no_score_and_new_evidence_displaces_old() {
+        let name = |n: &str| NodeName::new(n).unwrap();
+        let config = ReputationConfig::default();
+        let vote = |correct| Evidence { node: name("euclid"), label: "cup".into(), correct };
+        let mut ledger = ReputationLedger::default();
+        (0..2000).for_each(|_| ledger.record(1, &name("edge"), &vote(true)));
+        let score = |ledger: &ReputationLedger| ledger.reputations(&config)[&name("euclid")].score;
+        let before = score(&ledger);
+        ledger.record(1_732_154_400, &name("gauss"), &vote(true));
+        assert!((score(&ledger) - before).abs() < 1e-9, "{} {before}", score(&ledger));
+        (0..400).for_each(|_| ledger.record(1_732_154_400, &name("gauss"), &vote(false)));
+        assert!(score(&ledger) < 0.35, "{}", score(&ledger));
     }
 
     #[test]

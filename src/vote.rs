@@ -241,6 +241,14 @@ impl Vote {
         }
     }
 
+    /// Goes on from reputations that were published, after a restart or a change of aggregator; without effect in
+    /// `weighted` mode, which rests on evidence.
+    pub fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
+        if let Tally::Paper(tally) = &mut self.tally {
+            tally.resume(reputations);
+        }
+    }
+
     /// Objects that voted for nothing so far; see the module's documentation.
     pub fn ignored(&self) -> u64 {
         self.ignored

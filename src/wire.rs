@@ -8,6 +8,7 @@
 //! aggregator  -> global_detections        GlobalMap
 //! aggregator  -> global_verdicts          Verdicts
 //! aggregator  -> reputations              Reputations    retained
+//! candidate   -> ledger/<node>            LedgerShare    evidence behind the reputations, for the next aggregator
 //! every node  -> nodes/<node>             NodeStatus     retained, with last will
 //! ```
 //!
@@ -15,6 +16,7 @@
 
 mod check;
 mod codec;
+mod ledger;
 mod reject;
 mod topic;
 
@@ -26,6 +28,7 @@ use uuid::Uuid;
 
 pub use check::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, Payload, check_fused_at};
 pub use codec::{Encoding, decode, decode_report, encode};
+pub use ledger::{MAX_SHARE_ENTRIES, decode_share};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
 
@@ -207,6 +210,9 @@ pub struct Verdict {
 pub struct Reputations {
     /// Major version of the payload, [`SCHEMA_VERSION`].
     pub schema: u32,
+    /// The node that publishes them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aggregator: Option<NodeName>,
     /// Term of leadership.
     pub epoch: u64,
     /// The last round that went into the reputations.
@@ -221,6 +227,37 @@ pub struct Reputation {
     /// Weight of the vehicle's votes, 0.30 to 1.00.
     pub score: f64,
     /// Votes that agreed with the verdict.
+    pub correct: u64,
+    /// Votes that did not.
+    pub incorrect: u64,
+}
+
+/// A part of the evidence that reputations rest on; receivers keep the larger of every count.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct LedgerShare {
+    /// Major version of the payload, [`SCHEMA_VERSION`].
+    pub schema: u32,
+    /// The sender; equals the last level of the topic.
+    pub node: NodeName,
+    /// Term in which the sender leads; absent when it does not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub epoch: Option<u64>,
+    /// Counts, at most [`MAX_SHARE_ENTRIES`].
+    pub entries: Vec<LedgerEntry>,
+}
+
+/// How often one vehicle was right and wrong with one label under one leadership.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct LedgerEntry {
+    /// Term of the leadership that counted.
+    pub epoch: u64,
+    /// Its aggregator.
+    pub aggregator: NodeName,
+    /// The vehicle.
+    pub node: NodeName,
+    /// The label that it stated.
+    pub label: Label,
+    /// Votes that agreed with the verdict, since the leadership began.
     pub correct: u64,
     /// Votes that did not.
     pub incorrect: u64,
@@ -279,6 +316,7 @@ pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
         ("GlobalMap", schemars::schema_for!(GlobalMap)),
         ("Verdicts", schemars::schema_for!(Verdicts)),
         ("Reputations", schemars::schema_for!(Reputations)),
+        ("LedgerShare", schemars::schema_for!(LedgerShare)),
         ("NodeStatus", schemars::schema_for!(NodeStatus)),
     ]
     .into()

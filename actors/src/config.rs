@@ -19,6 +19,7 @@ use crate::broker::BrokerConfig;
 #[cfg(feature = "camera")]
 use crate::camera::CameraConfig;
 use crate::gateway::MqttConfig;
+use crate::reputation_keeper::ReputationKeeperConfig;
 
 /// Everything that a node can be told.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -33,6 +34,9 @@ pub struct NodeConfig {
     /// Where an aggregator's embedded broker listens. Default `127.0.0.1:1883`: other machines reach it only when told
     /// so, such as by `0.0.0.0:1883`.
     pub listen: SocketAddr,
+    /// Directory for what survives a restart: reputations. Default `$STATE_DIRECTORY`, which systemd sets, or none: then
+    /// they end with the node.
+    pub state_dir: Option<PathBuf>,
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line. Default none.
     pub map_log: Option<PathBuf>,
@@ -44,6 +48,8 @@ pub struct NodeConfig {
     pub broker: BrokerConfig,
     /// How reports are fused; used by aggregators.
     pub fusion: FusionConfig,
+    /// How often reputations are published, saved and replicated; used by aggregators.
+    pub reputations: ReputationKeeperConfig,
     /// The camera and what is made of its frames. Default none.
     #[cfg(feature = "camera")]
     pub camera: Option<CameraConfig>,
@@ -70,11 +76,13 @@ impl Default for NodeConfig {
             cell: NodeName::from_static("cell"),
             role: Role::Auto,
             listen: SocketAddr::from(([127, 0, 0, 1], 1883)),
+            state_dir: None,
             map_log: None,
             pose: PoseConfig::default(),
             mqtt: MqttConfig::default(),
             broker: BrokerConfig::default(),
             fusion: FusionConfig::default(),
+            reputations: ReputationKeeperConfig::default(),
             #[cfg(feature = "camera")]
             camera: None,
             landmarks: Vec::new(),
@@ -117,6 +125,9 @@ impl NodeConfig {
         if config.role == Role::Edge && config.name.is_none() {
             config.name = Some(NodeName::from_static("edge"));
         }
+        if config.state_dir.is_none() {
+            config.state_dir = std::env::var_os("STATE_DIRECTORY").map(PathBuf::from);
+        }
         config.validate()?;
         Ok(config)
     }
@@ -145,6 +156,7 @@ impl NodeConfig {
             return Err(ConfigError::new("broker.max_packet_bytes", bytes, allowed));
         }
         self.fusion.validate().map_err(|error| error.within("fusion"))?;
+        self.reputations.validate().map_err(|error| error.within("reputations"))?;
         #[cfg(feature = "camera")]
         if let Some(camera) = &self.camera {
             camera.validate().map_err(|error| error.within("camera"))?;

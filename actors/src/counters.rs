@@ -32,6 +32,18 @@ pub enum Event {
     BrokerRefused,
     /// A map newer than all before was taken.
     MapAccepted,
+    /// An object voted for nothing, such as at an unknown landmark.
+    VoteIgnored,
+    /// Verdicts newer than all before were taken.
+    VerdictsAccepted,
+    /// Reputations newer than all before were taken.
+    ReputationsAccepted,
+    /// Another candidate's evidence was taken in and held something new.
+    LedgerMerged,
+    /// Reputations were written to disk.
+    ReputationsSaved,
+    /// Reputations could not be written to disk.
+    ReputationsNotSaved,
     /// A camera frame was looked at.
     FrameDetected,
     /// A camera frame or image file could not be used.
@@ -44,7 +56,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 22] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -57,6 +69,12 @@ impl Event {
         Self::ConnectFailed,
         Self::BrokerRefused,
         Self::MapAccepted,
+        Self::VoteIgnored,
+        Self::VerdictsAccepted,
+        Self::ReputationsAccepted,
+        Self::LedgerMerged,
+        Self::ReputationsSaved,
+        Self::ReputationsNotSaved,
         Self::FrameDetected,
         Self::FrameFailed,
         Self::FrameSkipped,
@@ -78,6 +96,12 @@ impl Event {
             Self::ConnectFailed => "connect_failed",
             Self::BrokerRefused => "broker_refused",
             Self::MapAccepted => "map_accepted",
+            Self::VoteIgnored => "vote_ignored",
+            Self::VerdictsAccepted => "verdicts_accepted",
+            Self::ReputationsAccepted => "reputations_accepted",
+            Self::LedgerMerged => "ledger_merged",
+            Self::ReputationsSaved => "reputations_saved",
+            Self::ReputationsNotSaved => "reputations_not_saved",
             Self::FrameDetected => "frame_detected",
             Self::FrameFailed => "frame_failed",
             Self::FrameSkipped => "frame_skipped",

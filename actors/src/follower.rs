@@ -1,18 +1,20 @@
-//! The actor that takes the cell's maps: it drops what was superseded and hands on the rest.
+//! The actor that takes the cell's maps, verdicts and reputations: it drops what was superseded and hands on the rest.
 //!
 //! ```text
-//! Gateway ── TakeMap ──> Follower ──> watch of the newest map, optional log file
+//! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watches of the newest of each; maps also to an optional log file
 //! ```
+
+mod gate;
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
+use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeStatus, RejectReason};
+use ecod::wire::{GlobalMap, NodeStatus, RejectReason, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
@@ -20,6 +22,7 @@ use tokio::sync::watch;
 use crate::counters::{Counters, Event};
 use crate::gateway::{Delivery, GatewayMessage, Incoming};
 use crate::seat::Seat;
+use gate::{Gate, MEMORY};
 
 /// What the follower is asked to do.
 #[derive(Debug)]
@@ -29,6 +32,43 @@ pub enum FollowerMessage {
         /// The map and when it came.
         delivery: Delivery,
     },
+    /// Take verdicts.
+    TakeVerdicts {
+        /// The verdicts and when they came.
+        delivery: Delivery,
+    },
+    /// Take reputations.
+    TakeReputations {
+        /// The reputations and when they came.
+        delivery: Delivery,
+    },
+}
+
+/// A message and when it came.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Received<T> {
+    /// When it came, by this node's clock.
+    pub received_at: Timestamp,
+    /// The message.
+    pub message: Arc<T>,
+}
+
+/// Where the newest of everything is seen as it changes.
+#[derive(Debug, Clone)]
+pub struct Newest {
+    /// The newest map.
+    pub map: watch::Sender<Option<ReceivedMap>>,
+    /// The newest verdicts.
+    pub verdicts: watch::Sender<Option<Received<Verdicts>>>,
+    /// The newest reputations.
+    pub reputations: watch::Sender<Option<Received<Reputations>>>,
+}
+
+impl Default for Newest {
+    fn default() -> Self {
+        let (map, verdicts) = (watch::Sender::new(None), watch::Sender::new(None));
+        Self { map, verdicts, reputations: watch::Sender::new(None) }
+    }
 }
 
 /// A map and when it came; one line of a map log.
@@ -43,8 +83,8 @@ pub struct ReceivedMap {
 
 /// What a follower needs at its start.
 pub struct FollowerArguments {
-    /// Gets the newest map.
-    pub newest: watch::Sender<Option<ReceivedMap>>,
+    /// Gets the newest of everything.
+    pub newest: Newest,
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line.
     pub log: Option<PathBuf>,
@@ -56,13 +96,16 @@ pub struct FollowerArguments {
     pub counters: Arc<Counters>,
 }
 
-/// Keeps the newest map.
+/// Keeps the newest map, verdicts and reputations.
 #[derive(Debug, Default)]
 pub struct Follower;
 
-/// The newest map and where it goes.
+/// The newest of everything and where it goes.
 pub struct FollowerState {
-    newest: watch::Sender<Option<ReceivedMap>>,
+    newest: Newest,
+    maps: Gate,
+    verdicts: Gate,
+    reputations: Gate,
     log: Option<BufWriter<File>>,
     status: NodeStatus,
     gateway: Seat<GatewayMessage>,
@@ -81,7 +124,7 @@ impl Actor for Follower {
     ) -> Result<Self::State, ActorProcessingErr> {
         let FollowerArguments { newest, log, status, gateway, counters } = arguments;
         let log = log.as_deref().map(open).transpose()?;
-        Ok(FollowerState { newest, log, status, gateway, counters })
+        Ok(FollowerState::new(newest, log, status, gateway, counters))
     }
 
     async fn handle(
@@ -90,37 +133,70 @@ impl Actor for Follower {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let FollowerMessage::TakeMap { delivery } = message;
-        if let Incoming::Map(map) = &delivery.message {
-            state.take(map, delivery.received_at);
+        let (FollowerMessage::TakeMap { delivery }
+        | FollowerMessage::TakeVerdicts { delivery }
+        | FollowerMessage::TakeReputations { delivery }) = message;
+        let taken = match &delivery.message {
+            Incoming::Map(map) => state.take_map(map, delivery.received_at),
+            Incoming::Verdicts(verdicts) => state.take_verdicts(verdicts, delivery.received_at),
+            Incoming::Reputations(reputations) => state.take_reputations(reputations, delivery.received_at),
+            _ => Ok(()),
+        };
+        if let Err(reason) = taken {
+            state.counters.reject(reason);
         }
         Ok(())
     }
 }
 
 impl FollowerState {
-    fn take(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) {
-        let superseded =
-            self.newest.borrow().as_ref().is_some_and(|newest| {
-                order(map) <= order(&newest.map) && received_at.since(newest.received_at) < MEMORY
-            });
-        if superseded {
-            self.counters.reject(RejectReason::Superseded);
-            return;
-        }
-        self.counters.count(Event::MapAccepted);
-        self.follow(map);
-        let received = ReceivedMap { received_at, map: Arc::clone(map) };
-        self.write(&received);
-        self.newest.send_replace(Some(received));
+    fn new(
+        newest: Newest,
+        log: Option<BufWriter<File>>,
+        status: NodeStatus,
+        gateway: Seat<GatewayMessage>,
+        counters: Arc<Counters>,
+    ) -> Self {
+        let (maps, verdicts, reputations) = Default::default();
+        Self { newest, maps, verdicts, reputations, log, status, gateway, counters }
     }
 
-    /// Says so when the aggregator or its epoch has changed.
-    fn follow(&mut self, map: &GlobalMap) {
-        if (self.status.epoch, &self.status.aggregator) != (map.epoch, &Some(map.aggregator.clone())) {
-            tracing::info!(aggregator = %map.aggregator, epoch = map.epoch, "following");
-            self.status.epoch = map.epoch;
-            self.status.aggregator = Some(map.aggregator.clone());
+    fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), RejectReason> {
+        let epoch = Epoch::new(map.epoch, map.aggregator.clone());
+        self.maps.admit(&epoch, map.round, received_at)?;
+        self.counters.count(Event::MapAccepted);
+        self.follow(&epoch);
+        let received = ReceivedMap { received_at, map: Arc::clone(map) };
+        self.write(&received);
+        self.newest.map.send_replace(Some(received));
+        Ok(())
+    }
+
+    fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), RejectReason> {
+        let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
+        self.verdicts.admit(&epoch, verdicts.round, received_at)?;
+        self.counters.count(Event::VerdictsAccepted);
+        if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
+            self.follow(&epoch);
+        }
+        self.newest.verdicts.send_replace(Some(Received { received_at, message: Arc::clone(verdicts) }));
+        Ok(())
+    }
+
+    fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), RejectReason> {
+        let aggregator = reputations.aggregator.clone().unwrap_or(UNNAMED);
+        self.reputations.admit(&Epoch::new(reputations.epoch, aggregator), reputations.round, received_at)?;
+        self.counters.count(Event::ReputationsAccepted);
+        self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
+        Ok(())
+    }
+
+    /// Says so when the aggregator or its epoch has changed; maps tell, and verdicts where no maps come.
+    fn follow(&mut self, epoch: &Epoch) {
+        if (self.status.epoch, self.status.aggregator.as_ref()) != (epoch.term, Some(&epoch.leader)) {
+            tracing::info!(aggregator = %epoch.leader, epoch = epoch.term, "following");
+            self.status.epoch = epoch.term;
+            self.status.aggregator = Some(epoch.leader.clone());
             self.gateway.send(GatewayMessage::PublishStatus { status: self.status.clone() });
         }
     }
@@ -135,14 +211,8 @@ impl FollowerState {
     }
 }
 
-/// How long a newest map outranks others after it came: an aggregator that starts anew with a clock set back, or a map
-/// from a stranger with a huge epoch, silences the rest for no longer than this.
-const MEMORY: Duration = Duration::from_secs(3);
-
-/// Maps are ordered by epoch, then aggregator, then round.
-fn order(map: &GlobalMap) -> (u64, &NodeName, u64) {
-    (map.epoch, &map.aggregator, map.round)
-}
+/// The aggregator of reputations that name none; it sorts before all others.
+const UNNAMED: NodeName = NodeName::from_static("-");
 
 fn open(path: &Path) -> Result<BufWriter<File>, ActorProcessingErr> {
     let file = File::options().create(true).append(true).open(path);
@@ -167,8 +237,7 @@ mod tests {
             aggregator: None,
             version: String::new(),
         };
-        let newest = watch::Sender::new(None);
-        FollowerState { newest, log: None, status, gateway: Seat::default(), counters: Arc::default() }
+        FollowerState::new(Newest::default(), None, status, Seat::default(), Arc::default())
     }
 
     fn map(epoch: u64, round: u64) -> Arc<GlobalMap> {
@@ -188,14 +257,29 @@ mod tests {
     fn a_huge_epoch_silences_the_others_for_a_moment_only() {
         let mut follower = follower();
         let second = |n: u64| Timestamp(n * 1_000_000);
-        let accepted = |follower: &FollowerState| follower.newest.borrow().as_ref().map(|newest| newest.map.epoch);
-        follower.take(&map(u64::MAX, 1), second(0));
-        follower.take(&map(7, 1), second(1));
+        let accepted = |follower: &FollowerState| follower.newest.map.borrow().as_ref().map(|newest| newest.map.epoch);
+        assert_eq!(follower.take_map(&map(u64::MAX, 1), second(0)), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 1), second(1)), Err(RejectReason::Superseded));
         assert_eq!(accepted(&follower), Some(u64::MAX));
-        assert_eq!(follower.counters.rejects(RejectReason::Superseded), 1);
-        follower.take(&map(7, 2), second(4));
+        assert_eq!(follower.take_map(&map(7, 2), second(4)), Ok(()));
         assert_eq!(accepted(&follower), Some(7));
-        follower.take(&map(7, 2), second(5));
-        assert_eq!(follower.counters.rejects(RejectReason::Superseded), 2, "the same map is not taken twice");
+        assert_eq!(follower.take_map(&map(7, 2), second(5)), Err(RejectReason::Superseded), "not taken twice");
+    }
+
+    #[test]
+    fn each_topic_goes_by_its_own_order_and_reputations_may_come_without_a_name() {
+        let mut follower = follower();
+        let reputations = |epoch, round, aggregator: Option<&str>| {
+            let aggregator = aggregator.map(|name| NodeName::new(name).unwrap());
+            Arc::new(Reputations { schema: SCHEMA_VERSION, aggregator, epoch, round, reputations: Default::default() })
+        };
+        let now = Timestamp(1);
+        assert_eq!(follower.take_map(&map(7, 9), now), Ok(()));
+        assert_eq!(follower.take_reputations(&reputations(7, 1, None), now), Ok(()));
+        assert_eq!(follower.take_reputations(&reputations(7, 1, Some("edge")), now), Ok(()));
+        let late = follower.take_reputations(&reputations(7, 2, None), now);
+        assert_eq!(late, Err(RejectReason::Superseded));
+        let newest = follower.newest.reputations.borrow().as_ref().map(|newest| newest.message.aggregator.clone());
+        assert_eq!(newest, Some(Some(NodeName::from_static("edge"))));
     }
 }

@@ -1,21 +1,27 @@
-//! The actor that closes the rounds: reports in, maps out.
+//! The actor that closes the rounds: reports in, maps and verdicts out while the node leads.
 //!
 //! ```text
-//! Gateway ── TakeReport ──> Fuser ── PublishMap ──> Gateway
-//!                             ▲ │
-//!                             └─┘ CloseRound, at the aggregator's deadline
+//! Gateway ── TakeReport ─────────> Fuser ── PublishMap, PublishVerdicts ──> Gateway
+//! LeaderElection ── Lead, … ─────> │ ▲ └─── Record ──> ReputationKeeper
+//! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ecod::aggregator::{Aggregator, Fused};
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::reputation::ReputationLedger;
 use ecod::time::Timestamp;
+use ecod::wire::Reputation;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
 use crate::clock;
-use crate::counters::Counters;
+use crate::counters::{Counters, Event};
 use crate::gateway::{Delivery, GatewayMessage, Incoming};
+use crate::reputation_keeper::ReputationKeeperMessage;
 use crate::seat::Seat;
 
 /// What the fuser is asked to do.
@@ -28,14 +34,37 @@ pub enum FuserMessage {
     },
     /// Close the round if it is due.
     CloseRound,
+    /// Publish from now on.
+    Lead {
+        /// The leadership.
+        epoch: Epoch,
+        /// Number of the next round.
+        first_round: u64,
+        /// Whether the round before has just been published: the next is then due a period later, otherwise at once.
+        on_time: bool,
+    },
+    /// Publish nothing more; go on fusing, to be ready.
+    StopPublishing,
+    /// Start from evidence that came from elsewhere.
+    Adopt {
+        /// All evidence that is known.
+        ledger: Arc<ReputationLedger>,
+    },
+    /// Go on, in VOTE's `paper` mode, from reputations that were published.
+    Resume {
+        /// The reputations.
+        reputations: BTreeMap<NodeName, Reputation>,
+    },
 }
 
 /// What a fuser needs at its start.
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
-    /// Where maps are published.
+    /// Where maps and verdicts are published.
     pub gateway: Seat<GatewayMessage>,
+    /// Is told what rounds say about vehicles.
+    pub keeper: Seat<ReputationKeeperMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -48,6 +77,7 @@ pub struct Fuser;
 pub struct FuserState {
     aggregator: Aggregator,
     gateway: Seat<GatewayMessage>,
+    keeper: Seat<ReputationKeeperMessage>,
     counters: Arc<Counters>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
@@ -63,8 +93,8 @@ impl Actor for Fuser {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let FuserArguments { aggregator, gateway, counters } = arguments;
-        let mut state = FuserState { aggregator, gateway, counters, alarm: Timestamp(u64::MAX), timer: None };
+        let FuserArguments { aggregator, gateway, keeper, counters } = arguments;
+        let mut state = FuserState { aggregator, gateway, keeper, counters, alarm: Timestamp(u64::MAX), timer: None };
         state.set_alarm(&myself);
         Ok(state)
     }
@@ -79,9 +109,15 @@ impl Actor for Fuser {
             FuserMessage::TakeReport { delivery } => state.take(&delivery),
             FuserMessage::CloseRound => {
                 state.alarm = Timestamp(u64::MAX);
-                let fused = state.aggregator.tick(clock::now());
-                state.publish(fused);
+                state.tick();
             }
+            FuserMessage::Lead { epoch, first_round, on_time } => state.lead(epoch, first_round, on_time),
+            FuserMessage::StopPublishing => {
+                state.aggregator.stand_by();
+                state.keeper.send(ReputationKeeperMessage::StandBy);
+            }
+            FuserMessage::Adopt { ledger } => state.aggregator.adopt(&ledger),
+            FuserMessage::Resume { reputations } => state.aggregator.resume(&reputations),
         }
         state.set_alarm(&myself);
         Ok(())
@@ -91,22 +127,38 @@ impl Actor for Fuser {
 impl FuserState {
     fn take(&mut self, delivery: &Delivery) {
         let Incoming::Report { kind, report } = &delivery.message else { return };
-        match self.aggregator.report(*kind, report, delivery.received_at) {
+        let ignored_before = self.aggregator.ignored_votes();
+        let taken = self.aggregator.report(*kind, report, delivery.received_at);
+        self.counters.add(Event::VoteIgnored, self.aggregator.ignored_votes() - ignored_before);
+        match taken {
             Ok(fused) => self.publish(fused),
             Err(reason) => {
-                tracing::debug!(node = %report.node, seq = report.seq, %reason, "report not used");
+                tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
                 self.counters.reject(reason);
             }
         }
     }
 
+    fn lead(&mut self, epoch: Epoch, first_round: u64, on_time: bool) {
+        self.keeper
+            .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
+        self.aggregator.lead(epoch, first_round, on_time, clock::now());
+        self.tick();
+    }
+
+    fn tick(&mut self) {
+        let fused = self.aggregator.tick(clock::now());
+        self.publish(fused);
+    }
+
     fn publish(&self, fused: Option<Fused>) {
-        let Some(fused) = fused else { return };
-        if let Some(map) = fused.map {
+        let Some(Fused { epoch, round, map, verdicts, evidence, reputations }) = fused else { return };
+        if let Some(map) = map {
             self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });
         }
-        if let Some(verdicts) = fused.verdicts {
+        if let Some(verdicts) = verdicts {
             self.gateway.send(GatewayMessage::PublishVerdicts { verdicts: Arc::new(verdicts) });
+            self.keeper.send(ReputationKeeperMessage::Record { epoch, round, evidence, reputations });
         }
     }
 

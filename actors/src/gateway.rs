@@ -28,7 +28,8 @@ use std::time::Duration;
 use bytes::Bytes;
 use ecod::names::NodeName;
 use ecod::wire::{
-    Encoding, GlobalMap, NodeState, NodeStatus, ObjectReport, Payload, Reputations, Topic, Topics, Verdicts, encode,
+    Encoding, GlobalMap, LedgerShare, NodeState, NodeStatus, ObjectReport, Payload, Reputations, Topic, Topics,
+    Verdicts, encode,
 };
 use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
 use uuid::Uuid;
@@ -78,6 +79,11 @@ pub enum GatewayMessage {
         /// The reputations.
         reputations: Arc<Reputations>,
     },
+    /// Send evidence to the other candidates.
+    PublishShare {
+        /// The evidence.
+        share: LedgerShare,
+    },
     /// Replace what this node says about itself, now and on every later connection.
     PublishStatus {
         /// The status.
@@ -100,7 +106,7 @@ pub enum GatewayMessage {
 pub enum Part {
     /// Maps, verdicts, reputations and statuses.
     Follower,
-    /// Also reports: the node aggregates or may have to.
+    /// Also reports and evidence: the node aggregates or may have to.
     Candidate,
 }
 
@@ -186,13 +192,11 @@ impl Actor for Gateway {
                 inbox.deliver_local(Incoming::Verdicts(verdicts));
             }
             GatewayMessage::PublishReputations { reputations } => {
-                let payload = Bytes::from(encode(&*reputations, state.encoding));
-                let path = state.topics.path(&Topic::Reputations);
-                if state.fits::<Reputations>(&path, &payload) {
-                    inbox.expect_reputations(payload.clone());
-                    state.send(&path, &payload, Handling::State);
-                }
+                state.publish(&Topic::Reputations, &*reputations, Handling::State);
                 inbox.deliver_local(Incoming::Reputations(reputations));
+            }
+            GatewayMessage::PublishShare { share } => {
+                state.publish(&Topic::Ledger(share.node.clone()), &share, Handling::Stream);
             }
             GatewayMessage::PublishStatus { status } => state.set_status(status),
             GatewayMessage::Links { reply } => {
@@ -362,9 +366,15 @@ impl Part {
     fn levels(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
-            Self::Candidate => {
-                &["detections/+", "vote_detections/+", "global_detections", "global_verdicts", "reputations", "nodes/+"]
-            }
+            Self::Candidate => &[
+                "detections/+",
+                "vote_detections/+",
+                "global_detections",
+                "global_verdicts",
+                "reputations",
+                "ledger/+",
+                "nodes/+",
+            ],
         }
     }
 }

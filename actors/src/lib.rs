@@ -39,6 +39,8 @@ pub mod node;
 pub mod perception;
 #[cfg(feature = "camera")]
 pub mod projector;
+pub mod reputation_keeper;
 pub mod seat;
+pub mod state_file;
 #[cfg(feature = "camera")]
 pub mod testbed;

@@ -2,12 +2,13 @@
 //!
 //! ```text
 //! Node
-//! ├─ Broker      embedded MQTT broker             an aggregator without an external broker
-//! ├─ Gateway     the only owner of MQTT clients   always
-//! ├─ Follower    takes the cell's maps            always
-//! ├─ Fuser       closes rounds, makes maps        an aggregator
-//! ├─ Projector   detections -> report             with a camera
-//! └─ Detector    frames -> detections             with a camera
+//! ├─ Broker            embedded MQTT broker                  an aggregator without an external broker
+//! ├─ Gateway           the only owner of MQTT clients        always
+//! ├─ Follower          takes maps, verdicts, reputations     always
+//! ├─ ReputationKeeper  publishes and keeps reputations       an aggregator that runs VOTE
+//! ├─ Fuser             closes rounds: maps and verdicts      an aggregator
+//! ├─ Projector         detections -> report                  with a camera
+//! └─ Detector          frames -> detections                  with a camera
 //! ```
 //!
 //! A part that ends is started anew, and the others go on: they reach each other through seats. A node whose parts end
@@ -21,6 +22,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::wire::{Reputations, Verdicts};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -28,7 +30,7 @@ use tokio::task::JoinHandle;
 use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
-use crate::follower::ReceivedMap;
+use crate::follower::{Newest, Received, ReceivedMap};
 
 pub use parts::{Part, Seats};
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
@@ -67,7 +69,7 @@ pub struct NodeHandle {
     supervisor: ActorRef<NodeMessage>,
     ended: JoinHandle<()>,
     failure: watch::Receiver<Option<String>>,
-    newest: watch::Receiver<Option<ReceivedMap>>,
+    newest: Newest,
     broker: watch::Receiver<Option<SocketAddr>>,
     seats: Seats,
     counters: Arc<Counters>,
@@ -94,7 +96,17 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
 impl NodeHandle {
     /// The newest map of the cell, as it changes.
     pub fn newest_map(&self) -> watch::Receiver<Option<ReceivedMap>> {
-        self.newest.clone()
+        self.newest.map.subscribe()
+    }
+
+    /// The newest verdicts of the cell, as they change.
+    pub fn newest_verdicts(&self) -> watch::Receiver<Option<Received<Verdicts>>> {
+        self.newest.verdicts.subscribe()
+    }
+
+    /// The newest reputations of the cell, as they change.
+    pub fn newest_reputations(&self) -> watch::Receiver<Option<Received<Reputations>>> {
+        self.newest.reputations.subscribe()
     }
 
     /// Where the embedded broker listens, if there is one.

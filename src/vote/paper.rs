@@ -20,6 +20,12 @@ struct Vehicle {
     votes: Vec<(LandmarkId, Label)>,
 }
 
+impl Vehicle {
+    fn new(config: &PaperConfig) -> Self {
+        Self { reputation: config.initial_reputation, correct: 0, incorrect: 0, votes: Vec::new() }
+    }
+}
+
 /// S(ρ,l) = Σ_v Σ_ω [l_ω = l] r_v c_ω k(ρ,v), never cleared; λ_ρ = argmax_l S(ρ,l); r_v += Δr_v after each verdict.
 #[derive(Debug, Clone)]
 pub struct PaperTally {
@@ -47,13 +53,7 @@ impl PaperTally {
 
     /// Adds r_v · c_ω · k for one detection.
     pub fn add(&mut self, landmark: &LandmarkId, node: &NodeName, label: &Label, confidence: f64, visibility: f64) {
-        let initial = self.config.initial_reputation;
-        let vehicle = self.vehicles.entry(node.clone()).or_insert_with(|| Vehicle {
-            reputation: initial,
-            correct: 0,
-            incorrect: 0,
-            votes: Vec::new(),
-        });
+        let vehicle = self.vehicles.entry(node.clone()).or_insert_with(|| Vehicle::new(&self.config));
         let (scores, contributors) = self.scores.entry(landmark.clone()).or_default();
         *scores.entry(label.clone()).or_insert(0.0) += vehicle.reputation * confidence * visibility;
         contributors.insert(node.clone());
@@ -90,6 +90,16 @@ impl PaperTally {
             vehicle.votes.clear();
         }
         touched
+    }
+
+    /// Goes on from reputations that an earlier tally arrived at; those of vehicles that it does not name stay.
+    pub fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
+        for (node, Reputation { score, correct, incorrect }) in reputations {
+            let vehicle = self.vehicles.entry(node.clone()).or_insert_with(|| Vehicle::new(&self.config));
+            let (low, high) = REPUTATION_RANGE;
+            vehicle.reputation = score.clamp(low, high);
+            (vehicle.correct, vehicle.incorrect) = (*correct, *incorrect);
+        }
     }
 
     /// Every vehicle's reputation.

@@ -346,8 +346,8 @@ impl WeightedTally {
         self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), entry(vehicle))).collect()
     }
 
-    /// Takes over what a ledger knows of its first `most_vehicles` vehicles, each at most `memory_votes` strong, in
-    /// place of what it took over before.
+    /// Takes over what a ledger knows of its first `most_vehicles` vehicles beyond what was counted here, as a standby
+    /// has counted most of it itself; each at most `memory_votes` strong, in place of what it took over before.
     ///
     /// A ledger counts by stated label; what was right instead of a wrong one is taken to be any other label alike.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger, (most_vehicles, most_labels): (usize, usize)) {
@@ -358,7 +358,11 @@ impl WeightedTally {
             }
         }
         for (node, (correct, incorrect)) in known {
-            let scale = (self.config.memory_votes / (correct + incorrect).max(1) as f64).min(1.0);
+            let vehicle = self.vehicle(&node);
+            let (own_correct, own_incorrect) = self.records[vehicle];
+            let total = correct.saturating_add(incorrect);
+            let beyond = total.saturating_sub(own_correct.saturating_add(own_incorrect));
+            let scale = (beyond as f64).min(self.config.memory_votes) / total.max(1) as f64;
             let mut inherited = Confusion::default();
             for (label, counts) in ledger.by_label(&node) {
                 let Some(&label) = self.label_numbers.get(&label) else { continue };
@@ -367,7 +371,6 @@ impl WeightedTally {
                 let each = scale * counts.incorrect as f64 / others.len().max(1) as f64;
                 others.into_iter().for_each(|truth| inherited.add(truth, label, each));
             }
-            let vehicle = self.vehicle(&node);
             self.model.witnesses[vehicle].inherited = inherited;
         }
     }

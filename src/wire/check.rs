@@ -4,8 +4,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    FusedObject, GlobalMap, LandmarkState, NodeStatus, ObjectReport, RejectReason, Reputations, SCHEMA_VERSION,
-    Verdict, Verdicts,
+    FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_SHARE_ENTRIES, NodeStatus, ObjectReport, RejectReason,
+    Reputations, SCHEMA_VERSION, Verdict, Verdicts,
 };
 use crate::geometry::Covariance;
 use crate::names::MAX_NAME_BYTES;
@@ -117,6 +117,23 @@ impl Payload for Reputations {
             check_integers([reputation.correct, reputation.incorrect])?;
             let trusted = (0.0..=1.0).contains(&reputation.score);
             if trusted { Ok(()) } else { Err(number_reason(reputation.score)) }
+        })
+    }
+}
+
+impl Payload for LedgerShare {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        if self.entries.len() > MAX_SHARE_ENTRIES {
+            return Err(RejectReason::TooManyObjects);
+        }
+        check_integers(self.epoch)?;
+        self.entries.iter().try_for_each(|entry| {
+            check_integers([entry.epoch, entry.correct, entry.incorrect])?;
+            check_labels([&*entry.label])
         })
     }
 }

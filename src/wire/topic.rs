@@ -19,6 +19,8 @@ pub enum Topic {
     GlobalVerdicts,
     /// Reputations, retained.
     Reputations,
+    /// A candidate's shares of the evidence behind the reputations.
+    Ledger(NodeName),
     /// A node's status, retained.
     Nodes(NodeName),
 }
@@ -76,6 +78,7 @@ impl Topics {
         match (kind, node) {
             ("detections", Some(node)) => NodeName::new(node).ok().map(Topic::Detections),
             ("vote_detections", Some(node)) => NodeName::new(node).ok().map(Topic::VoteDetections),
+            ("ledger", Some(node)) => NodeName::new(node).ok().map(Topic::Ledger),
             ("nodes", Some(node)) => NodeName::new(node).ok().map(Topic::Nodes),
             ("global_detections", None) => Some(Topic::GlobalDetections),
             ("global_verdicts", None) => Some(Topic::GlobalVerdicts),
@@ -93,6 +96,7 @@ impl fmt::Display for Topic {
             Self::GlobalDetections => f.write_str("global_detections"),
             Self::GlobalVerdicts => f.write_str("global_verdicts"),
             Self::Reputations => f.write_str("reputations"),
+            Self::Ledger(node) => write!(f, "ledger/{node}"),
             Self::Nodes(node) => write!(f, "nodes/{node}"),
         }
     }
@@ -112,6 +116,7 @@ mod tests {
             Topic::GlobalDetections,
             Topic::GlobalVerdicts,
             Topic::Reputations,
+            Topic::Ledger(node.clone()),
             Topic::Nodes(node),
         ] {
             assert_eq!(topics.parse(&topics.path(&topic)), Some(topic));

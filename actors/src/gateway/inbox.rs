@@ -1,14 +1,13 @@
 //! From a packet to a decoded message in a receiver's hands; junk ends here as a count.
 
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, PoisonError, RwLock};
 
-use bytes::Bytes;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{
-    GlobalMap, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind, Reputations, Topic, Topics,
-    Verdicts, check_fused_at, decode, decode_report,
+    GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind, Reputations, Topic,
+    Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
@@ -36,6 +35,8 @@ pub enum Incoming {
     Verdicts(Arc<Verdicts>),
     /// Reputations, at once after connecting if the broker has some.
     Reputations(Arc<Reputations>),
+    /// A part of another candidate's evidence; only candidates get these.
+    Ledger(Arc<LedgerShare>),
     /// What another node says about itself, or its broker about it.
     Status(Arc<NodeStatus>),
     /// A link changed.
@@ -80,7 +81,6 @@ pub(super) struct Inbox {
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
     places: Arc<Semaphore>,
-    own_reputations: Mutex<Bytes>,
 }
 
 /// What became of a packet, as far as the link has to act on it.
@@ -112,17 +112,11 @@ impl Inbox {
             counters,
             subscriber: RwLock::new(subscriber),
             places: Arc::new(Semaphore::new(places)),
-            own_reputations: Mutex::default(),
         }
     }
 
     pub(super) fn set_subscriber(&self, subscriber: Subscriber) {
         *self.subscriber.write().unwrap_or_else(PoisonError::into_inner) = subscriber;
-    }
-
-    /// Reputations carry no aggregator, so that their echo is known by its bytes.
-    pub(super) fn expect_reputations(&self, payload: Bytes) {
-        *self.own_reputations.lock().unwrap_or_else(PoisonError::into_inner) = payload;
     }
 
     /// Deals with one packet; a payload that cannot be used is counted by its reason.
@@ -178,6 +172,8 @@ impl Inbox {
         let message = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
             Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload),
             Topic::VoteDetections(node) => return self.read_report(ReportKind::VoteDetections, &node, payload),
+            Topic::Ledger(node) if node == self.node => return Ok(Read::Echo),
+            Topic::Ledger(node) => Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?)),
             Topic::Nodes(node) => return self.read_status(&node, payload),
             Topic::GlobalDetections => {
                 let map: GlobalMap = decode(payload, &self.limits)?;
@@ -197,10 +193,11 @@ impl Inbox {
             }
             Topic::Reputations if payload.is_empty() => return Ok(Read::Cleared),
             Topic::Reputations => {
-                if *self.own_reputations.lock().unwrap_or_else(PoisonError::into_inner) == payload {
+                let reputations: Reputations = decode(payload, &self.limits)?;
+                if reputations.aggregator.as_ref() == Some(&self.node) {
                     return Ok(Read::Echo);
                 }
-                Incoming::Reputations(Arc::new(decode(payload, &self.limits)?))
+                Incoming::Reputations(Arc::new(reputations))
             }
         };
         Ok(Read::Message(message))
@@ -254,6 +251,8 @@ impl fmt::Debug for Inbox {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Mutex;
+
     use ecod::wire::{Encoding, encode};
 
     use super::*;
@@ -271,9 +270,15 @@ mod tests {
             Arc::clone(&counters),
             Arc::new(move |delivery| receiver.lock().unwrap().push(delivery)),
         );
-        let reputations = Reputations { schema: 1, epoch: 1, round: 1, reputations: Default::default() };
-        let payload = encode(&reputations, Encoding::Json);
-        let accept = |at| inbox.accept(b"ecod/v1/lot/reputations", &payload, Timestamp(at));
+        let payload = |aggregator: &str| {
+            let aggregator = NodeName::new(aggregator).ok();
+            let reputations =
+                Reputations { schema: 1, aggregator, epoch: 1, round: 1, reputations: Default::default() };
+            encode(&reputations, Encoding::Json)
+        };
+        let accept_from =
+            |aggregator: &str, at| inbox.accept(b"ecod/v1/lot/reputations", &payload(aggregator), Timestamp(at));
+        let accept = |at| accept_from("gauss", at);
         for at in 1..=5 {
             assert_eq!(accept(at), Outcome::Done);
         }
@@ -284,8 +289,7 @@ mod tests {
         let kept: Vec<_> = held.lock().unwrap().iter().map(|delivery| delivery.received_at).collect();
         assert_eq!(kept, [Timestamp(2), Timestamp(6)]);
 
-        inbox.expect_reputations(payload.clone().into());
-        accept(7);
+        accept_from("edge", 7);
         assert_eq!((counters.events(Event::Echo), counters.events(Event::InboxFull)), (1, 3));
     }
 }

@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
+use ecod::epoch::Epoch;
 use ecod::names::NodeName;
+use ecod::vote::VoteMode;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus, Role, SCHEMA_VERSION};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
 use tokio::sync::watch;
@@ -15,10 +17,12 @@ use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker};
 use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
-use crate::follower::{Follower, FollowerArguments, FollowerMessage, ReceivedMap};
+use crate::follower::{Follower, FollowerArguments, FollowerMessage, Newest};
 use crate::fuser::{Fuser, FuserArguments, FuserMessage};
 use crate::gateway::{self, BrokerAddress, Gateway, GatewayArguments, GatewayMessage, Incoming, Subscriber};
+use crate::reputation_keeper::{ReputationKeeper, ReputationKeeperArguments, ReputationKeeperMessage, SharedBook};
 use crate::seat::Seat;
+use crate::state_file::StateFile;
 #[cfg(feature = "camera")]
 use crate::{
     camera,
@@ -35,7 +39,9 @@ pub enum Part {
     Gateway,
     /// The taker of maps.
     Follower,
-    /// The maker of maps.
+    /// The keeper of reputations.
+    ReputationKeeper,
+    /// The maker of maps and verdicts.
     Fuser,
     /// The maker of reports.
     #[cfg(feature = "camera")]
@@ -54,6 +60,8 @@ pub struct Seats {
     pub gateway: Seat<GatewayMessage>,
     /// The follower's.
     pub follower: Seat<FollowerMessage>,
+    /// The reputation keeper's.
+    pub keeper: Seat<ReputationKeeperMessage>,
     /// The fuser's.
     pub fuser: Seat<FuserMessage>,
     /// The projector's.
@@ -71,7 +79,8 @@ pub(super) struct Assembly {
     run: Uuid,
     seats: Seats,
     counters: Arc<Counters>,
-    newest: watch::Sender<Option<ReceivedMap>>,
+    newest: Newest,
+    book: SharedBook,
     broker_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
     last_epoch: u64,
@@ -86,13 +95,15 @@ const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl Assembly {
     pub(super) fn new(config: NodeConfig, failed: watch::Sender<Option<String>>) -> Self {
+        let by_evidence = config.fusion.vote.mode != VoteMode::Paper;
         Self {
             name: config.name.clone().unwrap_or(NodeName::from_static("node")),
             config,
             run: Uuid::now_v7(),
             seats: Seats::default(),
             counters: Arc::default(),
-            newest: watch::Sender::new(None),
+            newest: Newest::default(),
+            book: SharedBook::new(by_evidence),
             broker_address: watch::Sender::new(None),
             failed,
             last_epoch: 0,
@@ -107,8 +118,8 @@ impl Assembly {
         Arc::clone(&self.counters)
     }
 
-    pub(super) fn newest(&self) -> watch::Receiver<Option<ReceivedMap>> {
-        self.newest.subscribe()
+    pub(super) fn newest(&self) -> Newest {
+        self.newest.clone()
     }
 
     pub(super) fn broker_address(&self) -> watch::Receiver<Option<SocketAddr>> {
@@ -125,7 +136,10 @@ impl Assembly {
         let mut parts = Vec::new();
         parts.extend((aggregates && self.config.mqtt.broker.is_none()).then_some(Part::Broker));
         parts.extend([Part::Gateway, Part::Follower]);
-        parts.extend(aggregates.then_some(Part::Fuser));
+        if aggregates {
+            parts.extend(self.config.fusion.algorithms.vote().then_some(Part::ReputationKeeper));
+            parts.push(Part::Fuser);
+        }
         #[cfg(feature = "camera")]
         if self.config.camera.is_some() {
             parts.extend([Part::Projector, Part::Detector]);
@@ -148,9 +162,15 @@ impl Assembly {
                 };
                 seat(&self.seats.follower, Actor::spawn_linked(None, Follower, arguments, supervisor).await)
             }
+            Part::ReputationKeeper => {
+                let arguments = self.keeper_arguments();
+                seat(&self.seats.keeper, Actor::spawn_linked(None, ReputationKeeper, arguments, supervisor).await)
+            }
             Part::Fuser => {
                 let arguments = self.fuser_arguments();
-                seat(&self.seats.fuser, Actor::spawn_linked(None, Fuser, arguments, supervisor).await)
+                let id = seat(&self.seats.fuser, Actor::spawn_linked(None, Fuser, arguments, supervisor).await)?;
+                self.lead();
+                Ok(id)
             }
             #[cfg(feature = "camera")]
             Part::Projector => {
@@ -178,6 +198,7 @@ impl Assembly {
             stop(&self.seats.projector).await;
         }
         stop(&self.seats.fuser).await;
+        stop(&self.seats.keeper).await;
         stop(&self.seats.follower).await;
         stop(&self.seats.gateway).await;
         stop(&self.seats.broker).await;
@@ -226,32 +247,59 @@ impl Assembly {
 
     /// Takes what comes in to the part that deals with it.
     fn subscriber(&self) -> Subscriber {
-        let (fuser, follower) = (self.seats.fuser.clone(), self.seats.follower.clone());
+        let Seats { fuser, follower, keeper, .. } = self.seats.clone();
         Arc::new(move |delivery| {
             match &delivery.message {
                 Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
                 Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
-                Incoming::Verdicts(_) | Incoming::Reputations(_) | Incoming::Status(_) | Incoming::Link { .. } => true,
+                Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
+                Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
+                Incoming::Ledger(_) => keeper.send(ReputationKeeperMessage::Merge { delivery }),
+                Incoming::Status(_) | Incoming::Link { .. } => true,
             };
         })
     }
 
-    /// Every run of a fuser leads in an epoch of its own, later than all before: the seconds of its start.
-    fn fuser_arguments(&mut self) -> FuserArguments {
-        let now = clock::now();
-        self.last_epoch = (now.micros() / 1_000_000).max(self.last_epoch + 1);
-        let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
-        FuserArguments {
-            aggregator: Aggregator::new(self.name.clone(), self.last_epoch, fusion, landmarks, now),
+    fn keeper_arguments(&self) -> ReputationKeeperArguments {
+        let directory = self.config.state_dir.as_deref();
+        ReputationKeeperArguments {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+            reputation: self.config.fusion.reputation.clone(),
+            config: self.config.reputations.clone(),
+            book: self.book.clone(),
+            file: directory.map(|path| StateFile::new(path, &self.config.cell, &self.name, "reputations")),
+            newest: self.newest.reputations.subscribe(),
             gateway: self.seats.gateway.clone(),
+            fuser: self.seats.fuser.clone(),
             counters: self.counters(),
         }
+    }
+
+    /// A fuser starts with the evidence that the keeper has.
+    fn fuser_arguments(&self) -> FuserArguments {
+        let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
+        let mut aggregator = Aggregator::standby(fusion, landmarks, clock::now());
+        aggregator.adopt(&self.book.open().ledger);
+        FuserArguments {
+            aggregator,
+            gateway: self.seats.gateway.clone(),
+            keeper: self.seats.keeper.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    /// Every run of a fuser leads in an epoch of its own, later than all before: the seconds of its start.
+    fn lead(&mut self) {
+        self.last_epoch = (clock::now().micros() / 1_000_000).max(self.last_epoch + 1);
+        let epoch = Epoch::new(self.last_epoch, self.name.clone());
+        self.seats.fuser.send(FuserMessage::Lead { epoch, first_round: 1, on_time: true });
     }
 
     /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
     fn status(&self) -> NodeStatus {
         let aggregates = self.config.role == Role::Edge;
-        let newest = self.newest.borrow();
+        let newest = self.newest.map.borrow();
         let followed = newest.as_ref().map(|received| received.map.aggregator.clone());
         NodeStatus {
             schema: SCHEMA_VERSION,

@@ -81,7 +81,8 @@ async fn each_flaw_of_a_map_is_counted_and_good_maps_go_on() {
     let mut euclid = Node::join("euclid", Part::Follower, mqtt.clone(), &[&address]).await;
     let edge = Node::join("edge", Part::Candidate, mqtt, &[&address]).await;
     euclid.next_state_of("edge").await;
-    let flaws: [(fn(&mut GlobalMap), RejectReason); 5] = [
+    type Flaw = (fn(&mut GlobalMap), RejectReason);
+    let flaws: [Flaw; 5] = [
         (|m| m.landmarks[0].x_m = f64::NAN, RejectReason::NotFinite),
         (|m| m.landmarks[0].confidence = 7.0, RejectReason::ConfidenceOutOfRange),
         (|m| m.landmarks[0].id = "".into(), RejectReason::InvalidLabel),

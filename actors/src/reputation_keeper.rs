@@ -1,0 +1,326 @@
+//! The actor that keeps what is known about vehicles: publishes, persists and replicates it.
+//!
+//! ```text
+//! Fuser ── Lead, Record, StandBy ──> ReputationKeeper ── PublishReputations, PublishShare ──> Gateway
+//! Gateway ── Merge ────────────────>   │ ▲      │ └──── Adopt, Resume ──> Fuser
+//! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
+//! ```
+//!
+//! - The leader records in the lane of its own epoch; every count that changed is shared with the other candidates
+//!   after the round, and all counts every [`ReputationKeeperConfig::snapshot_period_s`], in case a share was lost.
+//!   Receivers take the larger count: shares may come late, twice, or in any order.
+//! - What is published was saved before. What an actor knew outlives it in its [`Book`]; what a node knew outlives it in
+//!   its state directory.
+//! - Whoever has led sends its own lanes to a leader that it hears for the first time: when a split heals, the evidence
+//!   of both sides is kept.
+
+mod book;
+mod config;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::reputation::{EntryKey, Evidence, ReputationConfig};
+use ecod::wire::{LedgerEntry, LedgerShare, MAX_SHARE_ENTRIES, Reputation, Reputations, SCHEMA_VERSION};
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+pub use book::{Book, SharedBook};
+pub use config::ReputationKeeperConfig;
+
+use crate::counters::{Counters, Event};
+use crate::follower::Received;
+use crate::fuser::FuserMessage;
+use crate::gateway::{Delivery, GatewayMessage, Incoming};
+use crate::seat::Seat;
+use crate::state_file::StateFile;
+use book::Saved;
+
+/// What the keeper is asked to do.
+#[derive(Debug)]
+pub enum ReputationKeeperMessage {
+    /// Publish in the node's own leadership from now on.
+    Lead {
+        /// The leadership.
+        epoch: Epoch,
+        /// Number of the last round before it.
+        last_round: u64,
+    },
+    /// Record what a round of the node's own leadership says about vehicles.
+    Record {
+        /// The leadership.
+        epoch: Epoch,
+        /// The round.
+        round: u64,
+        /// Votes that were settled by it.
+        evidence: Vec<Evidence>,
+        /// In VOTE's `paper` mode, the reputations after it.
+        reputations: Option<BTreeMap<NodeName, Reputation>>,
+    },
+    /// Publish nothing more.
+    StandBy,
+    /// Take in another candidate's evidence.
+    Merge {
+        /// The share and when it came.
+        delivery: Delivery,
+    },
+    /// Share all evidence: a node needs it to lead, or to remain the leader.
+    SendSnapshot {
+        /// The node; other candidates get it too.
+        to: NodeName,
+    },
+    /// Save, publish and pass on what has changed.
+    Tick,
+}
+
+/// What a keeper needs at its start.
+pub struct ReputationKeeperArguments {
+    /// The node's name.
+    pub name: NodeName,
+    /// The cell's name.
+    pub cell: NodeName,
+    /// How evidence becomes reputations.
+    pub reputation: ReputationConfig,
+    /// Its rhythm.
+    pub config: ReputationKeeperConfig,
+    /// What earlier runs of the actor knew; shared with whoever starts a fuser.
+    pub book: SharedBook,
+    /// Where it is saved, if anywhere.
+    pub file: Option<StateFile>,
+    /// The newest reputations of the cell.
+    pub newest: watch::Receiver<Option<Received<Reputations>>>,
+    /// Where reputations and shares are published.
+    pub gateway: Seat<GatewayMessage>,
+    /// Starts from evidence of others.
+    pub fuser: Seat<FuserMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// Keeps the ledger.
+#[derive(Debug, Default)]
+pub struct ReputationKeeper;
+
+/// The ledger and what has not been done with it yet.
+pub struct ReputationKeeperState {
+    arguments: ReputationKeeperArguments,
+    leads: Option<Epoch>,
+    last_round: u64,
+    published: Option<(Epoch, u64)>,
+    /// The leader whose shares came last.
+    heard: Option<Epoch>,
+    unsaved: bool,
+    unadopted: bool,
+    writing: Option<JoinHandle<std::io::Result<()>>>,
+    disk_failed: bool,
+    ticks: u32,
+}
+
+/// How long a disk may take before reputations are published unsaved.
+const WRITE_PATIENCE: Duration = Duration::from_secs(1);
+
+impl Actor for ReputationKeeper {
+    type Msg = ReputationKeeperMessage;
+    type State = ReputationKeeperState;
+    type Arguments = ReputationKeeperArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        book::restore(&arguments);
+        myself.send_interval(arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
+        Ok(ReputationKeeperState {
+            arguments,
+            leads: None,
+            last_round: 0,
+            published: None,
+            heard: None,
+            // A run before may have left something.
+            unsaved: true,
+            unadopted: false,
+            writing: None,
+            disk_failed: false,
+            ticks: 0,
+        })
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        match message {
+            ReputationKeeperMessage::Lead { epoch, last_round } => {
+                state.lead(epoch, last_round);
+                state.save().await;
+                state.publish();
+                state.share_all();
+            }
+            ReputationKeeperMessage::Record { epoch, round, evidence, reputations } => {
+                state.record(epoch, round, &evidence, reputations);
+            }
+            ReputationKeeperMessage::StandBy => state.leads = None,
+            ReputationKeeperMessage::Merge { delivery } => state.merge(&delivery),
+            ReputationKeeperMessage::SendSnapshot { to } => {
+                tracing::info!(%to, "sharing all evidence");
+                state.share_all();
+            }
+            ReputationKeeperMessage::Tick => state.tick().await,
+        }
+        Ok(())
+    }
+
+    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+        state.save().await;
+        Ok(())
+    }
+}
+
+impl ReputationKeeperState {
+    fn lead(&mut self, epoch: Epoch, last_round: u64) {
+        let newest = self.arguments.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.message));
+        let mut book = self.arguments.book.open();
+        if let Some(newest) = newest.filter(|newest| newest.aggregator.as_ref() != Some(&self.arguments.name)) {
+            book.standing.clone_from(&newest.reputations);
+        }
+        self.arguments.fuser.send(FuserMessage::Resume { reputations: book.standing.clone() });
+        self.leads = Some(epoch);
+        self.last_round = last_round;
+    }
+
+    fn record(
+        &mut self,
+        epoch: Epoch,
+        round: u64,
+        evidence: &[Evidence],
+        reputations: Option<BTreeMap<NodeName, Reputation>>,
+    ) {
+        self.unsaved |= !evidence.is_empty() || reputations.is_some();
+        let key = |evidence: &Evidence| {
+            let Evidence { node, label, .. } = evidence.clone();
+            EntryKey { lane: epoch.clone(), node, label }
+        };
+        let keys: BTreeSet<_> = evidence.iter().map(key).collect();
+        let mut book = self.arguments.book.open();
+        for evidence in evidence {
+            book.ledger.record(epoch.term, &epoch.leader, evidence);
+        }
+        if let Some(reputations) = reputations {
+            book.standing = reputations;
+        }
+        let changed = book.ledger.entries_of(&keys);
+        drop(book);
+        self.leads = Some(epoch);
+        self.last_round = round;
+        self.share(&changed);
+    }
+
+    fn merge(&mut self, delivery: &Delivery) {
+        let Incoming::Ledger(share) = &delivery.message else { return };
+        let own = |entry: &LedgerEntry| {
+            self.leads.as_ref().is_some_and(|own| own.term == entry.epoch && own.leader == entry.aggregator)
+        };
+        let news: Vec<_> = share.entries.iter().filter(|entry| !own(entry)).cloned().collect();
+        if self.arguments.book.open().ledger.merge_entries(&news) {
+            self.arguments.counters.count(Event::LedgerMerged);
+            self.unsaved = true;
+            self.unadopted = true;
+        }
+        let leader = share.epoch.map(|term| Epoch::new(term, share.node.clone()));
+        if leader.is_some() && leader != self.heard {
+            self.heard = leader;
+            let own: Vec<_> = self.entries().filter(|entry| entry.aggregator == self.arguments.name).collect();
+            self.share(&own);
+        }
+    }
+
+    async fn tick(&mut self) {
+        self.save().await;
+        self.publish();
+        if std::mem::take(&mut self.unadopted) {
+            let ledger = Arc::new(self.arguments.book.open().ledger.clone());
+            self.arguments.fuser.send(FuserMessage::Adopt { ledger });
+        }
+        self.ticks += 1;
+        if self.ticks >= self.arguments.config.ticks_per_snapshot() {
+            self.ticks = 0;
+            if self.leads.is_some() {
+                self.share_all();
+            }
+        }
+    }
+
+    /// Publishes what the book says, unless it did so after the same round.
+    fn publish(&mut self) {
+        let Some(epoch) = &self.leads else { return };
+        let now = Some((epoch.clone(), self.last_round));
+        if self.published == now {
+            return;
+        }
+        let reputations = Reputations {
+            schema: SCHEMA_VERSION,
+            aggregator: Some(epoch.leader.clone()),
+            epoch: epoch.term,
+            round: self.last_round,
+            reputations: self.arguments.book.open().reputations(&self.arguments.reputation),
+        };
+        self.published = now;
+        self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
+    }
+
+    fn entries(&self) -> std::vec::IntoIter<LedgerEntry> {
+        self.arguments.book.open().ledger.entries().collect::<Vec<_>>().into_iter()
+    }
+
+    fn share_all(&self) {
+        self.share(&self.entries().collect::<Vec<_>>());
+    }
+
+    fn share(&self, entries: &[LedgerEntry]) {
+        for entries in entries.chunks(MAX_SHARE_ENTRIES) {
+            let share = LedgerShare {
+                schema: SCHEMA_VERSION,
+                node: self.arguments.name.clone(),
+                epoch: self.leads.as_ref().map(|epoch| epoch.term),
+                entries: entries.to_vec(),
+            };
+            self.arguments.gateway.send(GatewayMessage::PublishShare { share });
+        }
+    }
+
+    /// Saves what has changed; a disk that fails or hangs is counted, and the node goes on.
+    async fn save(&mut self) {
+        let Some(file) = self.arguments.file.clone().filter(|_| self.unsaved) else { return };
+        if self.writing.is_none() {
+            let saved = Saved::of(&self.arguments.book.open(), &self.arguments);
+            self.unsaved = false;
+            self.writing = Some(tokio::task::spawn_blocking(move || file.save(&saved)));
+        }
+        let Some(writing) = &mut self.writing else { return };
+        let written = match tokio::time::timeout(WRITE_PATIENCE, writing).await {
+            Ok(written) => {
+                self.writing = None;
+                written.map_err(std::io::Error::other).flatten()
+            }
+            Err(elapsed) => Err(elapsed.into()),
+        };
+        let Err(error) = written else {
+            self.disk_failed = false;
+            self.arguments.counters.count(Event::ReputationsSaved);
+            return;
+        };
+        self.unsaved = true;
+        self.arguments.counters.count(Event::ReputationsNotSaved);
+        if !std::mem::replace(&mut self.disk_failed, true) {
+            let path = self.arguments.file.as_ref().map(|file| file.path().display().to_string());
+            tracing::warn!(path, %error, "reputations not saved");
+        }
+    }
+}

@@ -1,0 +1,89 @@
+//! What is known about vehicles, in memory and on disk.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use ecod::names::NodeName;
+use ecod::reputation::{ReputationConfig, ReputationLedger};
+use ecod::wire::{LedgerEntry, Reputation, SCHEMA_VERSION};
+use serde::{Deserialize, Serialize};
+
+use super::ReputationKeeperArguments;
+
+/// What is known about vehicles; it outlives the runs of the actor that keeps it.
+#[derive(Debug)]
+pub struct Book {
+    /// The evidence.
+    pub ledger: ReputationLedger,
+    /// In VOTE's `paper` mode, the reputations themselves.
+    pub standing: BTreeMap<NodeName, Reputation>,
+    by_evidence: bool,
+    restored: bool,
+}
+
+impl Book {
+    pub(super) fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
+        if self.by_evidence { self.ledger.reputations(config) } else { self.standing.clone() }
+    }
+}
+
+/// A [`Book`] that several hold.
+#[derive(Debug, Clone)]
+pub struct SharedBook(Arc<Mutex<Book>>);
+
+impl SharedBook {
+    /// A book in which nothing is written yet; reputations go `by_evidence` unless VOTE runs in `paper` mode.
+    pub fn new(by_evidence: bool) -> Self {
+        let book = Book { ledger: Default::default(), standing: BTreeMap::new(), by_evidence, restored: false };
+        Self(Arc::new(Mutex::new(book)))
+    }
+
+    /// The book, for a moment.
+    pub fn open(&self) -> MutexGuard<'_, Book> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A book on disk.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Saved {
+    schema: u32,
+    cell: NodeName,
+    node: NodeName,
+    entries: Vec<LedgerEntry>,
+    standing: BTreeMap<NodeName, Reputation>,
+}
+
+impl Saved {
+    pub(super) fn of(book: &Book, arguments: &ReputationKeeperArguments) -> Self {
+        Self {
+            schema: SCHEMA_VERSION,
+            cell: arguments.cell.clone(),
+            node: arguments.name.clone(),
+            entries: book.ledger.entries().collect(),
+            standing: book.standing.clone(),
+        }
+    }
+
+    fn is_of(&self, arguments: &ReputationKeeperArguments) -> bool {
+        self.schema == SCHEMA_VERSION && self.cell == arguments.cell && self.node == arguments.name
+    }
+}
+
+/// Reads the file into the book, once in a book's life.
+pub(super) fn restore(arguments: &ReputationKeeperArguments) {
+    let mut book = arguments.book.open();
+    if std::mem::replace(&mut book.restored, true) {
+        return;
+    }
+    let Some(file) = &arguments.file else {
+        tracing::info!("no state directory: reputations end with the node");
+        return;
+    };
+    if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
+        tracing::info!(path = %file.path().display(), entries = saved.entries.len(), "reputations restored");
+        book.ledger.merge_entries(&saved.entries);
+        book.standing = saved.standing;
+    }
+}

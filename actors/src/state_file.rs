@@ -1,0 +1,110 @@
+//! A file that survives crashes: it holds the last state written whole, or the one before, never a mixture.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use ecod::names::NodeName;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+/// Where one kind of state of a node is kept.
+#[derive(Debug, Clone)]
+pub struct StateFile {
+    path: PathBuf,
+}
+
+/// A larger file is not one of ours.
+const MAX_BYTES: u64 = 64 * 1024 * 1024;
+
+impl StateFile {
+    /// The file `<cell>.<node>.<what>.json` in `directory`, so that the nodes of a machine can share a directory.
+    pub fn new(directory: &Path, cell: &NodeName, node: &NodeName, what: &str) -> Self {
+        Self { path: directory.join(format!("{cell}.{node}.{what}.json")) }
+    }
+
+    /// Where the state is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What was written last, if it is there, whole and `is_ours`; anything else is set aside with a warning.
+    pub fn load<T: DeserializeOwned>(&self, is_ours: impl FnOnce(&T) -> bool) -> Option<T> {
+        let mut bytes = Vec::new();
+        let read = File::open(&self.path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
+        match read {
+            Ok(_) => {}
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return None,
+            Err(error) => {
+                tracing::warn!(path = %self.path.display(), %error, "state not read");
+                return None;
+            }
+        }
+        let why = match serde_json::from_slice(&bytes) {
+            Ok(state) if is_ours(&state) => return Some(state),
+            Ok(_) => "it belongs to another node or version".into(),
+            Err(error) => error.to_string(),
+        };
+        let aside = self.path.with_extension("set-aside");
+        let moved = fs::rename(&self.path, &aside).err();
+        tracing::warn!(path = %self.path.display(), aside = %aside.display(), why, ?moved, "state set aside");
+        None
+    }
+
+    /// Replaces the state; after `Ok` it survives a loss of power.
+    ///
+    /// # Errors
+    /// When the directory or disk does not take it; the state before is still there then.
+    pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
+        let directory = self.path.parent().unwrap_or(Path::new("."));
+        fs::create_dir_all(directory)?;
+        let temporary = self.path.with_extension("tmp");
+        let mut file = File::create(&temporary)?;
+        file.write_all(&serde_json::to_vec(state)?)?;
+        file.sync_all()?;
+        fs::rename(&temporary, &self.path)?;
+        File::open(directory)?.sync_all()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn file(directory: &Path) -> StateFile {
+        StateFile::new(directory, &NodeName::from_static("lot-1"), &NodeName::from_static("edge"), "numbers")
+    }
+
+    #[test]
+    fn what_was_saved_comes_back_and_half_a_write_does_no_harm() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = file(&directory.path().join("made/on/demand"));
+        assert_eq!(file.load::<Vec<u32>>(|_| true), None);
+        file.save(&[1, 2]).unwrap();
+        file.save(&[1, 2, 3]).unwrap();
+        fs::write(file.path().with_extension("tmp"), b"[1,2,3,").unwrap();
+        assert_eq!(file.load(|_| true), Some(vec![1, 2, 3]));
+    }
+
+    #[test]
+    fn truncated_and_alien_files_are_set_aside() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = file(directory.path());
+        for content in [&b"[1,2"[..], b"", b"\xff\xfe", b"{\"other\":1}"] {
+            fs::write(file.path(), content).unwrap();
+            assert_eq!(file.load::<Vec<u32>>(|_| true), None);
+            assert!(!file.path().exists());
+            assert_eq!(fs::read(file.path().with_extension("set-aside")).unwrap(), content);
+        }
+        file.save(&[7]).unwrap();
+        assert_eq!(file.load::<Vec<u32>>(|_| false), None, "not ours");
+        assert!(!file.path().exists());
+    }
+
+    #[test]
+    fn a_directory_that_cannot_be_written_is_an_error() {
+        let directory = tempfile::tempdir().unwrap();
+        fs::write(directory.path().join("occupied"), b"").unwrap();
+        assert!(file(&directory.path().join("occupied")).save(&[1]).is_err());
+    }
+}

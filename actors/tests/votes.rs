@@ -1,0 +1,333 @@
+//! Cells that vote, on real sockets: verdicts, reputations, and what survives of them.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use ecod::aggregator::Algorithms;
+use ecod::epoch::Epoch;
+use ecod::landmark::LandmarkConfig;
+use ecod::names::NodeName;
+use ecod::vote::VoteMode;
+use ecod::wire::{
+    ObjectReport, PerceivedObject, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION, Verdict, decode,
+};
+use ecod_actors::clock;
+use ecod_actors::config::NodeConfig;
+use ecod_actors::counters::Event;
+use ecod_actors::fuser::FuserMessage;
+use ecod_actors::gateway::{GatewayMessage, ReportKind};
+use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::reputation_keeper::ReputationKeeperMessage;
+use tokio::time::timeout;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn name(name: &str) -> NodeName {
+    NodeName::new(name).unwrap()
+}
+
+fn config(node: &str, role: Role) -> NodeConfig {
+    let ball = LandmarkConfig {
+        id: "ball".into(),
+        x_m: 1.0,
+        y_m: 0.0,
+        facing_deg: None,
+        vacancy: None,
+        synonyms: Default::default(),
+    };
+    let mut config = NodeConfig {
+        name: Some(name(node)),
+        cell: NodeName::from_static("crossing"),
+        role,
+        listen: "127.0.0.1:0".parse().unwrap(),
+        landmarks: vec![ball],
+        ..NodeConfig::default()
+    };
+    config.fusion.vote.weighted.freshness_s = 0.2;
+    config.reputations.publish_period_s = 0.1;
+    config
+}
+
+async fn edge(configure: impl FnOnce(&mut NodeConfig)) -> NodeHandle {
+    let mut config = config("edge", Role::Edge);
+    configure(&mut config);
+    config.validate().unwrap();
+    node::start(config).await.unwrap()
+}
+
+async fn attached(node: &str, role: Role, edge: &NodeHandle, configure: impl FnOnce(&mut NodeConfig)) -> NodeHandle {
+    let mut config = config(node, role);
+    config.mqtt.broker = edge.broker_address().map(Into::into);
+    config.mqtt.retry_max_ms = 100;
+    configure(&mut config);
+    node::start(config).await.unwrap()
+}
+
+async fn cav(node: &str, edge: &NodeHandle) -> NodeHandle {
+    attached(node, Role::Cav, edge, |_| ()).await
+}
+
+fn report(node: &str, label: &str, landmark: &str) -> Arc<ObjectReport> {
+    static SEQ: AtomicU64 = AtomicU64::new(0);
+    Arc::new(ObjectReport {
+        schema: SCHEMA_VERSION,
+        node: name(node),
+        seq: SEQ.fetch_add(1, Ordering::Relaxed),
+        captured_at_us: clock::now(),
+        pose: None,
+        objects: vec![PerceivedObject {
+            label: label.into(),
+            confidence: 0.9,
+            x_m: 1.0,
+            y_m: 0.0,
+            covariance_m2: None,
+            landmark: Some(landmark.into()),
+        }],
+        seen: None,
+    })
+}
+
+/// Lets time pass, with `act` every 20 ms, until `is_reached`.
+async fn until(what: &str, mut act: impl FnMut(), is_reached: impl Fn() -> bool) {
+    let reached = async {
+        while !is_reached() {
+            act();
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, reached).await.unwrap_or_else(|_| panic!("never: {what}"));
+}
+
+/// Has two vehicles say cup and a third say dog, all over the third's connection to the broker.
+fn disagree(reporter: &NodeHandle) {
+    for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
+        let message =
+            GatewayMessage::PublishReport { kind: ReportKind::VoteDetections, report: report(node, label, "ball") };
+        reporter.seats().gateway.send(message);
+    }
+}
+
+fn verdict(node: &NodeHandle) -> Option<Verdict> {
+    node.newest_verdicts().borrow().as_ref().and_then(|newest| newest.message.verdicts.first().cloned())
+}
+
+fn reputations(node: &NodeHandle) -> Option<Arc<Reputations>> {
+    node.newest_reputations().borrow().as_ref().map(|newest| Arc::clone(&newest.message))
+}
+
+fn reputation(node: &NodeHandle, vehicle: &str) -> Option<Reputation> {
+    reputations(node)?.reputations.get(&name(vehicle)).copied()
+}
+
+/// Has the vehicles disagree until it shows in the published reputations.
+async fn unmasked(reporter: &NodeHandle, receiver: &NodeHandle) {
+    let settled = || {
+        reputation(receiver, "liar").is_some_and(|liar| liar.incorrect >= 5)
+            && reputation(receiver, "euclid").is_some_and(|euclid| euclid.correct >= 5)
+    };
+    until("the liar unmasked", || disagree(reporter), settled).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn vehicles_that_disagree_get_a_verdict_and_reputations() {
+    let edge = edge(|_| ()).await;
+    let euclid = cav("euclid", &edge).await;
+    let agreed = || verdict(&euclid).is_some_and(|v| v.label.as_deref() == Some("cup") && v.contributors.len() == 3);
+    until("a verdict by three", || disagree(&euclid), agreed).await;
+    let verdict = verdict(&euclid).unwrap();
+    assert_eq!(verdict.landmark, "ball");
+    assert!(verdict.score > verdict.votes["dog"] && verdict.score == verdict.votes["cup"], "{verdict:?}");
+    assert!((verdict.margin - (verdict.score - verdict.votes["dog"])).abs() < 1e-9, "{verdict:?}");
+
+    unmasked(&euclid, &euclid).await;
+    let newest = reputations(&euclid).unwrap();
+    assert_eq!(newest.aggregator, Some(name("edge")));
+    assert!(newest.reputations[&name("euclid")].score > newest.reputations[&name("liar")].score);
+    assert!(euclid.counters().events(Event::VerdictsAccepted) > 0);
+
+    let retained = retained_reputations(&edge).await;
+    assert!(retained.reputations[&name("liar")].incorrect >= 5, "a latecomer gets them at once");
+    for node in [euclid, edge] {
+        node.stop().await;
+    }
+}
+
+/// What the broker keeps for latecomers.
+async fn retained_reputations(edge: &NodeHandle) -> Reputations {
+    let broker = edge.broker_address().unwrap();
+    let options = rumqttc::MqttOptions::new("latecomer", broker.ip().to_string(), broker.port());
+    let (client, mut events) = rumqttc::AsyncClient::new(options, 8);
+    client.subscribe("ecod/v1/crossing/reputations", rumqttc::QoS::AtLeastOnce).await.unwrap();
+    let first = async {
+        loop {
+            if let rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) = events.poll().await.unwrap() {
+                return publish;
+            }
+        }
+    };
+    let publish = timeout(PATIENCE, first).await.expect("nothing is retained");
+    assert!(publish.retain);
+    assert_eq!(publish.qos, rumqttc::QoS::AtLeastOnce);
+    decode(&publish.payload, &Default::default()).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_restarted_node_goes_on_with_its_reputations() {
+    for mode in [VoteMode::Weighted, VoteMode::Paper] {
+        let directory = tempfile::tempdir().unwrap();
+        let keep = |config: &mut NodeConfig| {
+            config.fusion.vote.mode = mode;
+            config.state_dir = Some(directory.path().join("state"));
+        };
+        let before = edge(keep).await;
+        let euclid = cav("euclid", &before).await;
+        unmasked(&euclid, &euclid).await;
+        let known = reputation(&euclid, "liar").unwrap();
+        for node in [euclid, before] {
+            node.stop().await;
+        }
+
+        let after = edge(keep).await;
+        until("reputations", || (), || reputations(&after).is_some()).await;
+        let restored = reputation(&after, "liar").expect("nothing was restored");
+        assert!(restored.incorrect >= known.incorrect, "{mode:?}: {restored:?} after {known:?}");
+        assert!(restored.score <= known.score + 1e-9, "{mode:?}: {restored:?} after {known:?}");
+        after.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_broken_state_does_not_stop_a_node() {
+    let spoil_file = |directory: &Path| std::fs::write(directory.join("crossing.edge.reputations.json"), b"{\"sch");
+    let spoil_directory = |directory: &Path| std::fs::write(directory.join("occupied"), b"");
+    for (state_dir, saved) in [("", true), ("occupied", false)] {
+        let directory = tempfile::tempdir().unwrap();
+        spoil_file(directory.path()).unwrap();
+        spoil_directory(directory.path()).unwrap();
+        let edge = edge(|config| config.state_dir = Some(directory.path().join(state_dir))).await;
+        let euclid = cav("euclid", &edge).await;
+        unmasked(&euclid, &euclid).await;
+        let event = if saved { Event::ReputationsSaved } else { Event::ReputationsNotSaved };
+        assert!(edge.counters().events(event) > 0);
+        assert_eq!(directory.path().join("crossing.edge.reputations.set-aside").exists(), saved);
+        euclid.stop().await;
+        edge.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn killing_the_keeper_or_the_fuser_loses_nothing_that_was_published() {
+    let edge = edge(|_| ()).await;
+    let euclid = cav("euclid", &edge).await;
+    unmasked(&euclid, &euclid).await;
+    let kills: [&dyn Fn(); 2] =
+        [&|| edge.seats().keeper.holder().unwrap().kill(), &|| edge.seats().fuser.holder().unwrap().kill()];
+    for kill in kills {
+        let before = reputations(&euclid).unwrap();
+        let known = before.reputations[&name("liar")];
+        kill();
+        let more = || reputation(&euclid, "liar").is_some_and(|liar| liar.incorrect > known.incorrect);
+        until("more evidence", || disagree(&euclid), || reputations(&euclid).unwrap() != before && more()).await;
+        let now = reputation(&euclid, "liar").unwrap();
+        assert!(now.correct >= known.correct && now.score <= known.score + 1e-9, "{now:?} after {known:?}");
+    }
+    euclid.stop().await;
+    edge.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn another_candidate_leads_with_the_same_reputations() {
+    let edge = edge(|_| ()).await;
+    // It never settles a vote itself: what it knows, it was told.
+    let standby = attached("standby", Role::Edge, &edge, |config| config.fusion.vote.weighted.freshness_s = 1e9).await;
+    standby.seats().fuser.send(FuserMessage::StopPublishing);
+    let euclid = cav("euclid", &edge).await;
+    let from_edge = || reputations(&edge).filter(|r| r.aggregator == Some(name("edge")));
+    let settled = || from_edge().is_some_and(|r| r.reputations.get(&name("liar")).is_some_and(|l| l.incorrect >= 5));
+    until("the liar unmasked", || disagree(&euclid), settled).await;
+    until("evidence replicated", || disagree(&euclid), || standby.counters().events(Event::LedgerMerged) > 2).await;
+    tokio::time::sleep(Duration::from_millis(500)).await;
+
+    let last = from_edge().unwrap();
+    edge.seats().fuser.send(FuserMessage::StopPublishing);
+    let epoch = Epoch::new(last.epoch + 1000, name("standby"));
+    standby.seats().fuser.send(FuserMessage::Lead { epoch, first_round: last.round + 1, on_time: false });
+    let took_over = || reputations(&euclid).filter(|r| r.aggregator == Some(name("standby")) && r.epoch > last.epoch);
+    until("the standby's reputations", || (), || took_over().is_some()).await;
+    assert_eq!(took_over().unwrap().reputations, last.reputations);
+    let verdicts = || euclid.newest_verdicts().borrow().as_ref().map(|newest| newest.message.aggregator.clone());
+    until("the standby's verdicts", || disagree(&euclid), || verdicts() == Some(name("standby"))).await;
+
+    // A candidate that was not there before is told all.
+    let late = attached("late", Role::Edge, &edge, |_| ()).await;
+    late.seats().fuser.send(FuserMessage::StopPublishing);
+    let tell = || {
+        standby.seats().keeper.send(ReputationKeeperMessage::SendSnapshot { to: name("late") });
+    };
+    until("a snapshot", tell, || late.counters().events(Event::LedgerMerged) > 0).await;
+    for node in [late, standby, euclid, edge] {
+        node.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_cell_runs_what_it_is_told_and_counts_the_rest() {
+    for (algorithms, kind, other) in [
+        (Algorithms::Pace, ReportKind::Detections, ReportKind::VoteDetections),
+        (Algorithms::Vote, ReportKind::VoteDetections, ReportKind::Detections),
+    ] {
+        let edge = edge(|config| config.fusion.algorithms = algorithms).await;
+        let euclid = cav("euclid", &edge).await;
+        let send = |kind, label: &str, landmark: &str| {
+            let report = report("euclid", label, landmark);
+            euclid.seats().gateway.send(GatewayMessage::PublishReport { kind, report });
+        };
+        let both = || {
+            send(kind, "cup", "ball");
+            send(other, "cup", "ball");
+        };
+        let maps = || euclid.newest_map().borrow().is_some();
+        let verdicts = || euclid.newest_verdicts().borrow().is_some();
+        let refused = || edge.counters().rejects(RejectReason::NotFused) > 0;
+        until("rounds", both, || (maps() || verdicts()) && refused()).await;
+        assert_eq!((maps(), verdicts()), (algorithms.pace(), algorithms.vote()));
+        if algorithms.vote() {
+            until("reputations", both, || reputations(&euclid).is_some()).await;
+        } else {
+            assert_eq!(reputations(&euclid), None);
+        }
+        euclid.stop().await;
+        edge.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn votes_that_cannot_count_are_counted() {
+    let edge = edge(|_| ()).await;
+    let euclid = cav("euclid", &edge).await;
+    let send = |report: &Arc<ObjectReport>| {
+        let (kind, report) = (ReportKind::VoteDetections, Arc::clone(report));
+        euclid.seats().gateway.send(GatewayMessage::PublishReport { kind, report });
+    };
+    let events = |event| edge.counters().events(event);
+    let rejects = |reason| edge.counters().rejects(reason);
+    until("unknown landmark", || send(&report("euclid", "cup", "moon")), || events(Event::VoteIgnored) > 0).await;
+    let twice = report("euclid", "cup", "ball");
+    until("duplicate", || send(&twice), || rejects(RejectReason::OutOfOrder) > 0).await;
+    let spoilt = |spoil: fn(&mut ObjectReport)| {
+        let mut report = (*report("euclid", "cup", "ball")).clone();
+        spoil(&mut report);
+        Arc::new(report)
+    };
+    let unsure = || spoilt(|r| r.objects[0].confidence = -0.5);
+    until("confidence", || send(&unsure()), || rejects(RejectReason::ConfidenceOutOfRange) > 0).await;
+    let far = || spoilt(|r| r.pose = Some(ecod::wire::WirePose { x_m: 900.0, y_m: 0.0, heading_rad: 0.0 }));
+    let before = events(Event::VoteIgnored);
+    until("beyond range", || send(&far()), || events(Event::VoteIgnored) > before).await;
+    let right = || verdict(&euclid).is_some_and(|v| v.label.as_deref() == Some("cup"));
+    until("the cell goes on", || send(&report("euclid", "cup", "ball")), right).await;
+    euclid.stop().await;
+    edge.stop().await;
+}
