@@ -11,7 +11,7 @@ use std::time::Duration;
 use nalgebra::Point2;
 
 use super::{PaceConfig, PaceRound};
-use crate::landmark::LandmarkIndex;
+use crate::landmark::{Landmark, LandmarkIndex};
 use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
@@ -28,6 +28,10 @@ pub struct PaperPace {
 impl PaperPace {
     pub(super) fn new(config: &PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         Self { gate_m: config.gate_m, max_age: config.max_age(), landmarks, reports: BTreeMap::new() }
+    }
+
+    pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {
+        self.landmarks = Arc::new(self.landmarks.extended(added, self.gate_m));
     }
 
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
@@ -78,7 +82,7 @@ impl<'a> Group<'a> {
         }
     }
 
-    fn state(self, landmark: &crate::landmark::Landmark) -> LandmarkState {
+    fn state(self, landmark: &Landmark) -> LandmarkState {
         let best = self.labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then_with(|| b.0.cmp(a.0)));
         let position = if self.count > 0.0 { self.sum / self.count } else { landmark.position };
         LandmarkState {

@@ -10,8 +10,8 @@ use ecod::testbed::Scene;
 use nalgebra::Point2;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::Failure;
-use super::testbed::{Results, read, select, write};
+use super::testbed::{Results, read, select};
+use super::{Failure, write_json};
 use crate::demo::{Demo, DemoResult};
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
@@ -69,7 +69,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         results.push(outcome.result);
     }
     println!("\n{}", table(&results));
-    write(&arguments.out.join("result.json"), &Results { scenes: &results })?;
+    write_json(&arguments.out.join("result.json"), &Results { scenes: &results })?;
     println!("pictures, results, configurations and logs: {}", arguments.out.display());
     Ok(())
 }
