@@ -1,8 +1,8 @@
 //! The paper's VOTE testbed: recorded detector output through the projector, the naming of locations and VOTE.
 //!
-//! A recording says nothing of how large objects are, and a detector that mistakes an object would not know: all are
-//! taken to be a hand's breadth high, give or take a half. So the bearing decides which location an object is taken for,
-//! and the range only tells near from far. Poses are taken to be as exact as the recorded bearings turn out.
+//! Sizes were not recorded. Those of the objects on the table follow from the boxes that read them right; people and
+//! furniture have their natural size, which puts what is seen of them behind the table where it belongs; of anything
+//! else only the bearing is trusted. Poses are taken to be as exact as the recorded bearings turn out.
 
 pub mod generate;
 
@@ -33,10 +33,29 @@ use crate::perception::{Perception, Vantage};
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 /// The paper's time from one verdict to the next.
 const FRAME_INTERVAL: Duration = Duration::from_millis(120);
-/// Height of an object of unknown kind, in metres.
-const OBJECT_M: f64 = 0.11;
+/// Height in metres and its relative standard deviation by label.
+const SIZES: [(&str, f64, f64); 16] = [
+    ("mouse", 0.064, 0.2),
+    ("cup", 0.155, 0.2),
+    ("sports ball", 0.115, 0.2),
+    ("orange", 0.115, 0.2),
+    ("vase", 0.115, 0.3),
+    ("bowl", 0.115, 0.3),
+    ("bed", 0.8, 0.3),
+    ("chair", 0.9, 0.3),
+    ("couch", 0.9, 0.3),
+    ("dining table", 0.8, 0.3),
+    ("laptop", 0.25, 0.3),
+    ("keyboard", 0.1, 0.5),
+    ("person", 1.7, 0.3),
+    ("potted plant", 0.4, 0.5),
+    ("truck", 3.0, 0.3),
+    ("tv", 0.5, 0.3),
+];
+/// The same for any other label.
+const ANY_SIZE: (f64, f64) = (0.11, 0.5);
 /// Which location an object is taken for.
-const GATE: Gate = Gate { radius_m: 0.25, sigmas: 3.0, floor_m: 0.01 };
+const GATE: Gate = Gate { radius_m: 0.2, sigmas: 3.0, floor_m: 0.02 };
 
 /// What came of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -214,13 +233,14 @@ fn perception(recording: &Recording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -
         lens: Lens::ideal(recording.intrinsics),
         landmarks,
     };
-    let size = ObjectSize { relative_sigma: 0.5, ..ObjectSize::square(OBJECT_M) };
+    let size = |height_m, relative_sigma| ObjectSize { relative_sigma, ..ObjectSize::square(height_m) };
+    let labels = SIZES.map(|(label, height_m, relative_sigma)| (label.into(), size(height_m, relative_sigma)));
     let projection = ProjectionConfig {
         ranging: Ranging::BoxHeight,
-        sizes: ObjectSizes { default: Some(size), ..ObjectSizes::default() },
+        sizes: ObjectSizes { default: Some(size(ANY_SIZE.0, ANY_SIZE.1)), labels: labels.into() },
         pixel_sigma_px: 4.0,
         heading_sigma_rad: 0.05,
-        position_sigma_m: 0.015,
+        position_sigma_m: 0.02,
         ..ProjectionConfig::default()
     };
     Perception::new(vantage, projection, ViewConfig::default(), GATE)

@@ -19,9 +19,9 @@ use rand_chacha::ChaCha8Rng;
 use super::reports;
 
 /// How far objects and vehicles are moved, in metres along each axis.
-const MOVED_M: RangeInclusive<f64> = -0.05..=0.05;
+const MOVED_M: RangeInclusive<f64> = -0.025..=0.025;
 /// How far vehicles are turned, in radians.
-const TURNED_RAD: RangeInclusive<f64> = -0.05..=0.05;
+const TURNED_RAD: RangeInclusive<f64> = -0.03..=0.03;
 
 /// What a recording teaches about its detectors.
 #[derive(Debug, Clone)]
