@@ -166,43 +166,30 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Runs the program; what it says about used lines is not shown.
-fn run(options: &Options, arguments: &[&std::ffi::OsStr]) -> anyhow::Result<()> {
-    let output = Command::new(&options.program).args(arguments).stdin(Stdio::null()).output();
-    let output = output.with_context(|| format!("cannot run {}", options.program.display()))?;
-    if !output.status.success() {
-        bail!("{} {arguments:?}: {}", options.program.display(), String::from_utf8_lossy(&output.stderr));
-    }
+/// Runs the program; of what it says, only rejections are shown.
+fn run(command: &mut Command) -> anyhow::Result<()> {
+    let output = command.stdin(Stdio::null()).output().with_context(|| format!("cannot run {command:?}"))?;
     let said = String::from_utf8_lossy(&output.stderr);
+    if !output.status.success() {
+        bail!("{command:?}: {said}");
+    }
     said.lines().filter(|line| line.starts_with("rejected")).for_each(|line| eprintln!("{line}"));
     Ok(())
 }
 
 /// Accuracy in percent of one run and of the majority.
 fn measure(options: &Options, work: &Path, name: &str, config: &Path, passes: u32) -> anyhow::Result<(f64, f64)> {
-    let file = |name: &str| work.join(name).into_os_string();
-    let (reports, output, result) = (file("reports.jsonl"), file(&format!("{name}.jsonl")), file(&format!("{name}.json")));
-    let passes_text = passes.to_string();
-    let mut arguments: Vec<&std::ffi::OsStr> =
-        vec!["replay".as_ref(), "--config".as_ref(), config.as_os_str(), "--input".as_ref(), &reports];
-    arguments.extend(["--output".as_ref(), output.as_os_str()]);
+    let (reports, output) = (work.join("reports.jsonl"), work.join(format!("{name}.jsonl")));
+    let mut replay = Command::new(&options.program);
+    replay.arg("replay").arg("--config").arg(config).arg("--input").arg(&reports).arg("--output").arg(&output);
     if passes > 0 {
-        arguments.extend(["--passes".as_ref(), passes_text.as_ref()]);
+        replay.arg("--passes").arg(passes.to_string());
     }
-    run(options, &arguments)?;
-    let truth = file("truth.json");
-    let arguments: [&std::ffi::OsStr; 9] = [
-        "eval".as_ref(),
-        "--truth".as_ref(),
-        &truth,
-        "--input".as_ref(),
-        &output,
-        "--reports".as_ref(),
-        &reports,
-        "--out".as_ref(),
-        &result,
-    ];
-    run(options, &arguments)?;
+    run(&mut replay)?;
+    let result = work.join(format!("{name}.json"));
+    let mut eval = Command::new(&options.program);
+    eval.arg("eval").arg("--truth").arg(work.join("truth.json")).arg("--input").arg(&output);
+    run(eval.arg("--reports").arg(&reports).arg("--out").arg(&result))?;
     let result: Value = serde_json::from_slice(&fs::read(&result)?)?;
     let figure = |key: &str| result["vote"][key].as_f64().with_context(|| format!("{name}: eval gave no {key}"));
     Ok((figure("accuracy_pct")?, figure("majority_accuracy_pct")?))

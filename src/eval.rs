@@ -208,10 +208,7 @@ impl Tally {
             accuracy_pct: percent(right as f64, items),
             coverage_pct: percent(covered as f64, standing),
             labelled_accuracy_pct: percent(labelled_right as f64, labelled),
-            rounds: RoundScores {
-                accuracy_pct: percent(self.rounds.right as f64, self.rounds.entries),
-                ..self.rounds
-            },
+            rounds: RoundScores { accuracy_pct: percent(self.rounds.right as f64, self.rounds.entries), ..self.rounds },
             majority_accuracy_pct: self.votes.majority_accuracy_pct(truth),
             vehicles: self.votes.vehicles(truth),
             confusion: confusion.into_iter().map(entry).collect(),

@@ -19,7 +19,7 @@ use std::time::Duration;
 
 pub use line::FusedLine;
 
-use crate::aggregator::{Aggregator, Algorithms, FusionConfig, Fused};
+use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
 use crate::landmark::Landmark;
 use crate::names::{LandmarkId, NodeName};
 use crate::time::Timestamp;
@@ -234,7 +234,13 @@ impl Replay {
             let Some(id) = &object.landmark else { continue };
             if self.learnt.len() < MAX_LEARNT && self.learnt.insert(id.clone()) {
                 let position = nalgebra::Point2::new(object.x_m, object.y_m);
-                fresh.push(Landmark { id: id.clone(), position, facing_rad: None, vacancy: None, synonyms: Vec::new() });
+                fresh.push(Landmark {
+                    id: id.clone(),
+                    position,
+                    facing_rad: None,
+                    vacancy: None,
+                    synonyms: Vec::new(),
+                });
             }
         }
         if !fresh.is_empty() {

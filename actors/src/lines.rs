@@ -81,7 +81,8 @@ mod tests {
             (read, if read == LineRead::Whole { String::from_utf8(line.clone()).unwrap() } else { String::new() })
         };
         use LineRead::{End, TooLarge, Whole};
-        for (read, text) in [(Whole, "12345"), (TooLarge, ""), (Whole, ""), (TooLarge, ""), (Whole, "last"), (End, "")] {
+        for (read, text) in [(Whole, "12345"), (TooLarge, ""), (Whole, ""), (TooLarge, ""), (Whole, "last"), (End, "")]
+        {
             assert_eq!(next(), (read, text.to_owned()));
         }
     }

@@ -72,8 +72,17 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
         (example("recordings/lot_truth.json"), example("recordings/lot.jsonl"), example("recordings/lot.toml"));
     let result = folder.path().join("result.json");
     let run = ecod(&[
-        "eval", "--truth", text(&truth), "--input", text(&output), "--reports", text(&reports), "--config", text(&config),
-        "--out", text(&result),
+        "eval",
+        "--truth",
+        text(&truth),
+        "--input",
+        text(&output),
+        "--reports",
+        text(&reports),
+        "--config",
+        text(&config),
+        "--out",
+        text(&result),
     ]);
     assert!(run.status.success(), "{}", said(&run));
     let table = String::from_utf8(run.stdout).unwrap();
@@ -102,7 +111,9 @@ fn lines_that_cannot_be_used_are_counted_by_reason() {
     let run = ecod_with_input(&["replay", "--input", "-", "--output", "-"], &input);
     assert!(run.status.success());
     let said = said(&run);
-    for part in ["6 lines, 1 used, 1 written", "rejected malformed 3", "rejected too_large 1", "rejected out_of_order 1"] {
+    for part in
+        ["6 lines, 1 used, 1 written", "rejected malformed 3", "rejected too_large 1", "rejected out_of_order 1"]
+    {
         assert!(said.contains(part), "{said}");
     }
     assert_eq!(run.stdout.iter().filter(|byte| **byte == b'\n').count(), 1);
@@ -115,8 +126,12 @@ fn passes_write_one_set_of_verdicts() {
     let input = example("recordings/lot.jsonl");
     let run = ecod(&["replay", "--input", text(&input), "--output", "-", "--passes", "4"]);
     assert!(run.status.success() && said(&run).contains("rejected not_fused 48"), "{}", said(&run));
-    let lines: Vec<Value> =
-        run.stdout.split(|b| *b == b'\n').filter(|l| !l.is_empty()).map(|l| serde_json::from_slice(l).unwrap()).collect();
+    let lines: Vec<Value> = run
+        .stdout
+        .split(|b| *b == b'\n')
+        .filter(|l| !l.is_empty())
+        .map(|l| serde_json::from_slice(l).unwrap())
+        .collect();
     assert_eq!(lines.len(), 1);
     assert_eq!(lines[0]["verdicts"].as_array().unwrap().len(), 8);
 }
@@ -145,7 +160,11 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
         (vec!["eval", "--truth", "/no.json", "--input", recording], 2, "/no.json"),
         (vec!["eval", "--truth", text(&truth), "--input", recording], 2, "`a` has 3"),
         (vec!["eval", "--truth", text(&example("recordings/lot_truth.json")), "--input", text(&empty)], 1, "no map"),
-        (vec!["eval", "--truth", text(&example("recordings/lot_truth.json")), "--input", recording], 1, "1 lines are neither"),
+        (
+            vec!["eval", "--truth", text(&example("recordings/lot_truth.json")), "--input", recording],
+            1,
+            "1 lines are neither",
+        ),
     ] {
         let run = ecod(&arguments);
         assert_eq!(run.status.code(), Some(code), "{arguments:?}: {}", said(&run));
@@ -165,7 +184,15 @@ fn the_recorded_intersection_is_judged_right() {
         folder.path().join("reports.jsonl"),
     );
     let run = ecod(&[
-        "testbed", "--scenes", text(&scenes), "--generated", "3", "--out", text(&out), "--reports", text(&reports),
+        "testbed",
+        "--scenes",
+        text(&scenes),
+        "--generated",
+        "3",
+        "--out",
+        text(&out),
+        "--reports",
+        text(&reports),
     ]);
     assert!(run.status.success(), "{}", said(&run));
     let result: Value = serde_json::from_slice(&fs::read(out).unwrap()).unwrap();

@@ -82,8 +82,7 @@ fn figures_are_those_worked_out_by_hand() {
 
 #[test]
 fn a_truth_that_changes_makes_an_item_of_each_span() {
-    let truth =
-        Truth::parse(r#"{"a": [{"from_us": 0, "label": "cup"}, {"from_us": 10, "label": "mouse"}]}"#).unwrap();
+    let truth = Truth::parse(r#"{"a": [{"from_us": 0, "label": "cup"}, {"from_us": 10, "label": "mouse"}]}"#).unwrap();
     let mut evaluation = Evaluation::new(truth);
     evaluation.fused(&verdicts(5, &[("a", Some("cup"))]));
     evaluation.fused(&verdicts(15, &[("a", Some("cup"))]));

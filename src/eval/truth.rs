@@ -190,10 +190,14 @@ mod tests {
         )
         .unwrap();
         assert!(right(&truth, "a", 5, Some("cup")) && !right(&truth, "a", 5, None));
-        assert!(right(&truth, "b", 5, None) && right(&truth, "b", 5, Some("EMPTY")) && !right(&truth, "b", 5, Some("x")));
+        assert!(
+            right(&truth, "b", 5, None) && right(&truth, "b", 5, Some("EMPTY")) && !right(&truth, "b", 5, Some("x"))
+        );
         assert!(right(&truth, "c", 5, Some("vase")) && right(&truth, "c", 5, Some("sports ball")));
         assert!(truth.at(&"d".into(), Timestamp(9)).is_none() && truth.at(&"e".into(), Timestamp(9)).is_none());
-        assert!(right(&truth, "d", 19, Some("cup")) && right(&truth, "d", 20, None) && right(&truth, "d", 20, Some("hole")));
+        assert!(
+            right(&truth, "d", 19, Some("cup")) && right(&truth, "d", 20, None) && right(&truth, "d", 20, Some("hole"))
+        );
         assert_eq!(Truth::parse("\u{feff}{\"a\": \"1\", \"b\": \"2\"}"), Truth::parse("item,truth\r\na,1\r\nb,2\r\n"));
         let other = Truth::parse(r#"{"landmarks": {"a": null}, "empty": "free"}"#).unwrap();
         assert!(right(&other, "a", 0, Some("free")) && !right(&other, "a", 0, Some("EMPTY")));

@@ -128,7 +128,9 @@ impl RecordingFields {
         for (index, fields) in self.objects.into_iter().enumerate() {
             let object = fields.check(index, place)?;
             if !ids.insert(object.id.clone()) {
-                return Err(place.error(format!("objects[{index}].id"), format_args!("is {:?}, used before", object.id)));
+                return Err(
+                    place.error(format!("objects[{index}].id"), format_args!("is {:?}, used before", object.id))
+                );
             }
             objects.push(object);
         }
@@ -218,7 +220,10 @@ mod tests {
         assert_eq!((recording.objects.len(), recording.cavs.len(), recording.frame_count()), (3, 4, 3));
         let landmarks = recording.landmarks();
         assert!((landmarks[0].position - Point2::new(0.5334, 0.889)).norm() < 1e-12);
-        assert_eq!((landmarks[0].synonyms[0].from.as_str(), landmarks[0].synonyms[0].label.as_str()), ("vase", "sports ball"));
+        assert_eq!(
+            (landmarks[0].synonyms[0].from.as_str(), landmarks[0].synonyms[0].label.as_str()),
+            ("vase", "sports ball")
+        );
         let first = &recording.frames[0][0][0];
         assert_eq!(first.label, "sports ball");
         assert!((first.bounding_box.x_min - 0.5191 * 640.0).abs() < 1e-9);
@@ -234,7 +239,11 @@ mod tests {
             ("\"watson\"", "\"hal\"", ["frames.watson", "no vehicle"]),
             ("y_min, x_min", "x_min, y_min", ["bounding_box_order", "y_min, x_min"]),
             ("\"length\": \"inch\"", "\"length\": \"mile\"", ["units.length", "inch"]),
-            ("\"accepted_labels\": [", "\"accepted_labels\": [], \"other\": [", ["objects[0].accepted_labels", "empty"]),
+            (
+                "\"accepted_labels\": [",
+                "\"accepted_labels\": [], \"other\": [",
+                ["objects[0].accepted_labels", "empty"],
+            ),
         ] {
             assert!(TEXT.contains(from), "{from}");
             let error = Recording::from_json(&TEXT.replacen(from, to, 1)).unwrap_err().to_string();

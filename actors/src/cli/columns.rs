@@ -31,7 +31,8 @@ mod tests {
 
     #[test]
     fn numbers_end_in_one_column() {
-        let rows = [vec!["name".into(), "%".into()], vec!["é".into(), percent(Some(12.345))], vec!["x".into(), percent(None)]];
+        let rows =
+            [vec!["name".into(), "%".into()], vec!["é".into(), percent(Some(12.345))], vec!["x".into(), percent(None)]];
         assert_eq!(columns(&rows), "name      %\né     12.35\nx         -\n");
     }
 }

@@ -117,7 +117,8 @@ fn each_line(path: &Path, limit: usize, mut take: impl FnMut(Option<&[u8]>)) -> 
 fn table(result: &EvalResult) -> String {
     let algorithms = [("PACE", &result.pace), ("VOTE", &result.vote)];
     let judged = algorithms.iter().filter_map(|(name, scores)| Some((*name, scores.as_ref()?)));
-    let mut rows = vec![header(&["", "lines", "items", "accuracy %", "coverage %", "labelled %", "all lines %", "majority %"])];
+    let mut rows =
+        vec![header(&["", "lines", "items", "accuracy %", "coverage %", "labelled %", "all lines %", "majority %"])];
     rows.extend(judged.clone().map(|(name, scores)| summary(name, scores)));
     let mut text = columns(&rows);
     for (name, scores) in judged {

@@ -100,7 +100,8 @@ pub fn run(name: &str, recording: &Recording) -> anyhow::Result<IntersectionResu
     let reports = reports(recording);
     let (fused, scores) = vote(recording, &reports, VoteMode::Weighted)?;
     let (_, paper) = vote(recording, &reports, VoteMode::Paper)?;
-    let alone = |cav: &Cav| (cav.name.clone(), scores.vehicles.get(&cav.name).and_then(|v| v.accuracy_pct).unwrap_or(0.0));
+    let alone =
+        |cav: &Cav| (cav.name.clone(), scores.vehicles.get(&cav.name).and_then(|v| v.accuracy_pct).unwrap_or(0.0));
     Ok(IntersectionResult {
         name: name.to_owned(),
         scenes: 1,
@@ -126,7 +127,11 @@ impl IntersectionResult {
             vote_accuracy_pct: mean(&|scene| scene.vote_accuracy_pct),
             vote_paper_accuracy_pct: mean(&|scene| scene.vote_paper_accuracy_pct),
             majority_accuracy_pct: mean(&|scene| scene.majority_accuracy_pct),
-            single_cav_accuracy_pct: first.single_cav_accuracy_pct.keys().map(|cav| (cav.clone(), alone(cav))).collect(),
+            single_cav_accuracy_pct: first
+                .single_cav_accuracy_pct
+                .keys()
+                .map(|cav| (cav.clone(), alone(cav)))
+                .collect(),
             labels: Vec::new(),
         })
     }
