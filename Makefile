@@ -32,7 +32,7 @@ testbed: setup ## accuracy on the recorded parking lots, rendered and detected, 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
 eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/algorithms.md
 	cargo build --release --locked --bin ecod-node
-	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets $(SETS) --passes $(PASSES) \
+	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
 
 test: setup ## all tests
