@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
 use crate::geometry::Covariance;
-use crate::landmark::{Gate, LandmarkIndex};
+use crate::landmark::{Gate, Landmark, LandmarkIndex};
 use crate::time::Timestamp;
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
 
@@ -150,6 +150,14 @@ impl Pace {
         match config.mode {
             PaceMode::Paper => Self::Paper(PaperPace::new(&config, landmarks)),
             PaceMode::Bayes => Self::Bayes(BayesPace::new(config, landmarks)),
+        }
+    }
+
+    /// Adds known locations after those there are; evidence stays.
+    pub fn add_landmarks(&mut self, added: Vec<Landmark>) {
+        match self {
+            Self::Paper(pace) => pace.add_landmarks(added),
+            Self::Bayes(pace) => pace.add_landmarks(added),
         }
     }
 

@@ -132,6 +132,20 @@ impl NodeConfig {
         Ok(config)
     }
 
+    /// Reads what a file says about a cell: all keys of a node are known, none is required, and neither the environment
+    /// nor flags play a part. Fusion and locations are checked.
+    ///
+    /// # Errors
+    /// [`LoadError`] naming the file, or the key, the value and what is allowed.
+    pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
+        std::fs::metadata(file).map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
+        let figment = Figment::from(Serialized::defaults(Self::default())).merge(Toml::file_exact(file));
+        let config: Self = figment.extract().map_err(|errors| LoadError::Malformed(describe(errors)))?;
+        config.fusion.validate().map_err(|error| error.within("fusion"))?;
+        LandmarkConfig::validate_all(&config.landmarks)?;
+        Ok(config)
+    }
+
     /// Checks every value and that they fit together.
     ///
     /// # Errors

@@ -33,6 +33,7 @@ pub mod image_size;
 pub mod latest_slot;
 #[cfg(feature = "camera")]
 pub mod lens;
+pub mod lines;
 pub mod membership;
 pub mod node;
 #[cfg(feature = "camera")]

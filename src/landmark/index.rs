@@ -63,6 +63,11 @@ impl LandmarkIndex {
         }
     }
 
+    /// An index of these landmarks and then of more, for queries of about `radius_m` metres.
+    pub fn extended(&self, more: Vec<Landmark>, radius_m: f64) -> Self {
+        Self::new(self.landmarks.iter().cloned().chain(more).collect(), radius_m)
+    }
+
     /// The landmarks in configuration order.
     pub fn landmarks(&self) -> &[Landmark] {
         &self.landmarks

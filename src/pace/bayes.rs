@@ -58,6 +58,11 @@ impl BayesPace {
         }
     }
 
+    pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {
+        self.landmarks = Arc::new(self.landmarks.extended(added, self.config.gate_m));
+        self.published.resize(self.landmarks.landmarks().len(), None);
+    }
+
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
         let sightings = self.sightings(report);
         let vehicle = self.vehicles.entry(report.node.clone()).or_default();

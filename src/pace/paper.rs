@@ -55,6 +55,10 @@ impl PaperPace {
         }
     }
 
+    pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {
+        self.landmarks = Arc::new(self.landmarks.extended(added, self.gate_m));
+    }
+
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
         let freshest = self.vehicles.entry(report.node.clone()).or_default();
         freshest.captured_at = captured_at;

@@ -10,8 +10,8 @@ use ecod::testbed::Scene;
 use nalgebra::Point2;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::testbed::{Results, check_writable, read, select, write};
-use super::{Failure, print};
+use super::testbed::{Results, check_writable, read, select};
+use super::{Failure, print, write_json};
 use crate::demo::{Demo, DemoResult};
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
@@ -72,7 +72,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         results.push(outcome.result);
     }
     print(&format!("\n{}\n", table(&results)))?;
-    write(&results_file, &Results { scenes: &results })?;
+    write_json(&results_file, &Results { scenes: &results })?;
     Ok(print(&format!("pictures, results, configurations and logs: {}\n", arguments.out.display()))?)
 }
 
