@@ -38,12 +38,12 @@ fn rounds(figures: &mut Figures) {
                 .map(|round| {
                     let now = NOON + Duration::from_secs(3 * round);
                     let reports = reports(votes, round, now);
-                    let begin = Instant::now();
-                    for report in &reports {
-                        vote.observe(report, now).expect("reports are in order");
-                    }
-                    std::hint::black_box(vote.close(now));
-                    begin.elapsed()
+                    time(|| {
+                        for report in &reports {
+                            vote.observe(report, now).expect("reports are in order");
+                        }
+                        std::hint::black_box(vote.close(now));
+                    })
                 })
                 .min()
                 .expect("there are rounds");
@@ -66,17 +66,20 @@ fn ledgers(figures: &mut Figures) {
             .collect();
         let mut ledger = ReputationLedger::default();
         let least = (0..21)
-            .map(|epoch| {
-                let begin = Instant::now();
-                evidence.iter().for_each(|e| ledger.record(epoch / 10, &aggregator, e));
-                begin.elapsed()
-            })
+            .map(|epoch| time(|| evidence.iter().for_each(|e| ledger.record(epoch / 10, &aggregator, e))))
             .min()
             .expect("there are rounds");
         std::hint::black_box(ledger.reputations(&ReputationConfig::default()));
         record(figures, "ledger_update", votes, least)
     });
     flat(figures, "ledger_update_cost_per_vote_from_the_middle", costs);
+}
+
+#[expect(clippy::disallowed_methods, reason = "a benchmark reads the clock")]
+fn time(run: impl FnOnce()) -> Duration {
+    let begin = Instant::now();
+    run();
+    begin.elapsed()
 }
 
 fn record(figures: &mut Figures, name: &str, votes: usize, time: Duration) -> f64 {
