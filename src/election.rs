@@ -56,12 +56,12 @@ use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::SCHEMA_VERSION;
 
+pub use clock::Clock;
 pub use config::ElectionConfig;
 pub use message::{Body, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM, Standing};
 pub use step::{Effect, Health, Input};
 
 use claiming::{Questions, Seeking};
-use clock::Clock;
 use following::Following;
 use leading::Leading;
 use peers::Peers;

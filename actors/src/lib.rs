@@ -31,6 +31,7 @@ pub mod gateway;
 pub mod latest_slot;
 #[cfg(feature = "camera")]
 pub mod lens;
+pub mod membership;
 pub mod node;
 #[cfg(feature = "camera")]
 pub mod perception;

@@ -10,31 +10,33 @@ use crate::time::Timestamp;
 /// not listen is no silence of others. So time passes only up to the deadline that was planned plus a tolerance, and
 /// never backwards.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) struct Clock {
+pub struct Clock {
     outside: Timestamp,
     inside: Timestamp,
     tolerance: Duration,
 }
 
 impl Clock {
-    pub(super) fn new(now: Timestamp, tolerance: Duration) -> Self {
+    /// A clock that starts at `now` and takes a delay of up to `tolerance` for time.
+    pub fn new(now: Timestamp, tolerance: Duration) -> Self {
         Self { outside: now, inside: now, tolerance }
     }
 
     /// The time inside, after `now` outside, when the next thing was due at `due` inside.
-    pub(super) fn advance(&mut self, now: Timestamp, due: Timestamp) -> Timestamp {
+    pub fn advance(&mut self, now: Timestamp, due: Timestamp) -> Timestamp {
         let planned = due.since(self.inside) + self.tolerance;
         self.inside = self.inside + now.since(self.outside).min(planned);
         self.outside = now;
         self.inside
     }
 
-    pub(super) fn now(&self) -> Timestamp {
+    /// The time inside.
+    pub fn now(&self) -> Timestamp {
         self.inside
     }
 
     /// When `due` inside will be outside.
-    pub(super) fn outside(&self, due: Timestamp) -> Timestamp {
+    pub fn outside(&self, due: Timestamp) -> Timestamp {
         self.outside + due.since(self.inside)
     }
 }

@@ -1,0 +1,160 @@
+//! Frames: what a datagram of the membership looks like.
+//!
+//! ```text
+//!  0      2        3     4       8                24         32
+//! | ec 0d | version | kind | cell | sender's session | counter | sealed body ... | seal (16) |
+//! ```
+//!
+//! All integers are big-endian. The seal is ChaCha20-Poly1305 with the head as associated data, the counter as nonce,
+//! and a key of its own for every pair of sessions and direction.
+
+use ecod::names::NodeName;
+use serde::{Deserialize, Serialize};
+use std::net::SocketAddr;
+
+use super::MAX_PAYLOAD_BYTES;
+use super::key::{Cookie, Seal, SessionId};
+use super::node_id::NodeId;
+
+/// Bytes before the sealed body.
+pub(super) const HEAD_BYTES: usize = 32;
+
+/// Longest frame in bytes.
+pub(super) const MAX_FRAME_BYTES: usize = HEAD_BYTES + MAX_PAYLOAD_BYTES + SEAL_BYTES;
+
+const SEAL_BYTES: usize = 16;
+const MAGIC: [u8; 2] = [0xec, 0x0d];
+const VERSION: u8 = 1;
+
+/// What a frame holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// A greeting to whom it may concern, sealed for everybody.
+    Hello = 1,
+    /// A step of the handshake that establishes a session.
+    Handshake = 2,
+    /// Words of the gossip protocol.
+    Gossip = 3,
+    /// A datagram of the node's other parts.
+    Payload = 4,
+}
+
+/// A node greets; another challenges it; each proves that it is there now by returning the other's cookie:
+///
+/// ```text
+/// A ── Hello ─────────────────────────────────────▶ all, or a seed
+/// A ◀───── Challenge { cookie of B } ────────────── B    remembers nothing
+/// A ── Proof { that cookie, cookie of A } ────────▶ B    B knows A
+/// A ◀───── Accept { that cookie } ───────────────── B    A knows B
+/// ```
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum Handshake {
+    /// "Show that you are there."
+    Challenge {
+        /// To be returned.
+        cookie: Cookie,
+        /// Who asks.
+        name: NodeName,
+    },
+    /// "I am; show that you are."
+    Proof {
+        /// The challenger's cookie.
+        echo: Cookie,
+        /// To be returned.
+        cookie: Cookie,
+        /// Who proves.
+        word: Word,
+    },
+    /// "I am too."
+    Accept {
+        /// The prover's cookie.
+        echo: Cookie,
+        /// Who accepts.
+        word: Word,
+    },
+}
+
+/// What two nodes tell each other when they meet.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Word {
+    /// The sender.
+    pub(super) id: NodeId,
+    /// Where the sender sees the receiver.
+    pub(super) seen_at: SocketAddr,
+    /// What the sender knows of the receiver's name.
+    pub(super) standing: NameStanding,
+}
+
+/// What is known of a name besides who just proved to bear it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) enum NameStanding {
+    /// Nothing that is in the way.
+    Free,
+    /// A later life of that name is over: only one after it will be believed.
+    After(u64),
+    /// A node that started later bears it.
+    Taken,
+}
+
+/// A greeting.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Hello {
+    /// Who greets.
+    pub(super) name: NodeName,
+}
+
+/// The open part of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Head {
+    pub(super) kind: Kind,
+    pub(super) sender: SessionId,
+    pub(super) counter: u64,
+}
+
+/// A frame that is no frame of this cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum HeadError {
+    Oversized,
+    Malformed,
+    WrongCell,
+}
+
+impl Head {
+    /// Reads the head of a frame; its body is what follows [`HEAD_BYTES`].
+    pub(super) fn read(frame: &[u8], cell: [u8; 4]) -> Result<Self, HeadError> {
+        if frame.len() > MAX_FRAME_BYTES {
+            return Err(HeadError::Oversized);
+        }
+        if frame.len() < HEAD_BYTES + SEAL_BYTES || frame[..2] != MAGIC || frame[2] != VERSION {
+            return Err(HeadError::Malformed);
+        }
+        let kind = match frame[3] {
+            1 => Kind::Hello,
+            2 => Kind::Handshake,
+            3 => Kind::Gossip,
+            4 => Kind::Payload,
+            _ => return Err(HeadError::Malformed),
+        };
+        if frame[4..8] != cell {
+            return Err(HeadError::WrongCell);
+        }
+        let mut sender = SessionId::default();
+        sender.copy_from_slice(&frame[8..24]);
+        let mut counter = [0; 8];
+        counter.copy_from_slice(&frame[24..32]);
+        Ok(Self { kind, sender, counter: u64::from_be_bytes(counter) })
+    }
+
+    /// Writes a whole frame.
+    pub(super) fn write(&self, cell: [u8; 4], body: &[u8], seal: &Seal) -> Vec<u8> {
+        let mut frame = Vec::with_capacity(HEAD_BYTES + body.len() + SEAL_BYTES);
+        frame.extend_from_slice(&MAGIC);
+        frame.extend_from_slice(&[VERSION, self.kind as u8]);
+        frame.extend_from_slice(&cell);
+        frame.extend_from_slice(&self.sender);
+        frame.extend_from_slice(&self.counter.to_be_bytes());
+        frame.extend_from_slice(body);
+        seal.close(self.counter, &mut frame, HEAD_BYTES);
+        frame
+    }
+}

@@ -1,0 +1,464 @@
+//! Cells of machines on a network in simulated time.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::Ipv4Addr;
+
+use ecod::wire::Role;
+use proptest::prelude::*;
+
+use super::*;
+
+const KEY: &str = "0101010101010101010101010101010101010101010101010101010101010101";
+
+/// Machines, the datagrams between them, and what each told.
+struct Cell {
+    now: Timestamp,
+    nodes: BTreeMap<usize, Node>,
+    under_way: Vec<(Timestamp, SocketAddr, SocketAddr, Vec<u8>)>,
+    recorded: Vec<(SocketAddr, SocketAddr, Vec<u8>)>,
+    multicast: bool,
+    /// Nodes whose datagrams reach only each other.
+    island: BTreeSet<usize>,
+    loss_percent: u32,
+    sent: usize,
+    rng: ChaCha8Rng,
+}
+
+struct Node {
+    machine: Machine,
+    events: Vec<MembershipEvent>,
+    stopped: bool,
+}
+
+impl Cell {
+    fn new(multicast: bool) -> Self {
+        Self::seeded(multicast, 3)
+    }
+
+    /// A cell whose sessions differ from those of cells with another seed.
+    fn seeded(multicast: bool, seed: u64) -> Self {
+        Self {
+            now: Timestamp(1_700_000_000_000_000),
+            nodes: BTreeMap::new(),
+            under_way: Vec::new(),
+            recorded: Vec::new(),
+            multicast,
+            island: BTreeSet::new(),
+            loss_percent: 0,
+            sent: 0,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+        }
+    }
+
+    fn of(nodes: usize) -> Self {
+        let mut cell = Self::new(true);
+        (1..=nodes).for_each(|node| cell.start(node, &name(node)));
+        cell.run(3000);
+        cell
+    }
+
+    fn start(&mut self, node: usize, name: &str) {
+        self.start_at(node, name, KEY, self.now.micros());
+    }
+
+    fn start_at(&mut self, node: usize, name: &str, key: &str, run: u64) {
+        let own = NodeId {
+            name: NodeName::new(name).unwrap(),
+            run,
+            life: run,
+            role: Role::Auto,
+            gossip: SocketAddr::from(([0, 0, 0, 0], 17_884)),
+            broker: Some(SocketAddr::from(([0, 0, 0, 0], 1883))),
+        };
+        let mut session = SessionId::default();
+        self.rng.fill(&mut session);
+        let key = CellKey::new(key, &NodeName::from_static("lot-1"));
+        let seed = self.rng.random();
+        let setup = Setup { own, key, session, secret: [7; 32], seed, counters: Arc::default() };
+        let machine = Machine::new(setup, &MembershipConfig::default(), self.now);
+        self.nodes.insert(node, Node { machine, events: Vec::new(), stopped: false });
+    }
+
+    fn run(&mut self, ms: u64) {
+        for _ in 0..ms {
+            self.now = self.now + Duration::from_millis(1);
+            let (now, arrived): (_, Vec<_>) = (self.now, self.take_arrived());
+            for (_, from, to, frame) in arrived {
+                let Some(node) = self.nodes.get_mut(&index(to)) else { continue };
+                node.machine.receive(&frame, from, now);
+            }
+            for node in self.nodes.values_mut().filter(|node| !node.stopped) {
+                if node.machine.next_deadline().is_some_and(|deadline| deadline <= now) {
+                    node.machine.tick(now);
+                }
+            }
+            self.deliver();
+        }
+    }
+
+    fn take_arrived(&mut self) -> Vec<(Timestamp, SocketAddr, SocketAddr, Vec<u8>)> {
+        let stopped = |to: &SocketAddr| self.nodes.get(&index(*to)).is_some_and(|node| node.stopped);
+        let (arrived, later) =
+            std::mem::take(&mut self.under_way).into_iter().partition(|(at, _, to, _)| *at <= self.now && !stopped(to));
+        self.under_way = later;
+        arrived
+    }
+
+    fn deliver(&mut self) {
+        let all: Vec<usize> = self.nodes.keys().copied().collect();
+        let mut sent = Vec::new();
+        for (index, node) in &mut self.nodes {
+            while let Some(output) = node.machine.poll() {
+                match output {
+                    Output::Send { to, frame } => sent.push((*index, to, frame)),
+                    Output::Multicast { frame } if self.multicast => {
+                        sent.extend(all.iter().map(|to| (*index, address(*to), frame.clone())));
+                    }
+                    Output::Multicast { .. } => (),
+                    Output::Tell(event) => node.events.push(event),
+                }
+            }
+        }
+        for (from, to, frame) in sent {
+            self.sent += 1;
+            self.recorded.push((address(from), to, frame.clone()));
+            let cut = self.island.contains(&from) != self.island.contains(&index(to));
+            if !cut && !self.rng.random_ratio(self.loss_percent, 100) {
+                let delay = Duration::from_micros(self.rng.random_range(100..3000));
+                self.under_way.push((self.now + delay, address(from), to, frame));
+            }
+        }
+    }
+
+    fn sees(&self, node: usize) -> BTreeSet<String> {
+        self.nodes[&node].machine.members().iter().map(|member| member.name.to_string()).collect()
+    }
+
+    fn assert_complete(&self) {
+        for node in self.nodes.keys() {
+            let others: BTreeSet<_> =
+                self.nodes.keys().filter(|other| *other != node).map(|other| name(*other)).collect();
+            assert_eq!(self.sees(*node), others, "as seen by {node}");
+        }
+    }
+
+    fn forget_events(&mut self) {
+        self.nodes.values_mut().for_each(|node| node.events.clear());
+    }
+
+    fn events(&self) -> usize {
+        self.nodes.values().map(|node| node.events.len()).sum()
+    }
+}
+
+fn name(node: usize) -> String {
+    format!("node-{node}")
+}
+
+fn node_name(node: usize) -> NodeName {
+    NodeName::new(name(node)).unwrap()
+}
+
+fn address(node: usize) -> SocketAddr {
+    SocketAddr::from((Ipv4Addr::new(10, 0, 0, node as u8), 17_884))
+}
+
+fn index(address: SocketAddr) -> usize {
+    match address.ip() {
+        std::net::IpAddr::V4(ip) => usize::from(ip.octets()[3]),
+        std::net::IpAddr::V6(_) => usize::MAX,
+    }
+}
+
+#[test]
+fn nodes_find_each_other_by_multicast() {
+    let cell = Cell::of(8);
+    cell.assert_complete();
+    let member = &cell.nodes[&1].machine.members()[0];
+    assert_eq!((member.gossip, member.broker), (address(2), Some(SocketAddr::from(([10, 0, 0, 2], 1883)))));
+}
+
+#[test]
+fn nodes_find_each_other_by_one_seed_whoever_starts_first() {
+    let mut cell = Cell::new(false);
+    for node in 2..=5 {
+        cell.start(node, &name(node));
+        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(1)]);
+    }
+    cell.run(1000);
+    assert!(cell.sees(2).is_empty());
+    cell.start(1, "node-1");
+    cell.run(6000);
+    cell.assert_complete();
+}
+
+#[test]
+fn cells_form_over_a_network_that_loses_a_fifth() {
+    let mut cell = Cell::new(true);
+    cell.loss_percent = 20;
+    (1..=6).for_each(|node| cell.start(node, &name(node)));
+    cell.run(6000);
+    cell.loss_percent = 0;
+    cell.run(3000);
+    cell.assert_complete();
+}
+
+#[test]
+fn a_dead_node_is_given_up_by_all_and_nobody_else_is() {
+    let mut cell = Cell::of(8);
+    cell.forget_events();
+    cell.nodes.remove(&3);
+    cell.run(1500);
+    cell.assert_complete();
+    for node in cell.nodes.values() {
+        let downs: Vec<_> = node.events.iter().filter(|event| matches!(event, MembershipEvent::Down { .. })).collect();
+        assert_eq!(downs, [&MembershipEvent::Down { name: node_name(3) }]);
+        assert!(!node.events.iter().any(|event| matches!(event, MembershipEvent::Alive { .. })));
+    }
+}
+
+#[test]
+fn a_node_that_leaves_is_gone_at_once() {
+    let mut cell = Cell::of(4);
+    let now = cell.now;
+    cell.nodes.get_mut(&2).unwrap().machine.leave(now);
+    cell.deliver();
+    cell.nodes.get_mut(&2).unwrap().stopped = true;
+    cell.run(150);
+    assert!([1, 3, 4].iter().all(|node| !cell.sees(*node).contains("node-2")));
+    assert_eq!(cell.nodes[&2].machine.next_deadline(), None);
+}
+
+#[test]
+fn a_stopped_node_comes_back_and_blames_nobody() {
+    let mut cell = Cell::of(6);
+    cell.nodes.get_mut(&4).unwrap().stopped = true;
+    cell.run(5000);
+    assert!(!cell.sees(1).contains("node-4"));
+    cell.forget_events();
+    cell.nodes.get_mut(&4).unwrap().stopped = false;
+    cell.run(2000);
+    cell.assert_complete();
+    let blamed =
+        cell.nodes.values().flat_map(|node| &node.events).any(|event| matches!(event, MembershipEvent::Down { .. }));
+    assert!(!blamed);
+}
+
+#[test]
+fn a_restarted_node_replaces_its_older_run_even_with_its_clock_set_back() {
+    let mut cell = Cell::of(4);
+    for run in [cell.now.micros(), 1000] {
+        cell.nodes.remove(&2);
+        cell.start_at(2, "node-2", KEY, run);
+        cell.run(3000);
+        cell.assert_complete();
+        for node in [1, 3, 4] {
+            let member = cell.nodes[&node].machine.members().into_iter().find(|member| member.name == node_name(2));
+            assert_eq!(member.unwrap().run, run, "as seen by {node}");
+        }
+    }
+}
+
+#[test]
+fn a_quick_restart_is_news_and_no_death() {
+    let mut cell = Cell::new(false);
+    for node in 1..=8 {
+        cell.start(node, &name(node));
+        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(1)]);
+    }
+    cell.run(5000);
+    cell.assert_complete();
+    cell.forget_events();
+    cell.start(5, "node-5");
+    cell.nodes.get_mut(&5).unwrap().machine.set_seeds(vec![address(1)]);
+    cell.run(3000);
+    cell.assert_complete();
+    for (node, Node { events, .. }) in cell.nodes.iter().filter(|(node, _)| **node != 5) {
+        let alive = |event: &&MembershipEvent| matches!(event, MembershipEvent::Alive { .. });
+        let down = |event: &MembershipEvent| matches!(event, MembershipEvent::Down { .. });
+        assert_eq!(events.iter().filter(alive).count(), 1, "{node}: {events:?}");
+        assert!(!events.iter().any(down), "{node}: {events:?}");
+    }
+}
+
+#[test]
+fn two_running_nodes_with_one_name_are_reported_and_the_later_one_is_heard() {
+    let mut cell = Cell::of(4);
+    cell.start(9, "node-2");
+    cell.run(8000);
+    cell.forget_events();
+    let sent = cell.sent;
+    cell.run(8000);
+    for node in [1, 3, 4] {
+        let member = cell.nodes[&node].machine.members().into_iter().find(|member| member.name == node_name(2));
+        assert_eq!(member.unwrap().gossip, address(9), "as seen by {node}");
+        let flapped =
+            cell.nodes[&node].events.iter().filter(|event| !matches!(event, MembershipEvent::NameTaken { .. }));
+        assert_eq!(flapped.count(), 0, "{:?}", cell.nodes[&node].events);
+    }
+    assert!((cell.sent - sent) / 5 / 8 < 100, "{} frames", cell.sent - sent);
+    cell.run(60_000);
+    for node in [1, 2, 3, 4] {
+        let events = &cell.nodes[&node].events;
+        assert!(events.contains(&MembershipEvent::NameTaken { name: node_name(2) }), "{node}: {events:?}");
+    }
+}
+
+#[test]
+fn a_broker_address_reaches_all() {
+    let mut cell = Cell::of(5);
+    cell.forget_events();
+    let now = cell.now;
+    cell.nodes.get_mut(&1).unwrap().machine.set_broker(Some(SocketAddr::from(([10, 0, 0, 1], 2000))), now);
+    cell.run(1000);
+    cell.assert_complete();
+    for node in 2..=5 {
+        let changed = |event: &MembershipEvent| match event {
+            MembershipEvent::Changed { member } => member.broker.is_some_and(|broker| broker.port() == 2000),
+            _ => panic!("{event:?}"),
+        };
+        assert_eq!(cell.nodes[&node].events.iter().filter(|event| changed(event)).count(), 1);
+    }
+}
+
+#[test]
+fn datagrams_arrive_with_their_sender() {
+    let mut cell = Cell::of(3);
+    cell.forget_events();
+    let now = cell.now;
+    let sender = &mut cell.nodes.get_mut(&1).unwrap().machine;
+    sender.send(&node_name(3), &[42; 1200], now);
+    sender.send(&NodeName::from_static("nobody"), b"lost", now);
+    cell.run(10);
+    assert!(cell.nodes[&2].events.is_empty());
+    let [MembershipEvent::Received { from, payload, .. }] = &cell.nodes[&3].events[..] else { panic!("nothing came") };
+    assert_eq!((from, &payload[..]), (&node_name(1), &[42; 1200][..]));
+    assert_eq!(cell.nodes[&1].machine.counters.get(FrameEvent::NoSession), 1);
+}
+
+#[test]
+fn two_sides_of_a_split_meet_again() {
+    let mut cell = Cell::of(6);
+    cell.island = [1, 2, 3].into();
+    cell.run(4000);
+    assert_eq!((cell.sees(1).len(), cell.sees(6).len()), (2, 2));
+    cell.island.clear();
+    cell.run(5000);
+    cell.assert_complete();
+}
+
+#[test]
+fn nodes_with_another_key_are_not_seen() {
+    let mut cell = Cell::new(true);
+    cell.start(1, "node-1");
+    cell.start(2, "node-2");
+    cell.start_at(3, "node-3", "another passphrase", 5);
+    cell.run(2000);
+    assert_eq!(cell.sees(1), ["node-2".to_owned()].into());
+    assert!(cell.sees(3).is_empty());
+    assert!(cell.nodes[&1].machine.counters.get(FrameEvent::BadSeal) > 0);
+    assert!(cell.nodes[&3].machine.counters.get(FrameEvent::BadSeal) > 0);
+}
+
+/// Everything that was ever sent, again: to whom it was meant, to everybody else, and to nodes that have restarted.
+#[test]
+fn recorded_frames_change_nothing() {
+    let mut cell = Cell::of(4);
+    let now = cell.now;
+    cell.nodes.get_mut(&1).unwrap().machine.send(&node_name(2), b"payload", now);
+    cell.run(100);
+    cell.nodes.remove(&4);
+    cell.run(2000);
+    cell.start(4, "node-4");
+    cell.run(3000);
+    cell.assert_complete();
+    cell.forget_events();
+    let recorded = std::mem::take(&mut cell.recorded);
+    for (from, _, frame) in &recorded {
+        for to in 1..=4 {
+            cell.under_way.push((cell.now, *from, address(to), frame.clone()));
+        }
+        if cell.under_way.len() > 40 {
+            cell.run(1);
+        }
+    }
+    cell.run(3000);
+    cell.assert_complete();
+    assert_eq!(cell.events(), 0, "{:?}", cell.nodes.values().map(|node| &node.events).collect::<Vec<_>>());
+    for node in cell.nodes.values() {
+        assert!(node.machine.counters.get(FrameEvent::Replayed) > 0);
+        assert!(node.machine.counters.get(FrameEvent::BadSeal) > 0);
+    }
+}
+
+/// A recorded cell, replayed to a lone node of the same name and key that has restarted: nobody appears.
+#[test]
+fn recorded_frames_conjure_up_nobody() {
+    let mut old = Cell::of(4);
+    old.run(1000);
+    let mut cell = Cell::seeded(true, 4);
+    cell.now = old.now;
+    cell.start(1, "node-1");
+    for (from, _, frame) in &old.recorded {
+        cell.under_way.push((cell.now, *from, address(1), frame.clone()));
+        if cell.under_way.len() > 20 {
+            cell.run(1);
+        }
+    }
+    cell.run(1000);
+    assert_eq!(cell.events(), 0);
+    let counters = &cell.nodes[&1].machine.counters;
+    let answers = old.recorded.len() as u64;
+    assert!(counters.get(FrameEvent::BadSeal) > answers / 2, "{:?}", counters.snapshot());
+    assert!((cell.sent as u64) < 256 + answers / 4, "{} answers", cell.sent);
+}
+
+#[test]
+fn a_flood_of_recorded_greetings_is_answered_at_a_bounded_rate() {
+    let mut old = Cell::of(2);
+    let (_, _, hello) = old.recorded.remove(0);
+    let mut cell = Cell::seeded(true, 4);
+    cell.start(1, "node-1");
+    for _ in 0..1000 {
+        (0..20).for_each(|_| cell.under_way.push((cell.now, address(77), address(1), hello.clone())));
+        cell.run(1);
+    }
+    assert!(cell.sent < 20 + 10, "{} answers to 20,000 greetings", cell.sent);
+    assert!(cell.nodes[&1].machine.counters.get(FrameEvent::Throttled) > 10_000);
+    cell.start(2, "node-2");
+    cell.run(200);
+    assert_eq!(cell.sees(1), ["node-2".to_owned()].into(), "newcomers are met all the same");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn junk_is_counted_and_changes_nothing(
+        junk in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..1400), 1..40),
+        bent in prop::collection::vec((any::<prop::sample::Index>(), any::<prop::sample::Index>(), 1u8..), 1..40),
+    ) {
+        let mut cell = Cell::new(true);
+        (1..=3).for_each(|node| cell.start(node, &name(node)));
+        cell.run(1000);
+        cell.forget_events();
+        let (now, node) = (cell.now, cell.nodes.get_mut(&1).unwrap());
+        let members = node.machine.members();
+        for (frame, at, bits) in bent {
+            let (from, _, mut frame) = frame.get(&cell.recorded).clone();
+            let at = at.index(frame.len());
+            frame[at] ^= bits;
+            node.machine.receive(&frame, from, now);
+        }
+        for bytes in &junk {
+            node.machine.receive(bytes, address(2), now);
+            let headed = [&cell.recorded[0].2[..32], bytes].concat();
+            node.machine.receive(&headed, address(2), now);
+        }
+        node.machine.tick(now);
+        prop_assert_eq!(node.machine.members(), members);
+        while let Some(output) = node.machine.poll() {
+            prop_assert!(!matches!(output, Output::Tell(_)), "{:?}", output);
+        }
+    }
+}

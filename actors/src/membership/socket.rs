@@ -1,0 +1,122 @@
+//! The sockets of the membership: one of its own, and one that all nodes of a machine share for greetings to the group.
+
+use std::io::{self, ErrorKind};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
+
+use socket2::{Domain, Protocol, Socket, Type};
+use tokio::net::UdpSocket;
+
+use super::config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
+
+/// The node's end of the gossip.
+pub(super) struct GossipSocket {
+    own: UdpSocket,
+    group: Option<(UdpSocket, SocketAddr)>,
+    address: SocketAddr,
+}
+
+/// A gossip socket that could not be opened.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot gossip on {address}: {source}")]
+pub struct BindError {
+    address: SocketAddr,
+    source: io::Error,
+}
+
+impl GossipSocket {
+    /// Opens the sockets. Without multicast, should it not be possible here, seeds have to do.
+    pub(super) fn bind(config: &MembershipConfig) -> Result<Self, BindError> {
+        let own = match config.bind {
+            Some(address) => open(address),
+            None => open_default(config.default_ip()),
+        }?;
+        let failed = |source| BindError { address: config.bind.unwrap_or(UNKNOWN), source };
+        let address = own.local_addr().map_err(failed)?;
+        let group = join(&config.multicast, &own, address).unwrap_or_else(|error| {
+            tracing::warn!(%error, group = %config.multicast.group, "no discovery by multicast");
+            None
+        });
+        Ok(Self { own: UdpSocket::from_std(own).map_err(failed)?, group, address })
+    }
+
+    /// Where the node gossips; the address may be unspecified.
+    pub(super) fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Waits until a datagram can be taken.
+    pub(super) async fn readable(&self) -> io::Result<()> {
+        match &self.group {
+            None => self.own.readable().await,
+            Some((group, _)) => tokio::select! {
+                ready = self.own.readable() => ready,
+                ready = group.readable() => ready,
+            },
+        }
+    }
+
+    /// Takes a datagram that waits.
+    pub(super) fn receive(&self, buffer: &mut [u8]) -> Option<(usize, SocketAddr)> {
+        let sockets = [Some(&self.own), self.group.as_ref().map(|(group, _)| group)];
+        sockets.into_iter().flatten().find_map(|socket| socket.try_recv_from(buffer).ok())
+    }
+
+    /// Sends a datagram, unless that takes waiting.
+    pub(super) fn send(&self, frame: &[u8], to: SocketAddr) -> io::Result<()> {
+        self.own.try_send_to(frame, to).map(drop)
+    }
+
+    /// Sends a datagram to the group, if there is one.
+    pub(super) fn multicast(&self, frame: &[u8]) -> Option<io::Result<()>> {
+        self.group.as_ref().map(|(_, group)| self.send(frame, *group))
+    }
+}
+
+/// Room for what comes in while the node is held up.
+const RECEIVE_BUFFER_BYTES: usize = 1 << 20;
+
+const UNKNOWN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
+
+fn open_default(ip: IpAddr) -> Result<std::net::UdpSocket, BindError> {
+    match open(SocketAddr::new(ip, DEFAULT_PORT)) {
+        Err(error) if error.source.kind() == ErrorKind::AddrInUse => open(SocketAddr::new(ip, 0)),
+        opened => opened,
+    }
+}
+
+fn open(address: SocketAddr) -> Result<std::net::UdpSocket, BindError> {
+    let open = || {
+        let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
+        socket.set_nonblocking(true)?;
+        // The system may grant less.
+        let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES);
+        socket.bind(&address.into())?;
+        Ok(socket.into())
+    };
+    open().map_err(|source| BindError { address, source })
+}
+
+fn join(
+    config: &MulticastConfig,
+    own: &std::net::UdpSocket,
+    address: SocketAddr,
+) -> io::Result<Option<(UdpSocket, SocketAddr)>> {
+    let IpAddr::V4(ip) = address.ip() else { return Ok(None) };
+    if !config.enabled {
+        return Ok(None);
+    }
+    let interface = config.interface.unwrap_or(ip);
+    let sender = socket2::SockRef::from(own);
+    if !interface.is_unspecified() {
+        sender.set_multicast_if_v4(&interface)?;
+    }
+    sender.set_multicast_ttl_v4(1)?;
+    sender.set_multicast_loop_v4(true)?;
+    let group = SocketAddr::V4(SocketAddrV4::new(config.group, config.port));
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+    socket.set_nonblocking(true)?;
+    socket.set_reuse_address(true)?;
+    socket.bind(&group.into())?;
+    socket.join_multicast_v4(&config.group, &interface)?;
+    Ok(Some((UdpSocket::from_std(socket.into())?, group)))
+}

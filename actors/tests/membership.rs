@@ -1,0 +1,241 @@
+//! Membership actors on loopback, with real sockets.
+
+use std::collections::BTreeSet;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use bytes::Bytes;
+use ecod::names::NodeName;
+use ecod::wire::Role;
+use ecod_actors::clock;
+use ecod_actors::gateway::Secret;
+use ecod_actors::membership::{
+    FrameCounters, FrameEvent, Member, Membership, MembershipArguments, MembershipConfig, MembershipEvent,
+    MembershipMessage, MulticastConfig,
+};
+use ractor::{Actor, ActorRef, call_t};
+use tokio::net::UdpSocket;
+use tokio::sync::watch;
+use tokio::time::{sleep, timeout};
+
+/// Long enough for a loaded machine.
+const SOON: Duration = Duration::from_secs(20);
+
+struct Node {
+    name: NodeName,
+    actor: ActorRef<MembershipMessage>,
+    address: SocketAddr,
+    events: Arc<Mutex<Vec<MembershipEvent>>>,
+    members: watch::Receiver<Vec<Member>>,
+    counters: Arc<FrameCounters>,
+}
+
+/// A node on a free port of loopback, with a key, without multicast.
+fn config(seeds: &[SocketAddr]) -> MembershipConfig {
+    MembershipConfig {
+        key: Some(Secret::new("5e".repeat(32))),
+        bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
+        seeds: seeds.iter().map(ToString::to_string).collect(),
+        multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+        // Patient, as the machine that runs this may be busy.
+        probe_ms: 200,
+        reply_ms: 80,
+        suspect_ms: 600,
+        ..MembershipConfig::default()
+    }
+}
+
+impl Node {
+    async fn start(name: &str, config: MembershipConfig) -> Self {
+        let events = Arc::<Mutex<Vec<_>>>::default();
+        let (sink, counters) = (Arc::clone(&events), Arc::<FrameCounters>::default());
+        let (sender, members) = watch::channel(Vec::new());
+        let name = NodeName::new(name).unwrap();
+        let arguments = MembershipArguments {
+            name: name.clone(),
+            cell: NodeName::from_static("lot-1"),
+            run: clock::now().micros(),
+            role: Role::Auto,
+            broker: None,
+            config,
+            events: Arc::new(move |event| sink.lock().unwrap().push(event)),
+            members: sender,
+            counters: Arc::clone(&counters),
+        };
+        let (actor, _) = Actor::spawn(None, Membership, arguments).await.unwrap();
+        let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).unwrap();
+        Self { name, actor, address, events, members, counters }
+    }
+
+    async fn sees(&mut self, names: &[&str]) {
+        let wanted: BTreeSet<_> = names.iter().copied().collect();
+        let complete = |members: &Vec<Member>| {
+            members.iter().map(|member| member.name.as_str()).collect::<BTreeSet<_>>() == wanted
+        };
+        let seen = timeout(SOON, self.members.wait_for(complete)).await.map(|_| ());
+        assert!(seen.is_ok(), "{} sees {:?}, not {names:?}", self.name, self.members.borrow());
+    }
+
+    async fn counts(&self, event: FrameEvent, at_least: u64) {
+        let counted = async {
+            while self.counters.get(event) < at_least {
+                sleep(Duration::from_millis(5)).await;
+            }
+        };
+        assert!(timeout(SOON, counted).await.is_ok(), "{:?}", self.counters.snapshot());
+    }
+
+    fn events(&self) -> Vec<MembershipEvent> {
+        self.events.lock().unwrap().clone()
+    }
+}
+
+async fn all_see_each_other(nodes: &mut [Node]) {
+    let names: Vec<_> = nodes.iter().map(|node| node.name.clone()).collect();
+    for node in nodes {
+        let others: Vec<_> = names.iter().filter(|name| **name != node.name).map(NodeName::as_str).collect();
+        node.sees(&others).await;
+    }
+}
+
+async fn five() -> Vec<Node> {
+    let mut nodes = vec![Node::start("node-1", config(&[])).await];
+    let seed = nodes[0].address;
+    for name in ["node-2", "node-3", "node-4", "node-5"] {
+        nodes.push(Node::start(name, config(&[seed])).await);
+    }
+    all_see_each_other(&mut nodes).await;
+    nodes
+}
+
+#[tokio::test]
+async fn five_nodes_find_each_other_by_one_seed_and_miss_one_that_dies() {
+    let mut nodes = five().await;
+    let dead = nodes.remove(2);
+    dead.actor.kill();
+    all_see_each_other(&mut nodes).await;
+    for node in &nodes {
+        assert!(node.events().contains(&MembershipEvent::Down { name: dead.name.clone() }));
+    }
+    let back = Node::start("node-3", config(&[nodes[0].address])).await;
+    nodes.push(back);
+    all_see_each_other(&mut nodes).await;
+}
+
+#[tokio::test]
+async fn datagrams_and_broker_addresses_reach_the_others() {
+    let mut nodes = five().await;
+    let payload = Bytes::from_static(b"who leads?");
+    let to = nodes[4].name.clone();
+    nodes[1].actor.cast(MembershipMessage::Send { to, payload: payload.clone() }).unwrap();
+    let broker = Some(SocketAddr::from(([0, 0, 0, 0], 1883)));
+    nodes[1].actor.cast(MembershipMessage::SetBroker { address: broker }).unwrap();
+    let reached = |members: &Vec<Member>| {
+        let member = members.iter().find(|member| member.name.as_str() == "node-2");
+        member.and_then(|member| member.broker) == Some(SocketAddr::from(([127, 0, 0, 1], 1883)))
+    };
+    assert!(timeout(SOON, nodes[4].members.wait_for(reached)).await.is_ok());
+    let received = |event: &MembershipEvent| match event {
+        MembershipEvent::Received { from, payload: received, .. } => from.as_str() == "node-2" && *received == payload,
+        _ => false,
+    };
+    assert!(nodes[4].events().iter().any(received));
+    assert!(!nodes[3].events().iter().any(received));
+}
+
+#[tokio::test]
+async fn nodes_find_each_other_by_multicast() {
+    let probe = std::net::UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+    let port = probe.local_addr().unwrap().port();
+    drop(probe);
+    let multicast = MulticastConfig { port, interface: Some(Ipv4Addr::LOCALHOST), ..MulticastConfig::default() };
+    if !loopback_has_multicast(&multicast).await {
+        println!("skipped: loopback carries no multicast here");
+        return;
+    }
+    let config = || MembershipConfig { multicast: multicast.clone(), ..config(&[]) };
+    let mut nodes = Vec::new();
+    for name in ["node-1", "node-2", "node-3"] {
+        nodes.push(Node::start(name, config()).await);
+    }
+    all_see_each_other(&mut nodes).await;
+}
+
+async fn loopback_has_multicast(config: &MulticastConfig) -> bool {
+    let exchange = async {
+        let receiver = UdpSocket::bind((config.group, config.port)).await?;
+        receiver.join_multicast_v4(config.group, Ipv4Addr::LOCALHOST)?;
+        let sender = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await?;
+        socket2::SockRef::from(&sender).set_multicast_if_v4(&Ipv4Addr::LOCALHOST)?;
+        sender.send_to(b"?", (config.group, config.port)).await?;
+        let mut buffer = [0; 8];
+        timeout(Duration::from_secs(2), receiver.recv_from(&mut buffer)).await.map_err(std::io::Error::other)??;
+        Ok::<_, std::io::Error>(())
+    };
+    exchange.await.is_ok()
+}
+
+#[tokio::test]
+async fn a_node_with_another_key_is_not_seen_and_counted() {
+    let first = Node::start("node-1", config(&[])).await;
+    let wrong = MembershipConfig { key: Some(Secret::new("another passphrase")), ..config(&[first.address]) };
+    let second = Node::start("node-2", wrong).await;
+    first.counts(FrameEvent::BadSeal, 2).await;
+    assert!(first.events().is_empty() && second.events().is_empty());
+}
+
+#[tokio::test]
+async fn garbage_is_counted_and_changes_nothing() {
+    let mut nodes = five().await;
+    let before = nodes[0].events().len();
+    let stranger = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
+    for n in 0..2000_usize {
+        let junk: Vec<u8> = (0..n % 1500).map(|at| (at * n) as u8).collect();
+        stranger.send_to(&junk, nodes[0].address).await.unwrap();
+        if n % 50 == 0 {
+            sleep(Duration::from_millis(1)).await;
+        }
+    }
+    nodes[0].counts(FrameEvent::Malformed, 500).await;
+    nodes[0].counts(FrameEvent::Oversized, 50).await;
+    all_see_each_other(&mut nodes).await;
+    assert_eq!(nodes[0].events().len(), before);
+}
+
+/// Two nodes that see each other only through a recorder, whose recording is then played back to both and to a third.
+#[tokio::test]
+async fn recorded_frames_change_nothing() {
+    let mut first = Node::start("node-1", config(&[])).await;
+    let recorder = Arc::new(UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap());
+    let mut second = Node::start("node-2", config(&[recorder.local_addr().unwrap()])).await;
+    let recording = Arc::<Mutex<Vec<Vec<u8>>>>::default();
+    let (one, two) = (first.address, second.address);
+    let (relay, tape) = (Arc::clone(&recorder), Arc::clone(&recording));
+    let relaying = tokio::spawn(async move {
+        let mut buffer = [0; 2048];
+        loop {
+            let (length, from) = relay.recv_from(&mut buffer).await.unwrap();
+            tape.lock().unwrap().push(buffer[..length].to_vec());
+            relay.send_to(&buffer[..length], if from == one { two } else { one }).await.unwrap();
+        }
+    });
+    first.sees(&["node-2"]).await;
+    second.sees(&["node-1"]).await;
+    let third = Node::start("node-3", config(&[])).await;
+    let taken = recording.lock().unwrap().clone();
+    assert!(taken.len() >= 6, "{} frames recorded", taken.len());
+    let events = (first.events(), second.events());
+    for frame in &taken {
+        for to in [one, two, third.address] {
+            recorder.send_to(frame, to).await.unwrap();
+        }
+    }
+    third.counts(FrameEvent::BadSeal, 2).await;
+    first.counts(FrameEvent::Replayed, 2).await;
+    second.counts(FrameEvent::Replayed, 2).await;
+    sleep(Duration::from_millis(500)).await;
+    assert_eq!((first.events(), second.events()), events);
+    assert!(third.events().is_empty());
+    relaying.abort();
+}
