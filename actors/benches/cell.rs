@@ -81,7 +81,7 @@ fn config(name: &str, role: Role, broker: Option<BrokerAddress>) -> anyhow::Resu
         name: Some(NodeName::new(name)?),
         cell: NodeName::from_static("bench"),
         role,
-        listen: ([127, 0, 0, 1], 0).into(),
+        listen: Some(([127, 0, 0, 1], 0).into()),
         landmarks: (0..LANDMARKS).map(landmark).collect(),
         ..NodeConfig::default()
     };

@@ -38,6 +38,8 @@ pub enum Event {
     ReputationsSaved,
     /// Reputations could not be written to disk.
     ReputationsNotSaved,
+    /// The fuser looked whether a round is due, published or not.
+    RoundDue,
     /// A camera frame was looked at.
     FrameDetected,
     /// A camera frame could not be used.
@@ -48,7 +50,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Published,
         Self::PublishRefused,
         Self::Received,
@@ -64,6 +66,7 @@ impl Event {
         Self::LedgerMerged,
         Self::ReputationsSaved,
         Self::ReputationsNotSaved,
+        Self::RoundDue,
         Self::FrameDetected,
         Self::FrameFailed,
         Self::FrameSkipped,
@@ -87,6 +90,7 @@ impl Event {
             Self::LedgerMerged => "ledger_merged",
             Self::ReputationsSaved => "reputations_saved",
             Self::ReputationsNotSaved => "reputations_not_saved",
+            Self::RoundDue => "round_due",
             Self::FrameDetected => "frame_detected",
             Self::FrameFailed => "frame_failed",
             Self::FrameSkipped => "frame_skipped",

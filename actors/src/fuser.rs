@@ -108,6 +108,7 @@ impl Actor for Fuser {
         match message {
             FuserMessage::TakeReport { delivery } => state.take(&delivery),
             FuserMessage::CloseRound => {
+                state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
                 state.tick();
             }

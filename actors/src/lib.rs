@@ -29,6 +29,7 @@ pub mod fuser;
 pub mod gateway;
 #[cfg(feature = "camera")]
 pub mod latest_slot;
+pub mod leader_election;
 #[cfg(feature = "camera")]
 pub mod lens;
 pub mod membership;

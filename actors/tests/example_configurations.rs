@@ -18,7 +18,7 @@ fn load(name: &str) -> NodeConfig {
 fn the_example_edge_aggregates_for_the_network() {
     let edge = load("edge.toml");
     assert_eq!(edge.role, Role::Edge);
-    assert!(edge.listen.ip().is_unspecified());
+    assert!(edge.broker_listen().ip().is_unspecified());
     assert!(edge.mqtt.broker.is_none());
 }
 
@@ -30,7 +30,7 @@ fn the_example_vehicle_fits_the_example_edge() {
     assert_eq!(cav.cell, edge.cell);
     assert_eq!(cav.landmarks, edge.landmarks);
     assert_eq!(cav.fusion.pace.gate_m, edge.fusion.pace.gate_m);
-    assert_eq!(cav.mqtt.broker.unwrap().port(), edge.listen.port());
+    assert_eq!(cav.mqtt.broker.unwrap().port(), edge.broker_listen().port());
     assert!(cav.camera.is_some());
 }
 

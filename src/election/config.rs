@@ -13,7 +13,8 @@ use crate::wire::Role;
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ElectionConfig {
-    /// What the node is meant to do. Default `auto`.
+    /// What the node is meant to do; the `role` of the node, no key of this table. Default `auto`.
+    #[serde(skip)]
     pub role: Role,
     /// Preference among nodes of one role, higher leads first. Default 100.
     pub priority: u8,
