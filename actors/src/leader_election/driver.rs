@@ -206,9 +206,11 @@ impl ElectionDriver {
             self.update_health().await?;
         }
         // Events from before this actor's start went nowhere.
-        let unmet = |member: &&Member| self.members.get(&member.name).is_none_or(|known| known.run != member.run);
-        for member in self.all_members.borrow().iter().filter(unmet).cloned().collect::<Vec<_>>() {
-            self.meet(member).await?;
+        let members = self.all_members.borrow().clone();
+        for member in members {
+            if self.members.get(&member.name).is_none_or(|known| known.run != member.run) {
+                self.meet(member).await?;
+            }
         }
         Ok(())
     }
