@@ -86,6 +86,8 @@ fn config(name: &str, role: Role, broker: Option<BrokerAddress>) -> anyhow::Resu
         ..NodeConfig::default()
     };
     config.mqtt.broker = broker;
+    config.membership.bind = Some(([127, 0, 0, 1], 0).into());
+    config.membership.multicast.enabled = false;
     config.validate()?;
     Ok(config)
 }

@@ -76,6 +76,7 @@ pub struct NodeHandle {
     failure: watch::Receiver<Option<String>>,
     newest: Newest,
     broker: watch::Receiver<Option<SocketAddr>>,
+    gossip: watch::Receiver<Option<SocketAddr>>,
     members: watch::Receiver<Vec<Member>>,
     leadership: watch::Receiver<Leadership>,
     seats: Seats,
@@ -92,13 +93,13 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (failed, failure) = watch::channel(None);
     let assembly = Assembly::new(config, failed);
-    let (newest, broker) = (assembly.newest(), assembly.broker_address());
+    let (newest, broker, gossip) = (assembly.newest(), assembly.broker_address(), assembly.gossip_address());
     let (members, leadership) = (assembly.members(), assembly.leadership());
     let (seats, counters) = (assembly.seats().clone(), assembly.counters());
     let started = Actor::spawn(None, Node, assembly).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(error.to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
-    Ok(NodeHandle { supervisor, ended, failure, newest, broker, members, leadership, seats, counters })
+    Ok(NodeHandle { supervisor, ended, failure, newest, broker, gossip, members, leadership, seats, counters })
 }
 
 impl NodeHandle {
@@ -120,6 +121,11 @@ impl NodeHandle {
     /// Where the embedded broker listens, if there is one.
     pub fn broker_address(&self) -> Option<SocketAddr> {
         *self.broker.borrow()
+    }
+
+    /// Where the node gossips; the address may be unspecified.
+    pub fn gossip_address(&self) -> Option<SocketAddr> {
+        *self.gossip.borrow()
     }
 
     /// The other nodes of the cell, as they come and go.
@@ -185,7 +191,8 @@ impl Actor for Node {
     ) -> Result<(), ActorProcessingErr> {
         let NodeMessage::LogHealth = message;
         let snapshot = state.assembly.counters().snapshot();
-        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, "health");
+        let frames = state.assembly.frames().snapshot();
+        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?frames, "health");
         Ok(())
     }
 

@@ -23,14 +23,18 @@ fn config(name: &str, role: Role) -> NodeConfig {
         vacancy: None,
         synonyms: Default::default(),
     };
-    NodeConfig {
+    let mut config = NodeConfig {
         name: Some(NodeName::new(name).unwrap()),
         cell: NodeName::from_static("lot-1"),
         role,
         listen: Some("127.0.0.1:0".parse().unwrap()),
         landmarks: (0..3).map(slot).collect(),
         ..NodeConfig::default()
-    }
+    };
+    // Cells of other tests are not met.
+    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+    config.membership.multicast.enabled = false;
+    config
 }
 
 async fn edge() -> NodeHandle {

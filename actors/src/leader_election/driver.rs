@@ -134,7 +134,11 @@ impl ElectionDriver {
         }
     }
 
-    pub(super) async fn take_link(&mut self, broker: &BrokerAddress, link: LinkState) -> Result<(), ActorProcessingErr> {
+    pub(super) async fn take_link(
+        &mut self,
+        broker: &BrokerAddress,
+        link: LinkState,
+    ) -> Result<(), ActorProcessingErr> {
         let gone = self.monitor.note_link(broker, link);
         self.update_health().await?;
         // A broker that belongs to no node says nothing about any.

@@ -44,16 +44,15 @@ impl Cell {
         let config = config(name, role, is_seed.then_some(self.seed), self.seed, self.directory.path());
         let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
         let node = runtime.spawn(node::start(config)).await.unwrap().unwrap();
-        if !is_seed && let Some(member) = node.members().borrow().first() {
-            self.seed = member.gossip;
-        }
         self.nodes.insert(name.to_owned(), Running { node, runtime });
     }
 
     /// Ends all tasks of a node where they are; its sockets close.
     pub(crate) fn kill(&mut self, name: &str) {
         let Running { node, runtime } = self.nodes.remove(name).unwrap();
-        self.seed = self.nodes.values().next().map_or(self.seed, |other| other.gossip());
+        if let Some(other) = self.nodes.values().next() {
+            self.seed = other.node.gossip_address().unwrap();
+        }
         runtime.shutdown_background();
         drop(node);
     }
@@ -132,13 +131,6 @@ impl Cell {
             assert!(tokio::time::Instant::now() < deadline, "not within {PATIENCE:?}: {what}: {leaderships:?}");
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
-    }
-}
-
-impl Running {
-    /// Where others reach this node's gossip, as they see it.
-    fn gossip(&self) -> SocketAddr {
-        self.node.gossip_address().unwrap()
     }
 }
 
