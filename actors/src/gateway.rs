@@ -51,6 +51,11 @@ pub enum GatewayMessage {
         /// The brokers, in no particular order.
         addresses: Vec<BrokerAddress>,
     },
+    /// Take reports from these brokers only, on links made from now on; until told, a candidate takes them from all.
+    SetReportBrokers {
+        /// Brokers to which all vehicles send.
+        addresses: Vec<BrokerAddress>,
+    },
     /// Hand messages to another subscriber from now on, such as after a receiver's restart.
     SetSubscriber {
         /// The new subscriber.
@@ -137,7 +142,7 @@ pub struct GatewayState {
     topics: Topics,
     part: Part,
     encoding: Encoding,
-    filters: Vec<String>,
+    report_brokers: Option<Vec<BrokerAddress>>,
     status: NodeStatus,
     status_topic: String,
     status_payload: Bytes,
@@ -172,6 +177,7 @@ impl Actor for Gateway {
         let inbox = Arc::clone(&state.setup.inbox);
         match message {
             GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
+            GatewayMessage::SetReportBrokers { addresses } => state.report_brokers = Some(addresses),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
                 state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
@@ -236,7 +242,7 @@ impl GatewayState {
         let client_id = format!("{}-{}", status.node, status.id.simple());
         let setup = LinkSetup { client_id, will, config: mqtt, inbox: Arc::new(inbox), counters, seed };
         Self {
-            filters: part.levels().iter().map(|level| topics.filter(level)).collect(),
+            report_brokers: None,
             topics,
             part,
             encoding,
@@ -266,6 +272,12 @@ impl GatewayState {
         }
     }
 
+    fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
+        let reports = self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
+        let part = if reports { self.part } else { Part::Follower };
+        part.levels().iter().map(|level| self.topics.filter(level)).collect()
+    }
+
     fn set_status(&mut self, status: NodeStatus) {
         self.status_payload = encode(&status, self.encoding).into();
         self.status = status;
@@ -284,12 +296,13 @@ impl GatewayState {
     }
 
     fn link_changed(&mut self, LinkEvent { link: id, news }: LinkEvent) {
+        let Some(filters) = self.links.get(&id).map(|link| self.filters(&link.broker)) else { return };
         let Some(link) = self.links.get_mut(&id) else { return };
         let state = match news {
             LinkNews::Accepted(client) => {
                 // The queue of a new connection is empty, so that both fit.
                 client.publish(&self.status_topic, &self.status_payload, Handling::State);
-                client.subscribe(&self.filters);
+                client.subscribe(&filters);
                 link.client = Some(client);
                 LinkState::Up
             }

@@ -279,6 +279,8 @@ impl ElectionDriver {
             None => Brokers { own, ..self.routes.brokers().clone() },
         };
         if let Some(addresses) = self.routes.update(brokers, clock::now()) {
+            let own = self.routes.brokers().own.iter().chain(&self.routes.plane().external).cloned().collect();
+            self.parts.gateway.send(GatewayMessage::SetReportBrokers { addresses: own });
             self.parts.gateway.send(GatewayMessage::SetBrokers { addresses });
         }
     }
