@@ -17,7 +17,6 @@ mod driver;
 mod health;
 mod leadership;
 mod routes;
-mod term_file;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -25,15 +24,15 @@ use std::time::Duration;
 
 use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
+use ecod::names::NodeName;
 use ecod::wire::NodeStatus;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
-pub use driver::ElectionDriver;
+pub use driver::{ElectionDriver, saved_term};
 pub use health::Probe;
 pub use leadership::{Leadership, Position};
 pub use routes::DataPlane;
-pub use term_file::{TermFile, TermNotWritten};
 
 use crate::broker::BrokerMessage;
 use crate::counters::Counters;
@@ -42,6 +41,7 @@ use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
 use crate::membership::{Member, MembershipEvent, MembershipMessage};
 use crate::reputation_keeper::ReputationKeeperMessage;
 use crate::seat::Seat;
+use crate::state_file::StateFile;
 
 /// What the election is told.
 #[derive(Debug)]
@@ -70,8 +70,11 @@ pub enum LeaderElectionMessage {
         /// Its number.
         round: u64,
     },
-    /// The reputations of another node have arrived.
-    NoteState,
+    /// Evidence about vehicles came from another candidate.
+    NoteState {
+        /// The candidate.
+        from: NodeName,
+    },
     /// The fuser was started anew and has forgotten that it leads.
     NoteFuserRestart,
     /// The gateway was started anew and has no links.
@@ -108,8 +111,8 @@ pub struct Parts {
 pub struct LeaderElectionArguments {
     /// Timings, role and priority.
     pub config: ElectionConfig,
-    /// Where the term is kept.
-    pub term_file: TermFile,
+    /// Where the term is kept, if anywhere.
+    pub term_file: Option<StateFile>,
     /// Longest time between two rounds.
     pub round_period: Duration,
     /// Which brokers carry the data.
@@ -165,7 +168,7 @@ impl Actor for LeaderElection {
             LeaderElectionMessage::LinkChanged { broker, state } => driver.take_link(&broker, state).await?,
             LeaderElectionMessage::TakeStatus { status } => driver.take_status(&status).await?,
             LeaderElectionMessage::NoteRound { epoch, round } => driver.note_round(epoch, round).await?,
-            LeaderElectionMessage::NoteState => driver.note_state().await?,
+            LeaderElectionMessage::NoteState { from } => driver.note_state(&from),
             LeaderElectionMessage::NoteFuserRestart => driver.note_fuser_restart().await?,
             LeaderElectionMessage::NoteGatewayRestart => driver.note_gateway_restart().await?,
             LeaderElectionMessage::NoteProbe { probe } => driver.note_probe(probe).await?,

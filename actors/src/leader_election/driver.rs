@@ -17,20 +17,21 @@ use uuid::Uuid;
 
 use super::health::{self, HealthMonitor, Probe};
 use super::routes::{Brokers, Routes};
-use super::{LeaderElectionArguments, LeaderElectionMessage, Leadership, Parts, TermFile};
+use super::{LeaderElectionArguments, LeaderElectionMessage, Leadership, Parts};
 use crate::clock;
 use crate::counters::Counters;
 use crate::fuser::FuserMessage;
 use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
 use crate::membership::{Member, MembershipEvent, MembershipMessage};
 use crate::reputation_keeper::ReputationKeeperMessage;
+use crate::state_file::StateFile;
 
 /// The election, what it was told last, and what came of it.
 pub struct ElectionDriver {
     election: Election,
     name: NodeName,
     role: Role,
-    term_file: TermFile,
+    term_file: Option<StateFile>,
     round_period: Duration,
     members: BTreeMap<NodeName, Member>,
     all_members: watch::Receiver<Vec<Member>>,
@@ -56,6 +57,7 @@ pub struct ElectionDriver {
 /// A handover to this node under way.
 #[derive(Debug)]
 struct Preparing {
+    leader: NodeName,
     since: Timestamp,
     has_state: bool,
 }
@@ -73,12 +75,17 @@ const PREPARE_STEP: Duration = Duration::from_millis(50);
 const OVERSLEPT: Duration = Duration::from_millis(20);
 const DRAIN_TIME: Duration = Duration::from_millis(10);
 
+/// The highest term that an earlier run of the node knew; 0 without any.
+pub fn saved_term(file: Option<&StateFile>) -> u64 {
+    file.and_then(|file| file.load(|_| true)).unwrap_or(0)
+}
+
 impl ElectionDriver {
     pub(super) fn new(arguments: LeaderElectionArguments, myself: ActorRef<LeaderElectionMessage>) -> Self {
         let LeaderElectionArguments { config, status, term_file, plane, parts, leadership, counters, .. } = arguments;
         let (name, role) = (status.node.clone(), config.role);
         Self {
-            election: Election::new(config, name.clone(), term_file.read(), clock::now()),
+            election: Election::new(config, name.clone(), saved_term(term_file.as_ref()), clock::now()),
             name,
             role,
             term_file,
@@ -176,11 +183,10 @@ impl ElectionDriver {
         Ok(())
     }
 
-    pub(super) async fn note_state(&mut self) -> Result<(), ActorProcessingErr> {
-        if let Some(preparing) = &mut self.preparing {
+    pub(super) fn note_state(&mut self, from: &NodeName) {
+        if let Some(preparing) = self.preparing.as_mut().filter(|preparing| preparing.leader == *from) {
             preparing.has_state = true;
         }
-        Ok(())
     }
 
     /// A fuser that was started anew does not lead: the leadership is over.
@@ -335,8 +341,9 @@ impl ElectionDriver {
         for effect in effects {
             match effect {
                 Effect::PersistTerm { term } => {
-                    let file = self.term_file.clone();
-                    tokio::task::spawn_blocking(move || file.write(term)).await??;
+                    if let Some(file) = self.term_file.clone() {
+                        tokio::task::spawn_blocking(move || file.save(&term)).await??;
+                    }
                 }
                 Effect::Send { to, message } => {
                     let payload = message.encode(Encoding::Cbor).into();
@@ -353,7 +360,8 @@ impl ElectionDriver {
                 }
                 Effect::Prepare { leader } => {
                     tracing::info!(%leader, "preparing to take over");
-                    self.preparing = Some(Preparing { since: clock::now(), has_state: false });
+                    let has_state = self.parts.keeper.holder().is_none();
+                    self.preparing = Some(Preparing { leader, since: clock::now(), has_state });
                     self.myself.send_after(CONNECT_TIME, || LeaderElectionMessage::CheckPrepared);
                 }
                 Effect::SendState { to } => {

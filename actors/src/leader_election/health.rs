@@ -67,7 +67,7 @@ impl HealthMonitor {
 
     /// Looks at what can be seen without asking.
     pub(super) fn look(&mut self, counters: &Counters, now: Timestamp) {
-        let rounds = counters.events(Event::RoundClosed);
+        let rounds = counters.events(Event::RoundDue);
         if rounds != self.rounds {
             self.rounds = rounds;
             self.round_closed_at = now;
@@ -138,7 +138,7 @@ mod tests {
     fn monitor(counters: &Counters, now: Timestamp) -> HealthMonitor {
         let mut monitor = HealthMonitor::default();
         monitor.note_probe(Probe { broker_serves: true, gateway_answers: true, fuser_runs: true });
-        counters.count(Event::RoundClosed);
+        counters.count(Event::RoundDue);
         monitor.look(counters, now);
         monitor
     }
