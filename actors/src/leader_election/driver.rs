@@ -342,7 +342,9 @@ impl ElectionDriver {
             match effect {
                 Effect::PersistTerm { term } => {
                     if let Some(file) = self.term_file.clone() {
-                        tokio::task::spawn_blocking(move || file.save(&term)).await??;
+                        let path = file.path().display().to_string();
+                        let saved = tokio::task::spawn_blocking(move || file.save(&term)).await?;
+                        saved.map_err(|error| format!("cannot write term to {path}: {error}"))?;
                     }
                 }
                 Effect::Send { to, message } => {
