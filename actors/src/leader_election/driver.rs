@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::election::{Effect, Election, ElectionMessage, Health, Input};
+use ecod::election::{Body, Effect, Election, ElectionMessage, Health, Input};
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
@@ -348,6 +348,10 @@ impl ElectionDriver {
                     }
                 }
                 Effect::Send { to, message } => {
+                    // The next round is the other's unless it stays away for a whole period.
+                    if matches!(message.body, Body::Yield { .. }) {
+                        self.parts.fuser.send(FuserMessage::HoldRound);
+                    }
                     let payload = message.encode(Encoding::Cbor).into();
                     self.parts.membership.send(MembershipMessage::Send { to, payload });
                 }
