@@ -13,6 +13,7 @@ use ecod_actors::leader_election::Leadership;
 use ecod_actors::node::{self, NodeHandle};
 use tempfile::TempDir;
 use tokio::runtime::{Builder, Runtime};
+use tracing_subscriber::EnvFilter;
 
 use crate::record::Record;
 
@@ -33,6 +34,8 @@ struct Running {
 
 impl Default for Cell {
     fn default() -> Self {
+        // With RUST_LOG=info a failing test tells what the nodes did.
+        tracing_subscriber::fmt().with_env_filter(EnvFilter::from_default_env()).try_init().ok();
         Self { directory: tempfile::tempdir().unwrap(), seed: free_address(), nodes: BTreeMap::new() }
     }
 }
@@ -50,9 +53,8 @@ impl Cell {
     /// Ends all tasks of a node where they are; its sockets close.
     pub(crate) fn kill(&mut self, name: &str) {
         let Running { node, runtime } = self.nodes.remove(name).unwrap();
-        if let Some(other) = self.nodes.values().next() {
-            self.seed = other.node.gossip_address().unwrap();
-        }
+        let other = self.nodes.values().next();
+        self.seed = other.map_or_else(free_address, |other| other.node.gossip_address().unwrap());
         runtime.shutdown_background();
         drop(node);
     }
