@@ -203,7 +203,11 @@ impl Actor for Node {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let (actor, why) = match event {
-            SupervisionEvent::ActorTerminated(actor, _, why) => (actor, why.unwrap_or_else(|| "stopped".into())),
+            SupervisionEvent::ActorTerminated(actor, last, why) => {
+                // A killed part lives on in its state, such as the broker with its port; ending it may take a while.
+                tokio::task::spawn_blocking(|| drop(last));
+                (actor, why.unwrap_or_else(|| "stopped".into()))
+            }
             SupervisionEvent::ActorFailed(actor, error) => (actor, error.to_string()),
             SupervisionEvent::ActorStarted(_) | SupervisionEvent::ProcessGroupChanged(_) => return Ok(()),
         };
