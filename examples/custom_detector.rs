@@ -79,7 +79,7 @@ async fn main() -> anyhow::Result<()> {
     let edge = node::start(NodeConfig {
         name: Some(NodeName::new("edge")?),
         role: Role::Edge,
-        listen: ([127, 0, 0, 1], 0).into(),
+        listen: Some(([127, 0, 0, 1], 0).into()),
         ..cell.clone()
     });
     let edge = edge.await?;

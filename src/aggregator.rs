@@ -91,6 +91,11 @@ impl Aggregator {
         self.rounds.start(on_time, now);
     }
 
+    /// Lets the present round last its whole period: whoever takes the lead over has that long to say so.
+    pub fn hold(&mut self) {
+        self.rounds.hold();
+    }
+
     /// Goes on as a standby.
     pub fn stand_by(&mut self) {
         self.leads = None;

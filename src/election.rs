@@ -125,7 +125,7 @@ impl Election {
             round: 0,
             health: Health::default(),
             load: 0,
-            peers: Peers::new(config.contact()),
+            peers: Peers::new(config.contact(), config.patience()),
             questions: Questions::default(),
             state: State::Seeking(Seeking::new(now + join, Vec::new(), now)),
             effects: Vec::new(),

@@ -63,6 +63,7 @@ pub struct RoundTrigger {
     last_close: Timestamp,
     live: [BTreeMap<NodeName, Vehicle>; ReportKind::COUNT],
     missing: usize,
+    held: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -80,7 +81,7 @@ const MAX_RATE: u32 = 5;
 impl RoundTrigger {
     /// Starts counting at `now`.
     pub fn new(config: RoundConfig, now: Timestamp) -> Self {
-        Self { config, last_close: now, live: Default::default(), missing: 0 }
+        Self { config, last_close: now, live: Default::default(), missing: 0, held: false }
     }
 
     /// Takes note of a report; true when the round closes now.
@@ -109,18 +110,26 @@ impl RoundTrigger {
         }
         self.missing = self.live.iter().map(BTreeMap::len).sum();
         self.last_close = now;
+        self.held = false;
         true
     }
 
     /// Starts a run of rounds: the first is due a period after `now` if the one before was closed in time, else at once.
     pub fn start(&mut self, on_time: bool, now: Timestamp) {
         self.last_close = if on_time { now } else { now - self.config.period() };
+        self.held = false;
+    }
+
+    /// Lets the present round last its whole period, whoever has reported.
+    pub fn hold(&mut self) {
+        self.held = true;
     }
 
     /// When the round closes without a further report.
     pub fn deadline(&self) -> Timestamp {
         let anyone = self.live.iter().any(|live| !live.is_empty());
-        let complete = self.config.close == RoundClose::WhenComplete && self.missing == 0 && anyone;
+        let early = self.config.close == RoundClose::WhenComplete && !self.held;
+        let complete = early && self.missing == 0 && anyone;
         let wait = if complete { self.config.period() / MAX_RATE } else { self.config.period() };
         self.last_close + wait
     }
@@ -211,5 +220,18 @@ mod tests {
         let mut rounds = trigger(RoundClose::WhenComplete);
         let closed = (0..1000).filter(|ms| rounds.report(Detections, &node("a"), at(*ms))).count();
         assert!((45..=50).contains(&closed), "{closed} rounds in a second at a period of 100 ms");
+    }
+
+    #[test]
+    fn a_round_that_is_held_lasts_its_period() {
+        let start = Timestamp(1_000_000);
+        let mut rounds = RoundTrigger::new(RoundConfig::default(), start);
+        let (euclid, at) = (NodeName::from_static("euclid"), |ms: u64| Timestamp(1_000_000 + ms * 1000));
+        assert!(!rounds.report(ReportKind::Detections, &euclid, at(5)));
+        rounds.hold();
+        assert!(!rounds.tick(at(99)));
+        assert!(rounds.tick(at(100)));
+        assert!(!rounds.report(ReportKind::Detections, &euclid, at(105)));
+        assert!(rounds.tick(at(120)), "only that one was held");
     }
 }

@@ -209,7 +209,7 @@ impl Cell {
 
     fn converges(&self) -> bool {
         let mut quiet = self.clone();
-        quiet.run_quietly(4000);
+        quiet.run_quietly(14_000);
         let running = || quiet.nodes.iter().filter_map(|node| node.election.as_ref());
         let candidates = quiet.nodes.iter().take(3).any(|node| node.election.is_some());
         let leaders = running().filter(|election| election.is_leading()).count();

@@ -114,11 +114,13 @@ fn config(name: &str, role: Role, broker: &BrokerAddress) -> anyhow::Result<Node
         name: Some(NodeName::new(name)?),
         cell: NodeName::from_static("bench"),
         role,
-        listen: ([127, 0, 0, 1], 0).into(),
+        listen: Some(([127, 0, 0, 1], 0).into()),
         landmarks: (0..LANDMARKS).map(landmark).collect(),
         ..NodeConfig::default()
     };
     config.mqtt.broker = Some(broker.clone());
+    config.membership.bind = Some(([127, 0, 0, 1], 0).into());
+    config.membership.multicast.enabled = false;
     config.validate()?;
     Ok(config)
 }

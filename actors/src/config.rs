@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 use ecod::aggregator::FusionConfig;
 use ecod::config::{ConfigError, check_range};
+use ecod::election::ElectionConfig;
 use ecod::geometry::Pose;
 use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::names::NodeName;
@@ -19,6 +20,8 @@ use crate::broker::BrokerConfig;
 #[cfg(feature = "camera")]
 use crate::camera::CameraConfig;
 use crate::gateway::MqttConfig;
+use crate::leader_election::DataPlane;
+use crate::membership::MembershipConfig;
 use crate::reputation_keeper::ReputationKeeperConfig;
 
 /// Everything that a node can be told.
@@ -31,17 +34,22 @@ pub struct NodeConfig {
     pub cell: NodeName,
     /// What the node is meant to do. Default `auto`.
     pub role: Role,
-    /// Where an aggregator's embedded broker listens. Default `127.0.0.1:1883`: other machines reach it only when told
-    /// so, such as by `0.0.0.0:1883`.
-    pub listen: SocketAddr,
-    /// Directory for what survives a restart: reputations. Default `$STATE_DIRECTORY`, which systemd sets, or none: then
-    /// they end with the node.
+    /// Where the embedded broker of a node that may lead listens. Default port 1883, on all interfaces if the cell has a
+    /// key and on 127.0.0.1 without, where other machines do not reach it.
+    pub listen: Option<SocketAddr>,
+    /// Directory for what survives a restart: reputations and the highest term of leadership. Default
+    /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
+    /// others.
     pub state_dir: Option<PathBuf>,
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line. Default none.
     pub map_log: Option<PathBuf>,
     /// Pose of the vehicle. Default the origin, looking east.
     pub pose: PoseConfig,
+    /// How the nodes of the cell find and watch each other.
+    pub membership: MembershipConfig,
+    /// Who leads the cell.
+    pub election: ElectionConfig,
     /// MQTT connections.
     pub mqtt: MqttConfig,
     /// Limits of the embedded broker.
@@ -75,10 +83,12 @@ impl Default for NodeConfig {
             name: None,
             cell: NodeName::from_static("cell"),
             role: Role::Auto,
-            listen: SocketAddr::from(([127, 0, 0, 1], 1883)),
+            listen: None,
             state_dir: None,
             map_log: None,
             pose: PoseConfig::default(),
+            membership: MembershipConfig::default(),
+            election: ElectionConfig::default(),
             mqtt: MqttConfig::default(),
             broker: BrokerConfig::default(),
             fusion: FusionConfig::default(),
@@ -154,12 +164,11 @@ impl NodeConfig {
         if self.name.is_none() {
             return Err(ConfigError::new("name", "nothing", "the node's name, unique in its cell"));
         }
-        if self.role == Role::Auto {
-            return Err(ConfigError::new("role", "auto", "`edge` or `cav`: this version does not elect aggregators"));
-        }
         check_range("pose.x_m", self.pose.x_m, -1e8, 1e8)?;
         check_range("pose.y_m", self.pose.y_m, -1e8, 1e8)?;
         check_range("pose.heading_deg", self.pose.heading_deg, -360.0, 360.0)?;
+        self.membership.validate().map_err(|error| error.within("membership"))?;
+        self.election.validate().map_err(|error| error.within("election"))?;
         self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
         self.broker.validate().map_err(|error| error.within("broker"))?;
         let needed = self.mqtt.max_packet_bytes();
@@ -175,10 +184,6 @@ impl NodeConfig {
         if let Some(camera) = &self.camera {
             camera.validate().map_err(|error| error.within("camera"))?;
         }
-        if self.role == Role::Cav && self.mqtt.broker.is_none() {
-            let allowed = "the aggregator's address as host:port, for a node of role `cav`";
-            return Err(ConfigError::new("mqtt.broker", "nothing", allowed));
-        }
         LandmarkConfig::validate_all(&self.landmarks)
     }
 
@@ -192,6 +197,9 @@ impl NodeConfig {
         if shown.mqtt.password.take().is_some() {
             comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
         }
+        if shown.membership.key.take().is_some() {
+            comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");
+        }
         #[cfg(feature = "camera")]
         if shown.camera.as_mut().is_some_and(|camera| camera.source.forget_credentials()) {
             comment.push_str("# user and password of `camera.source.url` are set but not shown: add them\n");
@@ -203,6 +211,24 @@ impl NodeConfig {
     pub fn broker(&self) -> BrokerConfig {
         let needed = u32::try_from(self.mqtt.max_packet_bytes()).ok();
         BrokerConfig { max_packet_bytes: self.broker.max_packet_bytes.or(needed), ..self.broker.clone() }
+    }
+
+    /// Where the embedded broker listens.
+    pub fn broker_listen(&self) -> SocketAddr {
+        let ip = if self.membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
+        self.listen.unwrap_or(SocketAddr::from((ip, 1883)))
+    }
+
+    /// Whether the node may lead its cell.
+    pub fn may_lead(&self) -> bool {
+        self.role != Role::Cav
+    }
+
+    /// Which brokers carry the cell's data.
+    pub fn data_plane(&self) -> DataPlane {
+        let external = self.mqtt.broker.clone();
+        let embedded = external.is_none() || self.mqtt.fallback_to_embedded;
+        DataPlane { external, embedded }
     }
 
     /// The vehicle's pose.
@@ -318,9 +344,11 @@ mod tests {
     #[test]
     fn flags_override_the_file_and_the_file_the_defaults() {
         let config = load("name = \"from-file\"\nrole = \"edge\"\ncell = \"lot-9\"").unwrap();
-        assert_eq!(config.name.unwrap().as_str(), "from-flag");
+        assert_eq!(config.name.as_ref().unwrap().as_str(), "from-flag");
         assert_eq!(config.cell.as_str(), "lot-9");
-        assert_eq!(config.listen.to_string(), "127.0.0.1:1883");
+        assert_eq!(config.broker_listen().to_string(), "127.0.0.1:1883");
+        let keyed = load("[membership]\nkey = \"a key for the lot\"").unwrap();
+        assert_eq!(keyed.broker_listen().to_string(), "0.0.0.0:1883");
     }
 
     #[test]
@@ -334,7 +362,7 @@ mod tests {
                 "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",
                 ["`broker.max_packet_bytes`", "1048576", "8392704"],
             ),
-            ("role = \"cav\"", ["`mqtt.broker`", "nothing", "host:port"]),
+            ("[election]\nbeat_ms = 1", ["`election.beat_ms`", "1", "5 to"]),
             (
                 "role = \"edge\"\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 1\ny_m = 0",
                 ["`landmarks[1].id`", "\"a\"", "unique"],

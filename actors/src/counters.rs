@@ -44,6 +44,8 @@ pub enum Event {
     ReputationsSaved,
     /// Reputations could not be written to disk.
     ReputationsNotSaved,
+    /// The fuser looked whether a round is due, published or not.
+    RoundDue,
     /// A camera frame was looked at.
     FrameDetected,
     /// A camera frame or image file could not be used.
@@ -56,7 +58,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 22] = [
+    pub const ALL: [Self; 23] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -75,6 +77,7 @@ impl Event {
         Self::LedgerMerged,
         Self::ReputationsSaved,
         Self::ReputationsNotSaved,
+        Self::RoundDue,
         Self::FrameDetected,
         Self::FrameFailed,
         Self::FrameSkipped,
@@ -102,6 +105,7 @@ impl Event {
             Self::LedgerMerged => "ledger_merged",
             Self::ReputationsSaved => "reputations_saved",
             Self::ReputationsNotSaved => "reputations_not_saved",
+            Self::RoundDue => "round_due",
             Self::FrameDetected => "frame_detected",
             Self::FrameFailed => "frame_failed",
             Self::FrameSkipped => "frame_skipped",

@@ -177,7 +177,7 @@ impl Demo<'_> {
 
     fn start_edge(&self, broker: SocketAddr) -> anyhow::Result<NodeProcess> {
         let mut config = setup::edge(self.testbed, self.scene);
-        config.listen = broker;
+        config.listen = Some(broker);
         NodeProcess::start(self.program, &config, self.directory)
     }
 

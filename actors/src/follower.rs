@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watches of the newest of each; maps also to an optional log file
+//!                                            └── NoteRound ──> LeaderElection
 //! ```
 
 mod gate;
@@ -14,13 +15,14 @@ use std::sync::Arc;
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeStatus, RejectReason, Reputations, Verdicts};
+use ecod::wire::{GlobalMap, RejectReason, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 use crate::counters::{Counters, Event};
-use crate::gateway::{Delivery, GatewayMessage, Incoming};
+use crate::gateway::{Delivery, Incoming};
+use crate::leader_election::{LeaderElectionMessage, Leadership};
 use crate::seat::Seat;
 use gate::{Gate, MEMORY};
 
@@ -88,10 +90,12 @@ pub struct FollowerArguments {
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line.
     pub log: Option<PathBuf>,
-    /// What the node says about itself; epoch and aggregator follow the maps.
-    pub status: NodeStatus,
-    /// Where the status is published.
-    pub gateway: Seat<GatewayMessage>,
+    /// The lowest term taken at first: the highest that an earlier run of the node knew.
+    pub least_term: u64,
+    /// Who leads.
+    pub leadership: watch::Receiver<Leadership>,
+    /// Is told of the rounds taken.
+    pub election: Seat<LeaderElectionMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -107,8 +111,8 @@ pub struct FollowerState {
     verdicts: Gate,
     reputations: Gate,
     log: Option<BufWriter<File>>,
-    status: NodeStatus,
-    gateway: Seat<GatewayMessage>,
+    leadership: watch::Receiver<Leadership>,
+    election: Seat<LeaderElectionMessage>,
     counters: Arc<Counters>,
 }
 
@@ -122,9 +126,8 @@ impl Actor for Follower {
         _myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let FollowerArguments { newest, log, status, gateway, counters } = arguments;
-        let log = log.as_deref().map(open).transpose()?;
-        Ok(FollowerState::new(newest, log, status, gateway, counters))
+        let log = arguments.log.as_deref().map(open).transpose()?;
+        Ok(FollowerState::new(arguments, log))
     }
 
     async fn handle(
@@ -150,22 +153,17 @@ impl Actor for Follower {
 }
 
 impl FollowerState {
-    fn new(
-        newest: Newest,
-        log: Option<BufWriter<File>>,
-        status: NodeStatus,
-        gateway: Seat<GatewayMessage>,
-        counters: Arc<Counters>,
-    ) -> Self {
-        let (maps, verdicts, reputations) = Default::default();
-        Self { newest, maps, verdicts, reputations, log, status, gateway, counters }
+    fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
+        let FollowerArguments { newest, least_term, leadership, election, counters, .. } = arguments;
+        let [maps, verdicts, reputations] = [(); 3].map(|()| Gate::new(least_term));
+        Self { newest, maps, verdicts, reputations, log, leadership, election, counters }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), RejectReason> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
-        self.maps.admit(&epoch, map.round, received_at)?;
+        self.maps.admit(&epoch, map.round, received_at, self.may_lead(&epoch))?;
         self.counters.count(Event::MapAccepted);
-        self.follow(&epoch);
+        self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         self.write(&received);
         self.newest.map.send_replace(Some(received));
@@ -174,10 +172,10 @@ impl FollowerState {
 
     fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), RejectReason> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
-        self.verdicts.admit(&epoch, verdicts.round, received_at)?;
+        self.verdicts.admit(&epoch, verdicts.round, received_at, self.may_lead(&epoch))?;
         self.counters.count(Event::VerdictsAccepted);
         if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
-            self.follow(&epoch);
+            self.election.send(LeaderElectionMessage::NoteRound { epoch, round: verdicts.round });
         }
         self.newest.verdicts.send_replace(Some(Received { received_at, message: Arc::clone(verdicts) }));
         Ok(())
@@ -185,20 +183,17 @@ impl FollowerState {
 
     fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), RejectReason> {
         let aggregator = reputations.aggregator.clone().unwrap_or(UNNAMED);
-        self.reputations.admit(&Epoch::new(reputations.epoch, aggregator), reputations.round, received_at)?;
+        let epoch = Epoch::new(reputations.epoch, aggregator);
+        self.reputations.admit(&epoch, reputations.round, received_at, self.may_lead(&epoch))?;
         self.counters.count(Event::ReputationsAccepted);
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
         Ok(())
     }
 
-    /// Says so when the aggregator or its epoch has changed; maps tell, and verdicts where no maps come.
-    fn follow(&mut self, epoch: &Epoch) {
-        if (self.status.epoch, self.status.aggregator.as_ref()) != (epoch.term, Some(&epoch.leader)) {
-            tracing::info!(aggregator = %epoch.leader, epoch = epoch.term, "following");
-            self.status.epoch = epoch.term;
-            self.status.aggregator = Some(epoch.leader.clone());
-            self.gateway.send(GatewayMessage::PublishStatus { status: self.status.clone() });
-        }
+    /// Whether the election knows of nobody else who leads.
+    fn may_lead(&self, epoch: &Epoch) -> bool {
+        let leadership = self.leadership.borrow();
+        leadership.leader().is_none() || leadership.epoch.as_ref() == Some(epoch)
     }
 
     fn write(&mut self, received: &ReceivedMap) {
@@ -221,23 +216,21 @@ fn open(path: &Path) -> Result<BufWriter<File>, ActorProcessingErr> {
 
 #[cfg(test)]
 mod tests {
-    use ecod::wire::{NodeState, Role, SCHEMA_VERSION};
-    use uuid::Uuid;
+    use ecod::wire::SCHEMA_VERSION;
 
     use super::*;
+    use crate::leader_election::Position;
 
-    fn follower() -> FollowerState {
-        let status = NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: NodeName::from_static("euclid"),
-            id: Uuid::nil(),
-            role: Role::Cav,
-            state: NodeState::Following,
-            epoch: 0,
-            aggregator: None,
-            version: String::new(),
+    fn follower(leadership: Leadership) -> FollowerState {
+        let arguments = FollowerArguments {
+            newest: Newest::default(),
+            log: None,
+            least_term: 0,
+            leadership: watch::channel(leadership).1,
+            election: Seat::default(),
+            counters: Arc::default(),
         };
-        FollowerState::new(Newest::default(), None, status, Seat::default(), Arc::default())
+        FollowerState::new(arguments, None)
     }
 
     fn map(epoch: u64, round: u64) -> Arc<GlobalMap> {
@@ -255,7 +248,7 @@ mod tests {
 
     #[test]
     fn a_huge_epoch_silences_the_others_for_a_moment_only() {
-        let mut follower = follower();
+        let mut follower = follower(Leadership::default());
         let second = |n: u64| Timestamp(n * 1_000_000);
         let accepted = |follower: &FollowerState| follower.newest.map.borrow().as_ref().map(|newest| newest.map.epoch);
         assert_eq!(follower.take_map(&map(u64::MAX, 1), second(0)), Ok(()));
@@ -268,7 +261,7 @@ mod tests {
 
     #[test]
     fn each_topic_goes_by_its_own_order_and_reputations_may_come_without_a_name() {
-        let mut follower = follower();
+        let mut follower = follower(Leadership::default());
         let reputations = |epoch, round, aggregator: Option<&str>| {
             let aggregator = aggregator.map(|name| NodeName::new(name).unwrap());
             Arc::new(Reputations { schema: SCHEMA_VERSION, aggregator, epoch, round, reputations: Default::default() })
@@ -281,5 +274,13 @@ mod tests {
         assert_eq!(late, Err(RejectReason::Superseded));
         let newest = follower.newest.reputations.borrow().as_ref().map(|newest| newest.message.aggregator.clone());
         assert_eq!(newest, Some(Some(NodeName::from_static("edge"))));
+    }
+
+    #[test]
+    fn a_deposed_leader_is_refused_even_when_nobody_else_is_heard() {
+        let epoch = Some(Epoch::new(8, NodeName::from_static("euclid")));
+        let mut follower = follower(Leadership { position: Position::Following, epoch, standby: None });
+        assert_eq!(follower.take_map(&map(8, 1), Timestamp(0)), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 99), Timestamp(9_000_000)), Err(RejectReason::Superseded));
     }
 }

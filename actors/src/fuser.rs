@@ -43,6 +43,8 @@ pub enum FuserMessage {
         /// Whether the round before has just been published: the next is then due a period later, otherwise at once.
         on_time: bool,
     },
+    /// Let the present round last its whole period: another node is about to lead from the next one on.
+    HoldRound,
     /// Publish nothing more; go on fusing, to be ready.
     StopPublishing,
     /// Start from evidence that came from elsewhere.
@@ -108,10 +110,15 @@ impl Actor for Fuser {
         match message {
             FuserMessage::TakeReport { delivery } => state.take(&delivery),
             FuserMessage::CloseRound => {
+                state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
                 state.tick();
             }
             FuserMessage::Lead { epoch, first_round, on_time } => state.lead(epoch, first_round, on_time),
+            FuserMessage::HoldRound => {
+                state.aggregator.hold();
+                state.alarm = Timestamp(u64::MAX);
+            }
             FuserMessage::StopPublishing => {
                 state.aggregator.stand_by();
                 state.keeper.send(ReputationKeeperMessage::StandBy);

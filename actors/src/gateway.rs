@@ -52,6 +52,11 @@ pub enum GatewayMessage {
         /// The brokers, in no particular order.
         addresses: Vec<BrokerAddress>,
     },
+    /// Take reports from these brokers only, on links made from now on; until told, a candidate takes them from all.
+    SetReportBrokers {
+        /// Brokers to which all vehicles send.
+        addresses: Vec<BrokerAddress>,
+    },
     /// Hand messages to another subscriber from now on, such as after a receiver's restart.
     SetSubscriber {
         /// The new subscriber.
@@ -138,6 +143,7 @@ pub struct GatewayState {
     topics: Topics,
     part: Part,
     encoding: Encoding,
+    report_brokers: Option<Vec<BrokerAddress>>,
     status: NodeStatus,
     status_topic: String,
     status_payload: Bytes,
@@ -176,6 +182,7 @@ impl Actor for Gateway {
         let inbox = Arc::clone(&state.setup.inbox);
         match message {
             GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
+            GatewayMessage::SetReportBrokers { addresses } => state.report_brokers = Some(addresses),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
                 state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
@@ -240,6 +247,7 @@ impl GatewayState {
         let client_id = format!("{}-{}", status.node, status.id.simple());
         let setup = LinkSetup { client_id, filters, will, config: mqtt, inbox: Arc::new(inbox), counters, seed };
         Self {
+            report_brokers: None,
             topics,
             part,
             encoding,
@@ -269,6 +277,12 @@ impl GatewayState {
             self.next_link += 1;
             self.links.insert(id, Link::spawn(id, broker, Arc::clone(&self.setup), myself.clone()));
         }
+    }
+
+    fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
+        let reports = self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
+        let part = if reports { self.part } else { Part::Follower };
+        part.levels().iter().map(|level| self.topics.filter(level)).collect()
     }
 
     fn set_status(&mut self, status: NodeStatus) {
@@ -314,12 +328,13 @@ impl GatewayState {
     }
 
     fn link_changed(&mut self, LinkEvent { link: id, news }: LinkEvent) {
+        let Some(filters) = self.links.get(&id).map(|link| self.filters(&link.broker)) else { return };
         let Some(link) = self.links.get_mut(&id) else { return };
         let state = match news {
             LinkNews::Accepted(client) => {
                 // The queue of a new connection is empty, so that both fit.
                 client.publish(&self.status_topic, &self.status_payload, Handling::State);
-                client.subscribe(&self.setup.filters);
+                client.subscribe(&filters);
                 link.client = Some(client);
                 LinkState::Up
             }
@@ -363,17 +378,18 @@ fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
 }
 
 impl Part {
+    /// What a follower takes comes first for both, so that a level's place tells which it is.
     fn levels(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
             Self::Candidate => &[
-                "detections/+",
-                "vote_detections/+",
                 "global_detections",
                 "global_verdicts",
                 "reputations",
-                "ledger/+",
                 "nodes/+",
+                "detections/+",
+                "vote_detections/+",
+                "ledger/+",
             ],
         }
     }

@@ -31,6 +31,7 @@ pub mod gateway;
 pub mod image_size;
 #[cfg(feature = "camera")]
 pub mod latest_slot;
+pub mod leader_election;
 #[cfg(feature = "camera")]
 pub mod lens;
 pub mod lines;

@@ -2,13 +2,15 @@
 //!
 //! ```text
 //! Node
-//! ├─ Broker            embedded MQTT broker                  an aggregator without an external broker
-//! ├─ Gateway           the only owner of MQTT clients        always
-//! ├─ Follower          takes maps, verdicts, reputations     always
-//! ├─ ReputationKeeper  publishes and keeps reputations       an aggregator that runs VOTE
-//! ├─ Fuser             closes rounds: maps and verdicts      an aggregator
-//! ├─ Projector         detections -> report                  with a camera
-//! └─ Detector          frames -> detections                  with a camera
+//! ├─ Broker            embedded MQTT broker               may lead, and the nodes' own brokers are used
+//! ├─ Membership        who is there, datagrams            always
+//! ├─ Gateway           the only owner of MQTT clients     always
+//! ├─ Follower          takes maps, verdicts, reputations  always
+//! ├─ ReputationKeeper  publishes and keeps reputations    may lead, in a cell that runs VOTE
+//! ├─ Fuser             closes rounds: maps and verdicts   may lead; publishes only while leading
+//! ├─ LeaderElection    who leads, and what follows        always
+//! ├─ Projector         detections -> report               with a camera
+//! └─ Detector          frames -> detections               with a camera
 //! ```
 //!
 //! A part that ends is started anew, and the others go on: they reach each other through seats. A node whose parts end
@@ -16,6 +18,7 @@
 
 mod parts;
 mod restarts;
+mod seats;
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -31,9 +34,11 @@ use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
 use crate::follower::{Newest, Received, ReceivedMap};
+use crate::leader_election::Leadership;
+use crate::membership::Member;
 
-pub use parts::{Part, Seats};
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
+pub use seats::{Part, Seats};
 
 use parts::{Assembly, cause};
 use restarts::Restarts;
@@ -71,6 +76,9 @@ pub struct NodeHandle {
     failure: watch::Receiver<Option<String>>,
     newest: Newest,
     broker: watch::Receiver<Option<SocketAddr>>,
+    gossip: watch::Receiver<Option<SocketAddr>>,
+    members: watch::Receiver<Vec<Member>>,
+    leadership: watch::Receiver<Leadership>,
     seats: Seats,
     counters: Arc<Counters>,
 }
@@ -85,12 +93,13 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (failed, failure) = watch::channel(None);
     let assembly = Assembly::new(config, failed);
-    let (newest, broker) = (assembly.newest(), assembly.broker_address());
+    let (newest, broker, gossip) = (assembly.newest(), assembly.broker_address(), assembly.gossip_address());
+    let (members, leadership) = (assembly.members(), assembly.leadership());
     let (seats, counters) = (assembly.seats().clone(), assembly.counters());
     let started = Actor::spawn(None, Node, assembly).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
-    Ok(NodeHandle { supervisor, ended, failure, newest, broker, seats, counters })
+    Ok(NodeHandle { supervisor, ended, failure, newest, broker, gossip, members, leadership, seats, counters })
 }
 
 impl NodeHandle {
@@ -112,6 +121,21 @@ impl NodeHandle {
     /// Where the embedded broker listens, if there is one.
     pub fn broker_address(&self) -> Option<SocketAddr> {
         *self.broker.borrow()
+    }
+
+    /// Where the node gossips; the address may be unspecified.
+    pub fn gossip_address(&self) -> Option<SocketAddr> {
+        *self.gossip.borrow()
+    }
+
+    /// The other nodes of the cell, as they come and go.
+    pub fn members(&self) -> watch::Receiver<Vec<Member>> {
+        self.members.clone()
+    }
+
+    /// Who leads the cell, as it changes.
+    pub fn leadership(&self) -> watch::Receiver<Leadership> {
+        self.leadership.clone()
     }
 
     /// Where the node's actors are reached.
@@ -167,7 +191,8 @@ impl Actor for Node {
     ) -> Result<(), ActorProcessingErr> {
         let NodeMessage::LogHealth = message;
         let snapshot = state.assembly.counters().snapshot();
-        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, "health");
+        let frames = state.assembly.frames().snapshot();
+        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?frames, "health");
         Ok(())
     }
 
@@ -178,7 +203,11 @@ impl Actor for Node {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let (actor, why) = match event {
-            SupervisionEvent::ActorTerminated(actor, _, why) => (actor, why.unwrap_or_else(|| "stopped".into())),
+            SupervisionEvent::ActorTerminated(actor, last, why) => {
+                // A killed part lives on in its state, such as the broker with its port; ending it may take a while.
+                tokio::task::spawn_blocking(|| drop(last));
+                (actor, why.unwrap_or_else(|| "stopped".into()))
+            }
             SupervisionEvent::ActorFailed(actor, error) => (actor, error.to_string()),
             SupervisionEvent::ActorStarted(_) | SupervisionEvent::ProcessGroupChanged(_) => return Ok(()),
         };

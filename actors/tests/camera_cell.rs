@@ -44,7 +44,7 @@ async fn a_plate_goes_from_pixels_to_the_map_though_detector_and_projector_are_k
     let testbed = Testbed::from_json(&std::fs::read_to_string(&file).unwrap()).unwrap();
     let scene = testbed.scene(SCENE).unwrap();
     let mut edge = setup::edge(&testbed, scene);
-    edge.listen = "127.0.0.1:0".parse().unwrap();
+    edge.listen = Some("127.0.0.1:0".parse().unwrap());
     let edge = node::start(edge).await.unwrap();
 
     let euclid = scene.cavs.iter().find(|cav| cav.name.as_str() == "euclid").unwrap();

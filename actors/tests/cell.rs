@@ -23,14 +23,18 @@ fn config(name: &str, role: Role) -> NodeConfig {
         vacancy: None,
         synonyms: Default::default(),
     };
-    NodeConfig {
+    let mut config = NodeConfig {
         name: Some(NodeName::new(name).unwrap()),
         cell: NodeName::from_static("lot-1"),
         role,
-        listen: "127.0.0.1:0".parse().unwrap(),
+        listen: Some("127.0.0.1:0".parse().unwrap()),
         landmarks: (0..3).map(slot).collect(),
         ..NodeConfig::default()
-    }
+    };
+    // Cells of other tests are not met.
+    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+    config.membership.multicast.enabled = false;
+    config
 }
 
 async fn edge() -> NodeHandle {
@@ -183,7 +187,7 @@ async fn a_killed_supervisor_fails_the_node_and_takes_its_parts_with_it() {
 async fn a_busy_port_is_an_error_that_names_it() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();
-    let config = NodeConfig { listen: address, ..config("edge", Role::Edge) };
+    let config = NodeConfig { listen: Some(address), ..config("edge", Role::Edge) };
     let error = node::start(config).await.err().expect("the port is busy");
     assert!(error.to_string().contains(&address.to_string()), "{error}");
 }

@@ -18,20 +18,24 @@ fn load(name: &str) -> NodeConfig {
 fn the_example_edge_aggregates_for_the_network() {
     let edge = load("edge.toml");
     assert_eq!(edge.role, Role::Edge);
-    assert!(edge.listen.ip().is_unspecified());
+    assert!(edge.broker_listen().ip().is_unspecified());
     assert!(edge.mqtt.broker.is_none());
 }
 
 #[cfg(feature = "camera")]
 #[test]
-fn the_example_vehicle_fits_the_example_edge() {
-    let (edge, cav) = (load("edge.toml"), load("cav.toml"));
-    assert_eq!(cav.role, Role::Cav);
-    assert_eq!(cav.cell, edge.cell);
-    assert_eq!(cav.landmarks, edge.landmarks);
-    assert_eq!(cav.fusion.pace.gate_m, edge.fusion.pace.gate_m);
-    assert_eq!(cav.mqtt.broker.unwrap().port(), edge.listen.port());
-    assert!(cav.camera.is_some());
+fn the_example_vehicles_fit_the_example_edge() {
+    let edge = load("edge.toml");
+    for (file, role) in [("auto.toml", Role::Auto), ("cav.toml", Role::Cav)] {
+        let vehicle = load(file);
+        assert_eq!(vehicle.role, role);
+        assert_eq!(vehicle.cell, edge.cell);
+        assert_eq!(vehicle.membership, edge.membership);
+        assert_eq!(vehicle.landmarks, edge.landmarks);
+        assert_eq!(vehicle.fusion.pace.gate_m, edge.fusion.pace.gate_m);
+        assert!(vehicle.broker_listen().ip().is_unspecified(), "the others reach its broker");
+        assert!(vehicle.camera.is_some());
+    }
 }
 
 #[cfg(feature = "camera")]

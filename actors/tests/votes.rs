@@ -41,12 +41,15 @@ fn config(node: &str, role: Role) -> NodeConfig {
         name: Some(name(node)),
         cell: NodeName::from_static("crossing"),
         role,
-        listen: "127.0.0.1:0".parse().unwrap(),
+        listen: Some("127.0.0.1:0".parse().unwrap()),
         landmarks: vec![ball],
         ..NodeConfig::default()
     };
     config.fusion.vote.weighted.freshness_s = 0.2;
     config.reputations.publish_period_s = 0.1;
+    // Cells of other tests are not met.
+    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+    config.membership.multicast.enabled = false;
     config
 }
 

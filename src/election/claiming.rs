@@ -68,7 +68,7 @@ impl Election {
             self.lead(self.epoch.clone(), now);
         } else if now >= seeking.ask_at {
             self.ask_all(now);
-            let ask_at = now + self.config.idle_beat() / 2;
+            let ask_at = now + self.config.patience() / 4;
             if let State::Seeking(seeking) = &mut self.state {
                 seeking.ask_at = ask_at;
             }
@@ -96,7 +96,7 @@ impl Election {
     pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
         match &self.state {
             State::Leading(_) => self.send_beat(from, now),
-            State::Following(following) if now.since(following.evidence_at()) <= self.config.contact() => {
+            State::Following(following) if now.since(following.evidence_at()) <= self.config.patience() => {
                 let age = now.since(following.evidence_at()).as_micros().div_ceil(1000);
                 self.send(from, Body::Vouch { ask, age_ms: u64::try_from(age).unwrap_or(u64::MAX) }, now);
             }
@@ -110,7 +110,7 @@ impl Election {
         if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) {
             return;
         }
-        let believable = heard_at + self.config.contact() > now;
+        let believable = heard_at + self.config.patience() > now;
         let doubtful = match &mut self.state {
             State::Following(following) if following.epoch == epoch => {
                 following.hearsay_at = following.hearsay_at.max(heard_at);
@@ -150,7 +150,7 @@ impl Election {
         let order = std::mem::take(&mut leading.successors);
         self.close(epoch.clone());
         self.effects.push(Effect::StopPublishing { epoch: epoch.clone() });
-        self.seek(order, now + self.config.contact(), now);
+        self.seek(order, now + self.config.patience(), now);
         self.send_all(&Body::Resign { epoch, last_round: self.round }, now);
     }
 

@@ -13,19 +13,20 @@ use crate::wire::Role;
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ElectionConfig {
-    /// What the node is meant to do. Default `auto`.
+    /// What the node is meant to do; the `role` of the node, no key of this table. Default `auto`.
+    #[serde(skip)]
     pub role: Role,
     /// Preference among nodes of one role, higher leads first. Default 100.
     pub priority: u8,
-    /// Time between two beats of the leader to its successors, in ms. Default 40. Shorter finds a silent leader
-    /// sooner and costs packets.
+    /// Time between two beats of the leader to its standby, in ms; its other successors get every eighth. Default 50.
+    /// Shorter finds a silent leader sooner and costs packets.
     pub beat_ms: u64,
-    /// Time between two beats of the leader to everyone else, in ms. Default 200. Shorter costs a large cell packets.
+    /// Time between two beats of the leader to everyone else, in ms. Default 2500. Shorter costs a large cell packets.
     pub idle_beat_ms: u64,
-    /// Beats that must be missing in a row before a leader counts as lost. Default 4. Fewer is faster, and takes lost
-    /// packets for a lost leader more often.
+    /// Beats that must be missing in a row, and no round taken, before a leader counts as lost. Default 4. Fewer is
+    /// faster, and takes lost packets for a lost leader more often.
     pub silence_beats: u32,
-    /// How long a node that starts listens before it may lead, in ms. Default 500. Longer makes it surer to find the
+    /// How long a node that starts listens before it may lead, in ms. Default 1200. Longer makes it surer to find the
     /// leader that is there, and a lone vehicle wait.
     pub join_ms: u64,
     /// How much longer each next candidate waits before it claims the lead, in ms. Default 60. Must exceed the
@@ -45,10 +46,10 @@ impl Default for ElectionConfig {
         Self {
             role: Role::Auto,
             priority: 100,
-            beat_ms: 40,
-            idle_beat_ms: 200,
+            beat_ms: 50,
+            idle_beat_ms: 2500,
             silence_beats: 4,
-            join_ms: 500,
+            join_ms: 1200,
             claim_step_ms: 60,
             stable_ms: 3000,
             handover_ms: 3000,
@@ -75,8 +76,18 @@ impl ElectionConfig {
     }
 
     /// How long a peer that is spoken to every `idle_beat_ms` may be silent before it counts as not heard.
-    pub fn contact(&self) -> Duration {
-        self.idle_beat() * self.silence_beats
+    pub(super) fn contact(&self) -> Duration {
+        self.idle_beat() * 5 / 2
+    }
+
+    /// How long anything may take that those concerned do at once: an answer, a claim, a restart.
+    pub(super) fn patience(&self) -> Duration {
+        self.beat() * self.silence_beats * 4
+    }
+
+    /// Time between two beats to a successor other than the standby.
+    pub(super) fn near_beat(&self) -> Duration {
+        (self.beat() * NEAR_BEATS).min(self.idle_beat())
     }
 
     pub(super) fn beat(&self) -> Duration {
@@ -99,6 +110,9 @@ impl ElectionConfig {
         Duration::from_millis(self.handover_ms)
     }
 }
+
+/// How many beats apart a successor other than the standby gets one.
+pub(super) const NEAR_BEATS: u32 = 8;
 
 #[cfg(test)]
 mod tests {

@@ -24,6 +24,8 @@ pub(super) struct Following {
     mutual_at: Timestamp,
     /// When others heard the leader, at least.
     pub(super) hearsay_at: Timestamp,
+    /// Whether the membership gave the leader up since it was last heard.
+    given_up: bool,
     /// When the leader last offered the lead.
     pub(super) offered_at: Option<Timestamp>,
     /// Whether this node is ready to take it.
@@ -36,14 +38,26 @@ impl Following {
         self.direct_at.max(self.hearsay_at)
     }
 
-    /// From when on the leader is doubted: it missed two beats, or does not hear this node.
+    /// From when on the leader is doubted: it missed two beats and published no round, does not hear this node, or was
+    /// given up by the membership.
     pub(super) fn doubt_at(&self, config: &ElectionConfig) -> Timestamp {
-        (self.direct_at + self.every * 2).min(self.mutual_at + config.idle_beat() * 2)
+        if self.given_up {
+            return self.direct_at;
+        }
+        (self.direct_at + self.every * 2).min(self.mutual_at + (self.every * 2).max(config.patience() / 2))
     }
 
     /// From when on this node's own ear no longer counts.
     fn deaf_at(&self, config: &ElectionConfig) -> Timestamp {
-        (self.direct_at + self.every * config.silence_beats).min(self.mutual_at + config.contact())
+        let silence = self.every * config.silence_beats;
+        let deaf_at = (self.direct_at + silence).min(self.mutual_at + silence.max(config.patience()));
+        if self.given_up { deaf_at.min(self.direct_at + config.patience() / 2) } else { deaf_at }
+    }
+
+    /// The leader was heard, or what it published.
+    pub(super) fn hear(&mut self, now: Timestamp) {
+        self.direct_at = now;
+        self.given_up = false;
     }
 
     /// From when on the leader is lost.
@@ -52,8 +66,9 @@ impl Following {
     /// word is enough, and allowed to be as old as the leader's slowest beat makes it.
     fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
         let deaf_at = self.deaf_at(config);
-        if self.hearsay_at > self.direct_at.min(self.mutual_at) + self.every {
-            deaf_at.max(self.hearsay_at + config.contact())
+        let margin = if self.given_up { config.beat() } else { self.every };
+        if self.hearsay_at > self.direct_at.min(self.mutual_at) + margin {
+            deaf_at.max(self.hearsay_at + config.patience())
         } else {
             deaf_at
         }
@@ -78,7 +93,7 @@ impl Election {
 
     fn ask_at(&self, following: &Following) -> Timestamp {
         let deaf = self.clock.now() >= following.deaf_at(&self.config);
-        let pause = if deaf { self.config.idle_beat() } else { self.config.beat() / 2 };
+        let pause = if deaf { self.config.patience() / 4 } else { self.config.beat() / 2 };
         following.doubt_at(&self.config).max(self.questions.last_at() + pause)
     }
 
@@ -113,9 +128,10 @@ impl Election {
         if beat.epoch < own {
             let succeeded = leading.after.as_ref() >= Some(&beat.epoch);
             if beat.hears_us && followers == 0 && beat.followers > 0 && !succeeded {
+                self.close(own.clone());
                 self.effects.push(Effect::StopPublishing { epoch: own });
                 self.effects.push(Effect::SendState { to: beat.epoch.leader.clone() });
-                self.seek(vec![beat.epoch.leader.clone()], now + self.config.contact(), now);
+                self.seek(vec![beat.epoch.leader.clone()], now + self.config.patience(), now);
                 self.greet(&beat.epoch.leader, now);
             } else {
                 self.send_beat(&beat.epoch.leader, now);
@@ -153,6 +169,7 @@ impl Election {
             direct_at: now,
             mutual_at: now,
             hearsay_at: Timestamp::default(),
+            given_up: false,
             offered_at: None,
             prepared: false,
         });
@@ -171,6 +188,7 @@ impl Election {
             direct_at: Timestamp::default(),
             mutual_at: Timestamp::default(),
             hearsay_at: heard_at,
+            given_up: false,
             offered_at: None,
             prepared: false,
         });
@@ -182,7 +200,7 @@ impl Election {
         let State::Following(following) = &mut self.state else { return };
         self.round = self.round.max(beat.round);
         following.every = Duration::from_millis(beat.every_ms);
-        following.direct_at = now;
+        following.hear(now);
         if beat.hears_us {
             following.mutual_at = now;
         }
@@ -256,7 +274,12 @@ impl Election {
 
     /// What the membership gave up is only doubted here: it may hear less than the leader's beats and others tell.
     pub(super) fn peer_down(&mut self, peer: &NodeName, now: Timestamp) {
-        self.peer_suspected(peer, now);
+        if let State::Following(following) = &mut self.state
+            && following.epoch.leader == *peer
+        {
+            following.given_up = true;
+            self.ask_all(now);
+        }
         self.peers.down(peer, now);
     }
 

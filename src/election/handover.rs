@@ -72,12 +72,16 @@ impl Election {
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
         self.terms.seen = self.terms.seen.max(epoch.term.min(MAX_TERM));
         self.round = self.round.max(round);
-        if let State::Leading(leading) = &mut self.state
-            && let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some())
-        {
-            handover.yielded = true;
-            handover.retry_at = now;
-            self.drive_handover(now);
+        match &mut self.state {
+            State::Following(following) if following.epoch == *epoch => following.hear(now),
+            State::Leading(leading) => {
+                if let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some()) {
+                    handover.yielded = true;
+                    handover.retry_at = now;
+                    self.drive_handover(now);
+                }
+            }
+            State::Following(_) | State::Seeking(_) => {}
         }
     }
 
@@ -87,7 +91,7 @@ impl Election {
         if following.epoch.leader != *from || epoch != Some(&following.epoch) || !may_lead {
             return;
         }
-        let fresh = following.offered_at.is_some_and(|at| now.since(at) <= self.config.contact());
+        let fresh = following.offered_at.is_some_and(|at| now.since(at) <= self.config.patience());
         following.offered_at = Some(now);
         if !fresh {
             following.prepared = false;

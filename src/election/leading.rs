@@ -1,5 +1,7 @@
 //! Leading: beating, naming successors, noticing a better candidate.
 
+use std::time::Duration;
+
 use crate::election::handover::Handover;
 use crate::election::message::{Body, MAX_SUCCESSORS};
 use crate::election::step::Effect;
@@ -37,7 +39,6 @@ impl Leading {
 impl Election {
     pub(super) fn lead_timers(&mut self, now: Timestamp) {
         self.drive_handover(now);
-        let ratio = (self.config.idle_beat_ms / self.config.beat_ms).max(1);
         let next = now + self.config.beat();
         let State::Leading(leading) = &mut self.state else { return };
         if now < leading.beat_at {
@@ -56,7 +57,7 @@ impl Election {
         let State::Leading(leading) = &self.state else { return };
         let due: Vec<_> = (beats..)
             .zip(self.peers.names())
-            .filter(|(turn, name)| turn % ratio == 0 || leading.successors.contains(name))
+            .filter(|(turn, name)| turn % (self.beat_for(leading, name).as_millis() as u64 / self.config.beat_ms) == 0)
             .map(|(_, name)| name.clone())
             .collect();
         for peer in due {
@@ -67,7 +68,7 @@ impl Election {
     /// One of ours knows a later term, or holds this epoch for over. If that is for want of a newer leader rather than
     /// because one is just taking over, lead on in a term that nobody can refuse.
     pub(super) fn renew_later(&mut self, now: Timestamp) {
-        let at = now + self.config.idle_beat() * 2;
+        let at = now + self.config.patience() / 2;
         if let State::Leading(leading) = &mut self.state {
             leading.renew_at.get_or_insert(at);
         }
@@ -81,15 +82,23 @@ impl Election {
 
     pub(super) fn send_beat(&mut self, to: &NodeName, now: Timestamp) {
         let State::Leading(leading) = &self.state else { return };
-        let near = leading.successors.contains(to);
         let body = Body::Beat {
-            every_ms: if near { self.config.beat_ms } else { self.config.idle_beat_ms },
+            every_ms: self.beat_for(leading, to).as_millis() as u64,
             round: self.round,
             followers: u8::try_from(self.peers.followers(&leading.epoch, now)).unwrap_or(u8::MAX),
             after: leading.after.clone(),
             successors: leading.successors.clone(),
         };
         self.send(to, body, now);
+    }
+
+    /// How far apart a peer's beats are.
+    fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
+        match leading.successors.iter().position(|name| name == to) {
+            Some(0) => self.config.beat(),
+            Some(_) => self.config.near_beat(),
+            None => self.config.idle_beat(),
+        }
     }
 
     /// Chooses who leads next, and tells all when that changed.

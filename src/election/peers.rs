@@ -45,12 +45,14 @@ pub(super) struct Peer {
 pub(super) struct Peers {
     table: BTreeMap<NodeName, Peer>,
     contact: Duration,
+    patience: Duration,
 }
 
 impl Peers {
-    /// `contact` is how long a peer may be silent and still count as heard.
-    pub(super) fn new(contact: Duration) -> Self {
-        Self { table: BTreeMap::new(), contact }
+    /// `contact` is how long a peer may be silent and still count as heard, `patience` how long one that the membership
+    /// gave up.
+    pub(super) fn new(contact: Duration, patience: Duration) -> Self {
+        Self { table: BTreeMap::new(), contact, patience }
     }
 
     pub(super) fn add(&mut self, name: &NodeName) {
@@ -99,7 +101,7 @@ impl Peers {
     /// Marks a peer whose process is gone.
     pub(super) fn gone(&mut self, name: &NodeName, now: Timestamp) {
         if let Some(peer) = self.table.get_mut(name) {
-            peer.gone_until = Some(now + self.contact);
+            peer.gone_until = Some(now + self.patience);
             peer.fit_since = None;
             peer.heard_at = None;
         }
@@ -107,7 +109,8 @@ impl Peers {
 
     /// Forgets a peer that the membership gave up, unless it was heard lately.
     pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
-        if !self.hears(name, now) {
+        let heard_at = self.table.get(name).and_then(|peer| peer.heard_at);
+        if heard_at.is_none_or(|at| now.since(at) > self.patience / 2) {
             self.table.remove(name);
         }
     }

@@ -51,7 +51,8 @@ mod tests {
     #[test]
     fn the_largest_share_fits_and_each_flaw_has_its_reason() {
         assert_eq!(reason(&share()), None);
-        let flaws: [(fn(&mut LedgerShare), RejectReason); 5] = [
+        type Flaw = (fn(&mut LedgerShare), RejectReason);
+        let flaws: [Flaw; 5] = [
             (|s| s.schema = 2, RejectReason::UnknownSchema),
             (|s| s.node = NodeName::from_static("gauss"), RejectReason::NodeMismatch),
             (|s| s.entries.truncate(1), RejectReason::TooManyObjects),

@@ -21,7 +21,7 @@ use crate::node;
 /// Flags of a node; each overrides the key of its name in the configuration file.
 #[derive(Debug, Args, Serialize)]
 pub struct RunArguments {
-    /// What the node does: `edge` aggregates, `cav` sees and reports
+    /// Who leads: `edge` whenever it is there, `auto` if no better candidate is, `cav` never
     #[arg(long, value_parser = ["auto", "cav", "edge"])]
     #[serde(skip_serializing_if = "Option::is_none")]
     role: Option<String>,
@@ -37,14 +37,22 @@ pub struct RunArguments {
     #[arg(long)]
     #[serde(skip_serializing_if = "Option::is_none")]
     cell: Option<NodeName>,
-    /// Where the embedded broker of an aggregator listens
+    /// Where the embedded broker of a node that may lead listens
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     #[serde(skip_serializing_if = "Option::is_none")]
     listen: Option<SocketAddr>,
-    /// The broker to connect to, for a node without an embedded one
+    /// An external broker for all data; without one the nodes' own are used
     #[arg(long, value_name = "HOST:PORT")]
     #[serde(skip)]
     broker: Option<BrokerAddress>,
+    /// A node to ask for the cell; may be given several times
+    #[arg(long = "seed", value_name = "HOST:PORT")]
+    #[serde(skip)]
+    seeds: Vec<String>,
+    /// Directory for what survives a restart
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    state_dir: Option<PathBuf>,
     /// Append every accepted map and its time of receipt to this file, one JSON object a line
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -70,6 +78,8 @@ struct Overrides<'a> {
     top: &'a RunArguments,
     #[serde(skip_serializing_if = "Option::is_none")]
     mqtt: Option<MqttOverrides<'a>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    membership: Option<MembershipOverrides<'a>>,
 }
 
 #[derive(Serialize)]
@@ -77,9 +87,16 @@ struct MqttOverrides<'a> {
     broker: &'a BrokerAddress,
 }
 
+#[derive(Serialize)]
+struct MembershipOverrides<'a> {
+    seeds: &'a [String],
+}
+
 pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     let mqtt = arguments.broker.as_ref().map(|broker| MqttOverrides { broker });
-    let config = NodeConfig::load(arguments.config.as_deref(), &Overrides { top: arguments, mqtt });
+    let seeds = (!arguments.seeds.is_empty()).then_some(&*arguments.seeds);
+    let membership = seeds.map(|seeds| MembershipOverrides { seeds });
+    let config = NodeConfig::load(arguments.config.as_deref(), &Overrides { top: arguments, mqtt, membership });
     let config = config.map_err(Failure::usage)?;
     if arguments.print_config {
         return Ok(print(&config.to_toml().context("the configuration cannot be written as TOML")?)?);

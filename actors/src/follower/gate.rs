@@ -6,24 +6,38 @@ use ecod::epoch::{Epoch, EpochGate};
 use ecod::time::Timestamp;
 use ecod::wire::RejectReason;
 
-/// How long the newest message outranks others after it came: an aggregator that starts anew with a clock set back, or
-/// a message from a stranger with a huge epoch, silences the rest for no longer than this.
+/// How long the newest message outranks others after it came: one from a stranger with a huge epoch silences the elected
+/// leader, or where there is no election whoever publishes, for no longer than this.
 pub(super) const MEMORY: Duration = Duration::from_secs(3);
 
 /// Admits messages in the order of epoch, aggregator and round.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Gate {
     gate: EpochGate,
     newest_at: Option<Timestamp>,
 }
 
 impl Gate {
-    /// Takes round `round` of `epoch`, or refuses it as superseded.
-    pub(super) fn admit(&mut self, epoch: &Epoch, round: u64, received_at: Timestamp) -> Result<(), RejectReason> {
-        if self.newest_at.is_some_and(|newest_at| received_at.since(newest_at) >= MEMORY) {
+    /// A gate that refuses terms below `least_term` at first.
+    pub(super) fn new(least_term: u64) -> Self {
+        Self { gate: EpochGate::new(least_term), newest_at: None }
+    }
+
+    /// Takes round `round` of `epoch`, or refuses it as superseded. `may_lead` says that nobody else is known to lead.
+    pub(super) fn admit(
+        &mut self,
+        epoch: &Epoch,
+        round: u64,
+        received_at: Timestamp,
+        may_lead: bool,
+    ) -> Result<(), RejectReason> {
+        let quiet = self.newest_at.is_some_and(|newest_at| received_at.since(newest_at) >= MEMORY);
+        let mut admitted = self.gate.admit(epoch, round);
+        if admitted.is_err() && quiet && may_lead {
             self.gate = EpochGate::default();
+            admitted = self.gate.admit(epoch, round);
         }
-        self.gate.admit(epoch, round)?;
+        admitted?;
         self.newest_at = Some(received_at);
         Ok(())
     }

@@ -13,8 +13,11 @@ use super::address::BrokerAddress;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MqttConfig {
-    /// An external broker as `host:port`; default none: the aggregator's embedded broker is used.
+    /// An external broker as `host:port`; default none: the brokers embedded in the nodes are used.
     pub broker: Option<BrokerAddress>,
+    /// Whether the embedded brokers are used beside an external one; default false. With it a cell goes on while the
+    /// external broker is gone, and every message takes two ways while it is there.
+    pub fallback_to_embedded: bool,
     /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized packets away).
     pub version: MqttVersion,
     /// User name; default none. Needs `password`.
@@ -51,6 +54,7 @@ impl Default for MqttConfig {
         let limits = Limits::default();
         Self {
             broker: None,
+            fallback_to_embedded: false,
             version: MqttVersion::V311,
             user: None,
             password: None,

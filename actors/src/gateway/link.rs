@@ -94,6 +94,13 @@ impl Drop for Link {
     }
 }
 
+/// Waits before the first attempts after a session broke, for the quickest word of whether the broker's process is gone:
+/// a process that ends may still have the port for a moment when its connections break.
+const BREAK_CHECKS: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
+
+/// A session shorter than this earns no such attempts, or a broker that ends every session would be tried without pause.
+const SHORTEST_USE: Duration = Duration::from_millis(200);
+
 struct Task {
     id: LinkId,
     broker: BrokerAddress,
@@ -108,6 +115,7 @@ impl Task {
         // The first answer is waited for half as long: a session that outlived this was in use. One that ends sooner,
         // such as by a retained packet beyond all bounds, must not be tried again at full speed.
         let in_use = 2 * self.setup.config.connect_timeout();
+        let mut checks = BREAK_CHECKS.iter();
         loop {
             let begun = Instant::now();
             let error = match self.session().await {
@@ -128,7 +136,11 @@ impl Task {
             if begun.elapsed() > in_use {
                 backoff.reset();
             }
-            tokio::time::sleep(backoff.next_wait()).await;
+            if begun.elapsed() > SHORTEST_USE {
+                checks = BREAK_CHECKS.iter();
+            }
+            let wait = checks.next().copied().unwrap_or_else(|| backoff.next_wait());
+            tokio::time::sleep(wait).await;
         }
     }
 

@@ -1,76 +1,39 @@
-//! The parts of a node, how each is started, and where it is reached.
+//! How the parts of a node are made, connected, started and stopped.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
-use ecod::epoch::Epoch;
+use ecod::election::ElectionConfig;
 use ecod::names::NodeName;
 use ecod::vote::VoteMode;
-use ecod::wire::{NodeState as NodeCondition, NodeStatus, Role, SCHEMA_VERSION};
+use ecod::wire::{NodeState as NodeCondition, NodeStatus, SCHEMA_VERSION};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
 use tokio::sync::watch;
 use uuid::Uuid;
 
+use super::seats::{Part, Seats};
 use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker};
 use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
 use crate::follower::{Follower, FollowerArguments, FollowerMessage, Newest};
 use crate::fuser::{Fuser, FuserArguments, FuserMessage};
-use crate::gateway::{self, BrokerAddress, Gateway, GatewayArguments, GatewayMessage, Incoming, Subscriber};
+use crate::gateway::{self, Gateway, GatewayArguments, Incoming, Subscriber};
+use crate::leader_election::{
+    LeaderElection, LeaderElectionArguments, LeaderElectionMessage, Leadership, Parts, saved_term,
+};
+use crate::membership::{EventSink, FrameCounters, Member, Membership, MembershipArguments, MembershipMessage};
 use crate::reputation_keeper::{ReputationKeeper, ReputationKeeperArguments, ReputationKeeperMessage, SharedBook};
 use crate::seat::Seat;
 use crate::state_file::StateFile;
 #[cfg(feature = "camera")]
 use crate::{
     camera,
-    detector::{Detector, DetectorMessage},
-    projector::{Projector, ProjectorArguments, ProjectorMessage},
+    detector::Detector,
+    projector::{Projector, ProjectorArguments},
 };
-
-/// A part of a node, in the order of starting.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Part {
-    /// The embedded broker.
-    Broker,
-    /// The MQTT connections.
-    Gateway,
-    /// The taker of maps.
-    Follower,
-    /// The keeper of reputations.
-    ReputationKeeper,
-    /// The maker of maps and verdicts.
-    Fuser,
-    /// The maker of reports.
-    #[cfg(feature = "camera")]
-    Projector,
-    /// The finder of objects in frames.
-    #[cfg(feature = "camera")]
-    Detector,
-}
-
-/// Where the parts of a node are reached.
-#[derive(Debug, Clone, Default)]
-pub struct Seats {
-    /// The embedded broker's.
-    pub broker: Seat<BrokerMessage>,
-    /// The gateway's.
-    pub gateway: Seat<GatewayMessage>,
-    /// The follower's.
-    pub follower: Seat<FollowerMessage>,
-    /// The reputation keeper's.
-    pub keeper: Seat<ReputationKeeperMessage>,
-    /// The fuser's.
-    pub fuser: Seat<FuserMessage>,
-    /// The projector's.
-    #[cfg(feature = "camera")]
-    pub projector: Seat<ProjectorMessage>,
-    /// The detector's.
-    #[cfg(feature = "camera")]
-    pub detector: Seat<DetectorMessage>,
-}
 
 /// What the parts are made from; kept to make them again.
 pub(super) struct Assembly {
@@ -82,8 +45,11 @@ pub(super) struct Assembly {
     newest: Newest,
     book: SharedBook,
     broker_address: watch::Sender<Option<SocketAddr>>,
+    gossip_address: watch::Sender<Option<SocketAddr>>,
+    frames: Arc<FrameCounters>,
+    members: watch::Sender<Vec<Member>>,
+    leadership: watch::Sender<Leadership>,
     failed: watch::Sender<Option<String>>,
-    last_epoch: u64,
 }
 
 /// How long a part may take to stop.
@@ -105,8 +71,11 @@ impl Assembly {
             newest: Newest::default(),
             book: SharedBook::new(by_evidence),
             broker_address: watch::Sender::new(None),
+            gossip_address: watch::Sender::new(None),
+            frames: Arc::default(),
+            members: watch::Sender::new(Vec::new()),
+            leadership: watch::Sender::default(),
             failed,
-            last_epoch: 0,
         }
     }
 
@@ -126,20 +95,37 @@ impl Assembly {
         self.broker_address.subscribe()
     }
 
+    pub(super) fn gossip_address(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.gossip_address.subscribe()
+    }
+
+    pub(super) fn frames(&self) -> Arc<FrameCounters> {
+        Arc::clone(&self.frames)
+    }
+
+    pub(super) fn members(&self) -> watch::Receiver<Vec<Member>> {
+        self.members.subscribe()
+    }
+
+    pub(super) fn leadership(&self) -> watch::Receiver<Leadership> {
+        self.leadership.subscribe()
+    }
+
     pub(super) fn give_up(&self, why: String) {
         self.failed.send_replace(Some(why));
     }
 
     /// The parts that this node has, in the order of starting.
     pub(super) fn parts(&self) -> Vec<Part> {
-        let aggregates = self.config.role == Role::Edge;
+        let leads = self.config.may_lead();
         let mut parts = Vec::new();
-        parts.extend((aggregates && self.config.mqtt.broker.is_none()).then_some(Part::Broker));
-        parts.extend([Part::Gateway, Part::Follower]);
-        if aggregates {
+        parts.extend((leads && self.config.data_plane().embedded).then_some(Part::Broker));
+        parts.extend([Part::Membership, Part::Gateway, Part::Follower]);
+        if leads {
             parts.extend(self.config.fusion.algorithms.vote().then_some(Part::ReputationKeeper));
             parts.push(Part::Fuser);
         }
+        parts.push(Part::LeaderElection);
         #[cfg(feature = "camera")]
         if self.config.camera.is_some() {
             parts.extend([Part::Projector, Part::Detector]);
@@ -151,26 +137,31 @@ impl Assembly {
     pub(super) async fn start(&mut self, part: Part, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
         match part {
             Part::Broker => self.start_broker(supervisor).await,
-            Part::Gateway => self.start_gateway(supervisor).await,
+            Part::Membership => self.start_membership(supervisor).await,
+            Part::Gateway => {
+                let started = Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
+                let id = seat(&self.seats.gateway, started)?;
+                self.seats.election.send(LeaderElectionMessage::NoteGatewayRestart);
+                Ok(id)
+            }
             Part::Follower => {
-                let arguments = FollowerArguments {
-                    newest: self.newest.clone(),
-                    log: self.config.map_log.clone(),
-                    status: self.status(),
-                    gateway: self.seats.gateway.clone(),
-                    counters: self.counters(),
-                };
-                seat(&self.seats.follower, Actor::spawn_linked(None, Follower, arguments, supervisor).await)
+                let started = Actor::spawn_linked(None, Follower, self.follower_arguments(), supervisor).await;
+                seat(&self.seats.follower, started)
             }
             Part::ReputationKeeper => {
                 let arguments = self.keeper_arguments();
-                seat(&self.seats.keeper, Actor::spawn_linked(None, ReputationKeeper, arguments, supervisor).await)
+                let started = Actor::spawn_linked(None, ReputationKeeper, arguments, supervisor).await;
+                seat(&self.seats.keeper, started)
             }
             Part::Fuser => {
-                let arguments = self.fuser_arguments();
-                let id = seat(&self.seats.fuser, Actor::spawn_linked(None, Fuser, arguments, supervisor).await)?;
-                self.lead();
+                let started = Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
+                let id = seat(&self.seats.fuser, started)?;
+                self.seats.election.send(LeaderElectionMessage::NoteFuserRestart);
                 Ok(id)
+            }
+            Part::LeaderElection => {
+                let started = Actor::spawn_linked(None, LeaderElection, self.election_arguments(), supervisor).await;
+                seat(&self.seats.election, started)
             }
             #[cfg(feature = "camera")]
             Part::Projector => {
@@ -197,10 +188,12 @@ impl Assembly {
             stop(&self.seats.detector).await;
             stop(&self.seats.projector).await;
         }
+        stop(&self.seats.election).await;
         stop(&self.seats.fuser).await;
         stop(&self.seats.keeper).await;
         stop(&self.seats.follower).await;
         stop(&self.seats.gateway).await;
+        stop(&self.seats.membership).await;
         stop(&self.seats.broker).await;
     }
 
@@ -210,7 +203,7 @@ impl Assembly {
         let embedded = Box::new(EmbeddedBroker::new(self.config.broker()));
         let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await.map_err(cause)?;
         let before = *self.broker_address.borrow();
-        let address = before.unwrap_or(self.config.listen);
+        let address = before.unwrap_or(self.config.broker_listen());
         let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
         let bound = loop {
             attempts -= 1;
@@ -225,50 +218,87 @@ impl Assembly {
         Ok(id)
     }
 
-    async fn start_gateway(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let part = if self.config.role == Role::Cav { gateway::Part::Follower } else { gateway::Part::Candidate };
-        let arguments = GatewayArguments {
+    async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let (actor, _) = Actor::spawn_linked(None, Membership, self.membership_arguments(), supervisor).await?;
+        let address = ractor::call!(actor, |reply| MembershipMessage::Address { reply })?;
+        self.gossip_address.send_replace(Some(address));
+        let id = actor.get_id();
+        self.seats.membership.take(actor);
+        Ok(id)
+    }
+
+    fn membership_arguments(&self) -> MembershipArguments {
+        let election = self.seats.election.clone();
+        let events: EventSink = Arc::new(move |event| {
+            election.send(LeaderElectionMessage::Membership { event });
+        });
+        MembershipArguments {
+            name: self.name.clone(),
             cell: self.config.cell.clone(),
-            part,
+            run: clock::now().micros(),
+            role: self.config.role,
+            broker: *self.broker_address.borrow(),
+            config: self.config.membership.clone(),
+            events,
+            members: self.members.clone(),
+            counters: self.frames(),
+        }
+    }
+
+    fn gateway_arguments(&self) -> GatewayArguments {
+        GatewayArguments {
+            cell: self.config.cell.clone(),
+            part: if self.config.may_lead() { gateway::Part::Candidate } else { gateway::Part::Follower },
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
             counters: self.counters(),
             subscriber: self.subscriber(),
             seed: self.run.as_u64_pair().1,
-        };
-        let (actor, _) = Actor::spawn_linked(None, Gateway, arguments, supervisor).await.map_err(cause)?;
-        let embedded = *self.broker_address.borrow();
-        let addresses = self.config.mqtt.broker.clone().or(embedded.map(BrokerAddress::from)).into_iter().collect();
-        actor.cast(GatewayMessage::SetBrokers { addresses })?;
-        let id = actor.get_id();
-        self.seats.gateway.take(actor);
-        Ok(id)
+        }
     }
 
     /// Takes what comes in to the part that deals with it.
     fn subscriber(&self) -> Subscriber {
-        let Seats { fuser, follower, keeper, .. } = self.seats.clone();
+        let Seats { fuser, follower, keeper, election, .. } = self.seats.clone();
         Arc::new(move |delivery| {
             match &delivery.message {
                 Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
                 Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
                 Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
-                Incoming::Ledger(_) => keeper.send(ReputationKeeperMessage::Merge { delivery }),
-                Incoming::Status(_) | Incoming::Link { .. } => true,
+                Incoming::Ledger(share) => {
+                    election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
+                    keeper.send(ReputationKeeperMessage::Merge { delivery })
+                }
+                Incoming::Link { broker, state } => {
+                    election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
+                }
+                Incoming::Status(status) => {
+                    election.send(LeaderElectionMessage::TakeStatus { status: Arc::clone(status) })
+                }
             };
         })
     }
 
+    fn follower_arguments(&self) -> FollowerArguments {
+        FollowerArguments {
+            newest: self.newest.clone(),
+            log: self.config.map_log.clone(),
+            least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
+            leadership: self.leadership(),
+            election: self.seats.election.clone(),
+            counters: self.counters(),
+        }
+    }
+
     fn keeper_arguments(&self) -> ReputationKeeperArguments {
-        let directory = self.config.state_dir.as_deref();
         ReputationKeeperArguments {
             name: self.name.clone(),
             cell: self.config.cell.clone(),
             reputation: self.config.fusion.reputation.clone(),
             config: self.config.reputations.clone(),
             book: self.book.clone(),
-            file: directory.map(|path| StateFile::new(path, &self.config.cell, &self.name, "reputations")),
+            file: self.state_file("reputations"),
             newest: self.newest.reputations.subscribe(),
             gateway: self.seats.gateway.clone(),
             fuser: self.seats.fuser.clone(),
@@ -289,26 +319,38 @@ impl Assembly {
         }
     }
 
-    /// Every run of a fuser leads in an epoch of its own, later than all before: the seconds of its start.
-    fn lead(&mut self) {
-        self.last_epoch = (clock::now().micros() / 1_000_000).max(self.last_epoch + 1);
-        let epoch = Epoch::new(self.last_epoch, self.name.clone());
-        self.seats.fuser.send(FuserMessage::Lead { epoch, first_round: 1, on_time: true });
+    fn election_arguments(&self) -> LeaderElectionArguments {
+        let Seats { membership, gateway, fuser, keeper, broker, .. } = self.seats.clone();
+        LeaderElectionArguments {
+            config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+            term_file: self.state_file("term"),
+            round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
+            plane: self.config.data_plane(),
+            status: self.status(),
+            own_broker: self.broker_address(),
+            members: self.members(),
+            parts: Parts { membership, gateway, fuser, keeper, broker },
+            leadership: self.leadership.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    fn state_file(&self, what: &str) -> Option<StateFile> {
+        let directory = self.config.state_dir.as_deref()?;
+        Some(StateFile::new(directory, &self.config.cell, &self.name, what))
     }
 
     /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
     fn status(&self) -> NodeStatus {
-        let aggregates = self.config.role == Role::Edge;
-        let newest = self.newest.map.borrow();
-        let followed = newest.as_ref().map(|received| received.map.aggregator.clone());
+        let leadership = self.leadership.borrow();
         NodeStatus {
             schema: SCHEMA_VERSION,
             node: self.name.clone(),
             id: self.run,
             role: self.config.role,
-            state: if aggregates { NodeCondition::Aggregating } else { NodeCondition::Following },
-            epoch: self.last_epoch.max(newest.as_ref().map_or(0, |received| received.map.epoch)),
-            aggregator: if aggregates { Some(self.name.clone()) } else { followed },
+            state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
+            epoch: leadership.epoch.as_ref().map_or(0, |epoch| epoch.term),
+            aggregator: leadership.leader().cloned(),
             version: env!("CARGO_PKG_VERSION").into(),
         }
     }
@@ -349,27 +391,19 @@ async fn stop<M: Message>(seat: &Seat<M>) {
 
 #[cfg(test)]
 mod tests {
-    use ecod::time::Timestamp;
-    use ecod::wire::GlobalMap;
+    use ecod::epoch::Epoch;
+    use ecod::wire::Role;
 
     use super::*;
+    use crate::leader_election::Position;
 
     #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
         let assembly = Assembly::new(config, watch::Sender::new(None));
         assert_eq!((assembly.status().epoch, assembly.status().aggregator), (0, None));
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::from_static("edge"),
-            epoch: 7,
-            round: 1,
-            fused_at_us: Timestamp(0),
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-        };
-        assembly.newest.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
+        let epoch = Some(Epoch::new(7, NodeName::from_static("edge")));
+        assembly.leadership.send_replace(Leadership { position: Position::Following, epoch, standby: None });
         assert_eq!(
             (assembly.status().epoch, assembly.status().aggregator.as_ref().map(NodeName::as_str)),
             (7, Some("edge"))

@@ -1,5 +1,6 @@
 //! The configuration of the testbed's nodes: one set of parameters for every scene.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::aggregator::{Algorithms, FusionConfig};
@@ -20,6 +21,7 @@ use crate::detect::placard::PlacardConfig;
 use crate::frame_source::SourceConfig;
 use crate::frame_source::capture::CaptureConfig;
 use crate::lens::Lens;
+use crate::membership::{MembershipConfig, MulticastConfig};
 use crate::perception::{Perception, Vantage};
 
 /// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
@@ -118,9 +120,15 @@ fn view(placard: &Placard) -> ViewConfig {
     }
 }
 
-/// What all nodes of the cell share.
+/// What all nodes of the cell share; they gossip on loopback, where no other cell of this machine is met.
 fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
+    let membership = MembershipConfig {
+        bind: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
+        multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+        ..MembershipConfig::default()
+    };
     NodeConfig {
+        membership,
         cell: NodeName::from_static("testbed"),
         landmarks: scene.landmarks(&testbed.placard).iter().map(LandmarkConfig::from).collect(),
         fusion: fusion(testbed),

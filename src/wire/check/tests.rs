@@ -59,7 +59,8 @@ fn verdicts() -> Verdicts {
 
 fn reputations() -> Reputations {
     let reputation = Reputation { score: 0.62, correct: 410, incorrect: 22 };
-    Reputations { schema: SCHEMA_VERSION, epoch: 3, round: 88, reputations: [(edge(), reputation)].into() }
+    let reputations = [(edge(), reputation)].into();
+    Reputations { schema: SCHEMA_VERSION, aggregator: Some(edge()), epoch: 3, round: 88, reputations }
 }
 
 fn status() -> NodeStatus {
@@ -75,8 +76,11 @@ fn status() -> NodeStatus {
     }
 }
 
+/// What spoils a payload, and the reason that is then given.
+type Flaw<T> = (fn(&mut T), RejectReason);
+
 /// Spoils a sound payload in every listed way and sends it; CBOR, because JSON has no word for NaN.
-fn each_flaw_has_its_reason<T: Payload>(sound: impl Fn() -> T, flaws: &[(fn(&mut T), RejectReason)]) {
+fn each_flaw_has_its_reason<T: Payload>(sound: impl Fn() -> T, flaws: &[Flaw<T>]) {
     let received = |payload: &T| decode::<T>(&encode(payload, Encoding::Cbor), &Limits::default()).err();
     assert_eq!(received(&sound()), None);
     for (index, (spoil, expected)) in flaws.iter().enumerate() {

@@ -1,0 +1,190 @@
+//! The actor that takes part in the election and has the node do what comes of it.
+//!
+//! ```text
+//! Membership ── who is there, messages ──┐                    ┌── Lead, StopPublishing ──> Fuser
+//! Gateway ───── links, statuses ─────────┤                    ├── SetBrokers, PublishStatus ──> Gateway
+//! Follower ──── rounds accepted ─────────┼─> LeaderElection ──┼── SendSnapshot ──> ReputationKeeper
+//! Broker ┐                               │         │          ├── Send ──> Membership
+//! Fuser  ┴───── health ──────────────────┘         │          └── term ──> disk
+//!                                                  └──> watch of the leadership
+//! ```
+//!
+//! [`ecod::election::Election`] decides; the actor carries out its effects in their order, a term being on disk before
+//! anything that follows it. What is a state rather than an event (links, status, watch) is not carried out effect by
+//! effect but compared with what the election says now.
+
+mod driver;
+mod health;
+mod leadership;
+mod routes;
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::election::ElectionConfig;
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::wire::NodeStatus;
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
+
+pub use driver::{ElectionDriver, saved_term};
+pub use health::Probe;
+pub use leadership::{Leadership, Position};
+pub use routes::DataPlane;
+
+use crate::broker::BrokerMessage;
+use crate::counters::Counters;
+use crate::fuser::FuserMessage;
+use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
+use crate::membership::{Member, MembershipEvent, MembershipMessage};
+use crate::reputation_keeper::ReputationKeeperMessage;
+use crate::seat::Seat;
+use crate::state_file::StateFile;
+
+/// What the election is told.
+#[derive(Debug)]
+pub enum LeaderElectionMessage {
+    /// The membership found something out, or brought a message.
+    Membership {
+        /// What it was.
+        event: MembershipEvent,
+    },
+    /// One of the gateway's links changed.
+    LinkChanged {
+        /// The broker at its other end.
+        broker: BrokerAddress,
+        /// How it is now.
+        state: LinkState,
+    },
+    /// A broker told how another node is.
+    TakeStatus {
+        /// The other node's word, or its last will.
+        status: Arc<NodeStatus>,
+    },
+    /// A round was published by this node or accepted by its gate.
+    NoteRound {
+        /// The epoch of the round.
+        epoch: Epoch,
+        /// Its number.
+        round: u64,
+    },
+    /// Evidence about vehicles came from another candidate.
+    NoteState {
+        /// The candidate.
+        from: NodeName,
+    },
+    /// The fuser was started anew and has forgotten that it leads.
+    NoteFuserRestart,
+    /// The gateway was started anew and has no links.
+    NoteGatewayRestart,
+    /// The parts answered.
+    NoteProbe {
+        /// What they answered.
+        probe: Probe,
+    },
+    /// Find out how the parts are.
+    CheckHealth,
+    /// See whether the node is ready to be handed the lead.
+    CheckPrepared,
+    /// A deadline of the election has come.
+    Wake,
+}
+
+/// Where the parts that the election commands or asks are reached.
+#[derive(Debug, Clone, Default)]
+pub struct Parts {
+    /// Sends messages to other nodes.
+    pub membership: Seat<MembershipMessage>,
+    /// Keeps the links.
+    pub gateway: Seat<GatewayMessage>,
+    /// Makes maps and verdicts.
+    pub fuser: Seat<FuserMessage>,
+    /// Holds the reputations.
+    pub keeper: Seat<ReputationKeeperMessage>,
+    /// The node's own broker.
+    pub broker: Seat<BrokerMessage>,
+}
+
+/// What an election needs at its start.
+pub struct LeaderElectionArguments {
+    /// Timings, role and priority.
+    pub config: ElectionConfig,
+    /// Where the term is kept, if anywhere.
+    pub term_file: Option<StateFile>,
+    /// Longest time between two rounds.
+    pub round_period: Duration,
+    /// Which brokers carry the data.
+    pub plane: DataPlane,
+    /// What the node says about itself; state, epoch and aggregator follow the election.
+    pub status: NodeStatus,
+    /// Where the node's own broker listens.
+    pub own_broker: watch::Receiver<Option<SocketAddr>>,
+    /// The other nodes.
+    pub members: watch::Receiver<Vec<Member>>,
+    /// The parts it commands.
+    pub parts: Parts,
+    /// Gets the leadership whenever it changes.
+    pub leadership: watch::Sender<Leadership>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// Drives an [`Election`].
+#[derive(Debug, Default)]
+pub struct LeaderElection;
+
+/// How often the parts are looked at.
+const HEALTH_PERIOD: Duration = Duration::from_millis(250);
+
+impl Actor for LeaderElection {
+    type Msg = LeaderElectionMessage;
+    type State = ElectionDriver;
+    type Arguments = LeaderElectionArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        // A run before this one may have left the fuser leading.
+        arguments.parts.fuser.send(FuserMessage::StopPublishing);
+        myself.send_interval(HEALTH_PERIOD, || LeaderElectionMessage::CheckHealth);
+        let mut driver = ElectionDriver::new(arguments, myself);
+        driver.check_health().await?;
+        driver.reflect();
+        Ok(driver)
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        driver: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        match message {
+            LeaderElectionMessage::Membership { event } => driver.take_event(event).await?,
+            LeaderElectionMessage::LinkChanged { broker, state } => driver.take_link(&broker, state).await?,
+            LeaderElectionMessage::TakeStatus { status } => driver.take_status(&status).await?,
+            LeaderElectionMessage::NoteRound { epoch, round } => driver.note_round(epoch, round).await?,
+            LeaderElectionMessage::NoteState { from } => driver.note_state(&from),
+            LeaderElectionMessage::NoteFuserRestart => driver.note_fuser_restart().await?,
+            LeaderElectionMessage::NoteGatewayRestart => driver.note_gateway_restart().await?,
+            LeaderElectionMessage::NoteProbe { probe } => driver.note_probe(probe).await?,
+            LeaderElectionMessage::CheckHealth => driver.check_health().await?,
+            LeaderElectionMessage::CheckPrepared => driver.check_prepared().await?,
+            LeaderElectionMessage::Wake => driver.wake().await?,
+        }
+        driver.reflect();
+        Ok(())
+    }
+
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        driver: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        driver.leave().await
+    }
+}

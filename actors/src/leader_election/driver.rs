@@ -1,0 +1,389 @@
+//! From what happens in a node to the election's inputs, and from its effects to the node's parts.
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::election::{Body, Effect, Election, ElectionMessage, Health, Input};
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{Encoding, NodeState, NodeStatus, Role};
+use ractor::{ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
+use tokio::task::AbortHandle;
+use uuid::Uuid;
+
+use super::health::{self, HealthMonitor, Probe};
+use super::routes::{Brokers, Routes};
+use super::{LeaderElectionArguments, LeaderElectionMessage, Leadership, Parts};
+use crate::clock;
+use crate::counters::Counters;
+use crate::fuser::FuserMessage;
+use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
+use crate::membership::{Member, MembershipEvent, MembershipMessage};
+use crate::reputation_keeper::ReputationKeeperMessage;
+use crate::state_file::StateFile;
+
+/// The election, what it was told last, and what came of it.
+pub struct ElectionDriver {
+    election: Election,
+    name: NodeName,
+    role: Role,
+    term_file: Option<StateFile>,
+    round_period: Duration,
+    members: BTreeMap<NodeName, Member>,
+    all_members: watch::Receiver<Vec<Member>>,
+    own_broker: watch::Receiver<Option<SocketAddr>>,
+    monitor: HealthMonitor,
+    health: Health,
+    routes: Routes,
+    /// The last living run of each node, as brokers tell it.
+    runs: HashMap<NodeName, Uuid>,
+    status: NodeStatus,
+    /// The epoch of the last round, which a node without word from the election says it follows.
+    taken: Option<Epoch>,
+    preparing: Option<Preparing>,
+    parts: Parts,
+    leadership: watch::Sender<Leadership>,
+    counters: Arc<Counters>,
+    alarm: Timestamp,
+    timer: Option<AbortHandle>,
+    drained: bool,
+    myself: ActorRef<LeaderElectionMessage>,
+}
+
+/// A handover to this node under way.
+#[derive(Debug)]
+struct Preparing {
+    leader: NodeName,
+    since: Timestamp,
+    has_state: bool,
+}
+
+/// How long vehicles are given to connect to a broker that is about to be the leader's.
+const CONNECT_TIME: Duration = Duration::from_millis(300);
+
+/// How long the old leader's state is waited for.
+const STATE_PATIENCE: Duration = Duration::from_millis(1000);
+
+/// Time between two looks at what a handover waits for.
+const PREPARE_STEP: Duration = Duration::from_millis(50);
+
+/// A timer later than this was overslept; what waits in the sockets is then dealt with first, for as long as below.
+const OVERSLEPT: Duration = Duration::from_millis(20);
+const DRAIN_TIME: Duration = Duration::from_millis(10);
+
+/// The highest term that an earlier run of the node knew; 0 without any.
+pub fn saved_term(file: Option<&StateFile>) -> u64 {
+    file.and_then(|file| file.load(|_| true)).unwrap_or(0)
+}
+
+impl ElectionDriver {
+    pub(super) fn new(arguments: LeaderElectionArguments, myself: ActorRef<LeaderElectionMessage>) -> Self {
+        let LeaderElectionArguments { config, status, term_file, plane, parts, leadership, counters, .. } = arguments;
+        let (name, role) = (status.node.clone(), config.role);
+        Self {
+            election: Election::new(config, name.clone(), saved_term(term_file.as_ref()), clock::now()),
+            name,
+            role,
+            term_file,
+            round_period: arguments.round_period,
+            members: BTreeMap::new(),
+            all_members: arguments.members,
+            own_broker: arguments.own_broker,
+            monitor: HealthMonitor::default(),
+            health: Health::default(),
+            routes: Routes::new(plane),
+            runs: HashMap::new(),
+            status,
+            taken: None,
+            preparing: None,
+            parts,
+            leadership,
+            counters,
+            alarm: Timestamp(u64::MAX),
+            timer: None,
+            drained: false,
+            myself,
+        }
+    }
+
+    pub(super) async fn take_event(&mut self, event: MembershipEvent) -> Result<(), ActorProcessingErr> {
+        match event {
+            MembershipEvent::Alive { member } => self.meet(member).await,
+            MembershipEvent::Changed { member } => {
+                self.members.insert(member.name.clone(), member);
+                Ok(())
+            }
+            MembershipEvent::Suspected { name } => self.feed(Input::PeerSuspected { peer: name }).await,
+            MembershipEvent::Down { name } => {
+                self.members.remove(&name);
+                self.feed(Input::PeerDown { peer: name }).await
+            }
+            MembershipEvent::Received { from, payload, .. } => match ElectionMessage::decode(&payload) {
+                Ok(message) if message.from == from => self.feed(Input::Receive { message }).await,
+                Ok(message) => {
+                    tracing::debug!(%from, claimed = %message.from, "election message in another's name dropped");
+                    Ok(())
+                }
+                Err(reason) => {
+                    self.counters.reject(reason);
+                    tracing::debug!(%from, %reason, "election message dropped");
+                    Ok(())
+                }
+            },
+            MembershipEvent::NameTaken { name } => {
+                tracing::error!(%name, "two nodes have this name; the election cannot tell them apart");
+                Ok(())
+            }
+        }
+    }
+
+    pub(super) async fn take_link(
+        &mut self,
+        broker: &BrokerAddress,
+        link: LinkState,
+    ) -> Result<(), ActorProcessingErr> {
+        let gone = self.monitor.note_link(broker, link);
+        self.update_health().await?;
+        // A broker that belongs to no node says nothing about any.
+        if gone && self.routes.plane().external.as_ref() != Some(broker) {
+            let at = |member: &&Member| member.broker.map(BrokerAddress::from).as_ref() == Some(broker);
+            for peer in self.members.values().filter(at).map(|member| member.name.clone()).collect::<Vec<_>>() {
+                tracing::info!(%peer, %broker, "process is gone");
+                self.feed(Input::PeerGone { peer }).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Where all use one broker, its word that the leader's connection broke is the quickest news of the leader's end.
+    pub(super) async fn take_status(&mut self, status: &NodeStatus) -> Result<(), ActorProcessingErr> {
+        let peer = status.node.clone();
+        if status.state != NodeState::Offline {
+            self.runs.insert(peer, status.id);
+            return Ok(());
+        }
+        let ended = self.runs.remove(&peer) == Some(status.id);
+        if ended && !self.routes.plane().embedded && self.election.leader() == Some(&peer) {
+            tracing::info!(%peer, "connection of the leader broke");
+            self.feed(Input::PeerGone { peer }).await?;
+        }
+        Ok(())
+    }
+
+    /// Rounds of other epochs than the election's own prove nothing: whoever reaches a broker can publish some.
+    pub(super) async fn note_round(&mut self, epoch: Epoch, round: u64) -> Result<(), ActorProcessingErr> {
+        if self.election.epoch() == Some(&epoch) {
+            self.feed(Input::Round { epoch: epoch.clone(), round }).await?;
+        }
+        self.taken = Some(epoch);
+        Ok(())
+    }
+
+    pub(super) fn note_state(&mut self, from: &NodeName) {
+        if let Some(preparing) = self.preparing.as_mut().filter(|preparing| preparing.leader == *from) {
+            preparing.has_state = true;
+        }
+    }
+
+    /// A fuser that was started anew does not lead: the leadership is over.
+    pub(super) async fn note_fuser_restart(&mut self) -> Result<(), ActorProcessingErr> {
+        if self.election.is_leading() {
+            self.set_health(Health { fuser: false, ..self.health }).await?;
+        }
+        Ok(())
+    }
+
+    pub(super) async fn note_gateway_restart(&mut self) -> Result<(), ActorProcessingErr> {
+        self.routes.forget();
+        self.monitor.forget_links();
+        self.status.epoch = u64::MAX;
+        self.update_health().await
+    }
+
+    pub(super) async fn note_probe(&mut self, probe: Probe) -> Result<(), ActorProcessingErr> {
+        self.monitor.note_probe(probe);
+        self.update_health().await
+    }
+
+    pub(super) async fn check_health(&mut self) -> Result<(), ActorProcessingErr> {
+        if self.role != Role::Cav {
+            self.monitor.look(&self.counters, clock::now());
+            health::probe(&self.parts, self.myself.clone());
+            self.update_health().await?;
+        }
+        // Events from before this actor's start went nowhere.
+        let members = self.all_members.borrow().clone();
+        for member in members {
+            if self.members.get(&member.name).is_none_or(|known| known.run != member.run) {
+                self.meet(member).await?;
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) async fn check_prepared(&mut self) -> Result<(), ActorProcessingErr> {
+        let Some(preparing) = &self.preparing else { return Ok(()) };
+        let waited = clock::now().since(preparing.since);
+        let complete = waited >= CONNECT_TIME && (preparing.has_state || waited >= STATE_PATIENCE);
+        if complete && self.health.is_fit() {
+            self.preparing = None;
+            return self.feed(Input::Prepared).await;
+        }
+        self.myself.send_after(PREPARE_STEP, || LeaderElectionMessage::CheckPrepared);
+        Ok(())
+    }
+
+    pub(super) async fn wake(&mut self) -> Result<(), ActorProcessingErr> {
+        let now = clock::now();
+        if now.since(self.alarm) > OVERSLEPT && !self.drained {
+            self.drained = true;
+            self.timer = None;
+            self.set_timer(DRAIN_TIME);
+            return Ok(());
+        }
+        self.drained = false;
+        self.alarm = Timestamp(u64::MAX);
+        let effects = self.election.tick(now);
+        self.carry_out(effects).await
+    }
+
+    /// Gives up the lead, if this node has it, so that the next one need not find out.
+    pub(super) async fn leave(&mut self) -> Result<(), ActorProcessingErr> {
+        self.feed(Input::Leave).await
+    }
+
+    /// Makes links, status, watch and timer what the election says now.
+    pub(super) fn reflect(&mut self) {
+        let leadership = Leadership::of(&self.election, &self.name);
+        if *self.leadership.borrow() != leadership {
+            let Leadership { position, epoch, standby } = &leadership;
+            tracing::info!(?position, epoch = ?epoch.as_ref().map(ToString::to_string), ?standby, "leadership");
+            self.leadership.send_replace(leadership.clone());
+        }
+        self.reflect_links(&leadership);
+        self.reflect_status(&leadership);
+        let due = self.election.next_deadline();
+        if due != self.alarm && !self.drained {
+            self.alarm = due;
+            self.set_timer(due.since(clock::now()));
+        }
+    }
+
+    fn reflect_links(&mut self, leadership: &Leadership) {
+        let broker = |name: Option<&NodeName>| match name {
+            Some(name) if *name == self.name => self.own_broker.borrow().map(BrokerAddress::from),
+            Some(name) => self.members.get(name)?.broker.map(BrokerAddress::from),
+            None => None,
+        };
+        let own = broker(Some(&self.name));
+        let brokers = match leadership.leader() {
+            Some(leader) => Brokers { own, leader: broker(Some(leader)), standby: broker(leadership.standby.as_ref()) },
+            None => Brokers { own, ..self.routes.brokers().clone() },
+        };
+        if let Some(addresses) = self.routes.update(brokers, clock::now()) {
+            let own = self.routes.brokers().own.iter().chain(&self.routes.plane().external).cloned().collect();
+            self.parts.gateway.send(GatewayMessage::SetReportBrokers { addresses: own });
+            self.parts.gateway.send(GatewayMessage::SetBrokers { addresses });
+        }
+    }
+
+    fn reflect_status(&mut self, leadership: &Leadership) {
+        let epoch = leadership.leader().and(leadership.epoch.as_ref()).or(self.taken.as_ref());
+        let state = if leadership.is_leading() { NodeState::Aggregating } else { NodeState::Following };
+        let status = NodeStatus {
+            state,
+            epoch: epoch.map_or(0, |epoch| epoch.term),
+            aggregator: epoch.map(|epoch| epoch.leader.clone()),
+            ..self.status.clone()
+        };
+        if status != self.status {
+            self.status = status.clone();
+            self.parts.gateway.send(GatewayMessage::PublishStatus { status });
+        }
+    }
+
+    async fn meet(&mut self, member: Member) -> Result<(), ActorProcessingErr> {
+        let peer = member.name.clone();
+        self.members.insert(peer.clone(), member);
+        self.feed(Input::PeerAlive { peer }).await
+    }
+
+    async fn update_health(&mut self) -> Result<(), ActorProcessingErr> {
+        let (plane, brokers) = (self.routes.plane(), self.routes.brokers());
+        let health = self.monitor.health(plane, brokers, self.round_period, clock::now());
+        self.set_health(health).await
+    }
+
+    async fn set_health(&mut self, health: Health) -> Result<(), ActorProcessingErr> {
+        if self.role == Role::Cav || health == self.health {
+            return Ok(());
+        }
+        let Health { broker, fuser, gateway, .. } = health;
+        match (self.health.is_fit(), health.is_fit()) {
+            (false, true) => tracing::info!("fit to lead"),
+            (true, false) => tracing::warn!(broker, fuser, gateway, "not fit to lead"),
+            _ => {}
+        }
+        self.health = health;
+        self.feed(Input::Health { health }).await
+    }
+
+    async fn feed(&mut self, input: Input) -> Result<(), ActorProcessingErr> {
+        let effects = self.election.handle(input, clock::now());
+        self.carry_out(effects).await
+    }
+
+    async fn carry_out(&mut self, effects: Vec<Effect>) -> Result<(), ActorProcessingErr> {
+        for effect in effects {
+            match effect {
+                Effect::PersistTerm { term } => {
+                    if let Some(file) = self.term_file.clone() {
+                        let path = file.path().display().to_string();
+                        let saved = tokio::task::spawn_blocking(move || file.save(&term)).await?;
+                        saved.map_err(|error| format!("cannot write term to {path}: {error}"))?;
+                    }
+                }
+                Effect::Send { to, message } => {
+                    // The next round is the other's unless it stays away for a whole period.
+                    if matches!(message.body, Body::Yield { .. }) {
+                        self.parts.fuser.send(FuserMessage::HoldRound);
+                    }
+                    let payload = message.encode(Encoding::Cbor).into();
+                    self.parts.membership.send(MembershipMessage::Send { to, payload });
+                }
+                Effect::Lead { epoch, first_round, on_time } => {
+                    tracing::info!(%epoch, first_round, on_time, "leading");
+                    self.preparing = None;
+                    self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, on_time });
+                }
+                Effect::StopPublishing { epoch } => {
+                    tracing::info!(%epoch, "no longer leading");
+                    self.parts.fuser.send(FuserMessage::StopPublishing);
+                }
+                Effect::Prepare { leader } => {
+                    tracing::info!(%leader, "preparing to take over");
+                    let has_state = self.parts.keeper.holder().is_none();
+                    self.preparing = Some(Preparing { leader, since: clock::now(), has_state });
+                    self.myself.send_after(CONNECT_TIME, || LeaderElectionMessage::CheckPrepared);
+                }
+                Effect::SendState { to } => {
+                    self.parts.keeper.send(ReputationKeeperMessage::SendSnapshot { to });
+                }
+                // States, compared as a whole in `reflect`.
+                Effect::Follow { .. } | Effect::Seek | Effect::AnnounceStandby { .. } => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn set_timer(&mut self, after: Duration) {
+        let timer = self.myself.send_after(after, || LeaderElectionMessage::Wake);
+        if let Some(superseded) = self.timer.replace(timer.abort_handle()) {
+            superseded.abort();
+        }
+    }
+}

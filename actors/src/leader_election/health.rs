@@ -1,0 +1,190 @@
+//! Whether a node's parts are fit to lead.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use ecod::election::Health;
+use ecod::time::Timestamp;
+use ractor::{ActorRef, ActorStatus, Message, RpcReplyPort};
+
+use super::routes::{Brokers, DataPlane};
+use super::{LeaderElectionMessage, Parts};
+use crate::broker::{BrokerHealth, BrokerMessage};
+use crate::counters::{Counters, Event};
+use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
+use crate::seat::Seat;
+
+/// What was last heard of the parts.
+#[derive(Debug, Default)]
+pub(super) struct HealthMonitor {
+    links: BTreeMap<BrokerAddress, LinkState>,
+    probe: Probe,
+    rounds: u64,
+    round_closed_at: Timestamp,
+    load_percent: u8,
+}
+
+/// What the parts answered when asked.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Probe {
+    broker_serves: bool,
+    gateway_answers: bool,
+    fuser_runs: bool,
+}
+
+/// How long a part may take to answer.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// How long a fuser may close no round, a few periods aside.
+const ROUND_PATIENCE: Duration = Duration::from_secs(2);
+
+impl HealthMonitor {
+    /// Notes a link; true when an established one has broken and nothing listens there any more.
+    pub(super) fn note_link(&mut self, broker: &BrokerAddress, state: LinkState) -> bool {
+        match state {
+            // Whether nothing listens there is not known yet.
+            LinkState::Down if self.links.contains_key(broker) => {
+                self.links.insert(broker.clone(), LinkState::Down);
+                false
+            }
+            LinkState::Up => {
+                self.links.insert(broker.clone(), LinkState::Up);
+                false
+            }
+            LinkState::Down => false,
+            LinkState::Refused => self.links.remove(broker).is_some(),
+        }
+    }
+
+    /// Forgets all links: the gateway makes them anew.
+    pub(super) fn forget_links(&mut self) {
+        self.links.clear();
+    }
+
+    pub(super) fn note_probe(&mut self, probe: Probe) {
+        self.probe = probe;
+    }
+
+    /// Looks at what can be seen without asking.
+    pub(super) fn look(&mut self, counters: &Counters, now: Timestamp) {
+        let rounds = counters.events(Event::RoundDue);
+        if rounds != self.rounds {
+            self.rounds = rounds;
+            self.round_closed_at = now;
+        }
+        self.load_percent = load_percent().unwrap_or(0);
+    }
+
+    /// The parts as the election wants to know them. A node that uses an external broker, its own, or both, needs one of
+    /// them.
+    pub(super) fn health(&self, plane: &DataPlane, brokers: &Brokers, period: Duration, now: Timestamp) -> Health {
+        let up = |broker: Option<&BrokerAddress>| broker.is_some_and(|b| self.links.get(b) == Some(&LinkState::Up));
+        let external = up(plane.external.as_ref());
+        let embedded = plane.embedded && self.probe.broker_serves;
+        let patience = ROUND_PATIENCE + 3 * period;
+        Health {
+            broker: external || embedded,
+            fuser: self.probe.fuser_runs && now.since(self.round_closed_at) < patience,
+            gateway: self.probe.gateway_answers && (external || (embedded && up(brokers.own.as_ref()))),
+            load_percent: self.load_percent,
+        }
+    }
+}
+
+/// Asks the parts how they are, without waiting, and tells the election.
+pub(super) fn probe(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
+    let (broker, gateway) = (parts.broker.clone(), parts.gateway.clone());
+    let fuser_runs = parts.fuser.holder().is_some_and(|fuser| fuser.get_status() == ActorStatus::Running);
+    tokio::spawn(async move {
+        let (health, links) = tokio::join!(
+            ask(&broker, |reply| BrokerMessage::Health { reply }),
+            ask(&gateway, |reply| GatewayMessage::Links { reply }),
+        );
+        let broker_serves = matches!(health, Some(BrokerHealth::Serving(_)));
+        let probe = Probe { broker_serves, gateway_answers: links.is_some(), fuser_runs };
+        if election.cast(LeaderElectionMessage::NoteProbe { probe }).is_err() {
+            tracing::debug!("the election ended before its parts answered");
+        }
+    });
+}
+
+async fn ask<M: Message, T: Send + 'static>(seat: &Seat<M>, question: impl FnOnce(RpcReplyPort<T>) -> M) -> Option<T> {
+    let holder = seat.holder()?;
+    let answer = holder.call(question, Some(PATIENCE)).await.ok()?;
+    match answer {
+        ractor::rpc::CallResult::Success(value) => Some(value),
+        ractor::rpc::CallResult::Timeout | ractor::rpc::CallResult::SenderError => None,
+    }
+}
+
+/// The load of the last minute on all processors, 0 to 100 %; nothing where the system does not tell.
+fn load_percent() -> Option<u8> {
+    let text = std::fs::read_to_string("/proc/loadavg").ok()?;
+    let load: f64 = text.split_whitespace().next()?.parse().ok()?;
+    let processors = std::thread::available_parallelism().ok()?.get() as f64;
+    Some((load / processors * 100.0).clamp(0.0, 100.0) as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERIOD: Duration = Duration::from_millis(100);
+
+    fn address(port: u16) -> BrokerAddress {
+        format!("127.0.0.1:{port}").parse().unwrap()
+    }
+
+    fn monitor(counters: &Counters, now: Timestamp) -> HealthMonitor {
+        let mut monitor = HealthMonitor::default();
+        monitor.note_probe(Probe { broker_serves: true, gateway_answers: true, fuser_runs: true });
+        counters.count(Event::RoundDue);
+        monitor.look(counters, now);
+        monitor
+    }
+
+    #[test]
+    fn only_an_established_link_that_broke_proves_its_process_gone() {
+        let mut monitor = HealthMonitor::default();
+        let broker = address(1);
+        assert!(!monitor.note_link(&broker, LinkState::Refused), "never reached");
+        assert!(!monitor.note_link(&broker, LinkState::Up));
+        assert!(!monitor.note_link(&broker, LinkState::Down));
+        assert!(monitor.note_link(&broker, LinkState::Refused));
+        assert!(!monitor.note_link(&broker, LinkState::Refused), "told once");
+    }
+
+    #[test]
+    fn a_node_is_fit_while_broker_link_and_rounds_work() {
+        let now = Timestamp(60_000_000);
+        let counters = Counters::default();
+        let mut monitor = monitor(&counters, now);
+        let plane = DataPlane { external: None, embedded: true };
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        assert!(!monitor.health(&plane, &brokers, PERIOD, now).is_fit(), "no link to its own broker yet");
+        monitor.note_link(&address(1), LinkState::Up);
+        assert!(monitor.health(&plane, &brokers, PERIOD, now).is_fit());
+        let later = now + Duration::from_secs(3);
+        monitor.look(&counters, later);
+        assert!(!monitor.health(&plane, &brokers, PERIOD, later).fuser, "no rounds");
+        monitor.note_link(&address(1), LinkState::Down);
+        assert!(!monitor.health(&plane, &brokers, PERIOD, now).gateway);
+    }
+
+    #[test]
+    fn with_an_external_broker_its_link_counts_and_with_both_either() {
+        let now = Timestamp(60_000_000);
+        let counters = Counters::default();
+        let mut monitor = monitor(&counters, now);
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        monitor.note_link(&address(1), LinkState::Up);
+        let fit = |monitor: &HealthMonitor, embedded| {
+            let plane = DataPlane { external: Some(address(9)), embedded };
+            monitor.health(&plane, &brokers, PERIOD, now).is_fit()
+        };
+        assert!(!fit(&monitor, false));
+        assert!(fit(&monitor, true), "falls back to its own");
+        monitor.note_link(&address(9), LinkState::Up);
+        assert!(fit(&monitor, false));
+    }
+}

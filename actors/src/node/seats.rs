@@ -1,0 +1,62 @@
+//! The parts of a node and where each is reached.
+
+use crate::broker::BrokerMessage;
+use crate::follower::FollowerMessage;
+use crate::fuser::FuserMessage;
+use crate::gateway::GatewayMessage;
+use crate::leader_election::LeaderElectionMessage;
+use crate::membership::MembershipMessage;
+use crate::reputation_keeper::ReputationKeeperMessage;
+use crate::seat::Seat;
+#[cfg(feature = "camera")]
+use crate::{detector::DetectorMessage, projector::ProjectorMessage};
+
+/// A part of a node, in the order of starting.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Part {
+    /// The embedded broker.
+    Broker,
+    /// The gossip with the other nodes.
+    Membership,
+    /// The MQTT connections.
+    Gateway,
+    /// The taker of maps.
+    Follower,
+    /// The holder of reputations.
+    ReputationKeeper,
+    /// The maker of maps.
+    Fuser,
+    /// The node's part in the election.
+    LeaderElection,
+    /// The maker of reports.
+    #[cfg(feature = "camera")]
+    Projector,
+    /// The finder of objects in frames.
+    #[cfg(feature = "camera")]
+    Detector,
+}
+
+/// Where the parts of a node are reached.
+#[derive(Debug, Clone, Default)]
+pub struct Seats {
+    /// The embedded broker's.
+    pub broker: Seat<BrokerMessage>,
+    /// The membership's.
+    pub membership: Seat<MembershipMessage>,
+    /// The gateway's.
+    pub gateway: Seat<GatewayMessage>,
+    /// The follower's.
+    pub follower: Seat<FollowerMessage>,
+    /// The reputation keeper's.
+    pub keeper: Seat<ReputationKeeperMessage>,
+    /// The fuser's.
+    pub fuser: Seat<FuserMessage>,
+    /// The election's.
+    pub election: Seat<LeaderElectionMessage>,
+    /// The projector's.
+    #[cfg(feature = "camera")]
+    pub projector: Seat<ProjectorMessage>,
+    /// The detector's.
+    #[cfg(feature = "camera")]
+    pub detector: Seat<DetectorMessage>,
+}

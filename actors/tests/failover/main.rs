@@ -1,0 +1,124 @@
+//! Cells that lose and regain their leader, over real sockets on loopback.
+//!
+//! Bounds in here are generous, for a machine that does much else; how long a gap usually is, is printed.
+
+mod cell;
+mod processes;
+mod record;
+
+use std::time::Duration;
+
+use ecod::wire::Role;
+use ecod_actors::leader_election::Position;
+
+use cell::Cell;
+
+/// A cell of an edge and three vehicles finds together by one seed, goes on without the edge, and gives it the lead back.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn maps_go_on_without_the_edge_and_with_it_again() {
+    let mut cell = Cell::default();
+    for (name, role) in [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Auto), ("noether", Role::Auto)] {
+        cell.start(name, role).await;
+    }
+    cell.served_by("edge").await;
+    cell.standby_is_named().await;
+    cell.kill("edge");
+    let substitute = cell.served_by_another_than("edge").await;
+    assert_ne!(substitute, "edge");
+    for name in ["euclid", "gauss", "noether"] {
+        let record = cell.record(name);
+        record.never_goes_back();
+        eprintln!("{name}: longest gap when the edge was killed {:?}", record.longest_gap());
+        assert!(record.longest_gap() < Duration::from_secs(5));
+    }
+
+    let before = cell.record("euclid").last_round();
+    cell.start("edge", Role::Edge).await;
+    cell.served_by("edge").await;
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    for name in ["euclid", "gauss", "noether"] {
+        let record = cell.record(name);
+        record.never_goes_back();
+        record.misses_and_repeats_none_after(before);
+    }
+    cell.stop().await;
+}
+
+/// Those that are left find a leader when the leader and the one named to follow it end together.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_cell_outlives_its_leader_and_standby() {
+    let mut cell = Cell::default();
+    for name in ["euclid", "gauss", "noether", "turing"] {
+        cell.start(name, Role::Auto).await;
+    }
+    cell.served_by("euclid").await;
+    let standby = cell.standby_is_named().await;
+    cell.kill("euclid");
+    cell.kill(&standby);
+    cell.served_by_another_than("euclid").await;
+    for name in cell.names() {
+        let record = cell.record(&name);
+        record.never_goes_back();
+        eprintln!("{name}: longest gap when leader and standby were killed {:?}", record.longest_gap());
+    }
+    cell.stop().await;
+}
+
+/// A vehicle that finds nobody serves itself, and remembers its term when it starts again.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_lone_vehicle_serves_itself_in_ever_later_epochs() {
+    let mut cell = Cell::default();
+    cell.start("euclid", Role::Auto).await;
+    cell.served_by("euclid").await;
+    let first = cell.leadership("euclid").epoch.unwrap();
+    cell.kill("euclid");
+    cell.start("euclid", Role::Auto).await;
+    cell.served_by("euclid").await;
+    let second = cell.leadership("euclid").epoch.unwrap();
+    assert!(second.term > first.term, "{second} after {first}");
+    cell.record("euclid").never_goes_back();
+    cell.stop().await;
+}
+
+/// A leader that loses its broker stops leading at once; it is handed the lead again when it is whole.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
+    let mut cell = Cell::default();
+    for name in ["euclid", "gauss"] {
+        cell.start(name, Role::Auto).await;
+    }
+    cell.served_by("euclid").await;
+    cell.standby_is_named().await;
+    let seats = cell.node("euclid").seats().clone();
+    let kills: [(&str, &dyn Fn()); 2] =
+        [("broker", &|| seats.broker.holder().unwrap().kill()), ("fuser", &|| seats.fuser.holder().unwrap().kill())];
+    for (part, kill) in kills {
+        kill();
+        eprintln!("killed the leader's {part}");
+        cell.served_by("gauss").await;
+        cell.served_by("euclid").await;
+        cell.standby_is_named().await;
+    }
+    for name in ["euclid", "gauss"] {
+        cell.record(name).never_goes_back();
+    }
+    cell.stop().await;
+}
+
+/// A vehicle of role `cav` follows whoever leads and never leads itself.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_cav_follows_the_election_and_takes_no_part_in_leading() {
+    let mut cell = Cell::default();
+    for (name, role) in [("euclid", Role::Auto), ("gauss", Role::Cav), ("noether", Role::Auto)] {
+        cell.start(name, role).await;
+    }
+    cell.served_by("euclid").await;
+    assert_eq!(cell.standby_is_named().await, "noether");
+    cell.kill("euclid");
+    cell.served_by("noether").await;
+    cell.kill("noether");
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    assert_ne!(cell.leadership("gauss").position, Position::Leading);
+    cell.record("gauss").never_goes_back();
+    cell.stop().await;
+}

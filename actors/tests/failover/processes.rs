@@ -1,0 +1,82 @@
+//! The same with processes of their own.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use ecod::wire::Role;
+
+use crate::cell::{PATIENCE, config, free_address};
+use crate::record::Record;
+
+/// A node as a process; killed when dropped.
+struct Process(Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+fn start(name: &str, role: Role, seed: std::net::SocketAddr, directory: &Path) -> Process {
+    let bind = (role == Role::Edge).then_some(seed);
+    let file = directory.join(format!("{name}.toml"));
+    std::fs::write(&file, toml::to_string(&config(name, role, bind, seed, directory)).unwrap()).unwrap();
+    let log = File::options().create(true).append(true).open(directory.join(format!("{name}.log"))).unwrap();
+    let child = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
+        .arg("--config")
+        .arg(&file)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    Process(child)
+}
+
+/// SIGKILL for the edge's process: its vehicles go on at once, and hand back when it has started again.
+#[test]
+fn vehicles_go_on_when_the_process_of_the_edge_is_killed() {
+    let directory = tempfile::tempdir().unwrap();
+    let seed = free_address();
+    let vehicles = ["euclid", "gauss"];
+    let record = |name: &str| Record::read(&directory.path().join(format!("{name}.maps")));
+    let until = |what: &str, holds: &dyn Fn(&Record) -> bool| {
+        let deadline = Instant::now() + PATIENCE;
+        while !vehicles.iter().all(|name| holds(&record(name))) {
+            if Instant::now() > deadline {
+                for name in ["edge", "euclid", "gauss"] {
+                    let log = std::fs::read_to_string(directory.path().join(format!("{name}.log")));
+                    eprintln!("{name}:\n{}", log.unwrap_or_default());
+                }
+                panic!("not within {PATIENCE:?}: {what}");
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+
+    let edge = start("edge", Role::Edge, seed, directory.path());
+    let _vehicles = vehicles.map(|name| start(name, Role::Auto, seed, directory.path()));
+    until("the edge serves all", &|record| !record.is_empty() && record.source() == Some("edge"));
+    // Time to be told who stands by, and to connect to it.
+    std::thread::sleep(Duration::from_secs(2));
+    drop(edge);
+    until("a vehicle serves all", &|record| record.source() != Some("edge"));
+    for name in vehicles {
+        let record = record(name);
+        record.never_goes_back();
+        eprintln!("{name}: longest gap when the process was killed {:?}", record.longest_gap());
+        assert!(record.longest_gap() < Duration::from_secs(5));
+    }
+
+    let before = record("gauss").last_round();
+    let _edge = start("edge", Role::Edge, seed, directory.path());
+    until("the edge leads again", &|record| record.source() == Some("edge"));
+    std::thread::sleep(Duration::from_millis(500));
+    for name in vehicles {
+        record(name).never_goes_back();
+        record(name).misses_and_repeats_none_after(before);
+    }
+}

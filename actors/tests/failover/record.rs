@@ -1,0 +1,65 @@
+//! What a node took, as its map log tells.
+
+use std::path::Path;
+use std::time::Duration;
+
+use ecod::epoch::Epoch;
+use ecod_actors::follower::ReceivedMap;
+
+/// The maps that a node took, in their order.
+pub(crate) struct Record {
+    maps: Vec<ReceivedMap>,
+}
+
+impl Record {
+    pub(crate) fn read(path: &Path) -> Self {
+        let text = std::fs::read_to_string(path).unwrap_or_default();
+        // The last line of a killed process may be cut short.
+        let maps = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        Self { maps }
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.maps.is_empty()
+    }
+
+    /// Whose map was taken last.
+    pub(crate) fn source(&self) -> Option<&str> {
+        self.maps.last().map(|received| received.map.aggregator.as_str())
+    }
+
+    pub(crate) fn last_round(&self) -> u64 {
+        self.maps.last().map_or(0, |received| received.map.round)
+    }
+
+    pub(crate) fn longest_gap(&self) -> Duration {
+        let gap = |pair: &[ReceivedMap]| pair[1].received_at.since(pair[0].received_at);
+        self.maps.windows(2).map(gap).max().unwrap_or_default()
+    }
+
+    /// Neither does an epoch, nor within one a round.
+    #[track_caller]
+    pub(crate) fn never_goes_back(&self) {
+        let place = |received: &ReceivedMap| {
+            (Epoch::new(received.map.epoch, received.map.aggregator.clone()), received.map.round)
+        };
+        for pair in self.maps.windows(2) {
+            assert!(place(&pair[1]) > place(&pair[0]), "{:?} after {:?}", place(&pair[1]), place(&pair[0]));
+        }
+    }
+
+    /// From the round on every one was taken, and once, whoever published it.
+    #[track_caller]
+    pub(crate) fn misses_and_repeats_none_after(&self, round: u64) {
+        let rounds: Vec<_> = self
+            .maps
+            .iter()
+            .map(|received| (received.map.round, received.map.aggregator.to_string()))
+            .skip_while(|(taken, _)| *taken < round)
+            .collect();
+        assert!(rounds.len() > 5, "only {rounds:?}");
+        for pair in rounds.windows(2) {
+            assert_eq!(pair[1].0, pair[0].0 + 1, "{:?} after {:?}", pair[1], pair[0]);
+        }
+    }
+}
