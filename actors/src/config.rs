@@ -227,7 +227,7 @@ mod tests {
     #[test]
     fn flags_override_the_file_and_the_file_the_defaults() {
         let config = load("name = \"from-file\"\nrole = \"edge\"\ncell = \"lot-9\"").unwrap();
-        assert_eq!(config.name.unwrap().as_str(), "from-flag");
+        assert_eq!(config.name.as_ref().unwrap().as_str(), "from-flag");
         assert_eq!(config.cell.as_str(), "lot-9");
         assert_eq!(config.broker_listen().to_string(), "127.0.0.1:1883");
         let keyed = load("[membership]\nkey = \"a key for the lot\"").unwrap();

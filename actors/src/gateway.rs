@@ -274,8 +274,8 @@ impl GatewayState {
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
         let reports = self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
-        let part = if reports { self.part } else { Part::Follower };
-        part.levels().iter().map(|level| self.topics.filter(level)).collect()
+        let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
+        self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
 
     fn set_status(&mut self, status: NodeStatus) {
@@ -325,6 +325,9 @@ impl GatewayState {
         }
     }
 }
+
+/// Where vehicles report.
+const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
 
 impl Part {
     fn levels(self) -> &'static [&'static str] {
