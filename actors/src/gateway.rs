@@ -281,8 +281,8 @@ impl GatewayState {
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
         let reports = self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
-        let part = if reports { self.part } else { Part::Follower };
-        part.levels().iter().map(|level| self.topics.filter(level)).collect()
+        let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
+        self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
 
     fn set_status(&mut self, status: NodeStatus) {
@@ -377,8 +377,11 @@ fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
     encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
 }
 
+/// Where vehicles report.
+const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
+
 impl Part {
-    /// What a follower takes comes first for both, so that a level's place tells which it is.
+    /// Reports come last: wherever they are left out, a level keeps its place, by which a broker names it.
     fn levels(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
@@ -387,9 +390,9 @@ impl Part {
                 "global_verdicts",
                 "reputations",
                 "nodes/+",
+                "ledger/+",
                 "detections/+",
                 "vote_detections/+",
-                "ledger/+",
             ],
         }
     }

@@ -51,6 +51,7 @@ pub struct ElectionDriver {
     alarm: Timestamp,
     timer: Option<AbortHandle>,
     drained: bool,
+    disk_failed: bool,
     myself: ActorRef<LeaderElectionMessage>,
 }
 
@@ -70,6 +71,9 @@ const STATE_PATIENCE: Duration = Duration::from_millis(1000);
 
 /// Time between two looks at what a handover waits for.
 const PREPARE_STEP: Duration = Duration::from_millis(50);
+
+/// How long a disk may take before the node goes on without it.
+const DISK_PATIENCE: Duration = Duration::from_secs(1);
 
 /// A timer later than this was overslept; what waits in the sockets is then dealt with first, for as long as below.
 const OVERSLEPT: Duration = Duration::from_millis(20);
@@ -106,6 +110,7 @@ impl ElectionDriver {
             alarm: Timestamp(u64::MAX),
             timer: None,
             drained: false,
+            disk_failed: false,
             myself,
         }
     }
@@ -342,9 +347,7 @@ impl ElectionDriver {
             match effect {
                 Effect::PersistTerm { term } => {
                     if let Some(file) = self.term_file.clone() {
-                        let path = file.path().display().to_string();
-                        let saved = tokio::task::spawn_blocking(move || file.save(&term)).await?;
-                        saved.map_err(|error| format!("cannot write term to {path}: {error}"))?;
+                        self.save(file, term).await;
                     }
                 }
                 Effect::Send { to, message } => {
@@ -378,6 +381,23 @@ impl ElectionDriver {
             }
         }
         Ok(())
+    }
+
+    /// Waits until the term is on disk; a disk that fails or hangs is logged, and the node goes on as one without disk.
+    async fn save(&mut self, file: StateFile, term: u64) {
+        let path = file.path().to_owned();
+        let writing = tokio::task::spawn_blocking(move || file.save(&term));
+        let written = match tokio::time::timeout(DISK_PATIENCE, writing).await {
+            Ok(written) => written.map_err(std::io::Error::other).flatten(),
+            Err(elapsed) => Err(elapsed.into()),
+        };
+        match written {
+            Ok(()) => self.disk_failed = false,
+            Err(error) if !std::mem::replace(&mut self.disk_failed, true) => {
+                tracing::warn!(path = %path.display(), %error, "term not saved");
+            }
+            Err(_) => {}
+        }
     }
 
     fn set_timer(&mut self, after: Duration) {
