@@ -3,8 +3,11 @@
 PACKAGES := build-essential ca-certificates clang cmake gstreamer1.0-plugins-base libopencv-dev mosquitto pkg-config
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 SECONDS_PER_SCENE ?= 15
+BUILD := $(or $(CARGO_TARGET_DIR),target)
+SETS ?= examples/crowd_labels
+PASSES ?= 50
 
-.PHONY: help setup demo testbed test lint doc audit bench core-only edge-only clean
+.PHONY: help setup demo testbed eval-labels liars test lint doc audit bench core-only replay-check edge-only clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -21,9 +24,16 @@ demo: setup ## run a whole cell as separate processes on this machine and print 
 	cargo build --release --locked --bin ecod-node
 	target/release/ecod-node demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
 
-testbed: setup ## accuracy on the recorded parking lots, rendered and detected
+testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
 	cargo build --release --locked --bin ecod-node
 	for setup in 1 2; do target/release/ecod-node testbed --scenes examples/testbed/pace_setup$$setup.json --out target/testbed-setup$$setup.json; done
+	target/release/ecod-node testbed --scenes examples/testbed/vote_recording.json --out target/testbed-vote.json
+
+# SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
+eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/algorithms.md
+	cargo build --release --locked --bin ecod-node
+	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
+	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
 
 test: setup ## all tests
 	cargo test --locked --workspace
@@ -39,14 +49,21 @@ doc: setup ## API documentation in target/doc
 audit: ## licences, sources and duplicate policies of all dependencies; known vulnerabilities where the database is reachable
 	packaging/audit
 
-core-only: ## prove that the core needs no runtime: its dependency tree has no tokio, socket or OpenCV crate
+core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
 	packaging/check-core
+
+replay-check: setup ## prove that replays are byte-equal from run to run and from debug to release
+	packaging/check-replay
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features
 
 bench: setup ## speed of the core, the detectors and the path through the broker, in target/bench.json
 	packaging/bench
+
+liars: setup ## what lying vehicles achieve against VOTE: table in target/liars.md, drawing in target/liars.svg
+	mkdir -p target
+	cargo run --release --locked --example liars -- --table target/liars.md --svg target/liars.svg
 
 clean: ## remove everything that was built
 	cargo clean

@@ -29,6 +29,15 @@ impl Figures {
         self.insert(name, serde_json::json!({ "figure": figure, "goal": goal, "met": met }));
     }
 
+    /// Takes how far the costs of small and large loads are from the middle between the least and the most: within
+    /// half of it is the goal.
+    #[allow(dead_code, reason = "not every benchmark has loads of different sizes")]
+    pub(crate) fn flat(&mut self, name: &str, costs: &[f64]) {
+        let least = costs.iter().copied().fold(f64::INFINITY, f64::min);
+        let most = costs.iter().copied().fold(0.0, f64::max);
+        self.goal(&format!("{name}_from_the_middle"), 100.0 * (most - least) / (most + least), 50.0, " %");
+    }
+
     /// Replaces the section in the file and keeps the others.
     ///
     /// # Panics

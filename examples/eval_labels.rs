@@ -1,28 +1,31 @@
-//! Accuracy of VOTE on label sets: one landmark per item, one vehicle per annotator, no geometry.
+//! Accuracy of VOTE on label sets, measured on the program: one landmark per item, one vehicle per annotator, no geometry.
 //!
-//! `cargo run --release --example eval_labels -- [--data DIR] [--config FILE] [--passes N] [--seed S] [--keep FRACTION]
-//! [--stream SET] [--write-table FILE]`
+//! `make eval-labels`, or `cargo run --example eval_labels -- --program target/release/ecod-node [--sets DIR]
+//! [--config FILE] [--passes N] [--seed S] [--keep FRACTION] [--work DIR] [--write-table FILE]`
 //!
-//! The stream comes as from a drive: items one after the other in random order, all annotators of an item in random
-//! order within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests
-//! on; `--stream` prints one set's stream as lines for `ecod-node replay`.
+//! DIR holds a folder for each set, or is one: `label.csv` with the columns `item,worker,label` and, if there are any,
+//! `confidence` (0 to 1, otherwise 1), and `truth.csv` with `item,truth`. Each set is written as a recording, run
+//! by `ecod-node replay` in one pass, with passes, and in `paper` mode, and judged by `ecod-node eval`. All files stay
+//! in the work folder.
+//!
+//! The recording is as from a drive: items one after the other in random order, all annotators of an item in random order
+//! within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests on.
 
 use std::collections::{BTreeMap, HashMap};
-use std::error::Error;
 use std::fmt::Write as _;
-use std::fs;
+use std::fs::{self, File};
+use std::io::{BufWriter, Write as _};
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 
-use ecod::names::{LandmarkId, NodeName};
-use ecod::time::Timestamp;
-use ecod::vote::{Vote, VoteConfig, VoteMode};
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION, Verdict};
-use rand::RngExt;
-use rand::SeedableRng;
+use anyhow::{Context, bail};
+use ecod::names::{MAX_NAME_BYTES, NodeName};
 use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use serde_json::{Value, json};
 
-/// Name, majority and best published or recomputed accuracy in percent.
+/// Name and best published or recomputed accuracy in percent.
 const SETS: [(&str, f64); 8] = [
     ("bluebird", 88.9),
     ("dog", 84.3),
@@ -34,190 +37,227 @@ const SETS: [(&str, f64); 8] = [
     ("face", 64.0),
 ];
 
+const HEADER: &str =
+    "| set | majority | best known | `paper` | online, one pass | with passes |\n|---|---|---|---|---|---|\n";
 const START_US: u64 = 1_700_000_000_000_000;
 const ROUND_US: u64 = 100_000;
 
 struct Options {
-    data: PathBuf,
+    program: PathBuf,
+    sets: PathBuf,
     config: PathBuf,
     passes: u32,
     seed: u64,
     keep: f64,
-    stream: Option<String>,
+    work: PathBuf,
     table: Option<PathBuf>,
 }
 
-fn options() -> Result<Options, Box<dyn Error>> {
-    let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples");
+fn options() -> anyhow::Result<Options> {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut options = Options {
-        data: here.join("crowd_labels"),
-        config: here.join("labels.toml"),
+        program: here.join("target/release/ecod-node"),
+        sets: here.join("examples/crowd_labels"),
+        config: here.join("examples/labels.toml"),
         passes: 50,
         seed: 1,
         keep: 1.0,
-        stream: None,
+        work: here.join("target/eval-labels"),
         table: None,
     };
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
-        let value = args.next().ok_or_else(|| format!("{key} needs a value"))?;
+        let value = args.next().with_context(|| format!("{key} needs a value"))?;
         match key.as_str() {
-            "--data" => options.data = value.into(),
+            "--program" => options.program = value.into(),
+            "--sets" => options.sets = value.into(),
             "--config" => options.config = value.into(),
             "--passes" => options.passes = value.parse()?,
             "--seed" => options.seed = value.parse()?,
             "--keep" => options.keep = value.parse()?,
-            "--stream" => options.stream = Some(value),
+            "--work" => options.work = value.into(),
             "--write-table" => options.table = Some(value.into()),
-            _ => return Err(format!("unknown option {key}").into()),
+            _ => bail!("unknown option {key}"),
         }
     }
     Ok(options)
 }
 
-struct Set {
-    /// One round of reports per item.
-    rounds: Vec<Vec<ObjectReport>>,
-    truth: BTreeMap<LandmarkId, String>,
+/// Names that a report can carry for the names of a set: the same wherever possible, otherwise numbered.
+struct Names {
+    kind: &'static str,
+    is_allowed: fn(&str) -> bool,
+    known: HashMap<String, String>,
 }
 
-fn rows(path: &Path) -> Result<Vec<Vec<String>>, Box<dyn Error>> {
-    let text = fs::read_to_string(path).map_err(|e| format!("{}: {e}", path.display()))?;
-    Ok(text.lines().skip(1).map(|line| line.split(',').map(|f| f.trim().to_owned()).collect()).collect())
+impl Names {
+    fn new(kind: &'static str, is_allowed: fn(&str) -> bool) -> Self {
+        Self { kind, is_allowed, known: HashMap::new() }
+    }
+
+    fn of(&mut self, name: &str) -> String {
+        let (kind, number, is_allowed) = (self.kind, self.known.len(), self.is_allowed);
+        let given = || if is_allowed(name) { name.to_owned() } else { format!("{kind}~{number}") };
+        self.known.entry(name.to_owned()).or_insert_with(given).clone()
+    }
 }
 
-fn load(folder: &Path, options: &Options) -> Result<Set, Box<dyn Error>> {
+fn is_label(text: &str) -> bool {
+    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
+}
+
+/// The rows of a table, each with the values of the named columns; those after `required` may be absent.
+fn rows(path: &Path, columns: &[&str], required: usize) -> anyhow::Result<Vec<Vec<String>>> {
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path)?;
+    let header = reader.headers()?.clone();
+    let place = |column: &&str| header.iter().position(|name| name.trim_start_matches('\u{feff}') == *column);
+    let places: Vec<Option<usize>> = columns.iter().map(place).collect();
+    if let Some(missing) = places[..required].iter().position(Option::is_none) {
+        bail!("there is no column {}", columns[missing]);
+    }
+    let read = |row: csv::StringRecord| {
+        places.iter().map(|place| place.and_then(|p| row.get(p)).unwrap_or_default().to_owned()).collect()
+    };
+    reader.records().map(|row| Ok(read(row?))).collect()
+}
+
+/// Writes a set as a recording and its truth.
+fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
     let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
+    let (mut names, mut labels) = (Names::new("item", is_label), Names::new("label", is_label));
+    let mut workers = Names::new("worker", |name| NodeName::new(format!("w{name}")).is_ok());
     let mut items: BTreeMap<String, Vec<(String, String, f64)>> = BTreeMap::new();
-    for row in rows(&folder.join("label.csv"))? {
-        let [item, worker, label, rest @ ..] = row.as_slice() else { return Err("a row with too few columns".into()) };
+    let path = set.join("label.csv");
+    let of_path = || path.display().to_string();
+    for (number, row) in
+        rows(&path, &["item", "worker", "label", "confidence"], 3).with_context(of_path)?.into_iter().enumerate()
+    {
         if rng.random_bool(options.keep) {
-            let confidence = rest.first().map_or(Ok(1.0), |c| c.parse())?;
-            items.entry(item.clone()).or_default().push((worker.clone(), label.clone(), confidence));
+            let confidence = if row[3].is_empty() { 1.0 } else { row[3].parse().unwrap_or(f64::NAN) };
+            if !(0.0..=1.0).contains(&confidence) {
+                bail!("{}, row {}: confidence {:?} is not 0 to 1", of_path(), number + 1, row[3]);
+            }
+            let worker = format!("w{}", workers.of(&row[1]).replace('~', "-"));
+            items.entry(names.of(&row[0])).or_default().push((worker, labels.of(&row[2]), confidence));
         }
     }
     let mut order: Vec<_> = items.into_iter().collect();
     order.shuffle(&mut rng);
     let mut sequence: HashMap<String, u64> = HashMap::new();
-    let mut rounds = Vec::with_capacity(order.len());
-    for (round, (item, mut labels)) in order.into_iter().enumerate() {
-        labels.shuffle(&mut rng);
-        let mut reports = Vec::with_capacity(labels.len());
-        for (worker, label, confidence) in labels {
+    let mut recording = BufWriter::new(File::create(work.join("reports.jsonl"))?);
+    for (round, (item, mut votes)) in (0..).zip(order) {
+        votes.shuffle(&mut rng);
+        for (worker, label, confidence) in votes {
             let seq = sequence.entry(worker.clone()).or_default();
             *seq += 1;
-            reports.push(ObjectReport {
-                schema: SCHEMA_VERSION,
-                node: NodeName::new(format!("w{worker}"))?,
-                seq: *seq,
-                captured_at_us: Timestamp(START_US + round as u64 * ROUND_US),
-                pose: None,
-                objects: vec![PerceivedObject {
-                    label: label.into(),
-                    confidence,
-                    x_m: 0.0,
-                    y_m: 0.0,
-                    covariance_m2: None,
-                    landmark: Some(item.clone().into()),
-                }],
-                seen: None,
-            });
-        }
-        rounds.push(reports);
-    }
-    let truth = rows(&folder.join("truth.csv"))?.into_iter().map(|r| (r[0].clone().into(), r[1].clone())).collect();
-    Ok(Set { rounds, truth })
-}
-
-fn percent(right: f64, all: usize) -> f64 {
-    100.0 * right / all.max(1) as f64
-}
-
-/// Accuracy in percent over the items with a truth and votes.
-fn accuracy(set: &Set, verdicts: &BTreeMap<LandmarkId, Verdict>) -> f64 {
-    let judged: Vec<_> = set.truth.iter().filter_map(|(l, t)| verdicts.get(l).map(|v| (v, t))).collect();
-    let right = judged.iter().filter(|(v, t)| v.label.as_deref() == Some(t.as_str())).count();
-    percent(right as f64, judged.len())
-}
-
-/// Expected accuracy in percent of the most frequent label, ties broken at random.
-fn majority(set: &Set) -> f64 {
-    let (mut right, mut all) = (0.0, 0);
-    for reports in &set.rounds {
-        let mut votes: BTreeMap<&str, usize> = BTreeMap::new();
-        for object in reports.iter().flat_map(|r| &r.objects) {
-            *votes.entry(object.label.as_str()).or_default() += 1;
-        }
-        let item = reports.first().and_then(|r| r.objects[0].landmark.clone()).unwrap_or_default();
-        let Some(truth) = set.truth.get(&item) else { continue };
-        let most = votes.values().max().copied().unwrap_or(0);
-        let first = votes.values().filter(|v| **v == most).count();
-        all += 1;
-        right += if votes.get(truth.as_str()) == Some(&most) { 1.0 / first as f64 } else { 0.0 };
-    }
-    percent(right, all)
-}
-
-fn run(set: &Set, config: VoteConfig) -> Result<(BTreeMap<LandmarkId, Verdict>, Vote), Box<dyn Error>> {
-    let mut vote = Vote::new(config, Vec::new());
-    let mut latest = BTreeMap::new();
-    for reports in &set.rounds {
-        for report in reports {
-            vote.observe(report, report.captured_at_us)?;
-        }
-        let Some(now) = reports.first().map(|r| r.captured_at_us) else { continue };
-        for verdict in vote.close(now).verdicts {
-            latest.insert(verdict.landmark.clone(), verdict);
+            let object = json!({"label": label, "confidence": confidence, "x_m": 0.0, "y_m": 0.0, "landmark": item});
+            let at = START_US + round * ROUND_US;
+            let report = json!({"schema": 1, "node": worker, "seq": seq, "captured_at_us": at, "objects": [object],
+                "topic": "vote_detections"});
+            writeln!(recording, "{report}")?;
         }
     }
-    Ok((latest, vote))
+    recording.flush()?;
+    let path = set.join("truth.csv");
+    let truth = rows(&path, &["item", "truth"], 2).with_context(|| path.display().to_string())?;
+    let truth: BTreeMap<String, String> =
+        truth.into_iter().map(|row| (names.of(&row[0]), labels.of(&row[1]))).collect();
+    fs::write(work.join("truth.json"), json!({ "landmarks": truth }).to_string())?;
+    Ok(())
 }
 
-fn write_table(path: &Path, table: &str) -> Result<(), Box<dyn Error>> {
+/// Runs the program; of what it says, only rejections are shown.
+fn run(command: &mut Command) -> anyhow::Result<()> {
+    let output = command.stdin(Stdio::null()).output().with_context(|| format!("cannot run {command:?}"))?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    if !output.status.success() {
+        bail!("{command:?}: {said}");
+    }
+    said.lines().filter(|line| line.starts_with("rejected")).for_each(|line| eprintln!("{line}"));
+    Ok(())
+}
+
+/// Accuracy in percent of one run and of the majority.
+fn measure(options: &Options, work: &Path, name: &str, config: &Path, passes: u32) -> anyhow::Result<(f64, f64)> {
+    let (reports, output) = (work.join("reports.jsonl"), work.join(format!("{name}.jsonl")));
+    let mut replay = Command::new(&options.program);
+    replay.arg("replay").arg("--config").arg(config).arg("--input").arg(&reports).arg("--output").arg(&output);
+    if passes > 0 {
+        replay.arg("--passes").arg(passes.to_string());
+    }
+    run(&mut replay)?;
+    let result = work.join(format!("{name}.json"));
+    let mut eval = Command::new(&options.program);
+    eval.arg("eval").arg("--truth").arg(work.join("truth.json")).arg("--input").arg(&output);
+    run(eval.arg("--reports").arg(&reports).arg("--out").arg(&result))?;
+    let result: Value = serde_json::from_slice(&fs::read(&result)?)?;
+    let figure = |key: &str| result["vote"][key].as_f64().with_context(|| format!("{name}: eval gave no {key}"));
+    Ok((figure("accuracy_pct")?, figure("majority_accuracy_pct")?))
+}
+
+/// The configuration with the paper's formulas and a verdict after every item.
+fn paper_config(options: &Options) -> anyhow::Result<PathBuf> {
+    let text = fs::read_to_string(&options.config).with_context(|| options.config.display().to_string())?;
+    let mut config: toml::Table = toml::from_str(&text)?;
+    let table = |parent: &mut toml::Table, key: &str| -> anyhow::Result<toml::Table> {
+        match parent.remove(key) {
+            None => Ok(toml::Table::new()),
+            Some(toml::Value::Table(table)) => Ok(table),
+            Some(_) => bail!("{key} is not a table"),
+        }
+    };
+    let mut fusion = table(&mut config, "fusion")?;
+    let mut vote = table(&mut fusion, "vote")?;
+    let mut paper = table(&mut vote, "paper")?;
+    paper.insert("frames_per_verdict".into(), 1.into());
+    vote.insert("mode".into(), "paper".into());
+    vote.insert("paper".into(), paper.into());
+    fusion.insert("vote".into(), vote.into());
+    config.insert("fusion".into(), fusion.into());
+    let path = options.work.join("paper.toml");
+    fs::write(&path, toml::to_string(&config)?)?;
+    Ok(path)
+}
+
+/// The folders of the sets, known ones first.
+fn sets(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let is_set = |path: &PathBuf| path.join("label.csv").is_file();
+    if is_set(&folder.to_owned()) {
+        return Ok(vec![folder.to_owned()]);
+    }
+    let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+    let mut sets: Vec<PathBuf> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(is_set).collect();
+    let rank = |path: &Path| SETS.iter().position(|(set, _)| path.ends_with(set)).unwrap_or(SETS.len());
+    sets.sort_by_key(|path| (rank(path), path.clone()));
+    if sets.is_empty() { bail!("there is no set in {}", folder.display()) } else { Ok(sets) }
+}
+
+fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
     const BEGIN: &str = "<!-- label table begin -->\n";
     const END: &str = "<!-- label table end -->";
     let text = fs::read_to_string(path)?;
-    let (before, rest) = text.split_once(BEGIN).ok_or("no begin marker")?;
-    let (_, after) = rest.split_once(END).ok_or("no end marker")?;
+    let (before, rest) = text.split_once(BEGIN).context("no begin marker")?;
+    let (_, after) = rest.split_once(END).context("no end marker")?;
     Ok(fs::write(path, format!("{before}{BEGIN}{table}{END}{after}"))?)
 }
 
-fn main() -> Result<(), Box<dyn Error>> {
+fn main() -> anyhow::Result<()> {
     let options = options()?;
-    let config: VoteConfig = toml::from_str(&fs::read_to_string(&options.config)?)?;
-    config.validate()?;
-    if let Some(name) = &options.stream {
-        for report in load(&options.data.join(name), &options)?.rounds.iter().flatten() {
-            let mut line = serde_json::to_value(report)?;
-            line["topic"] = "vote_detections".into();
-            println!("{line}");
-        }
-        return Ok(());
-    }
-    let mut table = String::from(
-        "| set | majority | best known | `paper` | online, one pass | with passes |\n|---|---|---|---|---|---|\n",
-    );
+    fs::create_dir_all(&options.work)?;
+    let paper_config = paper_config(&options)?;
+    let mut table = HEADER.to_owned();
     print!("{table}");
-    let mut names: Vec<_> =
-        fs::read_dir(&options.data)?.filter_map(Result::ok).filter(|e| e.path().join("label.csv").is_file()).collect();
-    let rank = |name: &str| SETS.iter().position(|(set, _)| *set == name).unwrap_or(SETS.len());
-    names.sort_by_key(|e| (rank(&e.file_name().to_string_lossy()), e.file_name()));
-    for entry in names {
-        let name = entry.file_name().to_string_lossy().into_owned();
-        let set = load(&entry.path(), &options)?;
-        let paper = run(&set, VoteConfig { mode: VoteMode::Paper, ..config.clone() })?.0;
-        let (online, mut vote) = run(&set, config.clone())?;
-        let refined = vote.refine(options.passes).into_iter().map(|v| (v.landmark.clone(), v)).collect();
-        let best = SETS.iter().find(|(set, _)| *set == name).map_or("".to_owned(), |(_, best)| format!("{best:.1}"));
+    for set in sets(&options.sets)? {
+        let name = fs::canonicalize(&set)?.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let work = options.work.join(&name);
+        fs::create_dir_all(&work)?;
+        convert(&set, &work, &options)?;
+        let (paper, majority) = measure(&options, &work, "paper", &paper_config, 0)?;
+        let (online, _) = measure(&options, &work, "online", &options.config, 0)?;
+        let (refined, _) = measure(&options, &work, "passes", &options.config, options.passes)?;
+        let best = SETS.iter().find(|(set, _)| *set == name).map_or(String::new(), |(_, best)| format!("{best:.1}"));
         let mut row = String::new();
-        writeln!(
-            row,
-            "| {name} | {:.2} | {best} | {:.2} | {:.2} | {:.2} |",
-            majority(&set),
-            accuracy(&set, &paper),
-            accuracy(&set, &online),
-            accuracy(&set, &refined)
-        )?;
+        writeln!(row, "| {name} | {majority:.2} | {best} | {paper:.2} | {online:.2} | {refined:.2} |")?;
         print!("{row}");
         table.push_str(&row);
     }

@@ -1,6 +1,9 @@
-//! What liars achieve: up to ⌊(n−1)/2⌋ of n vehicles lie, in four ways, and by rejoining under new names.
+//! What liars achieve: ⌊(n−1)/2⌋ of n vehicles lie, in four ways, and by rejoining under new names.
 //!
-//! `cargo run --release --example liars -- [--svg FILE] [--seed S]`
+//! `cargo run --release --example liars -- [--svg FILE] [--table FILE] [--seeds N]`
+//!
+//! Honest vehicles are right 80 % of the time, independently. Figures are over the rounds from 300 to 600 and all seeds,
+//! 100 rounds after the last liar has begun to lie; `worst` is the worst seed. The drawing shows the mean of all seeds.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -15,9 +18,13 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 const LABELS: [&str; 5] = ["car", "cup", "mouse", "sports ball", "vase"];
+const SIZES: [usize; 5] = [3, 5, 7, 9, 15];
+const SERIES: [(&str, RGBColor); 3] =
+    [("share of right verdicts", BLACK), ("reputation of the honest", BLUE), ("reputation of liars", RED)];
 const LANDMARKS: usize = 6;
 const ROUNDS: u64 = 600;
 const SETTLED: u64 = 300;
+const LIES: [Lie; 5] = [Lie::Random, Lie::Constant, Lie::Copying, Lie::Turning, Lie::Rejoining];
 const HONEST_ACCURACY: f64 = 0.8;
 const PERIOD: Duration = Duration::from_millis(500);
 
@@ -40,20 +47,58 @@ struct Course {
     accuracy: Vec<f64>,
     /// Mean reputation of the honest and of the liars at the end of each ten rounds.
     reputation: Vec<(f64, f64)>,
+    /// Percent of right verdicts once settled, of all votes' majorities, and of the honest votes' majorities.
     settled: f64,
     majority: f64,
+    honest: f64,
+}
+
+/// The courses of all seeds.
+struct Trial {
+    vehicles: usize,
+    lie: Lie,
+    courses: Vec<Course>,
+}
+
+impl Trial {
+    fn mean(&self, of: impl Fn(&Course) -> f64) -> f64 {
+        self.courses.iter().map(of).sum::<f64>() / self.courses.len().max(1) as f64
+    }
+
+    fn row(&self) -> String {
+        let worst = self.courses.iter().map(|c| c.settled).fold(f64::INFINITY, f64::min);
+        let last = |c: &Course| c.reputation.last().copied().unwrap_or_default();
+        format!(
+            "| {} | {} | {} | {:.1} | {:.1} | {:.1} | {worst:.1} | {:.2} | {:.2} |\n",
+            self.vehicles,
+            (self.vehicles - 1) / 2,
+            format!("{:?}", self.lie).to_lowercase(),
+            self.mean(|c| c.majority),
+            self.mean(|c| c.honest),
+            self.mean(|c| c.settled),
+            self.mean(|c| last(c).0),
+            self.mean(|c| last(c).1),
+        )
+    }
 }
 
 fn other(rng: &mut ChaCha8Rng, truth: usize) -> usize {
     (truth + rng.random_range(1..LABELS.len())) % LABELS.len()
 }
 
+/// Chance that `truth` wins a majority vote, ties broken at random.
+fn chance_of_most(votes: &[usize], truth: usize) -> f64 {
+    let most = votes.iter().max().copied().unwrap_or(0);
+    let first = votes.iter().filter(|n| **n == most).count();
+    if votes[truth] == most { 1.0 / first as f64 } else { 0.0 }
+}
+
 fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let liars = (vehicles - 1) / 2;
     let mut vote = Vote::new(VoteConfig { max_vehicles: 4096, ..VoteConfig::default() }, Vec::new());
-    let mut course = Course { accuracy: Vec::new(), reputation: Vec::new(), settled: 0.0, majority: 0.0 };
-    let (mut right, mut settled, mut majority) = (0, 0, 0);
+    let mut course = Course { accuracy: Vec::new(), reputation: Vec::new(), settled: 0.0, majority: 0.0, honest: 0.0 };
+    let (mut right, mut settled, mut majority, mut honest) = (0, 0, 0.0, 0.0);
     let mut now = Timestamp(1_700_000_000_000_000);
     let mut truths = [0; LANDMARKS];
     for round in 0..ROUNDS {
@@ -65,6 +110,7 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
         }
         let common: Vec<usize> = truths.iter().map(|&t| other(&mut rng, t)).collect();
         let mut said = vec![[0usize; LABELS.len()]; LANDMARKS];
+        let mut said_honestly = said.clone();
         for vehicle in 0..vehicles {
             let lies = vehicle < liars && !(lie == Lie::Turning && round < ROUNDS / 3);
             let name = match lie {
@@ -86,6 +132,7 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
                     Lie::Copying | Lie::Turning | Lie::Rejoining => common[place],
                 };
                 said[place][label] += 1;
+                said_honestly[place][label] += usize::from(vehicle >= liars);
                 objects.push(PerceivedObject {
                     label: LABELS[label].into(),
                     confidence: 0.8,
@@ -115,8 +162,8 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
             right += good;
             if round >= SETTLED {
                 settled += good;
-                let most = said[place].iter().max().copied().unwrap_or(0);
-                majority += usize::from(said[place].iter().position(|&n| n == most) == Some(truth));
+                majority += chance_of_most(&said[place], truth);
+                honest += chance_of_most(&said_honestly[place], truth);
             }
         }
         if round % 10 == 9 {
@@ -133,70 +180,82 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     }
     let judged = (ROUNDS - SETTLED) as f64 * LANDMARKS as f64;
     course.settled = 100.0 * settled as f64 / judged;
-    course.majority = 100.0 * majority as f64 / judged;
+    course.majority = 100.0 * majority / judged;
+    course.honest = 100.0 * honest / judged;
     Ok(course)
 }
 
-fn draw(path: &str, courses: &[(Lie, Course)]) -> Result<(), Box<dyn Error>> {
-    let area = SVGBackend::new(path, (960, 1200)).into_drawing_area();
+/// One column a number of vehicles, one row a lie.
+fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
+    let columns = SIZES.len();
+    let area = SVGBackend::new(path, (320 * columns as u32, 1200)).into_drawing_area();
     area.fill(&WHITE)?;
-    for (area, (lie, course)) in area.split_evenly((courses.len(), 1)).iter().zip(courses) {
+    let (legend, panels) = area.split_vertically(28);
+    let mut x = 12;
+    for (name, color) in SERIES {
+        legend.draw(&PathElement::new([(x, 14), (x + 24, 14)], color.stroke_width(2)))?;
+        legend.draw(&Text::new(name, (x + 30, 8), ("sans-serif", 14)))?;
+        x += 230;
+    }
+    for (place, area) in panels.split_evenly((LIES.len(), columns)).iter().enumerate() {
+        let Some(trial) = trials.get(place % columns * LIES.len() + place / columns) else { continue };
         let mut chart = ChartBuilder::on(area)
             .margin(8)
-            .caption(format!("{lie:?}"), ("sans-serif", 16))
+            .margin_right(24)
+            .caption(format!("{:?}, {} vehicles", trial.lie, trial.vehicles), ("sans-serif", 15))
             .x_label_area_size(24)
-            .y_label_area_size(40)
+            .y_label_area_size(32)
             .build_cartesian_2d(0.0..ROUNDS as f64, 0.0..1.0)?;
-        chart.configure_mesh().x_desc("round").draw()?;
-        let x = |n: usize| (n as f64 + 1.0) * 10.0;
-        let series: [(&str, RGBColor, Vec<f64>); 3] = [
-            ("accuracy", BLACK, course.accuracy.clone()),
-            ("reputation of the honest", BLUE, course.reputation.iter().map(|r| r.0).collect()),
-            ("reputation of liars", RED, course.reputation.iter().map(|r| r.1).collect()),
-        ];
-        for (name, color, values) in series {
-            let points = values.into_iter().enumerate().map(|(n, y)| (x(n), y));
-            chart
-                .draw_series(LineSeries::new(points, color))?
-                .label(name)
-                .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], color));
-        }
-        chart.configure_series_labels().position(SeriesLabelPosition::LowerRight).border_style(BLACK).draw()?;
+        chart
+            .configure_mesh()
+            .x_labels(4)
+            .x_label_formatter(&|x| format!("{x:.0}"))
+            .y_labels(6)
+            .x_desc("round")
+            .light_line_style(WHITE)
+            .draw()?;
+        let course = |of: fn(&Course, usize) -> f64| {
+            (0..(ROUNDS / 10) as usize).map(move |n| (n as f64 * 10.0 + 10.0, trial.mean(|c| of(c, n))))
+        };
+        chart.draw_series(LineSeries::new(course(|c, n| c.accuracy[n]), SERIES[0].1.stroke_width(2)))?;
+        chart.draw_series(LineSeries::new(course(|c, n| c.reputation[n].0), SERIES[1].1.stroke_width(2)))?;
+        chart.draw_series(LineSeries::new(course(|c, n| c.reputation[n].1), SERIES[2].1.stroke_width(2)))?;
     }
     area.present()?;
     Ok(())
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let (mut svg, mut seed) = (None, 1);
+    let (mut svg, mut file, mut seeds) = (None, None, 5);
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
         let value = args.next().ok_or_else(|| format!("{key} needs a value"))?;
         match key.as_str() {
             "--svg" => svg = Some(value),
-            "--seed" => seed = value.parse()?,
+            "--table" => file = Some(value),
+            "--seeds" => seeds = value.parse()?,
             _ => return Err(format!("unknown option {key}").into()),
         }
     }
-    println!("| vehicles | liars | lie | majority % | verdicts % | honest | liars |\n|---|---|---|---|---|---|---|");
-    let mut drawn = Vec::new();
-    for vehicles in [3, 5, 7, 9, 15] {
-        for lie in [Lie::Random, Lie::Constant, Lie::Copying, Lie::Turning, Lie::Rejoining] {
-            let course = run(vehicles, lie, seed)?;
-            let (honest, liars) = course.reputation.last().copied().unwrap_or_default();
-            println!(
-                "| {vehicles} | {} | {lie:?} | {:.1} | {:.1} | {honest:.2} | {liars:.2} |",
-                (vehicles - 1) / 2,
-                course.majority,
-                course.settled
-            );
-            if vehicles == 7 {
-                drawn.push((lie, course));
-            }
+    let mut table = String::from(
+        "| vehicles | liars | lie | majority % | honest majority % | verdicts % | worst % | honest | liars |\n\
+         |---|---|---|---|---|---|---|---|---|\n",
+    );
+    let mut trials = Vec::new();
+    for vehicles in SIZES {
+        for lie in LIES {
+            let courses = (1..=seeds).map(|seed| run(vehicles, lie, seed)).collect::<Result<_, _>>()?;
+            let trial = Trial { vehicles, lie, courses };
+            table.push_str(&trial.row());
+            trials.push(trial);
         }
     }
+    print!("{table}");
+    if let Some(path) = file {
+        std::fs::write(path, &table)?;
+    }
     if let Some(path) = svg {
-        draw(&path, &drawn)?;
+        draw(&path, &trials)?;
     }
     Ok(())
 }

@@ -142,6 +142,30 @@ impl Aggregator {
         self.rounds.deadline()
     }
 
+    /// Adds known locations for PACE; evidence stays. VOTE takes locations from reports by itself where none are known.
+    pub fn add_landmarks(&mut self, landmarks: Vec<Landmark>) {
+        if let Some(pace) = &mut self.pace {
+            pace.add_landmarks(landmarks);
+        }
+    }
+
+    /// Goes over VOTE's stored votes `passes` times and says what came of it, in a round of its own; see
+    /// [`Vote::refine`]. `None` without VOTE or leadership.
+    pub fn refine(&mut self, passes: u32, now: Timestamp) -> Option<Verdicts> {
+        let epoch = self.leads.clone()?;
+        let verdicts = self.vote.as_mut()?.refine(passes);
+        let round = self.next_round;
+        self.next_round = round.saturating_add(1);
+        Some(Verdicts {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader,
+            epoch: epoch.term,
+            round,
+            fused_at_us: now,
+            verdicts,
+        })
+    }
+
     /// How far VOTE trusts each vehicle by what it has seen itself.
     pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
         self.vote.as_ref().map(Vote::reputations).unwrap_or_default()

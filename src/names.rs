@@ -27,12 +27,7 @@ impl NodeName {
     /// # Errors
     /// [`InvalidName`] when a character or the length is not allowed.
     pub fn new(name: impl AsRef<str>) -> Result<Self, InvalidName> {
-        let name = name.as_ref();
-        if (1..=MAX_NAME_BYTES).contains(&name.len()) && name.bytes().all(is_allowed) {
-            Ok(Self(SmolStr::new(name)))
-        } else {
-            Err(InvalidName(name.chars().take(MAX_NAME_BYTES).collect()))
-        }
+        Self::try_from(SmolStr::new(name))
     }
 
     /// A name known at compile time.
@@ -64,7 +59,11 @@ impl TryFrom<SmolStr> for NodeName {
     type Error = InvalidName;
 
     fn try_from(name: SmolStr) -> Result<Self, InvalidName> {
-        Self::new(name)
+        if (1..=MAX_NAME_BYTES).contains(&name.len()) && name.bytes().all(is_allowed) {
+            Ok(Self(name))
+        } else {
+            Err(InvalidName(name.chars().take(MAX_NAME_BYTES).collect()))
+        }
     }
 }
 

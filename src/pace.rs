@@ -5,6 +5,7 @@
 //! default, keeps the evidence of each vehicle as log-odds. `docs/algorithms.md` compares them.
 
 mod bayes;
+mod grouping;
 mod paper;
 
 use std::sync::Arc;
@@ -15,7 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
 use crate::geometry::Covariance;
-use crate::landmark::{Gate, LandmarkIndex};
+use crate::landmark::{Gate, Landmark, LandmarkIndex};
 use crate::time::Timestamp;
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
 
@@ -112,7 +113,7 @@ impl PaceConfig {
 
     /// The reported covariance; a position without one counts as known to the gate.
     fn covariance(&self, object: &PerceivedObject) -> Covariance {
-        object.covariance().unwrap_or(Covariance::isotropic(self.gate_m / self.gate_sigmas))
+        object.covariance().unwrap_or_else(|| Covariance::isotropic(self.gate_m / self.gate_sigmas))
     }
 
     fn max_age(&self) -> Duration {
@@ -149,6 +150,14 @@ impl Pace {
         match config.mode {
             PaceMode::Paper => Self::Paper(PaperPace::new(&config, landmarks)),
             PaceMode::Bayes => Self::Bayes(BayesPace::new(config, landmarks)),
+        }
+    }
+
+    /// Adds known locations after those there are; evidence stays.
+    pub fn add_landmarks(&mut self, added: Vec<Landmark>) {
+        match self {
+            Self::Paper(pace) => pace.add_landmarks(added),
+            Self::Bayes(pace) => pace.add_landmarks(added),
         }
     }
 

@@ -4,6 +4,7 @@
 //! the plate; it hides the first from most directions. Files are in inches and degrees and converted while being read.
 
 mod file;
+mod recording;
 mod sight;
 #[cfg(test)]
 mod tests;
@@ -13,6 +14,7 @@ use std::time::Duration;
 use nalgebra::Point2;
 
 pub use file::TestbedError;
+pub use recording::{KnownObject, Recording};
 pub use sight::{Hit, Sighting};
 
 use crate::camera::Intrinsics;

@@ -8,9 +8,11 @@
 //! not newer than the last of its vehicle is rejected. Of several objects that one report has at one landmark, the most
 //! confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
 
+mod ballot;
 mod calibration;
 mod config;
 mod confusion;
+mod dependence;
 mod model;
 mod paper;
 mod visibility;
@@ -18,7 +20,6 @@ mod weighted;
 
 use std::collections::BTreeMap;
 
-pub use calibration::{Calibration, Weights};
 pub use config::{PaperConfig, VoteConfig, VoteMode, WeightedConfig};
 pub use paper::{PaperTally, REPUTATION_RANGE};
 pub use visibility::{falling as falling_visibility, paper as paper_visibility};
@@ -236,7 +237,7 @@ impl Vote {
     /// Starts from what a ledger knows, after a restart or a change of aggregator; without effect in `paper` mode.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         if let Tally::Weighted(tally) = &mut self.tally {
-            tally.adopt(ledger);
+            tally.adopt(ledger, (self.config.max_vehicles, self.config.max_labels));
         }
     }
 

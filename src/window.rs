@@ -2,6 +2,9 @@
 //!
 //! Call [`ReportWindow::admit`] with every decoded report; what it returns may be fused once. A rejected report
 //! changes nothing but the vehicle's clock estimate.
+//!
+//! One wrong stamp does not silence its vehicle: a report that claims to be more than half of `max_age_s` further ahead
+//! than all before is rejected unless the next one agrees, and a first report that the second contradicts is forgotten.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -61,6 +64,8 @@ struct VehicleClock {
     last_seq: Option<u64>,
     last_received: Timestamp,
     delay: MinimumDelay,
+    /// Capture time of the last report, if it was rejected for a stamp too far ahead of all before.
+    suspect: Option<Timestamp>,
 }
 
 impl ReportWindow {
@@ -72,7 +77,7 @@ impl ReportWindow {
     /// Admits a report and returns its capture time on the aggregator's clock.
     ///
     /// # Errors
-    /// [`RejectReason::FromTheFuture`], [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] (also for duplicates) or
+    /// [`RejectReason::FromTheFuture`] (also for a stamp that no other report agrees with), [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] (also for duplicates) or
     /// [`RejectReason::TooManyVehicles`].
     pub fn admit(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<Timestamp, RejectReason> {
         let delay = received_at.micros_from(report.captured_at_us);
@@ -91,15 +96,20 @@ impl ReportWindow {
             last_seq: None,
             last_received: received_at,
             delay: MinimumDelay::new(received_at),
+            suspect: None,
         });
+        let tolerance = seconds(self.config.clock_tolerance_s);
+        let slack = seconds(self.config.max_age_s) / 2;
         let stepped_back = vehicle.last_captured.micros_from(report.captured_at_us) > reach;
-        if stepped_back {
+        if stepped_back || vehicle.is_contradicted(report.captured_at_us, delay, tolerance, slack) {
             vehicle.delay = MinimumDelay::new(received_at);
         } else if (report.captured_at_us, Some(report.seq)) <= (vehicle.last_captured, vehicle.last_seq) {
             return Err(RejectReason::OutOfOrder);
+        } else if vehicle.is_suspect(report.captured_at_us, delay, slack) {
+            return Err(RejectReason::FromTheFuture);
         }
         vehicle.delay.observe(delay, received_at);
-        let offset = vehicle.delay.clock_offset(seconds(self.config.clock_tolerance_s));
+        let offset = vehicle.delay.clock_offset(tolerance);
         if delay - offset > seconds(self.config.max_age_s) {
             return Err(RejectReason::Stale);
         }
@@ -123,6 +133,29 @@ impl ReportWindow {
     }
 }
 
+impl VehicleClock {
+    /// Whether the estimate rests on one report alone, whose clock was ahead, and this one's is not.
+    fn is_contradicted(&self, captured: Timestamp, delay_us: i64, tolerance_us: i64, slack_us: i64) -> bool {
+        let least = self.delay.least();
+        self.delay.reports == 1
+            && captured != self.last_captured
+            && least < -tolerance_us
+            && delay_us.saturating_sub(least) > slack_us
+    }
+
+    /// Whether the stamp is too far ahead of all before, and the report before this one did not say the same.
+    fn is_suspect(&mut self, captured: Timestamp, delay_us: i64, slack_us: i64) -> bool {
+        let before = self.suspect.take();
+        let least = self.delay.least();
+        let ahead = least != i64::MAX && least.saturating_sub(delay_us) > slack_us;
+        let alone = before.is_none_or(|before| before == captured);
+        if ahead && alone {
+            self.suspect = Some(captured);
+        }
+        ahead && alone
+    }
+}
+
 /// How long a silent vehicle's clock is remembered when room is short.
 const RETENTION: Duration = Duration::from_secs(10);
 
@@ -135,13 +168,15 @@ struct MinimumDelay {
     span_start: Timestamp,
     current_us: i64,
     previous_us: i64,
+    /// Reports that the estimate rests on.
+    reports: u64,
 }
 
 impl MinimumDelay {
     const SPAN: Duration = Duration::from_secs(10);
 
     fn new(now: Timestamp) -> Self {
-        Self { span_start: now, current_us: i64::MAX, previous_us: i64::MAX }
+        Self { span_start: now, current_us: i64::MAX, previous_us: i64::MAX, reports: 0 }
     }
 
     fn observe(&mut self, delay_us: i64, now: Timestamp) {
@@ -151,10 +186,16 @@ impl MinimumDelay {
             self.span_start = now;
         }
         self.current_us = self.current_us.min(delay_us);
+        self.reports += 1;
+    }
+
+    /// The least delay in microseconds; `i64::MAX` without any.
+    fn least(&self) -> i64 {
+        self.current_us.min(self.previous_us)
     }
 
     fn clock_offset(&self, tolerance_us: i64) -> i64 {
-        let least = self.current_us.min(self.previous_us);
+        let least = self.least();
         if least == i64::MAX || least.abs() <= tolerance_us { 0 } else { least }
     }
 }
@@ -217,6 +258,46 @@ mod tests {
         let late = NOON + 2_000_000;
         let admitted = window.admit(&report("fast", late + 1_500_000), Timestamp(late + 302_000)).unwrap();
         assert_eq!(admitted, Timestamp(late + 2_000), "queueing does not move the capture time");
+    }
+
+    /// Reports every 100 ms with 2 ms of transit; the numbered one is stamped `ahead_us` ahead. Returns which of them
+    /// are admitted.
+    fn admitted_around_a_wrong_stamp(wrong: u64, ahead_us: u64) -> Vec<bool> {
+        let mut window = window();
+        let admit = |n: u64| {
+            let stamp = NOON + n * 100_000 + if n == wrong { ahead_us } else { 0 };
+            window.admit(&report("a", stamp), Timestamp(NOON + n * 100_000 + 2_000)).is_ok()
+        };
+        (0..200).map(admit).collect()
+    }
+
+    #[test]
+    fn one_wrong_stamp_silences_its_vehicle_for_a_second_at_most() {
+        for wrong in [0, 1, 2, 50, 101] {
+            for ahead_us in [100_000, 400_000, 600_000, 1_000_000, 1_900_000] {
+                let admitted = admitted_around_a_wrong_stamp(wrong, ahead_us);
+                let lost = admitted.iter().filter(|admitted| !**admitted).count();
+                assert!(lost <= 10, "report {wrong}, {ahead_us} µs ahead: {lost} reports lost");
+            }
+        }
+    }
+
+    #[test]
+    fn a_clock_that_was_set_forward_is_followed_and_a_duplicate_confirms_nothing() {
+        let mut window = window();
+        let sent = |n: u64| NOON + n * 100_000;
+        for n in 0..10 {
+            assert!(window.admit(&report("a", sent(n)), Timestamp(sent(n) + 2_000)).is_ok());
+        }
+        let first = report("a", sent(10) + 1_500_000);
+        for transit_us in [2_000, 3_000] {
+            let received = Timestamp(sent(10) + transit_us);
+            assert_eq!(window.admit(&first, received), Err(RejectReason::FromTheFuture), "over two links");
+        }
+        for n in 11..20 {
+            let received = Timestamp(sent(n) + 2_000);
+            assert_eq!(window.admit(&report("a", sent(n) + 1_500_000), received), Ok(received));
+        }
     }
 
     #[test]

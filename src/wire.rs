@@ -14,6 +14,7 @@
 //!
 //! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
 
+mod check;
 mod codec;
 mod ledger;
 mod reject;
@@ -25,7 +26,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-pub use codec::{Encoding, Limits, Payload, decode, decode_report, encode};
+pub use check::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, Payload, check_fused_at};
+pub use codec::{Encoding, decode, decode_report, encode};
 pub use ledger::{MAX_SHARE_ENTRIES, decode_share};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};

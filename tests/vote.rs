@@ -2,10 +2,13 @@
 
 use std::time::Duration;
 
+use ecod::landmark::{Landmark, Synonym};
 use ecod::names::NodeName;
+use ecod::reputation::{Evidence, ReputationLedger};
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, PerceivedObject, RejectReason, SCHEMA_VERSION, WirePose};
+use nalgebra::Point2;
 use proptest::prelude::*;
 
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
@@ -69,9 +72,11 @@ fn a_verdict_ends_when_its_votes_are_stale() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     vote.observe(&report("a", 1, START, &[("x", "cup", 0.9)]), START).unwrap();
     assert_eq!(vote.close(START).verdicts[0].label.as_deref(), Some("cup"));
+    vote.observe(&report("b", 1, START, &[("x", "cup", 0.9)]), START).unwrap();
+    vote.close(START);
     let round = vote.close(START + Duration::from_secs(3));
     assert_eq!((&round.verdicts[0].label, round.verdicts[0].score), (&None, 0.0));
-    assert!(round.evidence[0].correct);
+    assert!(round.evidence.len() == 2 && round.evidence.iter().all(|e| e.correct));
 }
 
 #[test]
@@ -89,6 +94,208 @@ fn paper_mode_sums_the_printed_products_and_never_clears() {
     }
     let score = vote.reputations()[&NodeName::new("a").unwrap()].score;
     assert!((score - reputation).abs() < 1e-12);
+}
+
+fn landmark(id: &str, synonyms: &[(&str, &str)]) -> Landmark {
+    Landmark {
+        id: id.into(),
+        position: Point2::origin(),
+        facing_rad: None,
+        vacancy: None,
+        synonyms: synonyms.iter().map(|&(from, to)| Synonym { from: from.into(), label: to.into() }).collect(),
+    }
+}
+
+fn name(node: &str) -> NodeName {
+    NodeName::new(node).unwrap()
+}
+
+#[test]
+fn a_closed_cell_has_a_verdict_for_every_landmark_and_ignores_others() {
+    let mut vote = Vote::new(VoteConfig::default(), vec![landmark("x", &[]), landmark("y", &[])]);
+    vote.observe(&report("a", 1, START, &[("x", "cup", 0.9), ("elsewhere", "cup", 0.9)]), START).unwrap();
+    let verdicts = vote.close(START).verdicts;
+    assert_eq!(verdicts.iter().map(|v| v.landmark.as_str()).collect::<Vec<_>>(), ["x", "y"]);
+    assert_eq!((verdicts[0].label.as_deref(), &verdicts[1].label), (Some("cup"), &None));
+    assert_eq!(vote.ignored(), 1);
+}
+
+#[test]
+fn a_cell_without_reports_closes_round_after_round() {
+    let mut vote = Vote::new(VoteConfig::default(), vec![landmark("x", &[])]);
+    for second in 0..5 {
+        let round = vote.close(START + Duration::from_secs(second));
+        assert!(round.verdicts.iter().all(|v| v.label.is_none() && v.score == 0.0 && v.contributors.is_empty()));
+        assert!(round.evidence.is_empty());
+    }
+    assert!(vote.refine(3)[0].label.is_none());
+    assert!(vote.reputations().is_empty());
+}
+
+#[test]
+fn an_older_report_that_comes_later_is_rejected() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    let later = START + Duration::from_millis(100);
+    vote.observe(&report("a", 2, later, &[("x", "cup", 0.9)]), later).unwrap();
+    let late = vote.observe(&report("a", 1, START, &[("x", "mouse", 0.9)]), later);
+    assert_eq!(late, Err(RejectReason::OutOfOrder));
+    assert_eq!(vote.close(later).verdicts[0].label.as_deref(), Some("cup"));
+}
+
+#[test]
+fn a_negative_confidence_is_rejected_with_its_report() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    assert!(vote.observe(&report("a", 1, START, &[("x", "cup", -0.5)]), START).is_err());
+    assert!(vote.close(START).verdicts.is_empty());
+}
+
+#[test]
+fn two_labels_of_one_vehicle_at_a_landmark_are_one_vote_for_the_surer() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    vote.observe(&report("a", 1, START, &[("x", "cup", 0.4), ("x", "mouse", 0.8)]), START).unwrap();
+    let verdict = vote.close(START).verdicts.remove(0);
+    assert_eq!((verdict.label.as_deref(), verdict.votes.len()), (Some("mouse"), 1));
+    assert_eq!(vote.ignored(), 1);
+}
+
+#[test]
+fn synonyms_count_as_one_label() {
+    let mut vote = Vote::new(VoteConfig::default(), vec![landmark("ball", &[("vase", "sports ball")])]);
+    for (node, label) in [("a", "vase"), ("b", "sports ball"), ("c", "cup")] {
+        vote.observe(&report(node, 1, START, &[("ball", label, 0.8)]), START).unwrap();
+    }
+    assert_eq!(vote.close(START).verdicts[0].label.as_deref(), Some("sports ball"));
+}
+
+#[test]
+fn a_shown_label_is_held_until_another_leads_clearly() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    let shown = |vote: &mut Vote, seq: u64, votes: &[(&str, &str)]| {
+        let at = START + Duration::from_millis(seq);
+        for (node, label) in votes {
+            vote.observe(&report(node, seq, at, &[("x", label, 0.8)]), at).unwrap();
+        }
+        vote.close(at).verdicts.remove(0).label.unwrap()
+    };
+    assert_eq!(shown(&mut vote, 1, &[("a", "mouse")]), "mouse");
+    // A draw would otherwise go to the first in alphabetical order.
+    assert_eq!(shown(&mut vote, 2, &[("b", "cup")]), "mouse");
+    assert_eq!(shown(&mut vote, 3, &[("c", "cup"), ("d", "cup")]), "cup");
+}
+
+#[test]
+fn vehicles_labels_and_landmarks_beyond_their_limits_change_nothing_else() {
+    let config = VoteConfig { max_vehicles: 2, max_labels: 2, max_landmarks: 2, ..VoteConfig::default() };
+    let mut vote = Vote::new(config, Vec::new());
+    vote.observe(&report("a", 1, START, &[("x", "cup", 0.9), ("y", "mouse", 0.9)]), START).unwrap();
+    vote.observe(&report("b", 1, START, &[("x", "vase", 0.9)]), START).unwrap();
+    let third = vote.observe(&report("c", 1, START, &[("x", "mouse", 0.9)]), START);
+    assert_eq!(third, Err(RejectReason::TooManyVehicles));
+    assert_eq!(vote.ignored(), 1);
+    vote.observe(&report("b", 2, START, &[("z", "mouse", 0.9)]), START).unwrap();
+    let landmarks: Vec<_> = vote.close(START).verdicts.into_iter().map(|v| v.landmark).collect();
+    assert_eq!(landmarks, ["y", "z"]);
+}
+
+#[test]
+fn an_adopted_ledger_restores_trust_by_class() {
+    let mut ledger = ReputationLedger::default();
+    for n in 0..200 {
+        for (node, label, correct) in
+            [("a", "cup", true), ("a", "mouse", n % 5 == 0), ("b", "cup", n % 5 == 0), ("b", "mouse", true)]
+        {
+            ledger.record(1, &name("edge"), &Evidence { node: name(node), label: label.into(), correct });
+        }
+    }
+    let verdict = |votes: [(&str, &str); 2]| {
+        let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+        vote.adopt(&ledger);
+        vote.adopt(&ledger);
+        for (node, label) in votes {
+            vote.observe(&report(node, 1, START, &[("x", label, 0.8)]), START).unwrap();
+        }
+        let verdict = vote.close(START).verdicts.remove(0);
+        assert!(vote.reputations().values().all(|r| (0.3..=1.0).contains(&r.score)));
+        verdict.label.unwrap()
+    };
+    // Each states one label that it is always right about and one that it mostly gets wrong.
+    assert_eq!(verdict([("a", "cup"), ("b", "cup")]), "cup");
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    vote.adopt(&ledger);
+    for node in ["a", "c"] {
+        vote.observe(&report(node, 1, START, &[("x", if node == "a" { "cup" } else { "mouse" }, 0.8)]), START).unwrap();
+    }
+    let trusted = vote.close(START).verdicts.remove(0);
+    vote.observe(&report("a", 2, START, &[("y", "mouse", 0.8)]), START).unwrap();
+    vote.observe(&report("c", 2, START, &[("y", "cup", 0.8)]), START).unwrap();
+    let doubted = vote.close(START).verdicts.remove(0);
+    assert!(trusted.votes["cup"] > doubted.votes["mouse"]);
+}
+
+#[test]
+fn a_crowd_of_newcomers_does_not_outvote_a_proven_vehicle_pair() {
+    let mut ledger = ReputationLedger::default();
+    for _ in 0..100 {
+        for node in ["a", "b"] {
+            ledger.record(1, &name("edge"), &Evidence { node: name(node), label: "cup".into(), correct: true });
+        }
+    }
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    vote.adopt(&ledger);
+    for node in ["a", "b"] {
+        vote.observe(&report(node, 1, START, &[("x", "cup", 0.8)]), START).unwrap();
+    }
+    for n in 0..50 {
+        vote.observe(&report(&format!("new-{n}"), 1, START, &[("x", "mouse", 0.8)]), START).unwrap();
+    }
+    assert_eq!(vote.close(START).verdicts[0].label.as_deref(), Some("cup"));
+}
+
+#[test]
+fn a_vote_without_a_witness_earns_no_reputation() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    let mut evidence = 0;
+    for n in 0..100 {
+        let at = START + Duration::from_secs(3 * n);
+        vote.observe(&report("a", n, at, &[("x", "cup", 0.9)]), at).unwrap();
+        evidence += vote.close(at).evidence.len();
+    }
+    assert_eq!(evidence, 0);
+}
+
+#[test]
+fn four_of_nine_that_copy_one_wrong_label_are_found_out() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    let labels = ["car", "cup", "mouse", "sports ball", "vase"];
+    let mut state = 1u64;
+    let mut random = |below: u64| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        ((state >> 33) % below) as usize
+    };
+    let mut right = 0;
+    for round in 0..200 {
+        let at = START + Duration::from_secs(3 * round);
+        let truths: Vec<usize> = (0..6).map(|_| random(5)).collect();
+        let lies: Vec<usize> = truths.iter().map(|t| (t + 1 + random(4)) % 5).collect();
+        for vehicle in 0..9 {
+            let places: Vec<String> = (0..6).map(|p| format!("x{p}")).collect();
+            let votes: Vec<_> = (0..6)
+                .map(|p| {
+                    let honest = if random(5) == 0 { (truths[p] + 1 + random(4)) % 5 } else { truths[p] };
+                    (places[p].as_str(), labels[if vehicle < 4 { lies[p] } else { honest }], 0.8)
+                })
+                .collect();
+            vote.observe(&report(&format!("v{vehicle}"), round, at, &votes), at).unwrap();
+        }
+        for verdict in vote.close(at).verdicts {
+            let place: usize = verdict.landmark.as_str()[1..].parse().unwrap();
+            right += usize::from(round >= 100 && verdict.label.as_deref() == Some(labels[truths[place]]));
+        }
+    }
+    assert!(right >= 540, "{right} of 600");
+    let reputations = vote.reputations();
+    assert!((0..4).all(|v| reputations[&name(&format!("v{v}"))].score < 0.5));
+    assert!((4..9).all(|v| reputations[&name(&format!("v{v}"))].score > 0.6));
 }
 
 proptest! {

@@ -4,6 +4,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use ecod::names::NodeName;
@@ -15,7 +16,6 @@ use ecod_actors::membership::{
     MembershipMessage, MulticastConfig,
 };
 use ractor::{Actor, call_t};
-use std::sync::atomic::{AtomicU64, Ordering};
 use tokio::sync::watch;
 
 #[tokio::main(flavor = "multi_thread", worker_threads = 2)]

@@ -1,3 +1,4 @@
 //! Measurements that the `bench` command and the benchmarks share.
 
+pub mod rounds;
 pub mod two_hop;

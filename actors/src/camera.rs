@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use anyhow::Context;
 use ecod::camera::{Intrinsics, Mount};
 use ecod::config::{ConfigError, check_range};
 use ecod::landmark::LandmarkIndex;
@@ -17,6 +18,7 @@ use crate::detect::DetectorConfig;
 use crate::detector::DetectorArguments;
 use crate::frame_source::SourceConfig;
 use crate::frame_source::capture::CaptureConfig;
+use crate::image_size::ImageSize;
 use crate::lens::Lens;
 use crate::perception::{Perception, Vantage};
 use crate::projector::ProjectorMessage;
@@ -31,7 +33,7 @@ pub struct CameraConfig {
     /// When a source counts as stalled and how often it is opened again.
     #[serde(default)]
     pub capture: CaptureConfig,
-    /// Image size and field of view.
+    /// Image size and field of view. Frames of another size but the same shape are scaled, others are not used.
     #[serde(default)]
     pub optics: OpticsConfig,
     /// Where the camera sits on the vehicle.
@@ -142,7 +144,7 @@ pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
         node: config.name.clone().unwrap_or(ecod::names::NodeName::from_static("node")),
         pose: config.pose(),
         mount: camera.mount.into(),
-        lens: camera.optics.lens()?,
+        lens: camera.optics.lens().context("key `camera.optics.calibration`")?,
         landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),
     };
     Ok(Perception::new(vantage, camera.projection.clone(), camera.view.clone(), gate))
@@ -159,10 +161,12 @@ pub fn detector(
 ) -> anyhow::Result<DetectorArguments> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let source = camera.source.clone();
+    let lens = camera.optics.lens().context("key `camera.optics.calibration`")?;
     Ok(DetectorArguments {
         open: Arc::new(move || source.open()),
         capture: camera.capture.clone(),
-        detect: camera.detector.build()?,
+        detect: camera.detector.build().context("key `camera.detector`")?,
+        optics: ImageSize::from(&lens.intrinsics),
         projector,
         counters,
     })

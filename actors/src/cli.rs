@@ -2,17 +2,26 @@
 
 #[cfg(feature = "camera")]
 mod calibrate;
+mod columns;
 #[cfg(feature = "camera")]
 mod demo;
+mod eval;
+#[cfg(feature = "camera")]
+mod intersection;
+mod replay;
 mod run;
 mod schema;
 #[cfg(feature = "camera")]
 mod testbed;
 
-use std::io::IsTerminal;
+use std::fs;
+use std::io::{ErrorKind, IsTerminal, Write};
+use std::path::Path;
 use std::process::ExitCode;
 
+use anyhow::Context;
 use clap::{Parser, Subcommand};
+use serde::Serialize;
 use tracing_subscriber::EnvFilter;
 
 pub use run::RunArguments;
@@ -32,9 +41,13 @@ enum Command {
     /// Run a whole cell on this machine, as separate processes, and print what it saw
     #[cfg(feature = "camera")]
     Demo(demo::DemoArguments),
-    /// Run recorded parking-lot scenes: render, detect, project and fuse them in virtual time
+    /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
+    /// Run recorded reports again, in virtual time: the same input gives the same output
+    Replay(replay::ReplayArguments),
+    /// Judge the output of a replay by what is true
+    Eval(eval::EvalArguments),
     /// Calibrate a camera from photographs of a chessboard
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
@@ -70,7 +83,9 @@ pub fn main() -> ExitCode {
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
-        Some(Command::Schema) => schema::print(),
+        Some(Command::Replay(arguments)) => replay::run(&arguments),
+        Some(Command::Eval(arguments)) => eval::run(&arguments),
+        Some(Command::Schema) => schema::run(),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -78,6 +93,15 @@ pub fn main() -> ExitCode {
             eprintln!("ecod-node: {error:#}");
             ExitCode::from(code)
         }
+    }
+}
+
+/// Writes to standard output. A reader that has seen enough, such as `head`, is no failure.
+fn print(text: &str) -> anyhow::Result<()> {
+    let mut output = std::io::stdout().lock();
+    match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+        written => written.context("cannot write to standard output"),
     }
 }
 
@@ -91,4 +115,11 @@ impl Failure {
     fn usage(error: impl Into<anyhow::Error>) -> Self {
         Self { error: error.into(), code: USAGE }
     }
+}
+
+/// Writes JSON for programs.
+fn write_json(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string_pretty(value)?;
+    text.push('\n');
+    fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }

@@ -130,8 +130,8 @@ impl NodeConfig {
             std::fs::metadata(path).map_err(|source| LoadError::Unreadable { path: path.into(), source })?;
             figment = figment.merge(Toml::file_exact(path));
         }
-        let figment = figment.merge(Env::prefixed("ECOD_").split("__")).merge(Serialized::defaults(flags));
-        let mut config: Self = figment.extract().map_err(|errors| LoadError::Malformed(describe(errors)))?;
+        let figment = figment.merge(environment()).merge(Serialized::defaults(flags));
+        let mut config = extract(figment)?;
         if config.role == Role::Edge && config.name.is_none() {
             config.name = Some(NodeName::from_static("edge"));
         }
@@ -139,6 +139,20 @@ impl NodeConfig {
             config.state_dir = std::env::var_os("STATE_DIRECTORY").map(PathBuf::from);
         }
         config.validate()?;
+        Ok(config)
+    }
+
+    /// Reads what a file says about a cell: all keys of a node are known, none is required, and neither the environment
+    /// nor flags play a part. Fusion and locations are checked.
+    ///
+    /// # Errors
+    /// [`LoadError`] naming the file, or the key, the value and what is allowed.
+    pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
+        std::fs::metadata(file).map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
+        let figment = Figment::from(Serialized::defaults(Self::default())).merge(Toml::file_exact(file));
+        let config: Self = figment.extract().map_err(|errors| LoadError::Malformed(describe(errors)))?;
+        config.fusion.validate().map_err(|error| error.within("fusion"))?;
+        LandmarkConfig::validate_all(&config.landmarks)?;
         Ok(config)
     }
 
@@ -157,6 +171,13 @@ impl NodeConfig {
         self.election.validate().map_err(|error| error.within("election"))?;
         self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
         self.broker.validate().map_err(|error| error.within("broker"))?;
+        let needed = self.mqtt.max_packet_bytes();
+        if let Some(bytes) = self.broker.max_packet_bytes
+            && (bytes as usize) < needed
+        {
+            let allowed = format!("at least {needed}, so that `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` fit");
+            return Err(ConfigError::new("broker.max_packet_bytes", bytes, allowed));
+        }
         self.fusion.validate().map_err(|error| error.within("fusion"))?;
         self.reputations.validate().map_err(|error| error.within("reputations"))?;
         #[cfg(feature = "camera")]
@@ -184,6 +205,32 @@ impl NodeConfig {
         DataPlane { external, embedded }
     }
 
+    /// The configuration as TOML that can be read back; secrets are left out, and a comment says so.
+    ///
+    /// # Errors
+    /// When a value has no form in TOML.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        let mut shown = self.clone();
+        let mut comment = String::new();
+        if shown.mqtt.password.take().is_some() {
+            comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
+        }
+        if shown.membership.key.take().is_some() {
+            comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");
+        }
+        #[cfg(feature = "camera")]
+        if shown.camera.as_mut().is_some_and(|camera| camera.source.forget_credentials()) {
+            comment.push_str("# user and password of `camera.source.url` are set but not shown: add them\n");
+        }
+        Ok(comment + &toml::to_string(&shown)?)
+    }
+
+    /// The embedded broker's limits; its packets hold the cell's maps.
+    pub fn broker(&self) -> BrokerConfig {
+        let needed = u32::try_from(self.mqtt.max_packet_bytes()).ok();
+        BrokerConfig { max_packet_bytes: self.broker.max_packet_bytes.or(needed), ..self.broker.clone() }
+    }
+
     /// The vehicle's pose.
     pub fn pose(&self) -> Pose {
         Pose::new(self.pose.x_m, self.pose.y_m, self.pose.heading_deg.to_radians())
@@ -195,16 +242,86 @@ impl NodeConfig {
     }
 }
 
-/// Every error with its key and where it was read.
+const ENVIRONMENT_PREFIX: &str = "ECOD_";
+
+fn environment() -> Env {
+    Env::prefixed(ENVIRONMENT_PREFIX).split("__")
+}
+
+/// Reads the configuration. Values from the environment are guessed to be numbers, lists and so on by their looks;
+/// where a key does not want what was guessed, the value is taken as the text that it is.
+fn extract(mut figment: Figment) -> Result<NodeConfig, LoadError> {
+    let mut as_guessed: Option<figment::Error> = None;
+    loop {
+        let errors = match figment.extract() {
+            Ok(config) => return Ok(config),
+            Err(errors) => errors,
+        };
+        // Wrong as text too: the first error is the one to tell of.
+        if let Some(first) = as_guessed.take_if(|first| first.path == errors.path) {
+            return Err(LoadError::Malformed(describe(first)));
+        }
+        match guessed_wrong(&figment, &errors) {
+            Some((key, text)) => figment = figment.merge(Serialized::default(&key, text)),
+            None => return Err(LoadError::Malformed(describe(errors))),
+        }
+        as_guessed = Some(errors);
+    }
+}
+
+/// The key and the text of a value from the environment that was taken for something else than text.
+fn guessed_wrong(figment: &Figment, error: &figment::Error) -> Option<(String, String)> {
+    let key = error.path.join(".");
+    if !from_environment(error) || figment.find_value(&key).ok()?.as_str().is_some() {
+        return None;
+    }
+    let (_, text) = environment().iter().find(|(name, _)| *name == key)?;
+    Some((key, text))
+}
+
+fn from_environment(error: &figment::Error) -> bool {
+    error.metadata.as_ref().is_some_and(|metadata| metadata.name.contains("environment variable"))
+}
+
+/// Every error with its key and where it was read, and without any password.
 fn describe(errors: figment::Error) -> String {
     let describe = |error: figment::Error| {
-        let origin = error.metadata.as_ref().map_or_else(String::new, |metadata| {
-            let place = metadata.source.as_ref().map_or_else(String::new, |source| format!(" {source}"));
-            format!(" in {}{place}", metadata.name)
-        });
-        format!("configuration key `{}`{origin}: {}", error.path.join("."), error.kind)
+        let key = error.path.join(".");
+        let origin = match &error.metadata {
+            Some(_) if from_environment(&error) => {
+                format!(" in the environment variable {ENVIRONMENT_PREFIX}{}", error.path.join("__").to_uppercase())
+            }
+            Some(metadata) => {
+                let place = metadata.source.as_ref().map_or_else(String::new, |source| format!(" {source}"));
+                format!(" in {}{place}", metadata.name)
+            }
+            None => String::new(),
+        };
+        let reason = match &error.kind {
+            figment::error::Kind::InvalidType(..) | figment::error::Kind::InvalidValue(..)
+                if key.ends_with("password") =>
+            {
+                "must be text in quotes".to_owned()
+            }
+            kind => without_passwords(&kind.to_string()),
+        };
+        // Without a key, the file itself cannot be read as TOML.
+        if key.is_empty() {
+            format!("configuration{origin}: {reason}")
+        } else {
+            format!("configuration key `{key}`{origin}: {reason}")
+        }
     };
     errors.into_iter().map(describe).collect::<Vec<_>>().join("\n")
+}
+
+/// Errors in the syntax of TOML quote the line that they are about.
+fn without_passwords(text: &str) -> String {
+    let lines = text.lines().map(|line| match line.split_once("password") {
+        Some((before, after)) if after.contains('=') => format!("{before}password = ***"),
+        _ => line.to_owned(),
+    });
+    lines.collect::<Vec<_>>().join("\n")
 }
 
 #[cfg(test)]
@@ -243,10 +360,15 @@ mod tests {
             ("role = \"king\"", ["`role`", "king", "`edge`"]),
             ("[election]\nbeat_ms = 1", ["`election.beat_ms`", "1", "5 to"]),
             (
+                "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",
+                ["`broker.max_packet_bytes`", "1048576", "8392704"],
+            ),
+            (
                 "role = \"edge\"\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 1\ny_m = 0",
                 ["`landmarks[1].id`", "\"a\"", "unique"],
             ),
             ("role = ", ["TOML", "configuration", ""]),
+            ("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"***\"", ["`mqtt.password`", "not printed", "***"]),
         ] {
             let error = load(toml).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
@@ -262,6 +384,24 @@ mod tests {
     #[test]
     fn a_printed_configuration_can_be_read_back() {
         let config = load("role = \"edge\"").unwrap();
-        assert_eq!(load(&toml::to_string(&config).unwrap()).unwrap(), config);
+        assert_eq!(load(&config.to_toml().unwrap()).unwrap(), config);
+    }
+
+    #[test]
+    fn a_printed_configuration_says_that_the_password_is_missing_and_has_no_other_in_its_place() {
+        let config = load("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"hush\"").unwrap();
+        let printed = config.to_toml().unwrap();
+        assert!(printed.contains("# `mqtt.password` is set but not shown") && !printed.contains("hush"), "{printed}");
+        let read = load(&printed).unwrap();
+        assert_eq!((read.mqtt.user.as_deref(), read.mqtt.password), (Some("u"), None));
+    }
+
+    #[test]
+    fn no_error_shows_a_password() {
+        for password in ["4711", "hush4711", "\"hush4711", "[\"hush4711\"]", "{ a = \"hush4711\" }"] {
+            let error = load(&format!("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = {password}")).unwrap_err();
+            let error = format!("{error} {error:?}");
+            assert!(error.contains("password") && !error.contains("4711"), "{error}");
+        }
     }
 }

@@ -12,10 +12,14 @@ pub enum Event {
     Published,
     /// A payload was not sent because a link was down or its queue full.
     PublishRefused,
+    /// A payload was not sent because it is larger than receivers take.
+    PublishTooLarge,
     /// A packet came in from a broker.
     Received,
     /// The broker sent back what this node had published; it was delivered in-process already.
     Echo,
+    /// Another living node of this node's name said something about itself.
+    NameConflict,
     /// A decoded message was dropped because its receivers were too far behind.
     InboxFull,
     /// A link was established.
@@ -24,6 +28,8 @@ pub enum Event {
     Disconnected,
     /// An attempt to establish a link failed.
     ConnectFailed,
+    /// A broker refused this node's credentials, a subscription, or its status; once per change.
+    BrokerRefused,
     /// A map newer than all before was taken.
     MapAccepted,
     /// An object voted for nothing, such as at an unknown landmark.
@@ -42,23 +48,28 @@ pub enum Event {
     RoundDue,
     /// A camera frame was looked at.
     FrameDetected,
-    /// A camera frame could not be used.
+    /// A camera frame or image file could not be used.
     FrameFailed,
     /// A camera frame gave way to a later one.
     FrameSkipped,
+    /// A detection could not be placed in the world and was left out of its report.
+    DetectionUnplaced,
 }
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 23] = [
         Self::Published,
         Self::PublishRefused,
+        Self::PublishTooLarge,
         Self::Received,
         Self::Echo,
+        Self::NameConflict,
         Self::InboxFull,
         Self::Connected,
         Self::Disconnected,
         Self::ConnectFailed,
+        Self::BrokerRefused,
         Self::MapAccepted,
         Self::VoteIgnored,
         Self::VerdictsAccepted,
@@ -70,6 +81,7 @@ impl Event {
         Self::FrameDetected,
         Self::FrameFailed,
         Self::FrameSkipped,
+        Self::DetectionUnplaced,
     ];
 
     /// The event as a counter's label.
@@ -77,12 +89,15 @@ impl Event {
         match self {
             Self::Published => "published",
             Self::PublishRefused => "publish_refused",
+            Self::PublishTooLarge => "publish_too_large",
             Self::Received => "received",
             Self::Echo => "echo",
+            Self::NameConflict => "name_conflict",
             Self::InboxFull => "inbox_full",
             Self::Connected => "connected",
             Self::Disconnected => "disconnected",
             Self::ConnectFailed => "connect_failed",
+            Self::BrokerRefused => "broker_refused",
             Self::MapAccepted => "map_accepted",
             Self::VoteIgnored => "vote_ignored",
             Self::VerdictsAccepted => "verdicts_accepted",
@@ -94,6 +109,7 @@ impl Event {
             Self::FrameDetected => "frame_detected",
             Self::FrameFailed => "frame_failed",
             Self::FrameSkipped => "frame_skipped",
+            Self::DetectionUnplaced => "detection_unplaced",
         }
     }
 }

@@ -84,15 +84,15 @@ impl Demo<'_> {
     /// Runs the scene; `progress` is told once a second.
     ///
     /// # Errors
-    /// When a node does not start or ends early, or a file cannot be written; all nodes are stopped in any case.
-    pub async fn run(&self, progress: impl Fn(Progress)) -> anyhow::Result<DemoResult> {
+    /// When a node does not start or ends early, `progress` fails, or a file cannot be written; all nodes are stopped in any case.
+    pub async fn run(&self, progress: impl Fn(Progress) -> anyhow::Result<()>) -> anyhow::Result<DemoResult> {
         fs::create_dir_all(self.directory).with_context(|| format!("cannot make {}", self.directory.display()))?;
         let broker = free_address()?;
         let mut nodes = vec![self.start_edge(broker)?];
         for cav in &self.scene.cavs {
             nodes.push(self.start_cav(cav, broker)?);
         }
-        let observer = Observer::start(broker).await?;
+        let observer = Observer::start(broker, setup::unused_name(self.scene, "observer")).await?;
         let outcome = self.watch(&mut nodes, &observer, progress).await;
         for node in nodes.iter_mut().rev() {
             node.stop().await;
@@ -107,7 +107,7 @@ impl Demo<'_> {
         &self,
         nodes: &mut [NodeProcess],
         observer: &Observer,
-        progress: impl Fn(Progress),
+        progress: impl Fn(Progress) -> anyhow::Result<()>,
     ) -> anyhow::Result<(Timestamp, Timestamp)> {
         let started = clock::now();
         while observer.reporters() < self.scene.cavs.len() {
@@ -126,7 +126,7 @@ impl Demo<'_> {
         while clock::now().since(from) < self.duration {
             tokio::time::sleep(Duration::from_secs(1)).await;
             check(nodes)?;
-            progress(Progress { elapsed: clock::now().since(from), reports: observer.reports() });
+            progress(Progress { elapsed: clock::now().since(from), reports: observer.reports() })?;
         }
         Ok((from, clock::now()))
     }

@@ -10,6 +10,7 @@
 
 use std::sync::Arc;
 
+use ecod::detection::Detection;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::{JoinHandle, spawn_blocking};
@@ -18,6 +19,7 @@ use crate::counters::{Counters, Event};
 use crate::detect::Detect;
 use crate::frame::Frame;
 use crate::frame_source::capture::{Capture, CaptureConfig, Opener};
+use crate::image_size::{ImageSize, SizeMismatch};
 use crate::projector::ProjectorMessage;
 use crate::seat::Seat;
 
@@ -41,6 +43,8 @@ pub struct DetectorArguments {
     pub capture: CaptureConfig,
     /// Finds the objects.
     pub detect: Box<dyn Detect>,
+    /// The image that the camera's optics describe; detections are handed on as of this size.
+    pub optics: ImageSize,
     /// Gets the detections.
     pub projector: Seat<ProjectorMessage>,
     /// The node's counters.
@@ -55,6 +59,9 @@ pub struct Detector;
 pub struct DetectorState {
     /// Away only while a frame is being looked at.
     detect: Option<Box<dyn Detect>>,
+    optics: ImageSize,
+    /// The last mismatch, told of once.
+    mismatch: Option<SizeMismatch>,
     projector: Seat<ProjectorMessage>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
@@ -70,10 +77,10 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, projector, counters } = arguments;
+        let DetectorArguments { open, capture, detect, optics, projector, counters } = arguments;
         let capture = Capture::start(open, capture)?;
         let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters)));
-        Ok(DetectorState { detect: Some(detect), projector, counters, pump })
+        Ok(DetectorState { detect: Some(detect), optics, mismatch: None, projector, counters, pump })
     }
 
     async fn handle(
@@ -84,7 +91,7 @@ impl Actor for Detector {
     ) -> Result<(), ActorProcessingErr> {
         let DetectorMessage::Look { frame, turn } = message;
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
-        let captured_at = frame.captured_at;
+        let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let (detect, outcome) = spawn_blocking(move || {
             let outcome = detect.detect(&frame);
             (detect, outcome)
@@ -92,9 +99,13 @@ impl Actor for Detector {
         .await?;
         state.detect = Some(detect);
         match outcome {
-            Ok(detections) => {
-                state.counters.count(Event::FrameDetected);
-                state.projector.send(ProjectorMessage::Report { detections, captured_at });
+            Ok(mut detections) => {
+                if state.fits(size, &mut detections) {
+                    state.counters.count(Event::FrameDetected);
+                    state.projector.send(ProjectorMessage::Report { detections, captured_at });
+                } else {
+                    state.counters.count(Event::FrameFailed);
+                }
             }
             Err(error) => {
                 state.counters.count(Event::FrameFailed);
@@ -103,6 +114,20 @@ impl Actor for Detector {
         }
         drop(turn);
         Ok(())
+    }
+}
+
+impl DetectorState {
+    /// Reads the detections in the size that the optics describe; false, and told of once, when that cannot be.
+    fn fits(&mut self, frame: ImageSize, detections: &mut [Detection]) -> bool {
+        let mismatch = self.optics.fit(frame, detections).err();
+        if let Some(error) = mismatch
+            && self.mismatch != mismatch
+        {
+            tracing::error!(%error, "frames not used");
+        }
+        self.mismatch = mismatch;
+        mismatch.is_none()
     }
 }
 
@@ -115,12 +140,16 @@ impl Drop for DetectorState {
 /// Hands over the latest frame whenever the detector is ready, until the source or the detector ends.
 async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>) {
     let turns = Arc::new(Semaphore::new(1));
-    let mut skipped = 0;
+    let (mut skipped, mut unusable) = (0, 0);
     while let Ok(turn) = Arc::clone(&turns).acquire_owned().await {
-        let Some(frame) = capture.next_frame().await else { return };
-        let total = capture.skipped();
-        counters.add(Event::FrameSkipped, total - skipped);
-        skipped = total;
+        let frame = capture.next_frame().await;
+        for (event, total, counted) in [
+            (Event::FrameSkipped, capture.skipped(), &mut skipped),
+            (Event::FrameFailed, capture.unusable(), &mut unusable),
+        ] {
+            counters.add(event, total - std::mem::replace(counted, total));
+        }
+        let Some(frame) = frame else { return };
         if detector.cast(DetectorMessage::Look { frame, turn }).is_err() {
             return;
         }

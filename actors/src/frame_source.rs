@@ -22,7 +22,8 @@ pub trait FrameSource: Send {
     /// Waits for the next frame; may block for as long as the camera does.
     ///
     /// # Errors
-    /// [`FrameError`]; the source is of no further use and is to be opened again, unless it ended.
+    /// [`FrameError`]; the source is of no further use and is to be opened again, unless it ended or the error is
+    /// [`FrameError::Unusable`], after which it goes on.
     fn next_frame(&mut self) -> Result<Frame, FrameError>;
 }
 
@@ -33,6 +34,14 @@ pub enum FrameError {
     #[error("cannot open {origin}: {reason}")]
     Open {
         /// Device, pipeline, address or path.
+        origin: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// One frame of a recording is no image; the next may well be one.
+    #[error("cannot use {origin}: {reason}")]
+    Unusable {
+        /// Path of the frame.
         origin: String,
         /// What is wrong.
         reason: String,
@@ -136,13 +145,28 @@ impl SourceConfig {
         }
     }
 
+    /// Takes user and password out of an address; true when there were some.
+    pub(crate) fn forget_credentials(&mut self) -> bool {
+        let Self::Url { url } = self else { return false };
+        let bare = video::without_credentials(url);
+        let had = bare != *url;
+        *url = bare;
+        had
+    }
+
     /// Checks every value; whether the source exists is found when it is opened.
     ///
     /// # Errors
     /// [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match self {
-            Self::V4l2 { fps: Some(fps), .. } | Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
+            Self::V4l2 { width, height, fps, .. } => {
+                for (key, wish) in [("width", width), ("height", height)] {
+                    wish.map_or(Ok(()), |pixels| check_range(key, f64::from(pixels), 1.0, 16_384.0))?;
+                }
+                fps.map_or(Ok(()), |fps| check_range("fps", fps, 0.01, 1000.0))
+            }
+            Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
             Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => {
                 Err(ConfigError::new("pipeline", pipeline, "a pipeline that ends in appsink"))
             }

@@ -22,7 +22,7 @@ mod inbox;
 mod link;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -32,9 +32,10 @@ use ecod::wire::{
     Verdicts, encode,
 };
 use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
+use uuid::Uuid;
 
 pub use address::{BrokerAddress, InvalidAddress};
-pub use config::{MqttConfig, MqttVersion, Secret};
+pub use config::{HiddenSecret, MqttConfig, MqttVersion, Secret};
 pub use ecod::wire::ReportKind;
 pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
@@ -148,6 +149,10 @@ pub struct GatewayState {
     status_payload: Bytes,
     links: BTreeMap<LinkId, Link>,
     next_link: u64,
+    /// Topics whose last payload was not sent for its size.
+    too_large: BTreeSet<String>,
+    /// Other living runs of this node's name.
+    namesakes: BTreeSet<Uuid>,
     setup: Arc<LinkSetup>,
 }
 
@@ -227,10 +232,10 @@ impl GatewayState {
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
         let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
-        let offline = NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() };
-        let will = LastWill { topic: status_topic.clone(), payload: encode(&offline, encoding).into() };
+        let filters = part.levels().iter().map(|level| topics.filter(level)).collect();
+        let will = Mutex::new(LastWill { topic: status_topic.clone(), payload: last_will(&status, encoding) });
         let inbox = Inbox::new(
-            status.node.clone(),
+            (status.node.clone(), status.id),
             topics.clone(),
             mqtt.limits(),
             mqtt.inbox,
@@ -240,7 +245,7 @@ impl GatewayState {
         // One id for a run of the node: a broker that still holds the last connection ends it before it takes the next,
         // so that the will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
-        let setup = LinkSetup { client_id, will, config: mqtt, inbox: Arc::new(inbox), counters, seed };
+        let setup = LinkSetup { client_id, filters, will, config: mqtt, inbox: Arc::new(inbox), counters, seed };
         Self {
             report_brokers: None,
             topics,
@@ -251,6 +256,8 @@ impl GatewayState {
             status_topic,
             links: BTreeMap::new(),
             next_link: 0,
+            too_large: BTreeSet::new(),
+            namesakes: BTreeSet::new(),
             setup: Arc::new(setup),
         }
     }
@@ -280,12 +287,37 @@ impl GatewayState {
 
     fn set_status(&mut self, status: NodeStatus) {
         self.status_payload = encode(&status, self.encoding).into();
+        self.setup.will.lock().unwrap_or_else(PoisonError::into_inner).payload = last_will(&status, self.encoding);
         self.status = status;
         self.send(&self.status_topic, &self.status_payload, Handling::State);
     }
 
-    fn publish<T: Payload>(&self, topic: &Topic, payload: &T, handling: Handling) {
-        self.send(&self.topics.path(topic), &encode(payload, self.encoding).into(), handling);
+    fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, handling: Handling) {
+        let payload = Bytes::from(encode(payload, self.encoding));
+        let path = self.topics.path(topic);
+        if self.fits::<T>(&path, &payload) {
+            self.send(&path, &payload, handling);
+        }
+    }
+
+    /// Whether receivers with this node's limits take the payload. One beyond them would cost links, or be dropped by
+    /// every receiver without a word here; the first in a row is told of.
+    fn fits<T: Payload>(&mut self, topic: &str, payload: &Bytes) -> bool {
+        let limit = T::max_bytes(&self.setup.config.limits());
+        if payload.len() <= limit {
+            self.too_large.remove(topic);
+            return true;
+        }
+        self.setup.counters.count(Event::PublishTooLarge);
+        if self.too_large.insert(topic.to_owned()) {
+            tracing::warn!(
+                topic,
+                bytes = payload.len(),
+                limit,
+                "payload too large to be sent, raise the limit in [mqtt]"
+            );
+        }
+        false
     }
 
     fn send(&self, topic: &str, payload: &Bytes, handling: Handling) {
@@ -313,6 +345,17 @@ impl GatewayState {
                 }
                 return;
             }
+            LinkNews::Namesake(run) => {
+                // Answered once for each, so that both know and neither goes on for ever.
+                if self.namesakes.len() < MAX_NAMESAKES && self.namesakes.insert(run) {
+                    let node = &self.status.node;
+                    tracing::warn!(broker = %link.broker, %node, %run, "another living node has this node's name, rename one");
+                    if let Some(client) = &link.client {
+                        client.publish(&self.status_topic, &self.status_payload, Handling::State);
+                    }
+                }
+                return;
+            }
             LinkNews::Lost(state) => {
                 link.client = None;
                 state
@@ -328,6 +371,13 @@ impl GatewayState {
 
 /// Where vehicles report.
 const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
+/// Most runs of this node's name that are told of.
+const MAX_NAMESAKES: usize = 16;
+
+/// What the broker is to say when the node falls silent.
+fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
+    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
+}
 
 impl Part {
     fn levels(self) -> &'static [&'static str] {

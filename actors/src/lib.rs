@@ -28,10 +28,13 @@ pub mod frame_source;
 pub mod fuser;
 pub mod gateway;
 #[cfg(feature = "camera")]
+pub mod image_size;
+#[cfg(feature = "camera")]
 pub mod latest_slot;
 pub mod leader_election;
 #[cfg(feature = "camera")]
 pub mod lens;
+pub mod lines;
 pub mod membership;
 pub mod node;
 #[cfg(feature = "camera")]

@@ -40,7 +40,7 @@ use crate::membership::Member;
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
 pub use seats::{Part, Seats};
 
-use parts::Assembly;
+use parts::{Assembly, cause};
 use restarts::Restarts;
 
 /// What the supervisor is asked to do; it stops by [`NodeHandle::stop`].
@@ -97,7 +97,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (members, leadership) = (assembly.members(), assembly.leadership());
     let (seats, counters) = (assembly.seats().clone(), assembly.counters());
     let started = Actor::spawn(None, Node, assembly).await;
-    let (supervisor, ended) = started.map_err(|error| NodeError::Failed(error.to_string()))?;
+    let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
     Ok(NodeHandle { supervisor, ended, failure, newest, broker, gossip, members, leadership, seats, counters })
 }

@@ -93,8 +93,12 @@ impl Perception {
         match self.projection.place(detection, target.as_ref(), &self.camera) {
             Ok(object) => Some(self.at_landmark(object)),
             Err(error) => {
-                tracing::debug!(%error, "detection left out");
-                *self.without_position.entry(error.as_str()).or_default() += 1;
+                let times = self.without_position.entry(error.as_str()).or_default();
+                *times += 1;
+                match *times {
+                    1 => tracing::warn!(%error, "detection left out, the first for this reason"),
+                    _ => tracing::debug!(%error, "detection left out"),
+                }
                 None
             }
         }

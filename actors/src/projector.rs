@@ -10,6 +10,7 @@ use ecod::detection::Detection;
 use ecod::time::Timestamp;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 
+use crate::counters::{Counters, Event};
 use crate::gateway::{GatewayMessage, ReportKind};
 use crate::perception::Perception;
 use crate::seat::Seat;
@@ -32,6 +33,8 @@ pub struct ProjectorArguments {
     pub perception: Perception,
     /// Where reports are published.
     pub gateway: Seat<GatewayMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
 }
 
 /// Turns each frame's detections into a report.
@@ -58,7 +61,9 @@ impl Actor for Projector {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let ProjectorMessage::Report { detections, captured_at } = message;
+        let found = detections.len();
         let report = Arc::new(state.perception.report(detections, captured_at));
+        state.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
         state.gateway.send(GatewayMessage::PublishReport { kind: ReportKind::Detections, report });
         Ok(())
     }

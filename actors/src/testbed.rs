@@ -5,6 +5,7 @@
 //! as far below the upper end of its card as from its sides, cards stand on the floor, and vehicles hide nothing.
 
 pub mod birdseye;
+pub mod intersection;
 mod render;
 pub mod score;
 mod sensor;

@@ -168,6 +168,22 @@ async fn a_part_that_keeps_ending_makes_the_node_give_up() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_killed_supervisor_fails_the_node_and_takes_its_parts_with_it() {
+    let mut edge = edge().await;
+    let address = edge.broker_address().unwrap();
+    let supervisor = edge.seats().fuser.holder().unwrap().try_get_supervisor().unwrap();
+    supervisor.kill();
+    let error = timeout(Duration::from_secs(5), edge.failed()).await.expect("within bounds").unwrap_err();
+    assert!(error.to_string().contains("supervisor"), "{error}");
+    let closed = async {
+        while tokio::net::TcpStream::connect(address).await.is_ok() {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    timeout(PATIENCE, closed).await.expect("the broker ends with its supervisor");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_busy_port_is_an_error_that_names_it() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();

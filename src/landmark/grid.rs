@@ -1,36 +1,53 @@
 //! Points in square cells: a query looks at the few cells around it, however many points there are elsewhere.
 
-use std::ops::Range;
-
-use hashbrown::HashMap;
-use nalgebra::Point2;
+use nalgebra::{Point2, Vector2};
 
 /// A point and the landmark it belongs to.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct GridPoint {
     pub(super) position: Point2<f64>,
     /// Position of the landmark in configuration order.
-    pub(super) landmark: usize,
+    pub(super) landmark: u32,
+    /// Whether the landmark has a vacancy sign.
+    pub(super) has_sign: bool,
 }
 
-/// Points grouped by cell.
+/// Points grouped by cell, and cells by bucket. The cells of a row have successive buckets: a query reads one stretch of
+/// memory for each row, and what one vehicle asks for is near what it asked for before.
 #[derive(Debug, Clone)]
 pub(super) struct Grid {
     cell_m: f64,
-    points: Vec<GridPoint>,
-    cells: HashMap<Cell, Range<usize>>,
+    /// Ascending by bucket, each with its row.
+    points: Vec<(i32, GridPoint)>,
+    /// Where the points of each bucket end; as many as a power of two.
+    ends: Vec<u32>,
 }
+
+/// Keeps the rows of a grid apart: the fraction of the golden ratio in 64 bits (Knuth, "The Art of Computer Programming",
+/// volume 3, section 6.4).
+const ROW_STEP: u64 = 0x9e37_79b9_7f4a_7c15;
 
 impl Grid {
     /// Groups the points into cells of `cell_m` metres; a query looks at one to four cells for radii up to half of that.
-    pub(super) fn new(mut points: Vec<GridPoint>, cell_m: f64) -> Self {
-        let cell_of = |point: &GridPoint| cell(line(point.position.x, cell_m), line(point.position.y, cell_m));
-        points.sort_by_key(|point| (cell_of(point), point.landmark));
-        let mut cells: HashMap<Cell, Range<usize>> = HashMap::new();
+    pub(super) fn new(points: impl IntoIterator<Item = GridPoint>, cell_m: f64) -> Self {
+        let mut points: Vec<_> = points.into_iter().collect();
+        let buckets = (2 * points.len()).next_power_of_two();
+        let bucket_of = |at: Point2<f64>| bucket(line(at.x, cell_m), line(at.y, cell_m), buckets);
+        points.sort_by_key(|point| (bucket_of(point.position), point.landmark));
+        let mut ends = vec![0; buckets];
         for (index, point) in points.iter().enumerate() {
-            cells.entry(cell_of(point)).or_insert(index..index).end = index + 1;
+            ends[bucket_of(point.position)] = index as u32 + 1;
         }
-        Self { cell_m, points, cells }
+        for bucket in 1..buckets {
+            ends[bucket] = ends[bucket].max(ends[bucket - 1]);
+        }
+        let points = points.into_iter().map(|point| (line(point.position.y, cell_m), point)).collect();
+        Self { cell_m, points, ends }
+    }
+
+    /// Whether there are no points.
+    pub(super) fn is_empty(&self) -> bool {
+        self.points.is_empty()
     }
 
     /// The points within `radius_m` of a point, with the vector to the point from each.
@@ -38,29 +55,36 @@ impl Grid {
         &self,
         point: Point2<f64>,
         radius_m: f64,
-    ) -> impl Iterator<Item = (usize, nalgebra::Vector2<f64>)> + '_ {
-        let span = |middle: f64| line(middle - radius_m, self.cell_m)..=line(middle + radius_m, self.cell_m);
-        let rows = span(point.y);
-        span(point.x)
-            .flat_map(move |x| rows.clone().map(move |y| cell(x, y)))
-            .filter_map(|at| self.cells.get(&at))
-            .flat_map(|range| &self.points[range.clone()])
-            .map(move |candidate| (candidate.landmark, point - candidate.position))
+    ) -> impl Iterator<Item = (&GridPoint, Vector2<f64>)> + '_ {
+        let first = line(point.x - radius_m, self.cell_m);
+        let columns = line(point.x + radius_m, self.cell_m).abs_diff(first) as usize;
+        let rows = line(point.y - radius_m, self.cell_m)..=line(point.y + radius_m, self.cell_m);
+        rows.flat_map(move |row| self.stretch(first, columns, row).filter(move |(at, _)| *at == row))
+            .map(move |(_, candidate)| (candidate, point - candidate.position))
             .filter(move |(_, offset)| offset.norm_squared() <= radius_m * radius_m)
+    }
+
+    /// The points in the buckets of a cell and of so many more of its row, and whatever shares the buckets.
+    fn stretch(&self, first: i32, more: usize, row: i32) -> impl Iterator<Item = &(i32, GridPoint)> {
+        let buckets = self.ends.len();
+        let first = bucket(first, row, buckets);
+        let last = first + more.min(buckets - 1);
+        let start = |bucket: usize| if bucket == 0 { 0 } else { self.ends[bucket - 1] as usize };
+        let straight = &self.points[start(first)..self.ends[last.min(buckets - 1)] as usize];
+        // Beyond the last bucket comes the first.
+        let around = if last < buckets { 0 } else { self.ends[last - buckets] as usize };
+        straight.iter().chain(&self.points[..around])
     }
 }
 
-/// Column and row of a cell in one word, which hashes fastest. Cells 2³² apart share a word and their points one range
-/// of candidates; the distance tells them apart.
-type Cell = u64;
-
-fn cell(column: i64, row: i64) -> Cell {
-    (u64::from(column as u32) << 32) | u64::from(row as u32)
+fn bucket(column: i32, row: i32, buckets: usize) -> usize {
+    let spread = ((row as u64).wrapping_mul(ROW_STEP) >> 32).wrapping_add(column as u64);
+    spread as usize & (buckets - 1)
 }
 
-/// The column or row that a coordinate lies in.
-fn line(coordinate_m: f64, cell_m: f64) -> i64 {
+/// The column or row that a coordinate lies in; those beyond 32 bits share the outermost.
+fn line(coordinate_m: f64, cell_m: f64) -> i32 {
     let scaled = coordinate_m / cell_m;
-    let truncated = scaled as i64;
-    truncated - i64::from(scaled < truncated as f64)
+    let truncated = scaled as i32;
+    truncated.saturating_sub(i32::from(scaled < f64::from(truncated)))
 }

@@ -14,6 +14,8 @@ use crate::names::{Label, LandmarkId};
 #[derive(Debug, Clone)]
 pub struct LandmarkIndex {
     landmarks: Vec<Landmark>,
+    /// Side by side, for [`Self::position_near`].
+    ids: Vec<LandmarkId>,
     by_id: HashMap<LandmarkId, usize>,
     objects: Grid,
     vacancy_signs: Grid,
@@ -45,16 +47,25 @@ pub struct Gate {
 impl LandmarkIndex {
     /// Indexes the landmarks for queries of about `radius_m` metres.
     pub fn new(landmarks: Vec<Landmark>, radius_m: f64) -> Self {
-        let point = |(landmark, position)| GridPoint { position, landmark };
-        let objects = landmarks.iter().map(|l| l.position).enumerate().map(point).collect();
+        let point = |(index, position): (usize, Point2<f64>)| GridPoint {
+            position,
+            landmark: index as u32,
+            has_sign: landmarks[index].vacancy.is_some(),
+        };
+        let objects = landmarks.iter().map(|l| l.position).enumerate().map(point);
         let signs = landmarks.iter().enumerate().filter_map(|(index, l)| Some((index, l.vacancy.as_ref()?.position)));
-        let signs = signs.map(point).collect();
         Self {
+            ids: landmarks.iter().map(|l| l.id.clone()).collect(),
             by_id: landmarks.iter().enumerate().map(|(index, l)| (l.id.clone(), index)).collect(),
             objects: Grid::new(objects, 4.0 * radius_m),
-            vacancy_signs: Grid::new(signs, 4.0 * radius_m),
+            vacancy_signs: Grid::new(signs.map(point), 4.0 * radius_m),
             landmarks,
         }
+    }
+
+    /// An index of these landmarks and then of more, for queries of about `radius_m` metres.
+    pub fn extended(&self, more: Vec<Landmark>, radius_m: f64) -> Self {
+        Self::new(self.landmarks.iter().cloned().chain(more).collect(), radius_m)
     }
 
     /// The landmarks in configuration order.
@@ -67,9 +78,14 @@ impl LandmarkIndex {
         self.by_id.get(id).copied()
     }
 
+    /// The same for ids that mostly come in configuration order: `expected` is tried first.
+    pub fn position_near(&self, id: &LandmarkId, expected: usize) -> Option<usize> {
+        if self.ids.get(expected) == Some(id) { Some(expected) } else { self.position_of(id) }
+    }
+
     /// Landmarks whose object would stand within `radius_m` of a point in metres, in no particular order.
     pub fn within(&self, point: &Point2<f64>, radius_m: f64) -> impl Iterator<Item = usize> {
-        self.objects.within(*point, radius_m).map(|(landmark, _)| landmark)
+        self.objects.within(*point, radius_m).map(|(near, _)| near.landmark as usize)
     }
 
     /// The landmark that best explains a detection: within the gate and at the least Mahalanobis distance.
@@ -77,20 +93,26 @@ impl LandmarkIndex {
     /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
     /// with where objects stand.
     pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
-        let is_sign_of = |index: usize| self.landmarks[index].vacancy.as_ref().is_some_and(|sign| sign.label == *label);
+        let reads_sign_of = |near: &GridPoint| {
+            let sign = || self.landmarks[near.landmark as usize].vacancy.as_ref();
+            near.has_sign && sign().is_some_and(|sign| sign.label == *label)
+        };
         let near = |grid: &'_ Grid, is_vacancy_sign: bool| {
             grid.within(*point, gate.radius_m)
-                .filter(|(landmark, _)| is_sign_of(*landmark) == is_vacancy_sign)
-                .map(|(landmark, offset)| Candidate {
-                    landmark,
+                .filter(|(near, _)| reads_sign_of(near) == is_vacancy_sign)
+                .map(|(near, offset)| Candidate {
+                    landmark: near.landmark as usize,
                     is_vacancy_sign,
                     mahalanobis_squared: covariance.mahalanobis_squared(&offset, gate.floor_m),
                 })
                 .filter(|candidate| candidate.mahalanobis_squared <= gate.sigmas * gate.sigmas)
                 .min_by(Candidate::compare)
         };
-        let (object, sign) = (near(&self.objects, false), near(&self.vacancy_signs, true));
-        object.into_iter().chain(sign).min_by(Candidate::compare)
+        let object = near(&self.objects, false);
+        if self.vacancy_signs.is_empty() {
+            return object;
+        }
+        object.into_iter().chain(near(&self.vacancy_signs, true)).min_by(Candidate::compare)
     }
 }
 

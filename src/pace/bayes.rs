@@ -21,14 +21,19 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::Point2;
+use smallvec::SmallVec;
 
-use self::evidence::{Place, Sighting, Vehicle, Worth};
-use self::tally::{ByPlace, Grouping, NamedLook, Tally, weighted_mean};
+use self::evidence::{Look, Sighting, Vehicle, Worth};
+use self::tally::{NamedLook, Tally, WeightedMean};
+use super::grouping::{ByPlace, Grouping, Place};
 use super::{PaceConfig, PaceRound};
 use crate::landmark::{Candidate, Landmark, LandmarkIndex};
 use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
+
+/// The looks at one place; most places are in few vehicles' view.
+type Looks<'a> = SmallVec<[NamedLook<'a>; 16]>;
 
 /// See the module.
 #[derive(Debug, Clone)]
@@ -53,14 +58,15 @@ impl BayesPace {
         }
     }
 
+    pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {
+        self.landmarks = Arc::new(self.landmarks.extended(added, self.config.gate_m));
+        self.published.resize(self.landmarks.landmarks().len(), None);
+    }
+
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
         let sightings = self.sightings(report);
-        if !self.vehicles.contains_key(&report.node) {
-            self.vehicles.insert(report.node.clone(), Vehicle::default());
-        }
-        if let Some(vehicle) = self.vehicles.get_mut(&report.node) {
-            vehicle.observe(&sightings, captured_at, self.worth, &self.config);
-        }
+        let vehicle = self.vehicles.entry(report.node.clone()).or_default();
+        vehicle.observe(&sightings, captured_at, self.worth, &self.config);
     }
 
     pub(super) fn close(&mut self, now: Timestamp) -> PaceRound {
@@ -72,24 +78,29 @@ impl BayesPace {
             oldest.is_some()
         });
         let mut grouping = std::mem::take(&mut self.grouping);
-        let by_place = grouping.group(&self.vehicles, 2 * self.landmarks.landmarks().len());
-        let landmarks: Vec<LandmarkState> = self
-            .landmarks
-            .landmarks()
-            .iter()
-            .enumerate()
-            .map(|(index, landmark)| self.agree(landmark, self.published[index].as_ref(), index, &by_place))
-            .collect();
+        let held: Vec<_> = self.vehicles.iter().map(|(node, vehicle)| vehicle.held_by(node)).collect();
+        let by_place = grouping.group(&held, 2 * self.landmarks.landmarks().len());
+        let mut published = std::mem::take(&mut self.published);
+        let mut landmarks = Vec::with_capacity(published.len());
+        for (index, (landmark, published)) in self.landmarks.landmarks().iter().zip(&mut published).enumerate() {
+            let state = self.agree(landmark, published.as_ref(), index, &by_place);
+            published.clone_from(&state.label);
+            landmarks.push(state);
+        }
         self.grouping = grouping;
-        self.published = landmarks.iter().map(|state| state.label.clone()).collect();
+        self.published = published;
         PaceRound { landmarks, oldest_capture }
     }
 
     /// Every place that the vehicle looked at, ascending: where it found something and what it says it saw.
     fn sightings<'a>(&self, report: &'a ObjectReport) -> Vec<Sighting<'a>> {
         let mut sightings = self.associate(&report.objects);
-        let seen = report.seen.iter().flatten().filter_map(|id| self.landmarks.position_of(id));
-        sightings.extend(seen.map(|landmark| Sighting { place: Place::object(landmark), found: None }));
+        let mut expected = 0;
+        sightings.extend(report.seen.iter().flatten().filter_map(|id| {
+            let landmark = self.landmarks.position_near(id, expected)?;
+            expected = landmark + 1;
+            Some(Sighting { place: Place::object(landmark), found: None })
+        }));
         // Stable: what was found at a place comes before the bare fact that it was in view.
         sightings.sort_by_key(|sighting| sighting.place);
         sightings.dedup_by(|later, kept| later.place == kept.place && later.found.is_none());
@@ -127,39 +138,57 @@ impl BayesPace {
         landmark: &Landmark,
         published: Option<&Label>,
         index: usize,
-        by_place: &ByPlace<'_>,
+        by_place: &ByPlace<'_, Look>,
     ) -> LandmarkState {
-        let observers = || by_place.at(Place::object(index)).map(|(node, _)| node.clone()).collect();
-        for place in [Place::object(index), Place::vacancy_sign(index)] {
-            let looks = by_place.at(place);
-            if let Some(winner) = Tally::of(looks.clone()).winner(published, self.config.switch_lead) {
-                let contributions = looks.filter(|(_, look)| look.nats_for(winner.label) > 0.0);
-                let positions = contributions.clone().filter_map(|(_, look)| look.position);
-                let position = weighted_mean(positions, self.config.position_floor_m).unwrap_or(landmark.position);
-                return LandmarkState {
-                    id: landmark.id.clone(),
-                    label: Some(winner.label.clone()),
-                    confidence: winner.posterior,
-                    x_m: position.x,
-                    y_m: position.y,
-                    contributors: contributions.map(|(node, _)| node.clone()).collect(),
-                    observers: observers(),
-                };
+        let looks: Looks<'_> = by_place.at(Place::object(index)).collect();
+        if let Some(state) = self.agree_on_label(landmark, published, &looks, &looks) {
+            return state;
+        }
+        if landmark.vacancy.is_some() {
+            let signs: Looks<'_> = by_place.at(Place::vacancy_sign(index)).collect();
+            if let Some(state) = self.agree_on_label(landmark, published, &signs, &looks) {
+                return state;
             }
         }
-        self.without_label(landmark, by_place.at(Place::object(index)))
+        self.without_label(landmark, &looks)
+    }
+
+    /// The label that the looks at one place have the most evidence for, if they have any; `observers` looked at the
+    /// landmark at all.
+    fn agree_on_label(
+        &self,
+        landmark: &Landmark,
+        published: Option<&Label>,
+        looks: &[NamedLook<'_>],
+        observers: &[NamedLook<'_>],
+    ) -> Option<LandmarkState> {
+        let winner = Tally::of(looks).winner(published, self.config.switch_lead)?;
+        let mut contributors = Vec::with_capacity(looks.len());
+        let mut mean = WeightedMean::default();
+        for (node, look) in looks.iter().filter(|(_, look)| look.nats_for(winner.label) > 0.0) {
+            contributors.push((*node).clone());
+            if let Some((position, covariance)) = &look.position {
+                mean.add(position, covariance, self.config.position_floor_m);
+            }
+        }
+        let position = mean.position().unwrap_or(landmark.position);
+        Some(LandmarkState {
+            id: landmark.id.clone(),
+            label: Some(winner.label.clone()),
+            confidence: winner.posterior,
+            x_m: position.x,
+            y_m: position.y,
+            contributors,
+            observers: names(observers),
+        })
     }
 
     /// Known to be empty or never looked at.
-    fn without_label<'a>(
-        &self,
-        landmark: &Landmark,
-        looks: impl Iterator<Item = NamedLook<'a>> + Clone,
-    ) -> LandmarkState {
-        let absence: f64 = -looks.clone().map(|(_, look)| look.anything).sum::<f64>();
+    fn without_label(&self, landmark: &Landmark, looks: &[NamedLook<'_>]) -> LandmarkState {
+        let absence: f64 = -looks.iter().map(|(_, look)| look.anything).sum::<f64>();
         let known_empty = absence >= self.config.empty_evidence;
         let vacancy = landmark.vacancy.as_ref().filter(|_| known_empty);
-        let observers: Vec<NodeName> = looks.filter(|_| known_empty).map(|(node, _)| node.clone()).collect();
+        let observers = if known_empty { names(looks) } else { Vec::new() };
         LandmarkState {
             id: landmark.id.clone(),
             label: vacancy.map(|sign| sign.label.clone()),
@@ -170,6 +199,10 @@ impl BayesPace {
             observers,
         }
     }
+}
+
+fn names(looks: &[NamedLook<'_>]) -> Vec<NodeName> {
+    looks.iter().map(|(node, _)| (*node).clone()).collect()
 }
 
 fn logistic(nats: f64) -> f64 {

@@ -15,6 +15,11 @@ use crate::geometry::{Pose, wrap_angle};
 use crate::names::{Label, MAX_NAME_BYTES, NodeName};
 
 const METRES_PER_INCH: f64 = 0.0254;
+/// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is rendered.
+const LEAST_INTERVAL_S: f64 = 1e-4;
+const MOST_INTERVAL_S: f64 = 3600.0;
+/// Most frames that are rendered for one submission.
+const MOST_FRAMES_PER_SUBMISSION: f64 = 1000.0;
 /// Farthest coordinate, to keep squares and quotients finite.
 const MAX_COORDINATE_IN: f64 = 1e6;
 
@@ -22,12 +27,12 @@ const MAX_COORDINATE_IN: f64 = 1e6;
 #[derive(Debug, thiserror::Error)]
 pub enum TestbedError {
     /// The text is not JSON.
-    #[error("scene file is not json")]
+    #[error("not json")]
     NotJson(#[source] serde_json::Error),
     /// A value is missing, of the wrong kind or out of range.
     #[error("{place}: `{key}` {reason}")]
     Value {
-        /// `scene file`, or `scene` and its name or, if it has none, its number counted from 0.
+        /// `scene file`, `recording`, or `scene` and its name or, if it has none, its number counted from 0.
         place: String,
         /// Path of the key, such as `spots[2].truth`.
         key: String,
@@ -41,6 +46,9 @@ pub(super) fn read(text: &str) -> Result<Testbed, TestbedError> {
     let file = Place("scene file".into());
     let head: FileFields = file.parse(value)?;
     head.units.check(&file)?;
+    if head.scenes.is_empty() {
+        return Err(file.error("scenes", "is empty, must have at least one scene"));
+    }
     let camera = head.camera.check(&file)?;
     let placard = head.placard.check(&file)?;
     let mut scenes: Vec<Scene> = Vec::with_capacity(head.scenes.len());
@@ -57,20 +65,20 @@ pub(super) fn read(text: &str) -> Result<Testbed, TestbedError> {
 }
 
 /// The part of the file that an error is about.
-struct Place(String);
+pub(super) struct Place(pub(super) String);
 
 impl Place {
-    fn error(&self, key: impl Into<String>, reason: impl Display) -> TestbedError {
+    pub(super) fn error(&self, key: impl Into<String>, reason: impl Display) -> TestbedError {
         TestbedError::Value { place: self.0.clone(), key: key.into(), reason: reason.to_string() }
     }
 
-    fn parse<T: DeserializeOwned>(&self, value: Value) -> Result<T, TestbedError> {
+    pub(super) fn parse<T: DeserializeOwned>(&self, value: Value) -> Result<T, TestbedError> {
         serde_path_to_error::deserialize(value)
             .map_err(|error| self.error(error.path().to_string(), format_args!("cannot be read: {}", error.inner())))
     }
 
     /// A number above `low` and up to `high`.
-    fn number(&self, key: &str, value: f64, low: f64, high: f64) -> Result<f64, TestbedError> {
+    pub(super) fn number(&self, key: &str, value: f64, low: f64, high: f64) -> Result<f64, TestbedError> {
         if value > low && value <= high {
             Ok(value)
         } else {
@@ -78,7 +86,7 @@ impl Place {
         }
     }
 
-    fn point(&self, key: &str, inches: [f64; 2]) -> Result<Point2<f64>, TestbedError> {
+    pub(super) fn point(&self, key: &str, inches: [f64; 2]) -> Result<Point2<f64>, TestbedError> {
         if inches.iter().all(|value| value.abs() <= MAX_COORDINATE_IN) {
             Ok(Point2::from(inches) * METRES_PER_INCH)
         } else {
@@ -86,7 +94,7 @@ impl Place {
         }
     }
 
-    fn label(&self, key: &str, text: String) -> Result<Label, TestbedError> {
+    pub(super) fn label(&self, key: &str, text: String) -> Result<Label, TestbedError> {
         if (1..=MAX_NAME_BYTES).contains(&text.len()) {
             Ok(text.into())
         } else {
@@ -106,13 +114,13 @@ struct FileFields {
 
 /// Other units are refused rather than misread.
 #[derive(Deserialize, Default)]
-struct UnitFields {
+pub(super) struct UnitFields {
     length: Option<String>,
     angle: Option<String>,
 }
 
 impl UnitFields {
-    fn check(&self, place: &Place) -> Result<(), TestbedError> {
+    pub(super) fn check(&self, place: &Place) -> Result<(), TestbedError> {
         let expect = |key: &str, found: &Option<String>, unit: &str| match found {
             Some(found) if !found.starts_with(unit) => {
                 Err(place.error(key, format_args!("is {found:?}, must be {unit:?}")))
@@ -125,7 +133,7 @@ impl UnitFields {
 }
 
 #[derive(Deserialize)]
-struct CameraFields {
+pub(super) struct CameraFields {
     image_width: u32,
     image_height: u32,
     horizontal_fov_deg: f64,
@@ -145,12 +153,16 @@ fn default_submission_interval_s() -> f64 {
 }
 
 impl CameraFields {
-    fn check(&self, place: &Place) -> Result<Camera, TestbedError> {
+    pub(super) fn check(&self, place: &Place) -> Result<Camera, TestbedError> {
         place.number("camera.image_width", self.image_width.into(), 0.0, 8192.0)?;
         place.number("camera.image_height", self.image_height.into(), 0.0, 8192.0)?;
         let horizontal = place.number("camera.horizontal_fov_deg", self.horizontal_fov_deg, 0.0, 170.0)?;
         let vertical = place.number("camera.vertical_fov_deg", self.vertical_fov_deg, 0.0, 170.0)?;
-        let interval = |key, seconds| place.number(key, seconds, 0.0, 3600.0).map(Duration::from_secs_f64);
+        let capture_s =
+            place.number("camera.capture_interval_s", self.capture_interval_s, LEAST_INTERVAL_S, MOST_INTERVAL_S)?;
+        let most_s = (MOST_FRAMES_PER_SUBMISSION * capture_s).min(MOST_INTERVAL_S);
+        let submission_s =
+            place.number("camera.submission_interval_s", self.submission_interval_s, LEAST_INTERVAL_S, most_s)?;
         Ok(Camera {
             intrinsics: Intrinsics::from_field_of_view(
                 self.image_width,
@@ -158,8 +170,8 @@ impl CameraFields {
                 horizontal.to_radians(),
                 vertical.to_radians(),
             ),
-            capture_interval: interval("camera.capture_interval_s", self.capture_interval_s)?,
-            submission_interval: interval("camera.submission_interval_s", self.submission_interval_s)?,
+            capture_interval: Duration::from_secs_f64(capture_s),
+            submission_interval: Duration::from_secs_f64(submission_s),
         })
     }
 }
@@ -266,14 +278,14 @@ fn check_spots(fields: Vec<SpotFields>, place: &Place) -> Result<Vec<Spot>, Test
 }
 
 #[derive(Deserialize)]
-struct CavFields {
+pub(super) struct CavFields {
     id: String,
     position: [f64; 2],
     camera_heading_deg: f64,
 }
 
 impl CavFields {
-    fn check(self, index: usize, place: &Place) -> Result<Cav, TestbedError> {
+    pub(super) fn check(self, index: usize, place: &Place) -> Result<Cav, TestbedError> {
         let key = |name: &str| format!("cavs[{index}].{name}");
         let name = NodeName::new(&self.id).map_err(|error| place.error(key("id"), format_args!("is a {error}")))?;
         let position = place.point(&key("position"), self.position)?;

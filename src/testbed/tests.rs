@@ -109,6 +109,22 @@ fn errors_name_the_scene_the_key_and_the_value() {
         broken(&|file| file["units"] = json!({"length": "metre"})),
         "scene file: `units.length` is \"metre\", must be \"inch\""
     );
+    for interval_s in [1e-9, 0.0, -1.0, 7200.0] {
+        let error = broken(&|file| file["camera"]["capture_interval_s"] = json!(interval_s));
+        assert!(
+            error.starts_with("scene file: `camera.capture_interval_s` is ") && error.contains("0.0001"),
+            "{error}"
+        );
+    }
+    let hours = broken(&|file| {
+        file["camera"]["capture_interval_s"] = json!(0.001);
+        file["camera"]["submission_interval_s"] = json!(60);
+    });
+    assert_eq!(hours, "scene file: `camera.submission_interval_s` is 60, must be above 0.0001 and at most 1");
+    assert_eq!(
+        broken(&|file| file["scenes"] = json!([])),
+        "scene file: `scenes` is empty, must have at least one scene"
+    );
     assert!(matches!(Testbed::from_json("{"), Err(TestbedError::NotJson(_))));
 }
 

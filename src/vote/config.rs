@@ -113,6 +113,9 @@ pub struct WeightedConfig {
     pub class_share_verdicts: f64,
     /// Votes over which the memory of a vehicle fades to 1/e; default 500. Shorter notices a change of mind sooner.
     pub memory_votes: f64,
+    /// Comparisons over which the memory of two vehicles' agreement fades to 1/e; default 100. Shorter notices sooner
+    /// that vehicles begin to copy each other, longer finds fainter dependence.
+    pub pair_memory_votes: f64,
     /// Votes until a vehicle counts as proven; default 10.
     pub probation_votes: f64,
     /// Most that newcomers together weigh against the proven vehicles at a landmark; default 0.5. Bounds what an
@@ -126,7 +129,7 @@ pub struct WeightedConfig {
     pub visibility_at_max_range: f64,
     /// Older landmarks that are judged again per fresh vote, in votes; default 8. More settles sooner, costs more.
     pub revisit_votes: f64,
-    /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 50.
+    /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 10.
     pub calibration_votes: f64,
 }
 
@@ -140,13 +143,14 @@ impl Default for WeightedConfig {
             confusion_sharing: 0.5,
             class_share_verdicts: 100.0,
             memory_votes: 500.0,
+            pair_memory_votes: 100.0,
             probation_votes: 10.0,
             newcomer_share: 0.5,
             hysteresis: 0.1,
             half_visibility_rad: 0.8,
             visibility_at_max_range: 0.3,
             revisit_votes: 8.0,
-            calibration_votes: 50.0,
+            calibration_votes: 10.0,
         }
     }
 }
@@ -160,6 +164,7 @@ impl WeightedConfig {
         check_range("confusion_sharing", self.confusion_sharing, 0.0, 1.0)?;
         check_range("class_share_verdicts", self.class_share_verdicts, 2.0, 1e9)?;
         check_range("memory_votes", self.memory_votes, 1.0, 1e9)?;
+        check_range("pair_memory_votes", self.pair_memory_votes, 2.0, 1e9)?;
         check_range("probation_votes", self.probation_votes, 0.0, 1e6)?;
         check_range("newcomer_share", self.newcomer_share, 0.0, 1e9)?;
         check_range("hysteresis", self.hysteresis, 0.0, 0.99)?;

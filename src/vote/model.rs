@@ -10,20 +10,34 @@ pub(super) struct Witness {
     pub(super) live: Confusion,
     /// Evidence of votes that are past, fading.
     pub(super) settled: Confusion,
-    /// Right and wrong votes told by another aggregator.
-    pub(super) inherited: (f64, f64),
+    /// Evidence told by another aggregator, fading.
+    pub(super) inherited: Confusion,
+    /// Cumulative sum of how much less often than before the vehicle was right.
+    shortfall: f64,
     /// Log-odds of being right, against what the fleet would be on the same classes.
     advantage: f64,
 }
 
 impl Witness {
     fn correct(&self) -> f64 {
-        self.live.correct() + self.settled.correct() + self.inherited.0
+        self.live.correct() + self.settled.correct() + self.inherited.correct()
+    }
+
+    /// Page's (1954) cumulative sum: a vehicle that is suddenly right less often loses most of its past.
+    fn watch(&mut self, right: f64) {
+        let past = self.settled.total() + self.inherited.total();
+        let usual = (self.settled.correct() + self.inherited.correct()) / past.max(1.0);
+        self.shortfall = (self.shortfall + usual - right - SHORTFALL_SLACK).max(0.0);
+        if self.shortfall > SHORTFALL_ALARM {
+            self.shortfall = 0.0;
+            self.settled.fade(KEPT_AFTER_ALARM);
+            self.inherited.fade(KEPT_AFTER_ALARM);
+        }
     }
 
     /// Votes of evidence.
     pub(super) fn evidence(&self) -> f64 {
-        self.live.total() + self.settled.total() + self.inherited.0 + self.inherited.1
+        self.live.total() + self.settled.total() + self.inherited.total()
     }
 }
 
@@ -36,6 +50,8 @@ pub(super) struct Word {
     pub(super) label: LabelIndex,
     /// Calibrated confidence × visibility, 1 for a plain vote.
     pub(super) weight: f64,
+    /// Part of the vote that is the vehicle's own.
+    pub(super) own: f64,
 }
 
 /// Vehicles' and the fleet's confusion and the shares of the classes.
@@ -56,6 +72,12 @@ pub(super) struct Model {
 
 /// Weight, in votes, of the assumed accuracy against the fleet's record of a class.
 const FLEET_PRIOR_VOTES: f64 = 1.0;
+/// Fall in the rate of right votes that is not taken for a change.
+const SHORTFALL_SLACK: f64 = 0.2;
+/// Votes that must be missing beyond it: about seven wrong ones of a vehicle that was right 80 % of the time.
+const SHORTFALL_ALARM: f64 = 4.0;
+/// Part of a vehicle's past that still counts after a change.
+const KEPT_AFTER_ALARM: f64 = 0.1;
 
 impl Model {
     pub(super) fn new(config: WeightedConfig) -> Self {
@@ -104,9 +126,10 @@ impl Model {
         for vehicle in vehicles {
             let witness = &self.witnesses[vehicle];
             let expected = |rows: &Confusion| -> f64 { rows.rows().map(|(t, n)| n * self.fleet(t, t, accuracy)).sum() };
-            let counted = witness.live.total() + witness.settled.total();
+            let counted = witness.evidence();
             let fleet = if counted > 1e-9 {
-                ((expected(&witness.live) + expected(&witness.settled)) / counted).clamp(1e-6, 1.0 - 1e-6)
+                ((expected(&witness.live) + expected(&witness.settled) + expected(&witness.inherited)) / counted)
+                    .clamp(1e-6, 1.0 - 1e-6)
             } else {
                 accuracy.clamp(1e-6, 1.0 - 1e-6)
             };
@@ -145,7 +168,7 @@ impl Model {
         let others: Vec<_> = posterior
             .iter()
             .map(|&(label, p)| {
-                let lead = word.weight * (own - self.log_likelihood(word, label, accuracy));
+                let lead = word.weight * word.own * (own - self.log_likelihood(word, label, accuracy));
                 (label, p * lead.min(500.0).exp())
             })
             .collect();
@@ -166,8 +189,9 @@ impl Model {
             (1.0 - assumed_right) * (sharing * shared + (1.0 - sharing) / self.wrong_labels())
         };
         let prior = self.config.class_prior_votes;
-        let count = witness.live.cell(truth, word.label) + witness.settled.cell(truth, word.label);
-        let row = witness.live.row(truth) + witness.settled.row(truth);
+        let evidence = [&witness.live, &witness.settled, &witness.inherited];
+        let count: f64 = evidence.iter().map(|e| e.cell(truth, word.label)).sum();
+        let row: f64 = evidence.iter().map(|e| e.row(truth)).sum();
         ((count + prior * assumed) / (row + prior)).max(1e-12).ln()
     }
 
@@ -180,7 +204,7 @@ impl Model {
             .map(|&truth| {
                 let said = |word: &Word| {
                     let factor = if self.is_newcomer(word.vehicle) { newcomer } else { 1.0 };
-                    factor * word.weight * self.log_likelihood(word, truth, accuracy)
+                    factor * word.weight * word.own * self.log_likelihood(word, truth, accuracy)
                 };
                 self.log_shares[usize::from(truth)] + words.iter().map(said).sum::<f64>()
             })
@@ -199,17 +223,18 @@ impl Model {
     pub(super) fn newcomer_factor(&self, words: &[Word]) -> f64 {
         let (mut newcomers, mut proven) = (0.0, 0.0);
         for word in words {
-            *(if self.is_newcomer(word.vehicle) { &mut newcomers } else { &mut proven }) += word.weight;
+            *(if self.is_newcomer(word.vehicle) { &mut newcomers } else { &mut proven }) += word.weight * word.own;
         }
         let most = self.config.newcomer_share * proven;
         if proven > 0.0 && newcomers > most { most / newcomers } else { 1.0 }
     }
 
-    /// Adds the words as live evidence, `sign` −1 to take them back.
+    /// Adds the words as live evidence, `sign` −1 to take them back. A vote that stands alone is no evidence of who is
+    /// right.
     pub(super) fn count(&mut self, words: &[Word], posterior: &[(LabelIndex, f64)], sign: f64) {
         for &(truth, p) in posterior {
             self.shares[usize::from(truth)] += sign * p;
-            for word in words {
+            for word in words.iter().filter(|_| words.len() > 1) {
                 let weight = sign * p * word.weight.min(1.0);
                 self.witnesses[word.vehicle].live.add(truth, word.label, weight);
                 self.live.add(truth, word.label, weight);
@@ -222,12 +247,23 @@ impl Model {
         let fade = 1.0 - 1.0 / self.config.memory_votes;
         let fleet_fade = 1.0 - 1.0 / (self.config.memory_votes * self.witnesses.len().max(1) as f64);
         let witness = &mut self.witnesses[word.vehicle];
+        let right = posterior.iter().find(|(truth, _)| *truth == word.label).map_or(0.0, |(_, p)| *p);
+        witness.watch(right);
         witness.settled.fade(fade);
-        witness.inherited = (witness.inherited.0 * fade, witness.inherited.1 * fade);
+        witness.inherited.fade(fade);
         self.settled.fade(fleet_fade);
         for &(truth, p) in posterior {
             witness.settled.add(truth, word.label, p * word.weight.min(1.0));
             self.settled.add(truth, word.label, p * word.weight.min(1.0));
+        }
+    }
+
+    /// Forgets all past evidence.
+    pub(super) fn clear_settled(&mut self) {
+        self.settled = Confusion::default();
+        for witness in &mut self.witnesses {
+            witness.settled = Confusion::default();
+            witness.inherited = Confusion::default();
         }
     }
 

@@ -3,61 +3,17 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use super::ballot::{Ballot, Cast, probability};
 use super::calibration::{Calibration, Weights};
 use super::config::WeightedConfig;
-use super::confusion::LabelIndex;
-use super::model::{Model, Witness, Word};
+use super::confusion::{Confusion, LabelIndex};
+use super::dependence::Dependence;
+use super::model::{Model, Witness};
 use super::paper::REPUTATION_RANGE;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
-
-/// A vote that counts.
-#[derive(Debug, Clone, Copy)]
-struct Cast {
-    vehicle: usize,
-    label: LabelIndex,
-    confidence: f64,
-    visibility: f64,
-    weight: f64,
-    at: Timestamp,
-    /// When it began to count once more as evidence.
-    since: Timestamp,
-    /// Whether a posterior rests on it.
-    judged: bool,
-}
-
-impl Cast {
-    fn word(&self) -> Word {
-        Word { vehicle: self.vehicle, label: self.label, weight: self.weight }
-    }
-}
-
-/// The votes on one landmark, at most one of each vehicle, in order of vehicle.
-#[derive(Debug, Clone, Default)]
-struct Ballot {
-    casts: Vec<Cast>,
-    /// As of the last judgement.
-    posterior: Vec<(LabelIndex, f64)>,
-    /// Whether votes and posterior are in the live evidence at present.
-    counted: bool,
-    shown: Option<LabelIndex>,
-}
-
-impl Ballot {
-    fn words(&self) -> Vec<Word> {
-        self.casts.iter().map(Cast::word).collect()
-    }
-
-    fn candidates(&self) -> Vec<LabelIndex> {
-        self.casts.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
-    }
-
-    fn probability(&self, label: LabelIndex) -> f64 {
-        self.posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
-    }
-}
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the votes that are fresh.
 #[derive(Debug, Clone)]
@@ -65,6 +21,7 @@ pub(super) struct WeightedTally {
     config: WeightedConfig,
     model: Model,
     calibration: Calibration,
+    dependence: Dependence,
     vehicles: BTreeMap<NodeName, usize>,
     names: Vec<NodeName>,
     records: Vec<(u64, u64)>,
@@ -83,6 +40,7 @@ impl WeightedTally {
         Self {
             model: Model::new(config.clone()),
             calibration: Calibration::new(config.calibration_votes),
+            dependence: Dependence::new(config.pair_memory_votes),
             config,
             vehicles: BTreeMap::new(),
             names: Vec::new(),
@@ -150,18 +108,31 @@ impl WeightedTally {
         let (vehicle, label) = (self.vehicle(node), self.label(label));
         let freshness = Duration::from_secs_f64(self.config.freshness_s);
         let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
-        let mut since = at;
+        let (mut since, mut compared) = (at, false);
         if let Some(earlier) = earlier {
             if at.since(earlier.since) >= freshness {
                 self.retire(landmark, |c| c.vehicle == vehicle);
             } else {
-                since = earlier.since;
+                (since, compared) = (earlier.since, earlier.compared);
                 self.uncount(landmark);
             }
         } else {
             self.uncount(landmark);
         }
-        let cast = Cast { vehicle, label, confidence, visibility, weight: 1.0, at, since, judged: false };
+        let cast = Cast {
+            vehicle,
+            label,
+            confidence,
+            visibility,
+            weight: 1.0,
+            own: 1.0,
+            at,
+            since,
+            band: 0,
+            agreement: None,
+            judged: false,
+            compared,
+        };
         let ballot = self.ballots.entry(landmark.clone()).or_default();
         match ballot.casts.binary_search_by_key(&vehicle, |c| c.vehicle) {
             Ok(place) => ballot.casts[place] = cast,
@@ -178,6 +149,11 @@ impl WeightedTally {
             && std::mem::take(&mut ballot.counted)
         {
             self.model.count(&ballot.words(), &ballot.posterior, -1.0);
+            for cast in &mut ballot.casts {
+                if let Some(agreement) = cast.agreement.take() {
+                    self.calibration.count(cast.band, agreement, -1.0);
+                }
+            }
         }
     }
 
@@ -188,7 +164,7 @@ impl WeightedTally {
         }
         self.uncount(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        let posterior = ballot.posterior.clone();
+        let (posterior, is_witnessed) = (ballot.posterior.clone(), ballot.is_witnessed());
         let (past, casts) = std::mem::take(&mut ballot.casts).into_iter().partition(is_past);
         ballot.casts = casts;
         let shown = ballot.shown;
@@ -197,12 +173,11 @@ impl WeightedTally {
             ballot.shown = None;
             ballot.posterior.clear();
         }
-        for cast in past.iter().filter(|cast| cast.judged) {
+        for cast in past.iter().filter(|cast| cast.judged && is_witnessed) {
             // Judged by the others: a vehicle that decides alone must not prove itself right.
             let others = self.model.without(&posterior, &cast.word());
             self.model.settle(&cast.word(), &others);
-            let agreement = posterior.iter().find(|(l, _)| *l == cast.label).map_or(0.0, |(_, p)| *p);
-            self.calibration.observe(cast.confidence, agreement);
+            self.calibration.settle(cast.band, probability(&others, cast.label));
             let correct = shown == Some(cast.label);
             let record = &mut self.records[cast.vehicle];
             *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
@@ -229,29 +204,31 @@ impl WeightedTally {
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
         self.uncount(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        for cast in &mut ballot.casts {
-            cast.weight = weights.of(cast.confidence) * cast.visibility;
-            cast.judged = true;
-        }
+        ballot.compare(&mut self.dependence, &mut self.calibration, |vehicle| vehicle);
+        ballot.weigh(&self.dependence, &self.calibration, weights);
+        ballot.casts.iter_mut().for_each(|cast| cast.judged = true);
         let words = ballot.words();
         self.model.prepare(words.iter().map(|w| w.vehicle));
-        let posterior = self.model.posterior(&words, &ballot.candidates());
-        self.model.count(&words, &posterior, 1.0);
-        ballot.posterior = posterior;
+        ballot.posterior = self.model.posterior(&words, &ballot.candidates());
+        ballot.agree(&self.model, &mut self.calibration);
+        self.model.count(&words, &ballot.posterior, 1.0);
         ballot.counted = true;
-        Self::show(ballot, self.config.hysteresis);
+        ballot.show(self.config.hysteresis);
     }
 
-    fn show(ballot: &mut Ballot, hysteresis: f64) {
-        let mut best: Option<(LabelIndex, f64)> = None;
-        for &(label, p) in &ballot.posterior {
-            if best.is_none_or(|(_, most)| p > most) {
-                best = Some((label, p));
-            }
-        }
-        let kept = ballot.shown.map_or(0.0, |shown| ballot.probability(shown));
-        if kept == 0.0 || best.is_some_and(|(_, p)| p > kept + hysteresis) {
-            ballot.shown = best.map(|(label, _)| label);
+    /// Finds who depends on whom. If the main group is thought wrong more often than right and those who copy right,
+    /// then verdicts of the copies' own making taught it: that evidence is void, and learning starts again.
+    fn fit_dependence(&mut self) {
+        let mut present = vec![false; self.names.len()];
+        self.ballots.values().flat_map(|b| &b.casts).for_each(|c| present[c.vehicle] = true);
+        let groups = self.dependence.fit(&present);
+        let trust = |vehicles: &[usize]| {
+            vehicles.iter().map(|&v| self.model.reliability(v)).sum::<f64>() / vehicles.len().max(1) as f64
+        };
+        if trust(&groups.copies) > 0.5 && trust(&groups.main) < 0.5 && !groups.main.is_empty() {
+            self.model.clear_settled();
+            let (dependence, calibration) = (self.dependence.clone(), self.calibration.clone());
+            self.start_from_majorities(&dependence, &calibration);
         }
     }
 
@@ -259,6 +236,9 @@ impl WeightedTally {
     pub(super) fn close(&mut self, now: Timestamp) -> BTreeSet<LandmarkId> {
         self.expire(now);
         let weights = self.calibration.weights();
+        if self.dependence.is_due() {
+            self.fit_dependence();
+        }
         let mut changed = std::mem::take(&mut self.touched);
         for landmark in &changed {
             self.judge(landmark, &weights);
@@ -291,35 +271,52 @@ impl WeightedTally {
 
     /// Judges all stored votes `passes` times over, starting from majorities (Dawid & Skene 1979).
     pub(super) fn refine(&mut self, passes: u32) {
-        let weights = self.calibration.weights();
-        self.model.clear_live();
+        let mut dependence = Dependence::new(self.config.pair_memory_votes);
+        let mut calibration = Calibration::new(self.config.calibration_votes);
+        let mut by_name = vec![0; self.names.len()];
+        self.vehicles.values().enumerate().for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
         for ballot in self.ballots.values_mut() {
-            ballot.shown = None;
-            ballot.counted = true;
-            let total: f64 = ballot.casts.iter().map(|c| c.weight).sum();
-            let share = |label| ballot.casts.iter().filter(|c| c.label == label).map(|c| c.weight).sum::<f64>() / total;
-            ballot.posterior = ballot.candidates().into_iter().map(|label| (label, share(label))).collect();
-            self.model.count(&ballot.words(), &ballot.posterior, 1.0);
+            ballot.casts.iter_mut().for_each(|cast| cast.compared = false);
+            ballot.compare(&mut dependence, &mut calibration, |vehicle| by_name[vehicle]);
         }
+        dependence.fit(&vec![true; self.names.len()]);
+        self.start_from_majorities(&dependence, &calibration);
         for _ in 0..passes {
             self.model.prepare(0..self.names.len());
+            let weights = calibration.weights();
             for ballot in self.ballots.values_mut() {
-                for cast in &mut ballot.casts {
-                    cast.weight = weights.of(cast.confidence) * cast.visibility;
-                }
+                ballot.weigh(&dependence, &calibration, &weights);
                 ballot.posterior = self.model.posterior(&ballot.words(), &ballot.candidates());
             }
+            calibration.clear_live();
+            self.ballots.values_mut().for_each(|ballot| ballot.agree(&self.model, &mut calibration));
             self.model.clear_live();
             for ballot in self.ballots.values_mut() {
                 self.model.count(&ballot.words(), &ballot.posterior, 1.0);
-                Self::show(ballot, self.config.hysteresis);
+                ballot.shown = None;
+                ballot.show(0.0);
             }
+        }
+        self.calibration.take_live(calibration);
+    }
+
+    fn start_from_majorities(&mut self, dependence: &Dependence, calibration: &Calibration) {
+        let weights = calibration.weights();
+        self.model.clear_live();
+        self.calibration.clear_live();
+        for ballot in self.ballots.values_mut() {
+            ballot.shown = None;
+            ballot.counted = true;
+            ballot.weigh(dependence, calibration, &weights);
+            ballot.casts.iter_mut().for_each(|cast| cast.agreement = None);
+            ballot.posterior = ballot.majority();
+            self.model.count(&ballot.words(), &ballot.posterior, 1.0);
         }
     }
 
     pub(super) fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
         let ballot = self.ballots.get(landmark)?;
-        let mass: f64 = ballot.casts.iter().map(|c| self.score(c.vehicle) * c.weight).sum();
+        let mass: f64 = ballot.casts.iter().map(|c| self.score(c.vehicle) * c.weight * c.own).sum();
         let name = |label: LabelIndex| self.labels[usize::from(label)].clone();
         let votes = ballot.posterior.iter().map(|&(label, p)| (name(label), p * mass)).collect();
         let mut contributors: Vec<_> = ballot.casts.iter().map(|c| self.names[c.vehicle].clone()).collect();
@@ -349,15 +346,32 @@ impl WeightedTally {
         self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), entry(vehicle))).collect()
     }
 
-    /// Takes over what a ledger knows beyond what was counted here, each vehicle's at most `memory_votes` strong: a
-    /// standby has counted most of it itself.
-    pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
-        for (node, (correct, incorrect)) in ledger.totals() {
+    /// Takes over what a ledger knows of its first `most_vehicles` vehicles beyond what was counted here, as a standby
+    /// has counted most of it itself; each at most `memory_votes` strong, in place of what it took over before.
+    ///
+    /// A ledger counts by stated label; what was right instead of a wrong one is taken to be any other label alike.
+    pub(super) fn adopt(&mut self, ledger: &ReputationLedger, (most_vehicles, most_labels): (usize, usize)) {
+        let known: Vec<_> = ledger.totals().into_iter().take(most_vehicles).collect();
+        for label in known.iter().flat_map(|(node, _)| ledger.by_label(node).into_keys()) {
+            if self.has_room_for(&label, most_labels) {
+                self.label(&label);
+            }
+        }
+        for (node, (correct, incorrect)) in known {
             let vehicle = self.vehicle(&node);
             let (own_correct, own_incorrect) = self.records[vehicle];
-            let (correct, incorrect) = (correct.saturating_sub(own_correct), incorrect.saturating_sub(own_incorrect));
-            let scale = (self.config.memory_votes / correct.saturating_add(incorrect).max(1) as f64).min(1.0);
-            self.model.witnesses[vehicle].inherited = (correct as f64 * scale, incorrect as f64 * scale);
+            let total = correct.saturating_add(incorrect);
+            let beyond = total.saturating_sub(own_correct.saturating_add(own_incorrect));
+            let scale = (beyond as f64).min(self.config.memory_votes) / total.max(1) as f64;
+            let mut inherited = Confusion::default();
+            for (label, counts) in ledger.by_label(&node) {
+                let Some(&label) = self.label_numbers.get(&label) else { continue };
+                inherited.add(label, label, scale * counts.correct as f64);
+                let others: Vec<_> = (0..self.labels.len() as LabelIndex).filter(|l| *l != label).collect();
+                let each = scale * counts.incorrect as f64 / others.len().max(1) as f64;
+                others.into_iter().for_each(|truth| inherited.add(truth, label, each));
+            }
+            self.model.witnesses[vehicle].inherited = inherited;
         }
     }
 }

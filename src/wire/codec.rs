@@ -3,8 +3,8 @@
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, RejectReason, Reputations, SCHEMA_VERSION, Verdicts};
-use crate::names::{MAX_NAME_BYTES, NodeName};
+use super::{Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
+use crate::names::NodeName;
 
 /// How a payload is written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,24 +16,6 @@ pub enum Encoding {
     /// RFC 8949 with the same field names.
     Cbor,
 }
-
-/// Bounds that a report must keep to be decoded at all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Limits {
-    /// Largest payload in bytes.
-    pub payload_bytes: usize,
-    /// Most objects, and most seen landmarks, in one report.
-    pub objects: usize,
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        Self { payload_bytes: 256 * 1024, objects: 1024 }
-    }
-}
-
-/// Largest coordinate in metres that is taken for a position on Earth.
-const WORLD_BOUND_M: f64 = 1e8;
 
 /// Writes a payload.
 ///
@@ -48,31 +30,12 @@ pub fn encode<T: Serialize>(payload: &T, encoding: Encoding) -> Vec<u8> {
     bytes
 }
 
-/// What travels on a topic, with the version of its form.
-pub trait Payload: Serialize + DeserializeOwned {
-    /// Major version that the payload claims to have.
-    fn schema(&self) -> u32;
-}
-
-macro_rules! payloads {
-    ($($payload:ty),+) => {
-        $(impl Payload for $payload {
-            fn schema(&self) -> u32 {
-                self.schema
-            }
-        })+
-    };
-}
-
-payloads!(ObjectReport, GlobalMap, Verdicts, Reputations, LedgerShare, NodeStatus);
-
-/// Reads any payload whose `schema` is known.
+/// Reads any payload whose `schema` is known and checks every value in it.
 ///
 /// # Errors
-/// [`RejectReason::TooLarge`], [`RejectReason::Malformed`], [`RejectReason::UnknownSchema`], or
-/// [`RejectReason::NotFinite`] for JSON numbers beyond 64-bit floats.
+/// The first reason found; see [`RejectReason`].
 pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
-    if bytes.len() > limits.payload_bytes {
+    if bytes.len() > T::max_bytes(limits) {
         return Err(RejectReason::TooLarge);
     }
     let payload: T = read(bytes).map_err(|reason| match read::<SchemaOnly>(bytes) {
@@ -82,6 +45,7 @@ pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReas
     if payload.schema() != SCHEMA_VERSION {
         return Err(RejectReason::UnknownSchema);
     }
+    payload.check(limits)?;
     Ok(payload)
 }
 
@@ -94,46 +58,7 @@ pub fn decode_report(bytes: &[u8], topic_node: &NodeName, limits: &Limits) -> Re
     if report.node != *topic_node {
         return Err(RejectReason::NodeMismatch);
     }
-    report.validate(limits)?;
     Ok(report)
-}
-
-impl ObjectReport {
-    /// Checks version, counts, numbers and labels.
-    ///
-    /// # Errors
-    /// The first reason found.
-    pub fn validate(&self, limits: &Limits) -> Result<(), RejectReason> {
-        if self.schema != SCHEMA_VERSION {
-            return Err(RejectReason::UnknownSchema);
-        }
-        let seen = self.seen.as_deref().unwrap_or_default();
-        if self.objects.len() > limits.objects || seen.len() > limits.objects {
-            return Err(RejectReason::TooManyObjects);
-        }
-        if let Some(pose) = self.pose
-            && !(in_world(pose.x_m) && in_world(pose.y_m) && pose.heading_rad.is_finite())
-        {
-            return Err(RejectReason::NotFinite);
-        }
-        if !seen.iter().all(|id| is_label(id)) {
-            return Err(RejectReason::InvalidLabel);
-        }
-        self.objects.iter().try_for_each(|object| {
-            if !(in_world(object.x_m) && in_world(object.y_m))
-                || object.covariance().is_some_and(|covariance| !covariance.is_valid())
-            {
-                return Err(RejectReason::NotFinite);
-            }
-            if !(0.0..=1.0).contains(&object.confidence) {
-                return Err(RejectReason::ConfidenceOutOfRange);
-            }
-            if !is_label(&object.label) || object.landmark.as_ref().is_some_and(|id| !is_label(id)) {
-                return Err(RejectReason::InvalidLabel);
-            }
-            Ok(())
-        })
-    }
 }
 
 #[derive(Deserialize)]
@@ -153,14 +78,6 @@ fn read<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     }
 }
 
-fn in_world(coordinate_m: f64) -> bool {
-    coordinate_m.abs() <= WORLD_BOUND_M
-}
-
-pub(super) fn is_label(text: &str) -> bool {
-    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -168,7 +85,7 @@ mod tests {
 
     use super::*;
     use crate::time::Timestamp;
-    use crate::wire::{PerceivedObject, WirePose};
+    use crate::wire::{PerceivedObject, Reputations, WirePose};
 
     fn node() -> NodeName {
         NodeName::new("euclid").unwrap()

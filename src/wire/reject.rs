@@ -5,7 +5,7 @@ use std::fmt;
 /// Why a payload was not used; nothing was changed by it. The name is the reason's label in counters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum RejectReason {
-    /// More bytes than [`Limits::payload_bytes`](super::Limits::payload_bytes).
+    /// More bytes than [`Limits`](super::Limits) allow.
     TooLarge,
     /// Neither JSON nor CBOR, truncated, not UTF-8, or without a required field.
     Malformed,
@@ -17,11 +17,13 @@ pub enum RejectReason {
     TooManyObjects,
     /// A number is NaN, infinite or out of the world's bounds, or a covariance is not one.
     NotFinite,
+    /// An epoch, round, count or time beyond [`MAX_INTEGER`](super::MAX_INTEGER), or a score out of its bounds.
+    OutOfRange,
     /// A confidence outside 0 to 1.
     ConfidenceOutOfRange,
     /// An empty or overlong label or landmark id.
     InvalidLabel,
-    /// Captured further in the future than clocks may differ.
+    /// Captured or fused further in the future than clocks may differ.
     FromTheFuture,
     /// Captured too long ago.
     Stale,
@@ -39,13 +41,14 @@ pub enum RejectReason {
 
 impl RejectReason {
     /// All reasons, for counters.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::TooLarge,
         Self::Malformed,
         Self::UnknownSchema,
         Self::NodeMismatch,
         Self::TooManyObjects,
         Self::NotFinite,
+        Self::OutOfRange,
         Self::ConfidenceOutOfRange,
         Self::InvalidLabel,
         Self::FromTheFuture,
@@ -66,6 +69,7 @@ impl RejectReason {
             Self::NodeMismatch => "node_mismatch",
             Self::TooManyObjects => "too_many_objects",
             Self::NotFinite => "not_finite",
+            Self::OutOfRange => "out_of_range",
             Self::ConfidenceOutOfRange => "confidence_out_of_range",
             Self::InvalidLabel => "invalid_label",
             Self::FromTheFuture => "from_the_future",

@@ -3,9 +3,8 @@
 
 use std::time::Duration;
 
-use bytes::Bytes;
 use hdrhistogram::Histogram;
-use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, NetworkOptions, Packet, QoS};
+use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, NetworkOptions, Packet, Publish, QoS, SubscribeFilter};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 
@@ -62,13 +61,14 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// [`TwoHopError`] when the broker cannot be reached or loses messages.
 pub async fn raw(broker: &BrokerAddress, load: Load) -> Result<Histogram<u64>, TwoHopError> {
     let error = |source| TwoHopError::Connection { broker: broker.clone(), source: Box::new(source) };
-    let (echoer, echo_events) = subscribed(broker, "ecod-bench-echo", OUT).await.map_err(error)?;
-    let (sender, events) = subscribed(broker, "ecod-bench", BACK).await.map_err(error)?;
+    let (echoer, echo_events) = subscribed(broker, "ecod-bench-echo", &[OUT]).await.map_err(error)?;
+    let (sender, events) = subscribed(broker, "ecod-bench", &[BACK]).await.map_err(error)?;
     let (arrivals, mut arrived) = mpsc::unbounded_channel();
-    let echo = tokio::spawn(each_message(echo_events, move |payload| {
-        echoer.try_publish(BACK, QoS::AtMostOnce, false, payload).is_ok()
+    let echo = tokio::spawn(each_message(echo_events, move |publish| {
+        echoer.try_publish(BACK, QoS::AtMostOnce, false, publish.payload).is_ok()
     }));
-    let receive = tokio::spawn(each_message(events, move |payload| arrivals.send((payload, Instant::now())).is_ok()));
+    let receive =
+        tokio::spawn(each_message(events, move |publish| arrivals.send((publish.payload, Instant::now())).is_ok()));
 
     let mut ticks = tokio::time::interval(load.interval);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Burst);
@@ -112,10 +112,11 @@ pub fn latencies() -> Histogram<u64> {
     Histogram::new_with_bounds(1, 60_000_000_000, 3).expect("the bounds are allowed")
 }
 
-async fn subscribed(
+/// A connected client that is subscribed to the topics.
+pub(super) async fn subscribed(
     broker: &BrokerAddress,
     client_id: &str,
-    topic: &str,
+    topics: &[&str],
 ) -> Result<(AsyncClient, EventLoop), rumqttc::ConnectionError> {
     let mut options = MqttOptions::new(client_id, broker.host(), broker.port());
     options.set_max_packet_size(1 << 20, 1 << 20);
@@ -125,7 +126,10 @@ async fn subscribed(
     events.set_network_options(network);
     loop {
         match events.poll().await? {
-            Event::Incoming(Packet::ConnAck(_)) => client.try_subscribe(topic, QoS::AtMostOnce).unwrap_or_default(),
+            Event::Incoming(Packet::ConnAck(_)) => {
+                let filters = topics.iter().map(|topic| SubscribeFilter::new((*topic).to_owned(), QoS::AtMostOnce));
+                client.try_subscribe_many(filters).unwrap_or_default();
+            }
             Event::Incoming(Packet::SubAck(_)) => return Ok((client, events)),
             _ => {}
         }
@@ -133,10 +137,10 @@ async fn subscribed(
 }
 
 /// Calls `act` for each message until it declines or the connection ends.
-async fn each_message(mut events: EventLoop, act: impl Fn(Bytes) -> bool) {
+pub(super) async fn each_message(mut events: EventLoop, act: impl Fn(Publish) -> bool) {
     while let Ok(event) = events.poll().await {
         if let Event::Incoming(Packet::Publish(publish)) = event
-            && !act(publish.payload)
+            && !act(publish)
         {
             return;
         }

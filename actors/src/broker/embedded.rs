@@ -74,13 +74,13 @@ pub enum BrokerError {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BrokerConfig {
-    /// Largest MQTT packet in bytes; default 1 MiB. A client that sends more is cut off. Larger admits larger reports,
-    /// smaller bounds the memory that a stranger can take.
-    pub max_packet_bytes: u32,
+    /// Largest MQTT packet in bytes; default what `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` need. A client that
+    /// sends more is cut off. Larger admits the packets of others, smaller bounds the memory that a stranger can take.
+    pub max_packet_bytes: Option<u32>,
     /// Most clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
     pub max_clients: usize,
     /// Most messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
-    /// then gets is old.
+    /// then gets is old. Each of them may be as large as the largest packet.
     pub max_waiting: usize,
     /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
     pub max_retained: usize,
@@ -88,7 +88,7 @@ pub struct BrokerConfig {
 
 impl Default for BrokerConfig {
     fn default() -> Self {
-        Self { max_packet_bytes: 1024 * 1024, max_clients: 2048, max_waiting: 256, max_retained: 8192 }
+        Self { max_packet_bytes: None, max_clients: 2048, max_waiting: 256, max_retained: 8192 }
     }
 }
 
@@ -98,7 +98,9 @@ impl BrokerConfig {
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("max_packet_bytes", f64::from(self.max_packet_bytes), 1024.0, 268_435_455.0)?;
+        if let Some(bytes) = self.max_packet_bytes {
+            check_range("max_packet_bytes", f64::from(bytes), 1024.0, 268_435_455.0)?;
+        }
         check_range("max_clients", self.max_clients as f64, 1.0, 1e6)?;
         check_range("max_waiting", self.max_waiting as f64, 1.0, 1e6)?;
         check_range("max_retained", self.max_retained as f64, 1.0, 1e6)
@@ -119,6 +121,9 @@ struct Running {
     thread: JoinHandle<()>,
 }
 
+/// Largest packet of a broker that was not told of a cell's limits: the default maps and their topics.
+const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
+
 /// How long connections may take to end when the broker stops; beyond it their thread is left to end by itself.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -135,7 +140,7 @@ impl EmbeddedBroker {
             // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
             .reuseaddr(Some(true))
             .nodelay(true)
-            .max_packet_size(self.config.max_packet_bytes)
+            .max_packet_size(self.config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
             .max_connections(self.config.max_clients)
             .max_mqueue_len(self.config.max_waiting)
             .handshake_timeout(Duration::from_secs(5))

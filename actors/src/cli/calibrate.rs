@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
-use super::Failure;
+use super::{Failure, print};
 use crate::calibrate::{Chessboard, calibrate, photographs};
 
 /// Flags of `calibrate`.
@@ -38,6 +38,6 @@ pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
     }
     let found = &report.calibration;
     found.write(out).context("no calibration")?;
-    println!("{}: {:.3} px rms over {} photographs", out.display(), found.rms_px, found.images.len());
-    Ok(())
+    let (out, rms_px, photographs) = (out.display(), found.rms_px, found.images.len());
+    Ok(print(&format!("{out}: {rms_px:.3} px rms over {photographs} photographs\n"))?)
 }

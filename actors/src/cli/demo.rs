@@ -10,8 +10,8 @@ use ecod::testbed::Scene;
 use nalgebra::Point2;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::Failure;
-use super::testbed::{Results, read, select, write};
+use super::testbed::{Results, check_writable, read, select};
+use super::{Failure, print, write_json};
 use crate::demo::{Demo, DemoResult};
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
@@ -39,7 +39,10 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let program = std::env::current_exe().context("this program cannot be found")?;
     let file = fs::canonicalize(&arguments.scenes).context("the scene file has gone")?;
     let runtime = tokio::runtime::Runtime::new().context("no threads for the demo")?;
-    println!("a cell on this machine: 1 edge with its MQTT broker, {}\n", vehicles(&scenes));
+    let results_file = arguments.out.join("result.json");
+    fs::create_dir_all(&arguments.out).with_context(|| format!("cannot make {}", arguments.out.display()))?;
+    check_writable(&results_file)?;
+    print(&format!("a cell on this machine: 1 edge with its MQTT broker, {}\n\n", vehicles(&scenes)))?;
     let mut results = Vec::with_capacity(scenes.len());
     let count = scenes.len();
     for (index, scene) in scenes.into_iter().enumerate() {
@@ -52,26 +55,25 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             duration: Duration::from_secs(arguments.seconds),
             directory: &directory,
         };
-        println!("[{}/{count}] {}: starting {} processes", index + 1, scene.name, scene.cavs.len() + 1);
+        print(&format!("[{}/{count}] {}: starting {} processes\n", index + 1, scene.name, scene.cavs.len() + 1))?;
         let outcome = runtime.block_on(until_signalled(demo.run(|progress| {
-            println!("        {:2.0} s, {} reports", progress.elapsed.as_secs_f64(), progress.reports);
+            print(&format!("        {:2.0} s, {} reports\n", progress.elapsed.as_secs_f64(), progress.reports))
         })));
         let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
-        println!(
-            "        {} maps, {} missed by a vehicle, {:.1} ms from the oldest capture in a map to its receipt (median)",
+        print(&format!(
+            "        {} maps, {} missed by a vehicle, {:.1} ms from the oldest capture in a map to its receipt (median)\n",
             outcome.maps,
             outcome.missed,
             outcome.median_age.as_secs_f64() * 1e3,
-        );
+        ))?;
         let picture = arguments.out.join(format!("{}.svg", file_name(&scene.name)));
         let svg = birdseye(&testbed, scene, &detections(&outcome), outcome.last_map.as_ref()).context("picture")?;
         fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
         results.push(outcome.result);
     }
-    println!("\n{}", table(&results));
-    write(&arguments.out.join("result.json"), &Results { scenes: &results })?;
-    println!("pictures, results, configurations and logs: {}", arguments.out.display());
-    Ok(())
+    print(&format!("\n{}\n", table(&results)))?;
+    write_json(&results_file, &Results { scenes: &results })?;
+    Ok(print(&format!("pictures, results, configurations and logs: {}\n", arguments.out.display()))?)
 }
 
 /// Runs a scene; SIGINT and SIGTERM end it and, with it, its processes.

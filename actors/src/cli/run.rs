@@ -2,14 +2,18 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
 use ecod::names::NodeName;
+#[cfg(feature = "camera")]
+use ecod::wire::Role;
 use serde::Serialize;
 use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::oneshot;
 
-use super::Failure;
+use super::{Failure, print};
 use crate::config::NodeConfig;
 use crate::gateway::BrokerAddress;
 use crate::node;
@@ -34,7 +38,7 @@ pub struct RunArguments {
     #[serde(skip_serializing_if = "Option::is_none")]
     cell: Option<NodeName>,
     /// Where the embedded broker of a node that may lead listens
-    #[arg(long, value_name = "IP:PORT")]
+    #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     #[serde(skip_serializing_if = "Option::is_none")]
     listen: Option<SocketAddr>,
     /// An external broker for all data; without one the nodes' own are used
@@ -57,6 +61,14 @@ pub struct RunArguments {
     #[arg(long)]
     #[serde(skip)]
     print_config: bool,
+    /// Stop when standard input ends, as it does when the process that started the node is gone
+    #[arg(long, hide = true)]
+    #[serde(skip)]
+    stop_at_eof: bool,
+}
+
+fn ip_and_port(text: &str) -> Result<SocketAddr, &'static str> {
+    text.parse().map_err(|_| "must be an IP address and a port, such as 0.0.0.0:1883")
 }
 
 /// Flags as they are laid over the configuration.
@@ -87,24 +99,47 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     let config = NodeConfig::load(arguments.config.as_deref(), &Overrides { top: arguments, mqtt, membership });
     let config = config.map_err(Failure::usage)?;
     if arguments.print_config {
-        print!("{}", toml::to_string(&config).context("the configuration cannot be written as TOML")?);
-        return Ok(());
+        return Ok(print(&config.to_toml().context("the configuration cannot be written as TOML")?)?);
     }
     let runtime = tokio::runtime::Runtime::new().context("no threads for the node")?;
-    runtime.block_on(serve(config))?;
-    Ok(())
+    let served = runtime.block_on(serve(config, arguments.stop_at_eof));
+    // A detector may be busy for good; whoever restarts the node must not wait for it.
+    runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
+    Ok(served?)
 }
 
+/// How long the threads of a stopped node may take to end.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
+
 /// Runs the node until SIGINT or SIGTERM.
-async fn serve(config: NodeConfig) -> anyhow::Result<()> {
+async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    #[cfg(feature = "camera")]
+    if config.role == Role::Cav && config.camera.is_none() {
+        tracing::warn!("no [camera] is configured: this vehicle reports nothing, it only follows");
+    }
     let mut node = node::start(config).await?;
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}
+        () = input_ended(), if stop_at_eof => {}
         failed = node.failed() => failed?,
     }
     tracing::info!("stopping");
     node.stop().await;
     Ok(())
+}
+
+/// Waits for the end of standard input. The thread that reads it is left behind: it cannot be woken.
+async fn input_ended() {
+    let (ended, end) = oneshot::channel();
+    std::thread::spawn(move || {
+        let copied = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
+        tracing::debug!(?copied, "standard input ended");
+        // Nobody waits any more when the node stops for another reason.
+        let _ = ended.send(());
+    });
+    if end.await.is_err() {
+        std::future::pending::<()>().await;
+    }
 }

@@ -3,10 +3,10 @@
 use anyhow::Context;
 use ecod::wire;
 
-use super::Failure;
+use super::{Failure, print};
 
-pub(super) fn print() -> Result<(), Failure> {
+pub(super) fn run() -> Result<(), Failure> {
     let schemas = wire::schemas();
-    println!("{}", serde_json::to_string_pretty(&schemas).context("schemas are plain JSON")?);
-    Ok(())
+    let text = serde_json::to_string_pretty(&schemas).context("schemas are plain JSON")?;
+    Ok(print(&format!("{text}\n"))?)
 }

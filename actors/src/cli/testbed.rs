@@ -1,15 +1,15 @@
-//! `ecod-node testbed`: the scenes of a file, rendered, detected and fused in virtual time.
+//! `ecod-node testbed`: the scenes of a file, rendered, detected and fused in virtual time; or a recorded intersection.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
-use ecod::testbed::{Scene, Testbed};
+use ecod::testbed::{Recording, Scene, Testbed};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
-use super::Failure;
+use super::{Failure, intersection, print, write_json};
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 use crate::testbed::trial::Trial;
@@ -17,32 +17,49 @@ use crate::testbed::trial::Trial;
 /// Flags of `testbed`.
 #[derive(Debug, Args)]
 pub(super) struct TestbedArguments {
-    /// Scene file, such as examples/testbed/pace_setup1.json
+    /// Scene file, such as examples/testbed/pace_setup1.json, or recorded detections, such as
+    /// examples/testbed/vote_recording.json
     #[arg(long, value_name = "FILE")]
-    scenes: PathBuf,
-    /// Run this scene only
+    pub(super) scenes: PathBuf,
+    /// Run this scene only; of recorded detections, `recording` or `generated`
     #[arg(long, value_name = "NAME")]
-    scene: Option<String>,
+    pub(super) scene: Option<String>,
     /// Fused maps to judge in each scene
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     verdicts: u64,
     /// Seed of everything that varies from frame to frame
     #[arg(long, default_value_t = 1)]
-    seed: u64,
+    pub(super) seed: u64,
+    /// Scenes to generate from recorded detections
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(..=100_000))]
+    pub(super) generated: u64,
+    /// Frames in each generated scene
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u16).range(1..))]
+    pub(super) frames: u16,
+    /// Write the vehicles' reports on recorded detections to this file, as `replay` reads them
+    #[arg(long, value_name = "FILE")]
+    pub(super) reports: Option<PathBuf>,
     /// Write the results to this file (JSON)
     #[arg(long, value_name = "FILE")]
-    out: Option<PathBuf>,
+    pub(super) out: Option<PathBuf>,
 }
 
 /// The file of `--out`.
 #[derive(Serialize)]
-pub(super) struct Results<'a> {
-    pub(super) scenes: &'a [SceneResult],
+pub(super) struct Results<'a, T = SceneResult> {
+    pub(super) scenes: &'a [T],
 }
 
 pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
+    let text = read_text(&arguments.scenes).map_err(Failure::usage)?;
+    if serde_json::from_str(&text).is_ok_and(|file| Recording::is_recording(&file)) {
+        return intersection::run(arguments, &text);
+    }
     let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
     let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;
+    if let Some(out) = &arguments.out {
+        check_writable(out)?;
+    }
     let mut results = Vec::with_capacity(scenes.len());
     for scene in scenes {
         let trial = Trial { testbed: &testbed, scene, verdicts: arguments.verdicts, seed: arguments.seed };
@@ -51,17 +68,20 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
         results.push(trial.run(|| bar.inc(1)).with_context(|| format!("scene {}", scene.name))?);
         bar.finish_and_clear();
     }
-    print!("{}", table(&results));
+    print(&table(&results).to_string())?;
     if let Some(out) = &arguments.out {
-        write(out, &Results { scenes: &results })?;
+        write_json(out, &Results { scenes: &results })?;
     }
     Ok(())
 }
 
 /// Reads a scene file.
 pub(super) fn read(path: &Path) -> anyhow::Result<Testbed> {
-    let text = fs::read_to_string(path).with_context(|| format!("cannot read scenes {}", path.display()))?;
-    Testbed::from_json(&text).with_context(|| format!("scenes {}", path.display()))
+    Testbed::from_json(&read_text(path)?).with_context(|| format!("scenes {}", path.display()))
+}
+
+fn read_text(path: &Path) -> anyhow::Result<String> {
+    fs::read_to_string(path).with_context(|| format!("cannot read scenes {}", path.display()))
 }
 
 /// The named scene, or all.
@@ -71,11 +91,12 @@ pub(super) fn select<'a>(testbed: &'a Testbed, name: Option<&str>) -> anyhow::Re
     Ok(vec![testbed.scene(name).with_context(|| format!("no scene {name:?}; there are {}", known()))?])
 }
 
-/// Writes JSON for programs.
-pub(super) fn write(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
-    let mut text = serde_json::to_string_pretty(value)?;
-    text.push('\n');
-    fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+/// Finds out before a long run that its results cannot be written; leaves nothing behind.
+pub(super) fn check_writable(path: &Path) -> anyhow::Result<()> {
+    let was_there = path.exists();
+    let opened = fs::File::options().create(true).append(true).open(path).map(drop);
+    let checked = opened.and_then(|()| if was_there { Ok(()) } else { fs::remove_file(path) });
+    checked.with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn progress(frames: u64, scene: &str) -> ProgressBar {

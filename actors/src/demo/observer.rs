@@ -30,12 +30,12 @@ pub(super) struct Observer {
 }
 
 impl Observer {
-    pub(super) async fn start(broker: SocketAddr) -> anyhow::Result<Self> {
+    pub(super) async fn start(broker: SocketAddr, name: NodeName) -> anyhow::Result<Self> {
         let reports: Arc<Mutex<Vec<ObservedReport>>> = Arc::default();
         let kept = Arc::clone(&reports);
         let status = NodeStatus {
             schema: SCHEMA_VERSION,
-            node: NodeName::from_static("observer"),
+            node: name,
             id: Uuid::now_v7(),
             role: Role::Cav,
             state: NodeState::Following,

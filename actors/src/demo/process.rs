@@ -39,7 +39,9 @@ impl NodeProcess {
         let child = command
             .arg("--config")
             .arg(&file)
-            .stdin(Stdio::null())
+            // The pipe is never written to; it closes with this process, however that ends, and so ends the node.
+            .arg("--stop-at-eof")
+            .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(output)
             .kill_on_drop(true)

@@ -88,6 +88,7 @@ pub struct Capture {
     slot: Arc<LatestSlot<Frame>>,
     status: watch::Receiver<CaptureStatus>,
     events: SyncSender<Event>,
+    unusable: Arc<AtomicU64>,
 }
 
 impl Capture {
@@ -109,9 +110,11 @@ impl Capture {
             opening: Arc::default(),
             left_behind: Vec::new(),
             captured: 0,
+            unusable: Arc::default(),
         };
+        let unusable = Arc::clone(&keeper.unusable);
         thread::Builder::new().name("capture".into()).spawn(move || keeper.run())?;
-        Ok(Self { slot, status, events })
+        Ok(Self { slot, status, events, unusable })
     }
 
     /// The latest frame, waiting for one; `None` once the source has ended. Frames are numbered across openings.
@@ -122,6 +125,11 @@ impl Capture {
     /// Frames that were replaced by a later one before anyone took them.
     pub fn skipped(&self) -> u64 {
         self.slot.skipped()
+    }
+
+    /// Frames of a recording that were no images and were passed over.
+    pub fn unusable(&self) -> u64 {
+        self.unusable.load(Ordering::Relaxed)
     }
 
     /// How the source is doing, now and from now on.
@@ -163,6 +171,7 @@ struct Keeper {
     opening: Arc<AtomicU64>,
     left_behind: Vec<JoinHandle<()>>,
     captured: u64,
+    unusable: Arc<AtomicU64>,
 }
 
 impl Keeper {
@@ -213,6 +222,10 @@ impl Keeper {
                 Ok(Event::Stop) | Err(RecvTimeoutError::Disconnected) => return Outcome::Stopped,
                 Err(RecvTimeoutError::Timeout) => return Outcome::Failed(FrameError::Stalled(stall_timeout)),
                 Ok(Event::Read(from, _)) if from != opening => {}
+                Ok(Event::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
+                    tracing::warn!(%error, "frame passed over");
+                    self.unusable.fetch_add(1, Ordering::Relaxed);
+                }
                 Ok(Event::Read(_, Err(error))) => return Outcome::Failed(error),
                 Ok(Event::Read(_, Ok(frame))) => {
                     deadline = Instant::now() + stall_timeout;
@@ -253,7 +266,7 @@ impl Reader {
         };
         while self.current.load(Ordering::SeqCst) == self.opening {
             let read = source.next_frame();
-            let failed = read.is_err();
+            let failed = read.as_ref().is_err_and(|error| !matches!(error, FrameError::Unusable { .. }));
             self.tell(read);
             if failed {
                 return;

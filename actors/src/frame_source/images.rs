@@ -17,7 +17,8 @@ pub(super) struct ImageSequence {
     files: Vec<PathBuf>,
     looping: bool,
     pace: Pace,
-    seq: u64,
+    /// Files looked at, also those that were no images.
+    next: u64,
 }
 
 impl ImageSequence {
@@ -33,26 +34,27 @@ impl ImageSequence {
         if files.is_empty() {
             return Err(failed("no images there".into()));
         }
-        Ok(Self { origin, files, looping, pace: Pace::new(fps), seq: 0 })
+        Ok(Self { origin, files, looping, pace: Pace::new(fps), next: 0 })
     }
 }
 
 impl FrameSource for ImageSequence {
     fn next_frame(&mut self) -> Result<Frame, FrameError> {
         let count = self.files.len() as u64;
-        if self.seq >= count && !self.looping {
+        if self.next >= count && !self.looping {
             return Err(FrameError::Ended { origin: self.origin.clone() });
         }
-        let file = &self.files[(self.seq % count) as usize];
+        let file = &self.files[(self.next % count) as usize];
+        let seq = self.next;
+        self.next += 1;
         self.pace.wait();
-        let lost = |reason: String| FrameError::Lost { origin: file.display().to_string(), reason };
-        let image = imgcodecs::imread(file, imgcodecs::IMREAD_COLOR).map_err(|e| lost(e.message))?;
+        let unusable = |reason: String| FrameError::Unusable { origin: file.display().to_string(), reason };
+        let image = imgcodecs::imread(file, imgcodecs::IMREAD_COLOR).map_err(|e| unusable(e.message))?;
         if image.empty() {
-            return Err(lost("not an image".into()));
+            let reason = std::fs::File::open(file).map_or_else(|error| error.to_string(), |_| "not an image".into());
+            return Err(unusable(reason));
         }
-        let frame = Frame { image, captured_at: clock::now(), seq: self.seq };
-        self.seq += 1;
-        Ok(frame)
+        Ok(Frame { image, captured_at: clock::now(), seq })
     }
 }
 

@@ -54,6 +54,24 @@ fn images_come_in_order_from_a_directory_and_from_a_pattern() {
 }
 
 #[test]
+fn a_bad_image_is_passed_over_and_the_rest_is_played() {
+    let directory = tempfile::tempdir().unwrap();
+    write_images(directory.path());
+    std::fs::write(directory.path().join("f001.png"), "half a fi").unwrap();
+    let mut source = open(&format!("kind = 'images'\npath = {:?}\nfps = 500.0", directory.path())).unwrap();
+    let mut played = Vec::new();
+    loop {
+        match source.next_frame() {
+            Ok(frame) => played.push(brightness(&frame).to_string()),
+            Err(FrameError::Ended { .. }) => break,
+            Err(error) => played.push(error.to_string()),
+        }
+    }
+    assert_eq!((&*played[0], &*played[2], played.len()), ("50", "150", 3));
+    assert!(played[1].contains("f001.png") && played[1].contains("not an image"), "{}", played[1]);
+}
+
+#[test]
 fn images_keep_their_rate() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
@@ -121,6 +139,8 @@ fn bad_configuration_is_refused() {
     assert!(toml::from_str::<SourceConfig>("kind = 'video'\npath = 'a'\nspeed = 2").is_err(), "unknown key");
     let pipeline: SourceConfig = toml::from_str("kind = 'gstreamer'\npipeline = 'videotestsrc'").unwrap();
     assert_eq!(pipeline.validate().expect_err("no appsink").key, "pipeline");
+    let camera: SourceConfig = toml::from_str("kind = 'v4l2'\nwidth = 0").unwrap();
+    assert_eq!(camera.validate().expect_err("no width").key, "width");
     let images: SourceConfig = toml::from_str("kind = 'images'\npath = 'a'\nfps = 0.0").unwrap();
     assert_eq!(images.validate().expect_err("no rate").key, "fps");
 }

@@ -122,7 +122,7 @@ impl FrameSource for Video {
 }
 
 /// An address as it may be logged: `rtsp://user:secret@camera/1` without user and secret.
-fn without_credentials(url: &str) -> String {
+pub(super) fn without_credentials(url: &str) -> String {
     match url.split_once("://") {
         Some((scheme, rest)) => {
             let host_end = rest.find('/').unwrap_or(rest.len());

@@ -40,8 +40,11 @@ pub struct MqttConfig {
     pub send_queue: usize,
     /// Most decoded messages that receivers may be behind; default 1024. When full, new ones are dropped and counted.
     pub inbox: usize,
-    /// Largest payload in bytes that is decoded; default 262144.
+    /// Largest report or status in bytes that is decoded; default 262144.
     pub max_payload_bytes: usize,
+    /// Largest map, verdicts or reputations in bytes that are sent and decoded; default 8388608, 512 bytes for each of
+    /// 16,384 locations. Larger admits larger cells, smaller bounds what a stranger can make a node read.
+    pub max_map_bytes: usize,
     /// Most objects, and most seen landmarks, in a report; default 1024.
     pub max_objects: usize,
 }
@@ -63,6 +66,7 @@ impl Default for MqttConfig {
             send_queue: 64,
             inbox: 1024,
             max_payload_bytes: limits.payload_bytes,
+            max_map_bytes: limits.map_bytes,
             max_objects: limits.objects,
         }
     }
@@ -74,13 +78,19 @@ impl MqttConfig {
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("keep_alive_s", f64::from(self.keep_alive_s), 1.0, 3600.0)?;
+        let least_keep_alive_s = match self.version {
+            MqttVersion::V311 => 1.0,
+            // The client library takes no less.
+            MqttVersion::V5 => 5.0,
+        };
+        check_range("keep_alive_s", f64::from(self.keep_alive_s), least_keep_alive_s, 3600.0)?;
         check_range("connect_timeout_ms", self.connect_timeout_ms as f64, 10.0, 60_000.0)?;
         check_range("retry_min_ms", self.retry_min_ms as f64, 1.0, 60_000.0)?;
         check_range("retry_max_ms", self.retry_max_ms as f64, self.retry_min_ms as f64, 600_000.0)?;
         check_range("send_queue", self.send_queue as f64, 8.0, 65_536.0)?;
         check_range("inbox", self.inbox as f64, 1.0, 1e6)?;
-        check_range("max_payload_bytes", self.max_payload_bytes as f64, 256.0, MAX_PACKET_BYTES as f64)?;
+        check_range("max_payload_bytes", self.max_payload_bytes as f64, 256.0, MAX_PAYLOAD_BYTES)?;
+        check_range("max_map_bytes", self.max_map_bytes as f64, 1024.0, MAX_PAYLOAD_BYTES)?;
         check_range("max_objects", self.max_objects as f64, 1.0, 1e6)?;
         if self.user.is_none() && self.password.is_some() {
             return Err(ConfigError::new("password", "a password", "set together with `user`"));
@@ -90,7 +100,13 @@ impl MqttConfig {
 
     /// The bounds of what is decoded.
     pub fn limits(&self) -> Limits {
-        Limits { payload_bytes: self.max_payload_bytes, objects: self.max_objects }
+        Limits { payload_bytes: self.max_payload_bytes, map_bytes: self.max_map_bytes, objects: self.max_objects }
+    }
+
+    /// Largest packet in bytes that carries a payload within the limits. A link does not read a larger one: it is cut
+    /// and made anew.
+    pub fn max_packet_bytes(&self) -> usize {
+        self.max_payload_bytes.max(self.max_map_bytes) + PACKET_OVERHEAD_BYTES
     }
 
     pub(super) fn keep_alive(&self) -> Duration {
@@ -102,9 +118,11 @@ impl MqttConfig {
     }
 }
 
-/// Largest packet in bytes that a link reads at all. A larger one costs the link, which is then made anew; one between
-/// [`MqttConfig::max_payload_bytes`] and this is read, counted and dropped.
-pub(super) const MAX_PACKET_BYTES: usize = 16 * 1024 * 1024;
+/// Room for a packet's header, topic and properties.
+const PACKET_OVERHEAD_BYTES: usize = 4096;
+
+/// Most that an MQTT packet can carry, 2²⁸ − 1, with room for the overhead.
+const MAX_PAYLOAD_BYTES: f64 = 268_000_000.0;
 
 /// A version of the MQTT protocol.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -120,8 +138,24 @@ pub enum MqttVersion {
 
 /// Text that shows in no log and no printed configuration.
 #[derive(Clone, PartialEq, Eq, Deserialize)]
-#[serde(transparent)]
+#[serde(try_from = "String")]
 pub struct Secret(String);
+
+/// What is shown in place of a secret.
+const HIDDEN: &str = "***";
+
+/// A secret that is only what is shown in place of one.
+#[derive(Debug, thiserror::Error)]
+#[error("`{HIDDEN}` stands for a secret that was not printed, give the secret itself")]
+pub struct HiddenSecret;
+
+impl TryFrom<String> for Secret {
+    type Error = HiddenSecret;
+
+    fn try_from(text: String) -> Result<Self, HiddenSecret> {
+        if text == HIDDEN { Err(HiddenSecret) } else { Ok(Self(text)) }
+    }
+}
 
 impl Secret {
     /// Takes the text.
@@ -137,13 +171,13 @@ impl Secret {
 
 impl Serialize for Secret {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str("***")
+        serializer.serialize_str(HIDDEN)
     }
 }
 
 impl fmt::Debug for Secret {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("***")
+        f.write_str(HIDDEN)
     }
 }
 
@@ -156,6 +190,8 @@ mod tests {
         MqttConfig::default().validate().unwrap();
         let error = MqttConfig { keep_alive_s: 0, ..MqttConfig::default() }.validate().unwrap_err();
         assert_eq!(error.key, "keep_alive_s");
+        let v5 = MqttConfig { keep_alive_s: 4, version: MqttVersion::V5, ..MqttConfig::default() };
+        assert_eq!(v5.validate().unwrap_err().allowed, "a number from 5 to 3600");
         let lone = MqttConfig { password: Some(Secret::new("x")), ..MqttConfig::default() };
         assert_eq!(lone.validate().unwrap_err().key, "password");
     }

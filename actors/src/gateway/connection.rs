@@ -8,7 +8,7 @@ use rumqttc::v5::mqttbytes::QoS as QoS5;
 use rumqttc::{QoS as QoS4, v5};
 
 use super::address::BrokerAddress;
-use super::config::{MAX_PACKET_BYTES, MqttConfig, MqttVersion};
+use super::config::{MqttConfig, MqttVersion};
 
 /// How the broker is to treat a message: contract of the topics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,6 +40,8 @@ pub(super) enum Packet {
     Message { topic: Bytes, payload: Bytes },
     /// This side's farewell is on its way.
     Left,
+    /// The broker answered a subscription and refused some of its filters, by their place in it, with its reason.
+    Denied(Vec<(usize, String)>),
     /// Something that only the protocol is concerned with.
     Other,
 }
@@ -66,7 +68,22 @@ impl ConnectionError {
         }
     }
 
-    /// Whether a packet beyond [`MAX_PACKET_BYTES`] came in.
+    /// Why the broker took the connection and then refused the node, in its own words.
+    pub(super) fn refusal(&self) -> Option<String> {
+        match self {
+            Self::V311(error) => match &**error {
+                rumqttc::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
+                _ => None,
+            },
+            Self::V5(error) => match &**error {
+                v5::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
+                _ => None,
+            },
+            Self::Silent(_) => None,
+        }
+    }
+
+    /// Whether a packet beyond [`MqttConfig::max_packet_bytes`] came in.
     pub(super) fn is_oversized(&self) -> bool {
         match self {
             Self::V311(error) => matches!(
@@ -107,11 +124,12 @@ pub(super) fn open(
     network.set_connection_timeout(timeout_s);
     let login = config.user.as_deref().map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
     let (host, port) = (address.host(), address.port());
+    let max_packet_bytes = config.max_packet_bytes();
     match config.version {
         MqttVersion::V311 => {
             let mut options = rumqttc::MqttOptions::new(client_id, host, port);
             options.set_keep_alive(config.keep_alive());
-            options.set_max_packet_size(MAX_PACKET_BYTES, MAX_PACKET_BYTES);
+            options.set_max_packet_size(max_packet_bytes, max_packet_bytes);
             options.set_last_will(rumqttc::LastWill::new(&will.topic, will.payload.clone(), QoS4::AtLeastOnce, true));
             if let Some((user, password)) = login {
                 options.set_credentials(user, password);
@@ -124,7 +142,7 @@ pub(super) fn open(
             let mut options = v5::MqttOptions::new(client_id, host, port);
             options.set_keep_alive(config.keep_alive());
             options.set_connection_timeout(timeout_s);
-            options.set_max_packet_size(u32::try_from(MAX_PACKET_BYTES).ok());
+            options.set_max_packet_size(u32::try_from(max_packet_bytes).ok());
             let will =
                 v5::mqttbytes::v5::LastWill::new(&will.topic, will.payload.clone(), QoS5::AtLeastOnce, true, None);
             options.set_last_will(will);
@@ -192,6 +210,9 @@ impl Connection {
                 rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) => {
                     Packet::Message { topic: publish.topic.into(), payload: publish.payload }
                 }
+                rumqttc::Event::Incoming(rumqttc::Packet::SubAck(answer)) => {
+                    denied(answer.return_codes, |code| matches!(code, rumqttc::SubscribeReasonCode::Success(_)))
+                }
                 rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
                 _ => Packet::Other,
             },
@@ -200,9 +221,23 @@ impl Connection {
                 v5::Event::Incoming(v5::Incoming::Publish(publish)) => {
                     Packet::Message { topic: publish.topic, payload: publish.payload }
                 }
+                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => denied(answer.return_codes, |code| {
+                    matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
+                }),
                 v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
                 _ => Packet::Other,
             },
         })
     }
+}
+
+/// The filters of a subscription that were refused.
+fn denied<C: std::fmt::Debug>(codes: Vec<C>, granted: impl Fn(&C) -> bool) -> Packet {
+    let refused: Vec<_> = codes
+        .into_iter()
+        .enumerate()
+        .filter(|(_, code)| !granted(code))
+        .map(|(index, code)| (index, format!("{code:?}")))
+        .collect();
+    if refused.is_empty() { Packet::Other } else { Packet::Denied(refused) }
 }

@@ -7,9 +7,10 @@ use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{
     GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind, Reputations, Topic,
-    Topics, Verdicts, decode, decode_report, decode_share,
+    Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use uuid::Uuid;
 
 use super::address::BrokerAddress;
 use crate::clock;
@@ -74,6 +75,7 @@ pub type Subscriber = Arc<dyn Fn(Delivery) + Send + Sync>;
 /// Decodes, counts and hands over; shared by the links of a gateway.
 pub(super) struct Inbox {
     node: NodeName,
+    run: Uuid,
     topics: Topics,
     limits: Limits,
     counters: Arc<Counters>,
@@ -87,11 +89,15 @@ pub(super) enum Outcome {
     Done,
     /// The broker took this node for dead; it has to be told otherwise.
     DeclaredOffline,
+    /// The broker passed on this run's own status: it may publish there.
+    OwnStatus,
+    /// Another living run has this node's name.
+    Namesake(Uuid),
 }
 
 impl Inbox {
     pub(super) fn new(
-        node: NodeName,
+        (node, run): (NodeName, Uuid),
         topics: Topics,
         limits: Limits,
         places: usize,
@@ -100,6 +106,7 @@ impl Inbox {
     ) -> Self {
         Self {
             node,
+            run,
             topics,
             limits,
             counters,
@@ -115,7 +122,7 @@ impl Inbox {
     /// Deals with one packet; a payload that cannot be used is counted by its reason.
     pub(super) fn accept(&self, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Outcome {
         self.counters.count(Event::Received);
-        match self.read(topic, payload) {
+        match self.read(topic, payload, received_at) {
             Ok(Read::Message(message)) => {
                 self.deliver(message, received_at);
                 Outcome::Done
@@ -126,6 +133,14 @@ impl Inbox {
             }
             Ok(Read::Cleared) => Outcome::Done,
             Ok(Read::OwnDeath) => Outcome::DeclaredOffline,
+            Ok(Read::OwnStatus) => {
+                self.counters.count(Event::Echo);
+                Outcome::OwnStatus
+            }
+            Ok(Read::Namesake(run)) => {
+                self.counters.count(Event::NameConflict);
+                Outcome::Namesake(run)
+            }
             Err(reason) => {
                 self.counters.reject(reason);
                 tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
@@ -152,7 +167,7 @@ impl Inbox {
         subscriber(delivery);
     }
 
-    fn read(&self, topic: &[u8], payload: &[u8]) -> Result<Read, RejectReason> {
+    fn read(&self, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Result<Read, RejectReason> {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
         let message = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
             Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload),
@@ -165,6 +180,7 @@ impl Inbox {
                 if map.aggregator == self.node {
                     return Ok(Read::Echo);
                 }
+                check_fused_at(map.fused_at_us, received_at)?;
                 Incoming::Map(Arc::new(map))
             }
             Topic::GlobalVerdicts => {
@@ -172,6 +188,7 @@ impl Inbox {
                 if verdicts.aggregator == self.node {
                     return Ok(Read::Echo);
                 }
+                check_fused_at(verdicts.fused_at_us, received_at)?;
                 Incoming::Verdicts(Arc::new(verdicts))
             }
             Topic::Reputations if payload.is_empty() => return Ok(Read::Cleared),
@@ -204,7 +221,8 @@ impl Inbox {
         }
         Ok(match (status.node == self.node, status.state) {
             (true, NodeState::Offline) => Read::OwnDeath,
-            (true, NodeState::Following | NodeState::Aggregating) => Read::Echo,
+            (true, NodeState::Following | NodeState::Aggregating) if status.id == self.run => Read::OwnStatus,
+            (true, NodeState::Following | NodeState::Aggregating) => Read::Namesake(status.id),
             (false, _) => Read::Message(Incoming::Status(Arc::new(status))),
         })
     }
@@ -219,6 +237,10 @@ enum Read {
     Cleared,
     /// This node's last will.
     OwnDeath,
+    /// This run's status.
+    OwnStatus,
+    /// The status of another run of this name.
+    Namesake(Uuid),
 }
 
 impl fmt::Debug for Inbox {
@@ -241,7 +263,7 @@ mod tests {
         let held = Arc::new(Mutex::new(Vec::new()));
         let receiver = Arc::clone(&held);
         let inbox = Inbox::new(
-            NodeName::new("edge").unwrap(),
+            (NodeName::new("edge").unwrap(), Uuid::nil()),
             Topics::new(&NodeName::new("lot").unwrap()),
             Limits::default(),
             2,

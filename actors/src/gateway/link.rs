@@ -1,6 +1,6 @@
 //! The task that keeps one link to one broker: connects, reads, and connects anew.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use ecod::wire::RejectReason;
@@ -8,6 +8,7 @@ use ractor::ActorRef;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tokio::task::{AbortHandle, JoinHandle};
+use uuid::Uuid;
 
 use super::GatewayMessage;
 use super::address::BrokerAddress;
@@ -34,6 +35,8 @@ pub(super) enum LinkNews {
     Accepted(Client),
     /// The broker published the last will of this living node.
     DeclaredOffline,
+    /// Another living run has this node's name.
+    Namesake(Uuid),
     /// Not connected; attempts go on.
     Lost(LinkState),
 }
@@ -42,7 +45,9 @@ pub(super) enum LinkNews {
 #[derive(Debug)]
 pub(super) struct LinkSetup {
     pub(super) client_id: String,
-    pub(super) will: LastWill,
+    pub(super) filters: Vec<String>,
+    /// The will of the next connection.
+    pub(super) will: Mutex<LastWill>,
     pub(super) config: MqttConfig,
     pub(super) inbox: Arc<Inbox>,
     pub(super) counters: Arc<Counters>,
@@ -67,7 +72,7 @@ impl Link {
         gateway: ActorRef<GatewayMessage>,
     ) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
-        let task = tokio::spawn(Task { id, broker: broker.clone(), setup, gateway }.run(backoff));
+        let task = tokio::spawn(Task { id, broker: broker.clone(), setup, gateway, told: None }.run(backoff));
         Self { broker, state: LinkState::Down, client: None, abort: task.abort_handle(), task: Some(task) }
     }
 
@@ -101,10 +106,12 @@ struct Task {
     broker: BrokerAddress,
     setup: Arc<LinkSetup>,
     gateway: ActorRef<GatewayMessage>,
+    /// What the broker refused, as last told of.
+    told: Option<String>,
 }
 
 impl Task {
-    async fn run(self, mut backoff: Backoff) {
+    async fn run(mut self, mut backoff: Backoff) {
         // The first answer is waited for half as long: a session that outlived this was in use. One that ends sooner,
         // such as by a retained packet beyond all bounds, must not be tried again at full speed.
         let in_use = 2 * self.setup.config.connect_timeout();
@@ -117,6 +124,9 @@ impl Task {
             };
             let state = if error.is_refused() { LinkState::Refused } else { LinkState::Down };
             tracing::debug!(broker = %self.broker, %error, "link lost");
+            if let Some(reason) = error.refusal() {
+                self.tell_refusal(format!("{NOT_ADMITTED}: {reason}"));
+            }
             if error.is_oversized() {
                 self.setup.counters.reject(RejectReason::TooLarge);
             }
@@ -135,27 +145,59 @@ impl Task {
     }
 
     /// One connection from beginning to end; `Ok` after a farewell.
-    async fn session(&self) -> Result<(), ConnectionError> {
-        let LinkSetup { client_id, will, config, inbox, counters, .. } = &*self.setup;
-        let (client, mut connection) = connection::open(&self.broker, client_id, will, config);
+    async fn session(&mut self) -> Result<(), ConnectionError> {
+        let setup = Arc::clone(&self.setup);
+        let LinkSetup { client_id, will, config, inbox, counters, .. } = &*setup;
+        let will = will.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let (client, mut connection) = connection::open(&self.broker, client_id, &will, config);
         // The protocol's own timeouts are whole seconds.
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
+        self.told.take_if(|told| told.starts_with(NOT_ADMITTED));
         if !self.tell(LinkNews::Accepted(client)) {
             return Ok(());
         }
         // Pings alone make a poll return every keep-alive; longer silence is a connection that hangs.
         let patience = 2 * config.keep_alive();
+        let accepted = Instant::now();
+        let mut heard_itself = false;
         loop {
             match connection.next(patience).await.inspect_err(|_| counters.count(Event::Disconnected))? {
-                Packet::Message { topic, payload } => {
-                    if inbox.accept(&topic, &payload, clock::now()) == Outcome::DeclaredOffline {
+                Packet::Message { topic, payload } => match inbox.accept(&topic, &payload, clock::now()) {
+                    Outcome::DeclaredOffline => {
                         self.tell(LinkNews::DeclaredOffline);
                     }
+                    Outcome::Namesake(run) => {
+                        self.tell(LinkNews::Namesake(run));
+                    }
+                    Outcome::OwnStatus => {
+                        heard_itself = true;
+                        self.told.take_if(|told| told == NOT_HEARD);
+                    }
+                    Outcome::Done => {}
+                },
+                Packet::Denied(refused) => {
+                    let name = |(index, reason): (usize, String)| {
+                        format!("{} ({reason})", setup.filters.get(index).map_or("?", String::as_str))
+                    };
+                    let refused: Vec<_> = refused.into_iter().map(name).collect();
+                    self.tell_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
                 Packet::Left => return Ok(()),
                 Packet::Accepted | Packet::Other => {}
             }
+            if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.told.is_none() {
+                self.tell_refusal(NOT_HEARD.to_owned());
+            }
+        }
+    }
+
+    /// Warns of what the broker refuses, once per change.
+    fn tell_refusal(&mut self, refusal: String) {
+        if self.told.as_ref() != Some(&refusal) {
+            tracing::warn!(broker = %self.broker, refusal, "broker refuses this node, check its password and permissions");
+            self.setup.counters.count(Event::BrokerRefused);
+            self.told = Some(refusal);
         }
     }
 
@@ -164,6 +206,12 @@ impl Task {
         self.gateway.cast(GatewayMessage::LinkChanged { event: LinkEvent { link: self.id, news } }).is_ok()
     }
 }
+
+/// A broker that wants other credentials.
+const NOT_ADMITTED: &str = "connection refused";
+
+/// A broker acknowledges what it does not permit; only the missing echo tells.
+const NOT_HEARD: &str = "this node's own status does not come back: publishing or subscribing to it is not permitted";
 
 /// Waits that double with every failure, shortened by up to half at random.
 struct Backoff {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
 use ecod::election::ElectionConfig;
+use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::vote::VoteMode;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus, SCHEMA_VERSION};
@@ -168,6 +169,7 @@ impl Assembly {
                 let arguments = ProjectorArguments {
                     perception: camera::perception(&self.config).map_err(in_full)?,
                     gateway: self.seats.gateway.clone(),
+                    counters: self.counters(),
                 };
                 seat(&self.seats.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
             }
@@ -199,8 +201,8 @@ impl Assembly {
     /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
     /// leave it.
     async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let embedded = Box::new(EmbeddedBroker::new(self.config.broker.clone()));
-        let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await?;
+        let embedded = Box::new(EmbeddedBroker::new(self.config.broker()));
+        let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await.map_err(cause)?;
         let before = *self.broker_address.borrow();
         let address = before.unwrap_or(self.config.broker_listen());
         let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
@@ -208,7 +210,7 @@ impl Assembly {
             attempts -= 1;
             match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
                 Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
-                outcome => break outcome?,
+                outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
             }
         };
         self.broker_address.send_replace(Some(bound));
@@ -339,15 +341,20 @@ impl Assembly {
         Some(StateFile::new(directory, &self.config.cell, &self.name, what))
     }
 
+    /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
     fn status(&self) -> NodeStatus {
+        let newest = self.newest.map.borrow();
+        let taken = newest.as_ref().map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()));
+        let leadership = self.leadership.borrow();
+        let epoch = leadership.epoch.clone().filter(|_| leadership.leader().is_some()).or(taken);
         NodeStatus {
             schema: SCHEMA_VERSION,
             node: self.name.clone(),
             id: self.run,
             role: self.config.role,
-            state: NodeCondition::Following,
-            epoch: 0,
-            aggregator: None,
+            state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
+            epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
+            aggregator: epoch.map(|epoch| epoch.leader),
             version: env!("CARGO_PKG_VERSION").into(),
         }
     }
@@ -357,10 +364,18 @@ fn seat<M: Message>(
     seat: &Seat<M>,
     spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
 ) -> Result<ActorId, ActorProcessingErr> {
-    let (actor, _) = spawned?;
+    let (actor, _) = spawned.map_err(cause)?;
     let id = actor.get_id();
     seat.take(actor);
     Ok(id)
+}
+
+/// Why an actor did not start, without the framework's own words around it.
+pub(super) fn cause(error: SpawnErr) -> ActorProcessingErr {
+    match error {
+        SpawnErr::StartupFailed(cause) => cause,
+        other => other.into(),
+    }
 }
 
 /// An error with all its causes, which the actor framework would leave out.
@@ -375,5 +390,36 @@ async fn stop<M: Message>(seat: &Seat<M>) {
     if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT)).await {
         tracing::debug!(%error, "part did not stop in time");
         actor.kill();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::time::Timestamp;
+    use ecod::wire::{GlobalMap, Role};
+
+    use super::*;
+    use crate::follower::ReceivedMap;
+
+    #[test]
+    fn a_part_started_anew_still_says_whom_the_node_follows() {
+        let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
+        let assembly = Assembly::new(config, watch::Sender::new(None));
+        assert_eq!((assembly.status().epoch, assembly.status().aggregator), (0, None));
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("edge"),
+            epoch: 7,
+            round: 1,
+            fused_at_us: Timestamp(0),
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+        };
+        assembly.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
+        assert_eq!(
+            (assembly.status().epoch, assembly.status().aggregator.as_ref().map(NodeName::as_str)),
+            (7, Some("edge"))
+        );
     }
 }

@@ -29,7 +29,15 @@ const GATE_M: f64 = 0.032;
 
 /// The edge's configuration: role, known locations and fusion.
 pub fn edge(testbed: &Testbed, scene: &Scene) -> NodeConfig {
-    NodeConfig { name: Some(NodeName::from_static("edge")), role: Role::Edge, ..cell(testbed, scene) }
+    NodeConfig { name: Some(unused_name(scene, "edge")), role: Role::Edge, ..cell(testbed, scene) }
+}
+
+/// The wanted name, or the first of `name-2`, `name-3` … that no vehicle of the scene has.
+pub fn unused_name(scene: &Scene, wanted: &'static str) -> NodeName {
+    let numbered = (2..).map(|n| NodeName::new(format!("{wanted}-{n}")));
+    let mut names = std::iter::once(Ok(NodeName::from_static(wanted))).chain(numbered).filter_map(Result::ok);
+    let unused = names.find(|name| scene.cavs.iter().all(|cav| cav.name != *name));
+    unused.unwrap_or(NodeName::from_static(wanted))
 }
 
 /// A vehicle's configuration, with its frames from `source`.

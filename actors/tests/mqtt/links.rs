@@ -72,6 +72,28 @@ async fn user_and_password_are_presented() {
         intruder.send(GatewayMessage::SetBrokers { addresses: vec![broker.address()] });
         until("refusals are counted", || intruder.counters.events(Event::ConnectFailed) >= 2).await;
         assert_eq!(intruder.counters.events(Event::Connected), 0);
+        assert_eq!(intruder.counters.events(Event::BrokerRefused), 1, "told of once, not with every attempt");
+    }
+}
+
+#[tokio::test]
+async fn a_node_that_may_not_publish_is_told_though_the_broker_keeps_silent() {
+    let permitted = Mosquitto::with_permissions("ecod", "hush", "topic readwrite ecod/v1/test/#");
+    let denied = Mosquitto::with_permissions("ecod", "hush", "topic read ecod/v1/test/#");
+    for version in [MqttVersion::V311, MqttVersion::V5] {
+        let mqtt = MqttConfig {
+            version,
+            user: Some("ecod".to_owned()),
+            password: Some(Secret::new("hush")),
+            keep_alive_s: if version == MqttVersion::V5 { 5 } else { 1 },
+            connect_timeout_ms: 500,
+            ..MqttConfig::default()
+        };
+        let gauss = Node::join("gauss", Part::Follower, mqtt.clone(), &[&permitted.address()]).await;
+        let euclid = Node::join("euclid", Part::Follower, mqtt, &[&denied.address()]).await;
+        until("told of the refusal", || euclid.counters.events(Event::BrokerRefused) == 1).await;
+        until("gauss hears itself", || gauss.counters.events(Event::Echo) > 0).await;
+        assert_eq!(gauss.counters.events(Event::BrokerRefused), 0);
     }
 }
 

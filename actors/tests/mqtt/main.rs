@@ -5,6 +5,7 @@
 mod broker;
 mod cell;
 mod junk;
+mod large;
 mod links;
 mod mosquitto;
 mod status;

@@ -24,11 +24,15 @@ impl Mosquitto {
 
     /// Admits only this user.
     pub(crate) fn with_user(user: &str, password: &str) -> Self {
+        Self::configured(|directory| passwords(directory, user, password))
+    }
+
+    /// Admits only this user, who may then do what the list says.
+    pub(crate) fn with_permissions(user: &str, password: &str, permissions: &str) -> Self {
         Self::configured(|directory| {
-            let file = directory.join("passwords");
-            let made = Command::new("mosquitto_passwd").arg("-b").arg("-c").arg(&file).args([user, password]).status();
-            assert!(made.is_ok_and(|status| status.success()), "mosquitto_passwd makes {}", file.display());
-            format!("allow_anonymous false\npassword_file {}\n", file.display())
+            let file = directory.join("permissions");
+            std::fs::write(&file, format!("user {user}\n{permissions}\n")).unwrap();
+            format!("{}acl_file {}\n", passwords(directory, user, password), file.display())
         })
     }
 
@@ -71,6 +75,13 @@ impl Drop for Mosquitto {
             self.child.wait().unwrap();
         }
     }
+}
+
+fn passwords(directory: &Path, user: &str, password: &str) -> String {
+    let file = directory.join("passwords");
+    let made = Command::new("mosquitto_passwd").arg("-b").arg("-c").arg(&file).args([user, password]).status();
+    assert!(made.is_ok_and(|status| status.success()), "mosquitto_passwd makes {}", file.display());
+    format!("allow_anonymous false\npassword_file {}\n", file.display())
 }
 
 fn spawn(directory: &Path) -> Child {

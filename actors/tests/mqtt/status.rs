@@ -1,9 +1,11 @@
 //! Statuses: retained, with a last will.
 
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, MqttConfig, MqttVersion, Part};
+use ecod_actors::broker::Mqtt;
+use ecod_actors::counters::Event;
+use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion, Part};
 
-use crate::cell::{Node, Stranger, embedded, topic};
+use crate::cell::{LOOPBACK, Node, Stranger, embedded, topic, until};
 use crate::mosquitto::Mosquitto;
 
 async fn latecomers_see_the_living_and_the_dead(broker: &BrokerAddress, version: MqttVersion) {
@@ -46,6 +48,51 @@ async fn mosquitto_v311() {
 async fn mosquitto_v5() {
     let broker = Mosquitto::start();
     latecomers_see_the_living_and_the_dead(&broker.address(), MqttVersion::V5).await;
+}
+
+#[tokio::test]
+async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() {
+    let (_broker, address) = embedded();
+    let first = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut watcher = Node::join("gauss", Part::Follower, MqttConfig::default(), &[&address]).await;
+    assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
+    assert_eq!(first.counters.events(Event::NameConflict), 0);
+    let second = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    for node in [&first, &second] {
+        until("both know", || node.counters.events(Event::NameConflict) > 0).await;
+    }
+    // Whatever was said in the meantime came before this.
+    watcher.send(GatewayMessage::PublishStatus { status: watcher.status.clone() });
+    let echoes = watcher.counters.events(Event::Echo);
+    until("the broker is done", || watcher.counters.events(Event::Echo) > echoes).await;
+    for node in [&first, &second] {
+        assert!(node.counters.events(Event::NameConflict) <= 2, "each is answered once");
+    }
+    second.stop().await;
+    let restarted = Node::join("riemann", Part::Follower, MqttConfig::default(), &[&address]).await;
+    restarted.stop().await;
+    let restarted = Node::join("riemann", Part::Follower, MqttConfig::default(), &[&address]).await;
+    until("it hears itself", || restarted.counters.events(Event::Echo) > 0).await;
+    assert_eq!(restarted.counters.events(Event::NameConflict), 0, "a run that is over is no conflict");
+}
+
+#[tokio::test]
+async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
+    let (mut broker, address) = embedded();
+    let mut euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    euclid.send(GatewayMessage::PublishStatus { status: NodeStatus { epoch: 7, ..euclid.status.clone() } });
+    broker.restart(LOOPBACK).unwrap();
+    euclid.link(LinkState::Up).await;
+    let mut watcher = Node::join("gauss", Part::Follower, MqttConfig::default(), &[&address]).await;
+    assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
+    euclid.kill().await;
+    let epoch = watcher
+        .next(|message| match message {
+            Incoming::Status(status) if status.state == NodeState::Offline => Some(status.epoch),
+            _ => None,
+        })
+        .await;
+    assert_eq!(epoch, 7);
 }
 
 #[tokio::test]

@@ -4,15 +4,13 @@ use nalgebra::Point2;
 use smallvec::SmallVec;
 
 use crate::geometry::Covariance;
-use crate::names::Label;
+use crate::names::{Label, NodeName};
 use crate::pace::PaceConfig;
+use crate::pace::grouping::{Held, Place};
 use crate::time::Timestamp;
 use crate::wire::PerceivedObject;
 
-/// Where a vehicle can look: the object or the vacancy sign of a landmark, in configuration order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Place(u32);
-
+/// A vehicle can look at the object and at the vacancy sign of a landmark, in configuration order.
 impl Place {
     pub(super) fn object(landmark: usize) -> Self {
         Self(2 * landmark as u32)
@@ -21,25 +19,24 @@ impl Place {
     pub(super) fn vacancy_sign(landmark: usize) -> Self {
         Self(2 * landmark as u32 + 1)
     }
-
-    pub(super) fn index(self) -> usize {
-        self.0 as usize
-    }
 }
 
 /// What one vehicle knows.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Vehicle {
     last_capture: Option<Timestamp>,
-    /// Ascending by place.
+    /// When the look that is longest ago was.
+    oldest_look: Option<Timestamp>,
+    /// Ascending.
+    places: Vec<Place>,
+    /// One for each place.
     looks: Vec<Look>,
 }
 
 /// One vehicle's view of one place.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Look {
-    pub(super) place: Place,
-    pub(super) last_look: Timestamp,
+    last_look: Timestamp,
     /// Log-odds that anything is there.
     pub(super) anything: f64,
     /// Log-odds of the labels that have any evidence left.
@@ -90,57 +87,62 @@ impl Vehicle {
             if elapsed_s < config.independent_after_s { elapsed_s / config.independent_after_s } else { 1.0 };
         let worth = Worth { hit_nats: worth.hit_nats * independence, miss_nats: worth.miss_nats * independence };
         self.last_capture = Some(captured_at);
-        let known = self.looks.len();
+        self.add_places(sightings);
+        let outdated = captured_at - config.max_age();
         let mut at = 0;
         for sighting in sightings {
-            while at < known && self.looks[at].place < sighting.place {
+            while self.places[at] < sighting.place {
                 at += 1;
             }
-            let newest = self.looks.len().wrapping_sub(1);
-            let index = if at < known && self.looks[at].place == sighting.place {
-                at
-            } else if newest >= known && self.looks.last().is_some_and(|look| look.place == sighting.place) {
-                newest
-            } else {
-                self.looks.push(Look::new(sighting.place));
-                self.looks.len() - 1
-            };
-            self.looks[index].update(sighting.found, captured_at, worth, config);
+            let look = &mut self.looks[at];
+            if look.last_look < outdated {
+                *look = Look::default();
+            }
+            look.last_look = captured_at;
+            look.update(sighting.found, worth, config);
         }
-        if self.looks.len() > known {
-            self.looks.sort_by_key(|look| look.place);
+        self.oldest_look = self.looks.iter().map(|look| look.last_look).min();
+    }
+
+    /// Makes a look for every place that is sighted for the first time.
+    fn add_places(&mut self, sightings: &[Sighting<'_>]) {
+        let mut known = self.places.iter().peekable();
+        let mut added: Vec<Place> = Vec::new();
+        for Sighting { place, .. } in sightings {
+            while known.next_if(|known| *known < place).is_some() {}
+            if known.peek() != Some(&place) && added.last() != Some(place) {
+                added.push(*place);
+            }
         }
+        if added.is_empty() {
+            return;
+        }
+        let known = std::mem::take(&mut self.places).into_iter().zip(std::mem::take(&mut self.looks));
+        let mut all: Vec<(Place, Look)> =
+            known.chain(added.into_iter().map(|place| (place, Look::default()))).collect();
+        all.sort_by_key(|(place, _)| *place);
+        (self.places, self.looks) = all.into_iter().unzip();
     }
 
     /// Drops what was last looked at before `limit`; the time of the oldest look that is left, `None` when none is.
     pub(super) fn forget_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
-        let mut oldest = None;
-        self.looks.retain(|look| {
-            let kept = look.last_look >= limit;
-            if kept && oldest.is_none_or(|oldest| look.last_look < oldest) {
-                oldest = Some(look.last_look);
-            }
-            kept
-        });
-        oldest
+        if self.oldest_look.is_some_and(|oldest| oldest < limit) {
+            let mut looks = self.looks.iter();
+            self.places.retain(|_| looks.next().is_some_and(|look| look.last_look >= limit));
+            self.looks.retain(|look| look.last_look >= limit);
+            self.oldest_look = self.looks.iter().map(|look| look.last_look).min();
+        }
+        self.oldest_look
     }
 
-    pub(super) fn looks(&self) -> &[Look] {
-        &self.looks
+    /// The vehicle's looks under its name.
+    pub(super) fn held_by(&self, node: &NodeName) -> Held<'_, Look> {
+        Held { node: node.clone(), places: &self.places, items: &self.looks }
     }
 }
 
 impl Look {
-    fn new(place: Place) -> Self {
-        Self { place, last_look: Timestamp(0), anything: 0.0, labels: SmallVec::new(), position: None }
-    }
-
-    fn update(&mut self, found: Option<&PerceivedObject>, captured_at: Timestamp, worth: Worth, config: &PaceConfig) {
-        if captured_at.since(self.last_look) > config.max_age() {
-            self.anything = 0.0;
-            self.labels.clear();
-        }
-        self.last_look = captured_at;
+    fn update(&mut self, found: Option<&PerceivedObject>, worth: Worth, config: &PaceConfig) {
         match found {
             Some(object) => self.hit(object, worth, config),
             None => self.miss(worth, config),
@@ -150,12 +152,14 @@ impl Look {
 
     fn hit(&mut self, object: &PerceivedObject, worth: Worth, config: &PaceConfig) {
         let nats = worth.hit_nats * object.confidence;
-        if !self.labels.iter().any(|evidence| evidence.label == object.label) {
-            self.labels.push(LabelEvidence { label: object.label.clone(), nats: 0.0 });
-        }
+        let mut is_known = false;
         for evidence in &mut self.labels {
-            let signed = if evidence.label == object.label { nats } else { -nats };
-            evidence.nats = (evidence.nats + signed).min(config.evidence_limit);
+            let is_same = evidence.label == object.label;
+            is_known |= is_same;
+            evidence.nats = (evidence.nats + if is_same { nats } else { -nats }).min(config.evidence_limit);
+        }
+        if !is_known {
+            self.labels.push(LabelEvidence { label: object.label.clone(), nats: nats.min(config.evidence_limit) });
         }
         self.anything = (self.anything + nats).min(config.evidence_limit);
         self.position = Some((Point2::new(object.x_m, object.y_m), config.covariance(object)));

@@ -10,6 +10,7 @@ use super::*;
 enum Step {
     Frame,
     Fail,
+    Spoil,
     /// Blocks until the test drops the other end.
     Block(Receiver<()>),
 }
@@ -21,6 +22,7 @@ impl FrameSource for Script {
         match self.0.pop_front() {
             Some(Step::Frame) => Ok(Frame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 }),
             Some(Step::Fail) => Err(FrameError::Lost { origin: "script".into(), reason: "unplugged".into() }),
+            Some(Step::Spoil) => Err(FrameError::Unusable { origin: "script".into(), reason: "torn".into() }),
             Some(Step::Block(until)) => {
                 let _ = until.recv();
                 Err(FrameError::Lost { origin: "script".into(), reason: "came back late".into() })
@@ -56,6 +58,15 @@ async fn a_source_that_fails_twice_works_the_third_time() {
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
     assert!(capture.next_frame().await.is_none(), "it ended");
     assert_eq!(*capture.status().borrow(), CaptureStatus::Ended);
+}
+
+#[tokio::test]
+async fn an_unusable_frame_is_counted_and_costs_no_new_opening() {
+    let openings = vec![Some(vec![Step::Spoil, Step::Frame, Step::Spoil])];
+    let capture = Capture::start(scripted(openings), hasty()).unwrap();
+    assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
+    assert!(capture.next_frame().await.is_none(), "it ended and was not opened again");
+    assert_eq!(capture.unusable(), 2);
 }
 
 #[tokio::test]

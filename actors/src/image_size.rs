@@ -1,0 +1,114 @@
+//! The size of an image, and how detections in one size are read in another.
+
+use std::fmt;
+
+use ecod::camera::Intrinsics;
+use ecod::detection::Detection;
+use opencv::core::{Mat, MatTraitConst};
+
+/// Width and height in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageSize {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// A frame that the camera's optics say nothing about: no scaling makes it the image that they describe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "frame has {frame} pixels and camera.optics describe {optics}, another shape: \
+     have the source give that shape, or set or calibrate the optics for {frame}"
+)]
+pub struct SizeMismatch {
+    /// The frame's size.
+    pub frame: ImageSize,
+    /// The size that the optics are for.
+    pub optics: ImageSize,
+}
+
+/// Largest difference between horizontal and vertical scale that rounding to whole pixels explains.
+const SHAPE_TOLERANCE: f64 = 0.01;
+
+impl ImageSize {
+    /// The size of an image.
+    pub fn of(image: &Mat) -> Self {
+        Self { width: image.cols().unsigned_abs(), height: image.rows().unsigned_abs() }
+    }
+
+    /// Moves detections in a frame to where a camera with images of this size sees them. A frame of the same shape is
+    /// taken for the whole image, enlarged or reduced.
+    ///
+    /// # Errors
+    /// [`SizeMismatch`] when the frame has another shape; the detections are then unchanged.
+    pub fn fit(self, frame: Self, detections: &mut [Detection]) -> Result<(), SizeMismatch> {
+        if frame == self {
+            return Ok(());
+        }
+        let scale =
+            [(self.width, frame.width), (self.height, frame.height)].map(|(to, from)| f64::from(to) / f64::from(from));
+        let [x, y] = scale;
+        if !(x.is_finite() && y.is_finite()) || (x / y - 1.0).abs() > SHAPE_TOLERANCE {
+            return Err(SizeMismatch { frame, optics: self });
+        }
+        for Detection { bounding_box, corners, .. } in detections {
+            bounding_box.x_min *= x;
+            bounding_box.x_max *= x;
+            bounding_box.y_min *= y;
+            bounding_box.y_max *= y;
+            for corner in corners.iter_mut().flatten() {
+                corner.x *= x;
+                corner.y *= y;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl From<&Intrinsics> for ImageSize {
+    fn from(intrinsics: &Intrinsics) -> Self {
+        Self { width: intrinsics.width, height: intrinsics.height }
+    }
+}
+
+impl fmt::Display for ImageSize {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}x{}", self.width, self.height)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::detection::BoundingBox;
+    use nalgebra::Point2;
+
+    use super::*;
+
+    const OPTICS: ImageSize = ImageSize { width: 640, height: 480 };
+
+    fn seen() -> Vec<Detection> {
+        let bounding_box = BoundingBox { x_min: 100.0, y_min: 50.0, x_max: 300.0, y_max: 250.0 };
+        let corners = [(100.0, 50.0), (300.0, 50.0), (300.0, 250.0), (100.0, 250.0)].map(|(x, y)| Point2::new(x, y));
+        vec![Detection { label: "QR".into(), confidence: 1.0, bounding_box, corners: Some(corners) }]
+    }
+
+    #[test]
+    fn a_frame_of_the_same_shape_is_scaled() {
+        let mut detections = seen();
+        OPTICS.fit(ImageSize { width: 1280, height: 960 }, &mut detections).unwrap();
+        let Detection { bounding_box, corners, .. } = &detections[0];
+        assert_eq!(*bounding_box, BoundingBox { x_min: 50.0, y_min: 25.0, x_max: 150.0, y_max: 125.0 });
+        assert_eq!(corners.unwrap()[2], Point2::new(150.0, 125.0));
+    }
+
+    #[test]
+    fn a_frame_of_another_shape_is_an_error_that_names_both_sizes() {
+        for (width, height) in [(1280, 720), (480, 640), (640, 0)] {
+            let mut detections = seen();
+            let error = OPTICS.fit(ImageSize { width, height }, &mut detections).unwrap_err().to_string();
+            assert!(error.contains(&format!("{width}x{height}")) && error.contains("640x480"), "{error}");
+            assert_eq!(detections, seen());
+        }
+    }
+}

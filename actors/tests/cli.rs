@@ -1,0 +1,204 @@
+//! The program as a newcomer meets it: what it accepts, what it prints, and what it says when something is wrong.
+
+use std::io::{BufRead, BufReader, Write};
+use std::process::{Command, Output, Stdio};
+
+fn ecod_node() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+    for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+        command.env_remove(key);
+    }
+    command.stdin(Stdio::null());
+    command
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The printed configuration of a node whose environment is as given.
+fn printed(environment: &[(&str, &str)]) -> Output {
+    let mut command = ecod_node();
+    command.args(["--role", "edge", "--print-config"]).envs(environment.iter().copied());
+    command.output().unwrap()
+}
+
+#[test]
+fn environment_values_that_look_like_numbers_are_text_where_text_is_wanted() {
+    let environment = [
+        ("ECOD_CELL", "42"),
+        ("ECOD_NAME", "007"),
+        ("ECOD_MQTT__USER", "1e5"),
+        ("ECOD_MQTT__PASSWORD", "12345"),
+        ("ECOD_MQTT__VERSION", "5"),
+        ("ECOD_MQTT__KEEP_ALIVE_S", "7"),
+    ];
+    let output = printed(&environment);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let text = String::from_utf8(output.stdout).unwrap();
+    for line in ["cell = \"42\"", "name = \"007\"", "user = \"1e5\"", "version = \"5\"", "keep_alive_s = 7"] {
+        assert!(text.contains(line), "{line} is not in\n{text}");
+    }
+    assert!(text.contains("# `mqtt.password` is set but not shown") && !text.contains("12345"), "{text}");
+}
+
+#[test]
+fn errors_in_the_environment_name_the_variable_and_show_no_password() {
+    let output = printed(&[("ECOD_MQTT__KEEP_ALIVE_S", "soon"), ("ECOD_MQTT__PASSWORD", "hush4711")]);
+    let error = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{error}");
+    assert!(error.contains("ECOD_MQTT__KEEP_ALIVE_S") && error.contains("soon"), "{error}");
+    let output = printed(&[("ECOD_MQTT__KEEP_ALIVE_S", "70000")]);
+    assert!(stderr(&output).contains("ECOD_MQTT__KEEP_ALIVE_S: ") && stderr(&output).contains("70000"));
+    let output = printed(&[("ECOD_MQTT__PASSWORD", "***"), ("ECOD_MQTT__USER", "u")]);
+    assert!(stderr(&output).contains("not printed"), "{}", stderr(&output));
+    let output = printed(&[("ECOD_MQTT__PASSWORD", "hush4711")]);
+    assert!(stderr(&output).contains("`mqtt.password`") && !stderr(&output).contains("4711"), "{}", stderr(&output));
+}
+
+#[test]
+fn a_listening_address_without_ip_is_told_what_is_missing() {
+    for listen in ["1883", "localhost:1883", "127.0.0.1:80000"] {
+        let output = ecod_node().args(["--role", "edge", "--listen", listen]).output().unwrap();
+        let error = stderr(&output);
+        assert!(output.status.code() == Some(2) && error.contains("0.0.0.0:1883") && error.contains(listen), "{error}");
+    }
+}
+
+#[test]
+fn a_reader_that_has_seen_enough_is_no_failure() {
+    for arguments in [&["schema"][..], &["--role", "edge", "--print-config"]] {
+        let mut node = ecod_node().args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        drop(node.stdout.take());
+        let output = node.wait_with_output().unwrap();
+        assert_eq!((output.status.code(), stderr(&output)), (Some(0), String::new()), "{arguments:?}");
+    }
+}
+
+#[test]
+fn startup_errors_are_plain_and_name_what_is_wrong() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap().to_string();
+    let camera = "[camera.source]\nkind = \"images\"\npath = \"frames\"\n[camera.detector]\n";
+    let cases = [
+        (String::new(), vec!["--listen", &address], vec!["`listen`", &*address, "in use"]),
+        (
+            String::new(),
+            vec!["--listen", "127.0.0.1:0", "--map-log", "/no/such/maps"],
+            vec!["/no/such/maps", "No such"],
+        ),
+        (
+            format!("{camera}kind = \"coco\"\nmodel = \"/no/such.onnx\""),
+            vec!["--listen", "127.0.0.1:0"],
+            vec!["camera.detector", "/no/such.onnx", "No such"],
+        ),
+        (
+            format!("{camera}kind = \"placard\"\n[camera.optics]\ncalibration = \"/no/such.toml\""),
+            vec!["--listen", "127.0.0.1:0"],
+            vec!["camera.optics.calibration", "/no/such.toml", "No such"],
+        ),
+    ];
+    for (toml, flags, parts) in cases {
+        if !cfg!(feature = "camera") && !toml.is_empty() {
+            continue;
+        }
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        write!(file, "role = \"edge\"\n{toml}").unwrap();
+        let output = ecod_node().arg("--config").arg(file.path()).args(flags).env("RUST_LOG", "off").output().unwrap();
+        let error = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{error}");
+        assert!(parts.iter().all(|part| error.contains(part)), "{parts:?} not in {error}");
+        assert!(!error.contains("panicked") && error.lines().count() == 1, "{error}");
+    }
+}
+
+#[test]
+fn a_node_ends_with_its_standard_input_when_told_to() {
+    let mut node = ecod_node();
+    node.args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"])
+        .stdin(Stdio::piped())
+        .stderr(Stdio::piped());
+    let mut node = node.spawn().unwrap();
+    let mut log = BufReader::new(node.stderr.take().unwrap()).lines();
+    assert!(log.any(|line| line.unwrap().contains("broker serves")));
+    drop(node.stdin.take());
+    assert!(log.any(|line| line.unwrap().contains("stopping")));
+    assert!(node.wait().unwrap().success());
+}
+
+#[test]
+fn a_vehicle_without_a_camera_is_told_that_it_only_follows() {
+    let mut node = ecod_node();
+    node.args(["--role", "cav", "--name", "blind", "--broker", "127.0.0.1:1", "--stop-at-eof"]);
+    node.stdin(Stdio::piped()).stderr(Stdio::piped());
+    let mut node = node.spawn().unwrap();
+    let mut log = BufReader::new(node.stderr.take().unwrap()).lines();
+    assert!(log.any(|line| line.unwrap().contains("only follows")));
+    drop(node.stdin.take());
+    assert!(node.wait().unwrap().success());
+}
+
+#[cfg(feature = "camera")]
+mod demo {
+    use std::path::{Path, PathBuf};
+    use std::time::{Duration, Instant};
+
+    use nix::sys::signal::{Signal, kill};
+    use nix::unistd::Pid;
+
+    use super::*;
+
+    const PATIENCE: Duration = Duration::from_secs(60);
+
+    fn scenes() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json")
+    }
+
+    #[test]
+    fn an_output_that_cannot_be_written_is_told_of_before_the_run() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("file");
+        std::fs::write(&file, "kept").unwrap();
+        for (command, out) in [("testbed", "/no/such/result.json"), ("demo", file.to_str().unwrap())] {
+            let started = Instant::now();
+            let output = ecod_node().args([command, "--out", out, "--scenes"]).arg(scenes()).output().unwrap();
+            let error = stderr(&output);
+            assert_eq!(output.status.code(), Some(1), "{error}");
+            assert!(error.contains(out) && output.stdout.is_empty(), "{error}");
+            assert!(started.elapsed() < Duration::from_secs(10), "{command} went to work first");
+        }
+        assert_eq!(std::fs::read_to_string(file).unwrap(), "kept");
+    }
+
+    /// Processes with the directory in their command line.
+    fn working_in(directory: &Path) -> Vec<i32> {
+        let processes = std::fs::read_dir("/proc").unwrap().filter_map(Result::ok);
+        let directory = directory.to_str().unwrap();
+        let ours = processes.filter(|process| {
+            // A process that has ended but was not waited for has an empty command line.
+            let line = std::fs::read(process.path().join("cmdline")).unwrap_or_default();
+            String::from_utf8_lossy(&line).contains(directory)
+        });
+        ours.filter_map(|process| process.file_name().to_str()?.parse().ok()).collect()
+    }
+
+    fn until(what: &str, reached: impl Fn() -> bool) {
+        let started = Instant::now();
+        while !reached() {
+            assert!(started.elapsed() < PATIENCE, "never reached: {what}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    #[test]
+    fn a_demo_that_is_killed_leaves_no_nodes_behind() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut demo = ecod_node();
+        demo.args(["demo", "--scene", "setup1-lot1", "--out"]).arg(directory.path()).arg("--scenes").arg(scenes());
+        let mut demo = demo.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        until("five nodes and the demo run", || working_in(directory.path()).len() == 6);
+        kill(Pid::from_raw(i32::try_from(demo.id()).unwrap()), Signal::SIGKILL).unwrap();
+        demo.wait().unwrap();
+        until("all nodes have ended", || working_in(directory.path()).is_empty());
+    }
+}

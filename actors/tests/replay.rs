@@ -1,0 +1,204 @@
+//! `ecod-node replay` and `ecod-node eval` as programs.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+fn example(name: &str) -> PathBuf {
+    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples")).join(name)
+}
+
+fn ecod(arguments: &[&str]) -> Output {
+    ecod_with_input(arguments, b"")
+}
+
+fn ecod_with_input(arguments: &[&str], input: &[u8]) -> Output {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
+        .args(arguments)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut stdin = child.stdin.take().unwrap();
+    let input = input.to_vec();
+    let writer = std::thread::spawn(move || drop(stdin.write_all(&input)));
+    let output = child.wait_with_output().unwrap();
+    writer.join().unwrap();
+    output
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Replays the example and returns the output.
+fn replay_lot(folder: &TempDir, name: &str) -> PathBuf {
+    let (config, input, output) =
+        (example("recordings/lot.toml"), example("recordings/lot.jsonl"), folder.path().join(name));
+    let arguments = ["replay", "--config", text(&config), "--input", text(&input), "--output", text(&output)];
+    let run = ecod(&arguments);
+    assert!(run.status.success(), "{}", said(&run));
+    assert!(said(&run).starts_with("96 lines, 96 used, "), "{}", said(&run));
+    output
+}
+
+#[test]
+fn equal_inputs_give_byte_equal_outputs_by_file_and_by_pipe() {
+    let folder = TempDir::new().unwrap();
+    let (first, second) = (replay_lot(&folder, "1.jsonl"), replay_lot(&folder, "2.jsonl"));
+    let bytes = fs::read(first).unwrap();
+    assert!(!bytes.is_empty());
+    assert!(bytes == fs::read(second).unwrap());
+    let config = example("recordings/lot.toml");
+    let recording = fs::read(example("recordings/lot.jsonl")).unwrap();
+    let arguments = ["replay", "--config", text(&config), "--input", "-", "--output", "-"];
+    assert!(ecod_with_input(&arguments, &recording).stdout == bytes);
+}
+
+#[test]
+fn a_replay_is_judged_beside_majority_and_every_vehicle() {
+    let folder = TempDir::new().unwrap();
+    let output = replay_lot(&folder, "out.jsonl");
+    let (truth, reports, config) =
+        (example("recordings/lot_truth.json"), example("recordings/lot.jsonl"), example("recordings/lot.toml"));
+    let result = folder.path().join("result.json");
+    let run = ecod(&[
+        "eval",
+        "--truth",
+        text(&truth),
+        "--input",
+        text(&output),
+        "--reports",
+        text(&reports),
+        "--config",
+        text(&config),
+        "--out",
+        text(&result),
+    ]);
+    assert!(run.status.success(), "{}", said(&run));
+    let table = String::from_utf8(run.stdout).unwrap();
+    assert!(["PACE", "VOTE", "majority %", "euclid", "truth"].iter().all(|part| table.contains(part)), "{table}");
+    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+    for (algorithm, least) in [("pace", 100.0), ("vote", 75.0)] {
+        let scores = &result[algorithm];
+        assert_eq!(scores["items"].as_u64(), Some(8));
+        assert!(scores["accuracy_pct"].as_f64().unwrap() >= least, "{scores}");
+        assert_eq!(scores["vehicles"].as_object().unwrap().len(), 4);
+        assert!(scores["vehicles"]["euclid"]["accuracy_pct"].as_f64().unwrap() < 100.0);
+    }
+}
+
+#[test]
+fn lines_that_cannot_be_used_are_counted_by_reason() {
+    let recording = fs::read(example("recordings/lot.jsonl")).unwrap();
+    let first = recording.split(|byte| *byte == b'\n').next().unwrap();
+    let mut input = first.to_vec();
+    input.extend_from_slice(b"\r\n\nnonsense\n\xff\xfe\n");
+    input.extend(std::iter::repeat_n(b'x', 5 << 20));
+    input.push(b'\n');
+    input.extend_from_slice(first);
+    input.push(b'\n');
+    input.extend_from_slice(&first[..first.len() / 2]);
+    let run = ecod_with_input(&["replay", "--input", "-", "--output", "-"], &input);
+    assert!(run.status.success());
+    let said = said(&run);
+    for part in
+        ["6 lines, 1 used, 1 written", "rejected malformed 3", "rejected too_large 1", "rejected out_of_order 1"]
+    {
+        assert!(said.contains(part), "{said}");
+    }
+    assert_eq!(run.stdout.iter().filter(|byte| **byte == b'\n').count(), 1);
+    let nothing = ecod(&["replay", "--input", "-", "--output", "-"]);
+    assert!(nothing.status.success() && nothing.stdout.is_empty());
+}
+
+#[test]
+fn passes_write_one_set_of_verdicts() {
+    let input = example("recordings/lot.jsonl");
+    let run = ecod(&["replay", "--input", text(&input), "--output", "-", "--passes", "4"]);
+    assert!(run.status.success() && said(&run).contains("rejected not_fused 48"), "{}", said(&run));
+    let lines: Vec<Value> = run
+        .stdout
+        .split(|b| *b == b'\n')
+        .filter(|l| !l.is_empty())
+        .map(|l| serde_json::from_slice(l).unwrap())
+        .collect();
+    assert_eq!(lines.len(), 1);
+    assert_eq!(lines[0]["verdicts"].as_array().unwrap().len(), 8);
+}
+
+#[test]
+fn what_cannot_be_done_is_said_and_changes_no_file() {
+    let folder = TempDir::new().unwrap();
+    let file = |name: &str, content: &str| {
+        let path = folder.path().join(name);
+        fs::write(&path, content).unwrap();
+        path
+    };
+    let (recording, typo, truth) =
+        (file("in.jsonl", "{}\n"), file("typo.toml", "[fusion.pace]\ngat_m = 1\n"), file("truth.json", "{\"a\": 3}"));
+    let empty = file("empty.jsonl", "");
+    let out = folder.path().join("out.jsonl");
+    let (recording, out) = (text(&recording), text(&out));
+    for (arguments, code, part) in [
+        (vec!["replay", "--input", "/no/such.jsonl", "--output", out], 2, "/no/such.jsonl"),
+        (vec!["replay", "--input", "/", "--output", out], 2, "directory"),
+        (vec!["replay", "--input", recording, "--output", recording], 2, "both read and written"),
+        (vec!["replay", "--input", recording, "--output", "/no/such/dir.jsonl"], 2, "/no/such/dir.jsonl"),
+        (vec!["replay", "--config", text(&typo), "--input", recording, "--output", out], 2, "fusion.pace.gat_m"),
+        (vec!["replay", "--config", "/no.toml", "--input", recording, "--output", out], 2, "/no.toml"),
+        (vec!["replay", "--input", recording, "--output", out, "--passes", "0"], 2, "--passes"),
+        (vec!["eval", "--truth", "/no.json", "--input", recording], 2, "/no.json"),
+        (vec!["eval", "--truth", text(&truth), "--input", recording], 2, "`a` has 3"),
+        (vec!["eval", "--truth", text(&example("recordings/lot_truth.json")), "--input", text(&empty)], 1, "no map"),
+        (
+            vec!["eval", "--truth", text(&example("recordings/lot_truth.json")), "--input", recording],
+            1,
+            "1 lines are neither",
+        ),
+    ] {
+        let run = ecod(&arguments);
+        assert_eq!(run.status.code(), Some(code), "{arguments:?}: {}", said(&run));
+        assert!(said(&run).contains(part), "{arguments:?}: {}", said(&run));
+    }
+    assert_eq!(fs::read_to_string(recording).unwrap(), "{}\n");
+    assert!(!Path::new(out).exists());
+}
+
+#[cfg(feature = "camera")]
+#[test]
+fn the_recorded_intersection_is_judged_right() {
+    let folder = TempDir::new().unwrap();
+    let (scenes, out, reports) = (
+        example("testbed/vote_recording.json"),
+        folder.path().join("result.json"),
+        folder.path().join("reports.jsonl"),
+    );
+    let run = ecod(&[
+        "testbed",
+        "--scenes",
+        text(&scenes),
+        "--generated",
+        "3",
+        "--out",
+        text(&out),
+        "--reports",
+        text(&reports),
+    ]);
+    assert!(run.status.success(), "{}", said(&run));
+    let result: Value = serde_json::from_slice(&fs::read(out).unwrap()).unwrap();
+    let recording = &result["scenes"][0];
+    assert_eq!((recording["verdicts"].as_u64(), recording["vote_accuracy_pct"].as_f64()), (Some(9), Some(100.0)));
+    assert_eq!(result["scenes"][1]["scenes"].as_u64(), Some(3));
+    let replayed = ecod(&["replay", "--input", text(&reports), "--output", "-"]);
+    assert!(said(&replayed).starts_with("12 lines, 12 used, "), "{}", said(&replayed));
+}

@@ -1,0 +1,160 @@
+//! Time per vote of a VOTE round and of a reputation update, and memory per tracked landmark.
+
+mod figures;
+
+use std::time::{Duration, Instant};
+
+use ecod::names::NodeName;
+use ecod::reputation::{Evidence, ReputationConfig, ReputationLedger};
+use ecod::time::Timestamp;
+use ecod::vote::{Vote, VoteConfig, VoteMode};
+use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION};
+
+use figures::Figures;
+
+const NOON: Timestamp = Timestamp(1_732_154_400_000_000);
+const LABELS: [&str; 5] = ["car", "cup", "mouse", "sports ball", "vase"];
+/// Vehicles that see each landmark.
+const WITNESSES: usize = 8;
+/// Objects that a vehicle reports.
+const OBJECTS: usize = 32;
+
+fn main() {
+    let mut figures = Figures::new("vote");
+    rounds(&mut figures);
+    ledgers(&mut figures);
+    memory(&mut figures);
+    figures.save();
+}
+
+/// Rounds of 10² to 10⁵ votes, eight vehicles a landmark; one in five votes is wrong.
+fn rounds(figures: &mut Figures) {
+    println!("{:<10} {:>8} {:>10} {:>10}", "mode", "votes", "round ms", "ns/vote");
+    for (name, mode) in [("weighted", VoteMode::Weighted), ("paper", VoteMode::Paper)] {
+        let costs = [100, 1_000, 10_000, 100_000].map(|votes| {
+            let mut vote = Vote::new(config(mode), Vec::new());
+            let repeats = if votes > 10_000 { 5 } else { 21 };
+            let least = (0..repeats)
+                .map(|round| {
+                    let now = NOON + Duration::from_secs(3 * round);
+                    let reports = reports(votes, round, now);
+                    time(|| {
+                        for report in &reports {
+                            vote.observe(report, now).expect("reports are in order");
+                        }
+                        std::hint::black_box(vote.close(now));
+                    })
+                })
+                .min()
+                .expect("there are rounds");
+            record(figures, &format!("{name}_round"), votes, least)
+        });
+        flat(figures, &format!("vote_{name}_cost_per_vote_from_the_middle"), costs);
+    }
+}
+
+/// Settled votes written into a ledger, and the reputations that follow.
+fn ledgers(figures: &mut Figures) {
+    let aggregator = NodeName::new("edge").expect("a valid name");
+    let costs = [100, 1_000, 10_000, 100_000].map(|votes| {
+        let evidence: Vec<_> = (0..votes)
+            .map(|n| Evidence {
+                node: node(n % 64),
+                label: LABELS[n % LABELS.len()].into(),
+                correct: !n.is_multiple_of(5),
+            })
+            .collect();
+        let mut ledger = ReputationLedger::default();
+        let least = (0..21)
+            .map(|epoch| time(|| evidence.iter().for_each(|e| ledger.record(epoch / 10, &aggregator, e))))
+            .min()
+            .expect("there are rounds");
+        std::hint::black_box(ledger.reputations(&ReputationConfig::default()));
+        record(figures, "ledger_update", votes, least)
+    });
+    flat(figures, "ledger_update_cost_per_vote_from_the_middle", costs);
+}
+
+#[expect(clippy::disallowed_methods, reason = "a benchmark reads the clock")]
+fn time(run: impl FnOnce()) -> Duration {
+    let begin = Instant::now();
+    run();
+    begin.elapsed()
+}
+
+fn record(figures: &mut Figures, name: &str, votes: usize, time: Duration) -> f64 {
+    let per_vote = time.as_secs_f64() * 1e9 / votes as f64;
+    println!("{name:<10} {votes:>8} {:>10.3} {per_vote:>10.1}", time.as_secs_f64() * 1e3);
+    let value = serde_json::json!({ "round_ms": time.as_secs_f64() * 1e3, "ns_per_vote": per_vote });
+    figures.insert(format!("{name}_{votes}_votes"), value);
+    per_vote
+}
+
+fn flat(figures: &mut Figures, name: &str, mut costs: [f64; 4]) {
+    costs.sort_by(f64::total_cmp);
+    let middle = (costs[1] + costs[2]) / 2.0;
+    let deviation = (costs[3] / middle - 1.0).max(1.0 - costs[0] / middle) * 100.0;
+    figures.goal(name, deviation, 50.0, " %");
+}
+
+/// Growth of the process per landmark that has eight fresh votes, from the resident set; Linux only.
+fn memory(figures: &mut Figures) {
+    let resident = || -> Option<f64> {
+        let status = std::fs::read_to_string("/proc/self/status").ok()?;
+        let line = status.lines().find(|line| line.starts_with("VmRSS:"))?;
+        line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|kib| kib * 1024.0)
+    };
+    let landmarks = 50_000;
+    let reports = reports(landmarks * WITNESSES, 0, NOON);
+    let Some(before) = resident() else { return };
+    let mut vote = Vote::new(config(VoteMode::Weighted), Vec::new());
+    for report in &reports {
+        vote.observe(report, NOON).expect("reports are in order");
+    }
+    drop(vote.close(NOON));
+    let Some(after) = resident() else { return };
+    let bytes = (after - before) / landmarks as f64;
+    println!("memory: {bytes:.0} bytes a landmark with {WITNESSES} votes");
+    figures.insert("bytes_per_landmark_of_8_votes", bytes.into());
+    drop(vote);
+}
+
+fn config(mode: VoteMode) -> VoteConfig {
+    VoteConfig { mode, max_landmarks: 1_000_000, max_vehicles: 100_000, ..VoteConfig::default() }
+}
+
+fn node(n: usize) -> NodeName {
+    NodeName::new(format!("v{n}")).expect("a valid name")
+}
+
+/// Eight reports for every group of 32 landmarks, from vehicles that drive on from group to group.
+fn reports(votes: usize, round: u64, at: Timestamp) -> Vec<ObjectReport> {
+    let landmarks = votes.div_ceil(WITNESSES);
+    let mut reports = Vec::new();
+    for group in 0..landmarks.div_ceil(OBJECTS) {
+        for witness in 0..WITNESSES {
+            let vehicle = group % 32 * WITNESSES + witness;
+            let object = |place: usize| {
+                let wrong = (place * 7 + witness * 13 + round as usize * 3).is_multiple_of(5);
+                PerceivedObject {
+                    label: LABELS[(place + usize::from(wrong) * (1 + witness % 4)) % LABELS.len()].into(),
+                    confidence: 0.5 + 0.5 * ((place * 31 + witness * 17) % 97) as f64 / 97.0,
+                    x_m: 0.0,
+                    y_m: 0.0,
+                    covariance_m2: None,
+                    landmark: Some(format!("place-{place}").into()),
+                }
+            };
+            reports.push(ObjectReport {
+                schema: SCHEMA_VERSION,
+                node: node(vehicle),
+                seq: round * 1_000_000 + group as u64,
+                captured_at_us: at + Duration::from_micros(group as u64),
+                pose: None,
+                objects: (group * OBJECTS..landmarks.min((group + 1) * OBJECTS)).map(object).collect(),
+                seen: None,
+            });
+        }
+    }
+    reports
+}

@@ -1,0 +1,72 @@
+//! What many vehicles hold about many places, regrouped from vehicles to places.
+
+use crate::names::NodeName;
+
+/// Something that vehicles look at, counted from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Place(pub(super) u32);
+
+impl Place {
+    fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// What one vehicle holds: items, and the place of each beside them, so that regrouping reads nothing but places.
+#[derive(Debug, Clone)]
+pub(super) struct Held<'a, T> {
+    pub(super) node: NodeName,
+    pub(super) places: &'a [Place],
+    pub(super) items: &'a [T],
+}
+
+/// Buffers that group items by place in time linear in items and places; kept from round to round.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Grouping {
+    /// (vehicle, item) by place.
+    entries: Vec<(u32, u32)>,
+    /// Where the entries of each place end.
+    ends: Vec<u32>,
+}
+
+/// Items grouped by place.
+pub(super) struct ByPlace<'a, T> {
+    vehicles: &'a [Held<'a, T>],
+    grouping: &'a Grouping,
+}
+
+impl Grouping {
+    /// Groups the vehicles' items for `places` places, keeping the order of vehicles and of their items within a place.
+    pub(super) fn group<'a, T>(&'a mut self, vehicles: &'a [Held<'a, T>], places: usize) -> ByPlace<'a, T> {
+        self.ends.clear();
+        self.ends.resize(places + 1, 0);
+        for place in vehicles.iter().flat_map(|vehicle| vehicle.places) {
+            self.ends[place.index() + 1] += 1;
+        }
+        for place in 1..self.ends.len() {
+            self.ends[place] += self.ends[place - 1];
+        }
+        self.entries.resize(self.ends[places] as usize, (0, 0));
+        // The start of each place serves as its cursor and so becomes its end.
+        for (v, vehicle) in vehicles.iter().enumerate() {
+            for (i, place) in vehicle.places.iter().enumerate() {
+                let cursor = &mut self.ends[place.index()];
+                self.entries[*cursor as usize] = (v as u32, i as u32);
+                *cursor += 1;
+            }
+        }
+        ByPlace { vehicles, grouping: self }
+    }
+}
+
+impl<'a, T> ByPlace<'a, T> {
+    /// The items at a place with their vehicles' names.
+    pub(super) fn at(&self, place: Place) -> impl ExactSizeIterator<Item = (&'a NodeName, &'a T)> + Clone + '_ {
+        let Grouping { entries, ends } = self.grouping;
+        let start = if place.index() == 0 { 0 } else { ends[place.index() - 1] };
+        entries[start as usize..ends[place.index()] as usize].iter().map(|&(vehicle, item)| {
+            let vehicle = &self.vehicles[vehicle as usize];
+            (&vehicle.node, &vehicle.items[item as usize])
+        })
+    }
+}

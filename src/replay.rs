@@ -1,0 +1,258 @@
+//! A recorded cell run again, in virtual time: lines in, maps and verdicts out, equal for equal input.
+//!
+//! Call [`Replay::line`] with every line in the order of arrival, then [`Replay::finish`]. Each line is one report as
+//! JSON, with two more fields that may be absent: `topic`, `"detections"` by default or `"vote_detections"`, and
+//! `received_at_us`. The time of a line is when it was received or else captured, and never before the line before it.
+//! The machine behind it is the [`Aggregator`] of a live node.
+//!
+//! A line that is ahead of most of the [`LOOKAHEAD`] lines after it, by more than clocks may differ, does not move the time
+//! and is rejected: one vehicle with a wrong clock must not make all others stale. A silence costs at most ten seconds'
+//! rounds; then time goes on at the next line. Memory is bounded by the cell and not by the recording.
+
+mod clock;
+mod line;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, HashSet, VecDeque};
+use std::time::Duration;
+
+pub use line::FusedLine;
+
+use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
+use crate::landmark::Landmark;
+use crate::names::{LandmarkId, NodeName};
+use crate::time::Timestamp;
+use crate::wire::{Limits, ObjectReport, RejectReason, ReportKind};
+use clock::VirtualClock;
+use line::Line;
+
+/// How many lines are read ahead to tell a wrong clock from a silence.
+pub const LOOKAHEAD: usize = 64;
+
+/// Most locations that an open cell learns for PACE; they are never forgotten.
+const MAX_LEARNT: usize = 4096;
+
+/// Silence that is replayed round by round, at least.
+const SILENCE: Duration = Duration::from_secs(10);
+
+/// The cell that a recording is replayed in.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReplayConfig {
+    /// The aggregator that is written into every line of output.
+    pub aggregator: NodeName,
+    /// How reports are fused; taken as valid.
+    pub fusion: FusionConfig,
+    /// The cell's known locations; without any, they are taken from the reports as they appear.
+    pub landmarks: Vec<Landmark>,
+    /// Bounds of a line.
+    pub limits: Limits,
+    /// Go over the stored votes so many times at the end and write only the verdicts of the last pass. Votes do not
+    /// grow stale then, and the last one of each vehicle at each location counts.
+    pub passes: Option<u32>,
+}
+
+impl Default for ReplayConfig {
+    fn default() -> Self {
+        Self {
+            aggregator: NodeName::from_static("replay"),
+            fusion: FusionConfig::default(),
+            landmarks: Vec::new(),
+            limits: Limits::default(),
+            passes: None,
+        }
+    }
+}
+
+/// What became of the lines.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Summary {
+    /// Lines that are not blank.
+    pub lines: u64,
+    /// Lines that were not used, by reason.
+    pub rejected: BTreeMap<RejectReason, u64>,
+    /// Lines that were used and whose own time is before that of a line before them.
+    pub late: u64,
+    /// Objects of used lines that voted for nothing; see [`crate::vote`].
+    pub ignored_votes: u64,
+    /// Maps and sets of verdicts made.
+    pub written: u64,
+}
+
+impl Summary {
+    /// Lines that were used.
+    pub fn used(&self) -> u64 {
+        self.lines - self.rejected.values().sum::<u64>()
+    }
+}
+
+/// Replays a recording; see the module.
+#[derive(Debug, Clone)]
+pub struct Replay {
+    config: ReplayConfig,
+    clock: VirtualClock,
+    ahead: VecDeque<Line>,
+    cell: Option<Aggregator>,
+    /// By kind, whether any report came.
+    heard: [bool; ReportKind::COUNT],
+    /// Locations of an open cell.
+    learnt: HashSet<LandmarkId>,
+    /// Whether a report waits for its round to close.
+    pending: bool,
+    summary: Summary,
+}
+
+impl Replay {
+    /// A cell that has heard nothing; `config` is taken as valid.
+    pub fn new(mut config: ReplayConfig) -> Self {
+        if config.passes.is_some() {
+            let vote = &mut config.fusion.vote;
+            config.fusion.algorithms = Algorithms::Vote;
+            vote.weighted.freshness_s = 1e12;
+            vote.weighted.hysteresis = 0.0;
+            vote.max_landmarks = vote.max_landmarks.max(1_000_000);
+        }
+        Self {
+            clock: VirtualClock::new(config.fusion.window.max_clock_offset_s),
+            config,
+            ahead: VecDeque::with_capacity(LOOKAHEAD + 1),
+            cell: None,
+            heard: [false; ReportKind::COUNT],
+            learnt: HashSet::new(),
+            pending: false,
+            summary: Summary::default(),
+        }
+    }
+
+    /// Takes the next line, without its end; returns what has come of the lines so far. Blank lines are passed over.
+    pub fn line(&mut self, text: &[u8]) -> Vec<FusedLine> {
+        if text.trim_ascii().is_empty() {
+            return Vec::new();
+        }
+        self.summary.lines += 1;
+        match Line::read(text, &self.config.limits) {
+            Ok(line) => self.ahead.push_back(line),
+            Err(reason) => self.reject(reason),
+        }
+        if self.ahead.len() > LOOKAHEAD { self.next() } else { Vec::new() }
+    }
+
+    /// Counts a line that was too large to be read at all.
+    pub fn oversized_line(&mut self) {
+        self.summary.lines += 1;
+        self.reject(RejectReason::TooLarge);
+    }
+
+    /// Takes the lines that were read ahead and closes the last round.
+    pub fn finish(mut self) -> (Vec<FusedLine>, Summary) {
+        let mut output = Vec::new();
+        while !self.ahead.is_empty() {
+            output.append(&mut self.next());
+        }
+        if self.pending
+            && let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline)
+        {
+            self.tick(deadline, &mut output);
+        }
+        if let (Some(passes), Some(cell)) = (self.config.passes, &mut self.cell) {
+            output.extend(cell.refine(passes, self.clock.now()).map(FusedLine::Verdicts));
+            self.summary.written += output.len() as u64;
+        }
+        self.summary.ignored_votes = self.cell.as_ref().map_or(0, Aggregator::ignored_votes);
+        (output, self.summary)
+    }
+
+    fn reject(&mut self, reason: RejectReason) {
+        *self.summary.rejected.entry(reason).or_default() += 1;
+    }
+
+    /// Takes the oldest of the lines that were read ahead.
+    fn next(&mut self) -> Vec<FusedLine> {
+        let mut output = Vec::new();
+        let Some(line) = self.ahead.pop_front() else { return output };
+        if !self.clock.is_plausible(line.at, self.ahead.iter().map(|line| line.at)) {
+            self.reject(RejectReason::FromTheFuture);
+            return output;
+        }
+        let before = self.clock.now();
+        let is_late = self.clock.advance(line.at);
+        let now = self.clock.now();
+        self.catch_up(before, now, &mut output);
+        self.learn(&line);
+        match self.cell(now).report(line.kind, &line.report, now) {
+            Ok(fused) => {
+                self.summary.late += u64::from(is_late);
+                self.heard[line.kind as usize] = true;
+                self.pending = fused.is_none();
+                self.emit(fused, &mut output);
+            }
+            Err(reason) => self.reject(reason),
+        }
+        output
+    }
+
+    fn cell(&mut self, now: Timestamp) -> &mut Aggregator {
+        let ReplayConfig { aggregator, fusion, landmarks, .. } = &self.config;
+        self.cell.get_or_insert_with(|| Aggregator::new(aggregator.clone(), 1, fusion.clone(), landmarks.clone(), now))
+    }
+
+    /// Closes the rounds that are due up to `now`; of a silence since `before`, only those at its beginning.
+    fn catch_up(&mut self, before: Timestamp, now: Timestamp, output: &mut Vec<FusedLine>) {
+        let period = Duration::from_secs_f64(self.config.fusion.round.period_s);
+        let silent_from = before + SILENCE.max(3 * period);
+        while let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline) {
+            if deadline > now || deadline > silent_from {
+                break;
+            }
+            self.tick(deadline, output);
+        }
+    }
+
+    fn tick(&mut self, now: Timestamp, output: &mut Vec<FusedLine>) {
+        let fused = self.cell.as_mut().and_then(|cell| cell.tick(now));
+        self.pending = false;
+        self.emit(fused, output);
+    }
+
+    /// What nobody has reported to yet says nothing; with passes, only the last one speaks.
+    fn emit(&mut self, fused: Option<Fused>, output: &mut Vec<FusedLine>) {
+        let Some(Fused { map, verdicts, .. }) = fused.filter(|_| self.config.passes.is_none()) else { return };
+        let known = output.len();
+        output.extend(map.filter(|_| self.heard[ReportKind::Detections as usize]).map(FusedLine::Map));
+        output.extend(verdicts.filter(|_| self.heard[ReportKind::VoteDetections as usize]).map(FusedLine::Verdicts));
+        self.summary.written += (output.len() - known) as u64;
+    }
+
+    /// In an open cell, a location stands where the first object that names it was seen. VOTE needs no place and takes
+    /// locations by itself.
+    fn learn(&mut self, line: &Line) {
+        if !self.config.landmarks.is_empty() || line.kind != ReportKind::Detections {
+            return;
+        }
+        let mut fresh = Vec::new();
+        for object in &line.report.objects {
+            let Some(id) = &object.landmark else { continue };
+            if self.learnt.len() < MAX_LEARNT && self.learnt.insert(id.clone()) {
+                let position = nalgebra::Point2::new(object.x_m, object.y_m);
+                fresh.push(Landmark {
+                    id: id.clone(),
+                    position,
+                    facing_rad: None,
+                    vacancy: None,
+                    synonyms: Vec::new(),
+                });
+            }
+        }
+        if !fresh.is_empty() {
+            self.cell(self.clock.now()).add_landmarks(fresh);
+        }
+    }
+}
+
+/// The report that a line carries and what it is for, for programs that read a recording without replaying it.
+///
+/// # Errors
+/// The reason for which a replay rejects the line by itself.
+pub fn read_report(text: &[u8], limits: &Limits) -> Result<(ReportKind, ObjectReport), RejectReason> {
+    Line::read(text, limits).map(|line| (line.kind, line.report))
+}

@@ -1,0 +1,88 @@
+//! The time of a replay: that of the newest line that can be believed.
+
+use std::time::Duration;
+
+use crate::time::Timestamp;
+
+/// Most time that may pass before a line that no other line follows.
+const LAST_STEP: Duration = Duration::from_secs(3600);
+
+/// Goes forward with the lines, never back.
+#[derive(Debug, Clone)]
+pub(super) struct VirtualClock {
+    now: Option<Timestamp>,
+    /// By how much clocks may differ.
+    tolerance: Duration,
+}
+
+impl VirtualClock {
+    pub(super) fn new(tolerance_s: f64) -> Self {
+        Self { now: None, tolerance: Duration::from_secs_f64(tolerance_s) }
+    }
+
+    /// The time of the newest line taken; zero before the first.
+    pub(super) fn now(&self) -> Timestamp {
+        self.now.unwrap_or_default()
+    }
+
+    /// Whether a line is not ahead of the present, or of most of the lines that follow, by more than clocks may differ.
+    pub(super) fn is_plausible(&self, at: Timestamp, following: impl Iterator<Item = Timestamp>) -> bool {
+        if self.now.is_some_and(|now| at.since(now) <= self.tolerance) {
+            return true;
+        }
+        let mut following: Vec<Timestamp> = following.collect();
+        if following.is_empty() {
+            return self.now.is_none_or(|now| at.since(now) <= LAST_STEP);
+        }
+        let middle = (following.len() - 1) / 2;
+        let (_, median, _) = following.select_nth_unstable(middle);
+        at.since(*median) <= self.tolerance
+    }
+
+    /// Goes to the time of a line; true if it was past already.
+    pub(super) fn advance(&mut self, at: Timestamp) -> bool {
+        let is_late = self.now.is_some_and(|now| at < now);
+        if !is_late {
+            self.now = Some(at);
+        }
+        is_late
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HOUR: u64 = 3_600_000_000;
+
+    fn accepted(times: &[u64]) -> Vec<u64> {
+        let mut clock = VirtualClock::new(2.0);
+        let mut taken = Vec::new();
+        for (index, &at) in times.iter().enumerate() {
+            if clock.is_plausible(Timestamp(at), times[index + 1..].iter().copied().map(Timestamp)) {
+                clock.advance(Timestamp(at));
+                taken.push(at);
+            }
+        }
+        taken
+    }
+
+    #[test]
+    fn a_wrong_clock_is_told_from_a_silence() {
+        let ahead = 9 * HOUR;
+        for (times, wrong) in [
+            (&[1, 2, ahead, 3, 4, 5][..], &[ahead][..]),
+            (&[ahead, 1, 2, 3], &[ahead]),
+            (&[1, ahead, 2, ahead + 1, 3, ahead + 2, 4], &[ahead, ahead + 1, ahead + 2]),
+            (&[1, 2, ahead], &[ahead]),
+            (&[1, 2, u64::MAX], &[u64::MAX]),
+            (&[1, 2, ahead, ahead + 1, ahead + 2], &[]),
+            (&[1, 2, HOUR], &[]),
+            (&[ahead], &[]),
+            (&[5, 1, 9], &[]),
+        ] {
+            let expected: Vec<u64> = times.iter().copied().filter(|at| !wrong.contains(at)).collect();
+            assert_eq!(accepted(times), expected, "{times:?}");
+        }
+    }
+}

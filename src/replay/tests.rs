@@ -1,0 +1,255 @@
+use super::*;
+use crate::testbed::Testbed;
+use crate::wire::{Encoding, PerceivedObject, SCHEMA_VERSION, WirePose, encode};
+
+const START: u64 = 1_700_000_000_000_000;
+
+fn report(node: &str, at_ms: u64, votes: &[(&str, &str)]) -> ObjectReport {
+    let object = |(n, &(landmark, label)): (usize, &(&str, &str))| PerceivedObject {
+        label: label.into(),
+        confidence: 0.9,
+        x_m: 5.0 * n as f64,
+        y_m: 0.0,
+        covariance_m2: None,
+        landmark: Some(landmark.into()),
+    };
+    ObjectReport {
+        schema: SCHEMA_VERSION,
+        node: NodeName::new(node).unwrap(),
+        seq: at_ms,
+        captured_at_us: Timestamp(START + at_ms * 1000),
+        pose: None,
+        objects: votes.iter().enumerate().map(object).collect(),
+        seen: None,
+    }
+}
+
+fn line(report: &ObjectReport, more: &[(&str, serde_json::Value)]) -> String {
+    let mut line = serde_json::to_value(report).unwrap();
+    for (key, value) in more {
+        line[*key] = value.clone();
+    }
+    line.to_string()
+}
+
+fn vote_line(report: &ObjectReport) -> String {
+    line(report, &[("topic", "vote_detections".into())])
+}
+
+fn replay(config: ReplayConfig, lines: impl IntoIterator<Item = impl AsRef<[u8]>>) -> (Vec<FusedLine>, Summary) {
+    let mut replay = Replay::new(config);
+    let mut output: Vec<_> = lines.into_iter().flat_map(|line| replay.line(line.as_ref())).collect();
+    let (mut rest, summary) = replay.finish();
+    output.append(&mut rest);
+    (output, summary)
+}
+
+fn rejected(summary: &Summary) -> Vec<(RejectReason, u64)> {
+    summary.rejected.iter().map(|(reason, count)| (*reason, *count)).collect()
+}
+
+fn map_labels(output: &[FusedLine]) -> Vec<(String, Option<String>)> {
+    let last = output.iter().rev().find_map(|line| if let FusedLine::Map(map) = line { Some(map) } else { None });
+    let state = |s: &crate::wire::LandmarkState| (s.id.to_string(), s.label.as_ref().map(ToString::to_string));
+    last.map(|map| map.landmarks.iter().map(state).collect()).unwrap_or_default()
+}
+
+fn verdict_labels(output: &[FusedLine]) -> BTreeMap<String, Option<String>> {
+    let verdicts = |line: &FusedLine| if let FusedLine::Verdicts(v) = line { v.verdicts.clone() } else { Vec::new() };
+    let pair = |v: crate::wire::Verdict| (v.landmark.to_string(), v.label.map(|label| label.to_string()));
+    output.iter().flat_map(verdicts).map(pair).collect()
+}
+
+#[test]
+fn an_open_cell_takes_its_locations_from_the_reports() {
+    let both = [("slot-0", "car"), ("slot-1", "truck")];
+    let mut lines = Vec::new();
+    for step in 0..5 {
+        lines.push(line(&report("euclid", step * 100, &both[..1 + usize::from(step > 2)]), &[]));
+        lines.push(vote_line(&report("euclid", step * 100, &[("ball", "vase")])));
+    }
+    let (output, summary) = replay(ReplayConfig::default(), &lines);
+    let label = |text: &str| Some(text.to_owned());
+    assert_eq!(map_labels(&output), [("slot-0".into(), label("car")), ("slot-1".into(), label("truck"))]);
+    assert_eq!(verdict_labels(&output), BTreeMap::from([("ball".into(), label("vase"))]));
+    assert_eq!((summary.lines, summary.used(), summary.written), (10, 10, output.len() as u64));
+}
+
+#[test]
+fn only_what_was_reported_to_speaks() {
+    let lines: Vec<_> = (0..5).map(|step| vote_line(&report("a", step * 100, &[("x", "cup")]))).collect();
+    let (output, _) = replay(ReplayConfig::default(), &lines);
+    assert!(!output.is_empty() && output.iter().all(|line| matches!(line, FusedLine::Verdicts(_))));
+}
+
+#[test]
+fn every_bad_line_has_its_reason_and_ends_nothing() {
+    use RejectReason::{Malformed, NodeMismatch, TooLarge, UnknownSchema, UnknownTopic};
+    let good = report("a", 0, &[("x", "cup")]);
+    let cbor = encode(&good, Encoding::Cbor);
+    let lines: [(Vec<u8>, Option<RejectReason>); 12] = [
+        (line(&good, &[]).into(), None),
+        (b"  \t".to_vec(), None),
+        (b"not json".to_vec(), Some(Malformed)),
+        (line(&good, &[]).into_bytes()[..80].to_vec(), Some(Malformed)),
+        (b"{\"schema\":1,\"node\":\"\xff\"}".to_vec(), Some(Malformed)),
+        (cbor, Some(Malformed)),
+        (line(&good, &[("schema", 2.into())]).into(), Some(UnknownSchema)),
+        (line(&good, &[("topic", "reputations".into())]).into(), Some(UnknownTopic)),
+        (line(&good, &[("topic", "detections/b".into())]).into(), Some(NodeMismatch)),
+        (line(&good, &[("received_at_us", "noon".into())]).into(), Some(Malformed)),
+        (vec![b' '; 1 << 20], None),
+        ([line(&good, &[]).into_bytes(), vec![b'x'; 1 << 20]].concat(), Some(TooLarge)),
+    ];
+    let (output, summary) = replay(ReplayConfig::default(), lines.iter().map(|(line, _)| line));
+    let mut expected: BTreeMap<RejectReason, u64> = BTreeMap::new();
+    for reason in lines.iter().filter_map(|(_, reason)| *reason) {
+        *expected.entry(reason).or_default() += 1;
+    }
+    assert_eq!(summary.rejected, expected);
+    assert_eq!((summary.lines, summary.used(), output.len()), (10, 1, 1));
+}
+
+#[test]
+fn nothing_in_is_nothing_out() {
+    let (output, summary) = replay(ReplayConfig::default(), [""; 0]);
+    assert!(output.is_empty() && summary == Summary::default());
+    let (output, _) = replay(ReplayConfig { passes: Some(3), ..ReplayConfig::default() }, ["", "junk"]);
+    assert!(output.is_empty());
+}
+
+#[test]
+fn whole_topics_and_times_of_receipt_are_understood() {
+    let late = report("a", 0, &[("x", "cup")]);
+    let topic = ("topic", serde_json::Value::from("ecod/v1/lot-1/vote_detections/a"));
+    let received = |ms: u64| ("received_at_us", serde_json::Value::from(START + ms * 1000));
+    let (output, _) = replay(ReplayConfig::default(), [line(&late, &[topic.clone(), received(700)])]);
+    let FusedLine::Verdicts(verdicts) = &output[0] else { panic!("{output:?}") };
+    assert!(verdicts.fused_at_us >= Timestamp(START + 700_000));
+    let first = line(&report("b", 0, &[("x", "cup")]), &[]);
+    let (_, summary) = replay(ReplayConfig::default(), [first, line(&late, &[topic, received(9000)])]);
+    assert_eq!(rejected(&summary), [(RejectReason::Stale, 1)]);
+}
+
+#[test]
+fn time_does_not_go_back_and_a_wrong_clock_does_not_take_it_along() {
+    let hour = 3_600_000;
+    let mut lines = Vec::new();
+    for step in 0..20 {
+        lines.push(line(&report("wrong", step * 100 + hour, &[("x", "truck")]), &[]));
+        lines.push(line(&report("a", step * 100 + 20, &[("x", "car")]), &[]));
+        lines.push(line(&report("b", step * 100, &[("x", "car")]), &[]));
+    }
+    let (output, summary) = replay(ReplayConfig::default(), &lines);
+    assert_eq!(rejected(&summary), [(RejectReason::FromTheFuture, 20)]);
+    assert_eq!((summary.used(), summary.late), (40, 20));
+    assert_eq!(map_labels(&output), [("x".into(), Some("car".into()))]);
+    let times: Vec<_> =
+        output.iter().map(|line| if let FusedLine::Map(map) = line { map.fused_at_us } else { Timestamp(0) }).collect();
+    assert!(times.is_sorted() && times[0] < Timestamp(START + 200_000), "{times:?}");
+}
+
+#[test]
+fn a_long_silence_is_passed_over() {
+    let day = 86_400_000;
+    let lines = [0, 100, day, day + 100].map(|at| line(&report("a", at, &[("x", "car")]), &[]));
+    let (output, summary) = replay(ReplayConfig::default(), &lines);
+    assert_eq!(summary.used(), 4);
+    assert!((90..120).contains(&output.len()), "{} maps", output.len());
+}
+
+#[test]
+fn passes_go_over_all_votes_however_old() {
+    let mut lines = Vec::new();
+    for item in 0..30u64 {
+        let place = format!("item-{item}");
+        for (node, label) in [("good", "cup"), ("also-good", "cup"), ("bad", "mouse")] {
+            lines.push(vote_line(&report(node, item * 5000, &[(&place, label)])));
+        }
+        if item % 2 == 0 {
+            lines.push(vote_line(&report("lonely", item * 5000, &[(&format!("only-{item}"), "vase")])));
+        }
+    }
+    let (output, summary) = replay(ReplayConfig { passes: Some(5), ..ReplayConfig::default() }, &lines);
+    assert_eq!((output.len(), summary.written), (1, 1));
+    let labels = verdict_labels(&output);
+    assert_eq!(labels.len(), 45);
+    assert!((0..30).all(|item| labels[&format!("item-{item}")].as_deref() == Some("cup")));
+    let pace = line(&report("a", 0, &[("x", "car")]), &[]);
+    let (output, summary) = replay(ReplayConfig { passes: Some(5), ..ReplayConfig::default() }, [pace]);
+    assert_eq!((output.len(), rejected(&summary)), (1, vec![(RejectReason::NotFused, 1)]));
+}
+
+/// Reports of the recorded lot's vehicles, of both kinds, with disagreement.
+fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
+    let testbed = Testbed::from_json(include_str!("../../examples/testbed/pace_setup1.json")).unwrap();
+    let scene = &testbed.scenes[0];
+    let landmarks = scene.landmarks(&testbed.placard);
+    let mut reports = Vec::new();
+    for step in 0..60u64 {
+        for (number, cav) in scene.cavs.iter().enumerate() {
+            let captured_at = Timestamp(START + step * 90_000 + number as u64 * 7_000);
+            let object = |(n, spot): (usize, &crate::testbed::Spot)| {
+                let is_wrong = (step as usize + 3 * n + 5 * number).is_multiple_of(7);
+                let label = spot.truth.clone().filter(|_| !is_wrong).unwrap_or("EMPTY".into());
+                let off = 0.002 * ((n + number) % 5) as f64;
+                PerceivedObject {
+                    label,
+                    confidence: 0.6 + 0.05 * number as f64,
+                    x_m: spot.occupied.x + off,
+                    y_m: spot.occupied.y - off,
+                    covariance_m2: Some([1e-4, 0.0, 1e-4]),
+                    landmark: Some(spot.id.clone()),
+                }
+            };
+            let report = ObjectReport {
+                schema: SCHEMA_VERSION,
+                node: cav.name.clone(),
+                seq: step + 1,
+                captured_at_us: captured_at,
+                pose: Some(WirePose::from(cav.pose)),
+                objects: scene.spots.iter().enumerate().map(object).collect(),
+                seen: None,
+            };
+            let received_at = captured_at + Duration::from_millis(5);
+            reports.push((ReportKind::Detections, report.clone(), received_at));
+            reports.push((ReportKind::VoteDetections, report, received_at));
+        }
+    }
+    reports.sort_by_key(|(_, _, received_at)| *received_at);
+    (landmarks, reports)
+}
+
+/// What a live node does: reports as they come, timers at their deadlines.
+fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]) -> Vec<FusedLine> {
+    let ReplayConfig { aggregator, fusion, landmarks, .. } = config.clone();
+    let mut cell = Aggregator::new(aggregator, 1, fusion, landmarks, reports[0].2);
+    let mut output = Vec::new();
+    let mut publish = |fused: Option<Fused>| {
+        let Some(Fused { map, verdicts, .. }) = fused else { return };
+        output.extend(map.map(FusedLine::Map));
+        output.extend(verdicts.map(FusedLine::Verdicts));
+    };
+    for (kind, report, received_at) in reports {
+        while cell.deadline() <= *received_at {
+            let deadline = cell.deadline();
+            publish(cell.tick(deadline));
+        }
+        publish(cell.report(*kind, report, *received_at).unwrap());
+    }
+    publish(cell.tick(cell.deadline()));
+    output
+}
+
+#[test]
+fn a_replay_is_what_a_live_aggregator_made_of_the_same_reports() {
+    let (landmarks, reports) = drive();
+    let config = ReplayConfig { landmarks, ..ReplayConfig::default() };
+    let lines = reports.iter().map(|(kind, report, received_at)| {
+        let topic = if *kind == ReportKind::Detections { "detections" } else { "vote_detections" };
+        line(report, &[("topic", topic.into()), ("received_at_us", received_at.micros().into())])
+    });
+    let (output, summary) = replay(config.clone(), lines);
+    assert!(summary.rejected.is_empty() && output.len() > 100);
+    assert_eq!(output, live(&config, &reports));
+}

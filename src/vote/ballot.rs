@@ -1,0 +1,133 @@
+//! The votes on one landmark.
+
+use std::collections::BTreeSet;
+
+use super::calibration::{Calibration, Weights};
+use super::confusion::LabelIndex;
+use super::dependence::Dependence;
+use super::model::{Model, Word};
+use crate::time::Timestamp;
+
+/// A vote that counts.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Cast {
+    pub(super) vehicle: usize,
+    pub(super) label: LabelIndex,
+    pub(super) confidence: f64,
+    pub(super) visibility: f64,
+    pub(super) weight: f64,
+    /// Part of it that is the vehicle's own.
+    pub(super) own: f64,
+    pub(super) at: Timestamp,
+    /// When it began to count once more as evidence.
+    pub(super) since: Timestamp,
+    /// Rank of its confidence as of the last judgement.
+    pub(super) band: usize,
+    /// How far the others agreed, if that is in the live evidence on confidences.
+    pub(super) agreement: Option<f64>,
+    /// Whether a posterior rests on it.
+    pub(super) judged: bool,
+    /// Whether it has been compared with the other vehicles' since it began to count.
+    pub(super) compared: bool,
+}
+
+impl Cast {
+    pub(super) fn word(&self) -> Word {
+        Word { vehicle: self.vehicle, label: self.label, weight: self.weight, own: self.own }
+    }
+}
+
+/// The votes on one landmark, at most one of each vehicle, in order of vehicle.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Ballot {
+    pub(super) casts: Vec<Cast>,
+    /// As of the last judgement.
+    pub(super) posterior: Vec<(LabelIndex, f64)>,
+    /// Whether votes and posterior are in the live evidence at present.
+    pub(super) counted: bool,
+    pub(super) shown: Option<LabelIndex>,
+}
+
+impl Ballot {
+    pub(super) fn words(&self) -> Vec<Word> {
+        self.casts.iter().map(Cast::word).collect()
+    }
+
+    pub(super) fn candidates(&self) -> Vec<LabelIndex> {
+        self.casts.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
+    }
+
+    /// Takes in what is new about who agrees with whom, and who states which confidences; of many voters, `order`
+    /// decides who is compared.
+    pub(super) fn compare(
+        &mut self,
+        dependence: &mut Dependence,
+        calibration: &mut Calibration,
+        order: impl Fn(usize) -> usize,
+    ) {
+        if self.casts.iter().any(|c| !c.compared) {
+            let mut votes: Vec<_> = self.casts.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
+            votes.sort_by_key(|(vehicle, ..)| order(*vehicle));
+            dependence.compare(&votes);
+            for cast in self.casts.iter_mut().filter(|c| !c.compared) {
+                calibration.state(cast.vehicle, cast.confidence);
+                cast.compared = true;
+            }
+        }
+    }
+
+    pub(super) fn weigh(&mut self, dependence: &Dependence, calibration: &Calibration, weights: &Weights) {
+        for place in 0..self.casts.len() {
+            let Cast { vehicle, label, confidence, visibility, .. } = self.casts[place];
+            let says_the_same = |other: usize| {
+                self.casts.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.casts[at].label == label)
+            };
+            let own = dependence.own_part(vehicle, says_the_same);
+            let band = calibration.band(vehicle, confidence);
+            let cast = &mut self.casts[place];
+            (cast.own, cast.band, cast.weight) = (own, band, weights.of(band, confidence) * visibility);
+        }
+    }
+
+    /// Adds to the evidence on confidences how far the others agree with each vote.
+    pub(super) fn agree(&mut self, model: &Model, calibration: &mut Calibration) {
+        if self.is_witnessed() {
+            for cast in &mut self.casts {
+                let agreement = probability(&model.without(&self.posterior, &cast.word()), cast.label);
+                calibration.count(cast.band, agreement, 1.0);
+                cast.agreement = Some(agreement);
+            }
+        }
+    }
+
+    /// Shows the most probable label, unless the one shown is less than `hysteresis` behind.
+    pub(super) fn show(&mut self, hysteresis: f64) {
+        let mut best: Option<(LabelIndex, f64)> = None;
+        for &(label, p) in &self.posterior {
+            if best.is_none_or(|(_, most)| p > most) {
+                best = Some((label, p));
+            }
+        }
+        let kept = self.shown.map_or(0.0, |shown| probability(&self.posterior, shown));
+        if kept == 0.0 || best.is_some_and(|(_, p)| p > kept + hysteresis) {
+            self.shown = best.map(|(label, _)| label);
+        }
+    }
+
+    /// Share of each label in the weighted votes.
+    pub(super) fn majority(&self) -> Vec<(LabelIndex, f64)> {
+        let total: f64 = self.casts.iter().map(|c| c.weight * c.own).sum();
+        let of_label = |label| self.casts.iter().filter(move |c| c.label == label);
+        let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
+        self.candidates().into_iter().map(|label| (label, share(label))).collect()
+    }
+
+    /// Whether several vehicles voted, so that they can judge each other.
+    pub(super) fn is_witnessed(&self) -> bool {
+        self.casts.len() > 1
+    }
+}
+
+pub(super) fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
+    posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
+}

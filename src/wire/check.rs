@@ -1,0 +1,248 @@
+//! What a payload may say: every value that came from outside is checked before anything is made of it.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::{
+    FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_SHARE_ENTRIES, NodeStatus, ObjectReport, RejectReason,
+    Reputations, SCHEMA_VERSION, Verdict, Verdicts,
+};
+use crate::geometry::Covariance;
+use crate::names::MAX_NAME_BYTES;
+use crate::time::Timestamp;
+
+/// Bounds that a payload must keep to be decoded at all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// Most bytes of a report or status.
+    pub payload_bytes: usize,
+    /// Most bytes of what an aggregator sends: maps, verdicts and reputations grow with the cell.
+    pub map_bytes: usize,
+    /// Most objects, and most seen landmarks, in one report.
+    pub objects: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self { payload_bytes: 256 * 1024, map_bytes: 8 * 1024 * 1024, objects: 1024 }
+    }
+}
+
+/// Largest epoch, round, count or time: every JSON reader keeps integers up to 2⁵³ − 1 exact (RFC 8259, section 6).
+pub const MAX_INTEGER: u64 = (1 << 53) - 1;
+
+/// How far in seconds a map's or verdict's time of fusion may be ahead of the receiver's clock. Maps say nothing that
+/// needs clocks to agree, so this keeps out only what would look fresh for hours.
+pub const MAX_FUSED_AHEAD_S: u64 = 3600;
+
+/// Largest coordinate in metres that is taken for a position on Earth.
+const WORLD_BOUND_M: f64 = 1e8;
+
+/// Largest score of a label: far beyond the votes of all vehicles that a cell can have.
+const SCORE_BOUND: f64 = 1e9;
+
+/// What travels on a topic, with the version of its form.
+pub trait Payload: Serialize + DeserializeOwned {
+    /// Major version that the payload claims to have.
+    fn schema(&self) -> u32;
+
+    /// The limit that its size must keep.
+    fn max_bytes(limits: &Limits) -> usize {
+        limits.payload_bytes
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// The first reason found.
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        Ok(())
+    }
+}
+
+impl Payload for ObjectReport {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+
+    fn check(&self, limits: &Limits) -> Result<(), RejectReason> {
+        self.validate(limits)
+    }
+}
+
+impl Payload for GlobalMap {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+
+    fn max_bytes(limits: &Limits) -> usize {
+        limits.map_bytes
+    }
+
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        let times = [Some(self.fused_at_us), self.oldest_capture_us];
+        check_integers([self.epoch, self.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
+        self.landmarks.iter().try_for_each(check_landmark)?;
+        self.objects.iter().try_for_each(check_object)
+    }
+}
+
+impl Payload for Verdicts {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+
+    fn max_bytes(limits: &Limits) -> usize {
+        limits.map_bytes
+    }
+
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        check_integers([self.epoch, self.round, self.fused_at_us.micros()])?;
+        self.verdicts.iter().try_for_each(check_verdict)
+    }
+}
+
+impl Payload for Reputations {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+
+    fn max_bytes(limits: &Limits) -> usize {
+        limits.map_bytes
+    }
+
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        check_integers([self.epoch, self.round])?;
+        self.reputations.values().try_for_each(|reputation| {
+            check_integers([reputation.correct, reputation.incorrect])?;
+            let trusted = (0.0..=1.0).contains(&reputation.score);
+            if trusted { Ok(()) } else { Err(number_reason(reputation.score)) }
+        })
+    }
+}
+
+impl Payload for LedgerShare {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        if self.entries.len() > MAX_SHARE_ENTRIES {
+            return Err(RejectReason::TooManyObjects);
+        }
+        check_integers(self.epoch)?;
+        self.entries.iter().try_for_each(|entry| {
+            check_integers([entry.epoch, entry.correct, entry.incorrect])?;
+            check_labels([&*entry.label])
+        })
+    }
+}
+
+impl Payload for NodeStatus {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        check_integers([self.epoch])?;
+        check_labels([&*self.version])
+    }
+}
+
+impl ObjectReport {
+    /// Checks version, counts, numbers and labels.
+    ///
+    /// # Errors
+    /// The first reason found.
+    pub fn validate(&self, limits: &Limits) -> Result<(), RejectReason> {
+        if self.schema != SCHEMA_VERSION {
+            return Err(RejectReason::UnknownSchema);
+        }
+        let seen = self.seen.as_deref().unwrap_or_default();
+        if self.objects.len() > limits.objects || seen.len() > limits.objects {
+            return Err(RejectReason::TooManyObjects);
+        }
+        if let Some(pose) = self.pose
+            && !(in_world(pose.x_m) && in_world(pose.y_m) && pose.heading_rad.is_finite())
+        {
+            return Err(RejectReason::NotFinite);
+        }
+        check_labels(seen.iter().map(|id| &**id))?;
+        self.objects.iter().try_for_each(|object| {
+            check_place(object.x_m, object.y_m)?;
+            object.covariance().map_or(Ok(()), check_covariance)?;
+            check_confidence(object.confidence)?;
+            check_labels([&*object.label].into_iter().chain(object.landmark.as_deref()))
+        })
+    }
+}
+
+/// Checks that a time of fusion is not so far ahead that it would look fresh for hours.
+///
+/// # Errors
+/// [`RejectReason::FromTheFuture`].
+pub fn check_fused_at(fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
+    let ahead = fused_at.since(received_at);
+    if ahead.as_secs() < MAX_FUSED_AHEAD_S { Ok(()) } else { Err(RejectReason::FromTheFuture) }
+}
+
+fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
+    check_place(state.x_m, state.y_m)?;
+    check_confidence(state.confidence)?;
+    check_labels([&*state.id].into_iter().chain(state.label.as_deref()))
+}
+
+fn check_object(object: &FusedObject) -> Result<(), RejectReason> {
+    let [xx, xy, yy] = object.covariance_m2;
+    check_place(object.x_m, object.y_m)?;
+    check_covariance(Covariance { xx, xy, yy })?;
+    check_confidence(object.confidence)?;
+    check_labels([&*object.label])
+}
+
+fn check_verdict(verdict: &Verdict) -> Result<(), RejectReason> {
+    let scores = [verdict.score, verdict.margin].into_iter().chain(verdict.votes.values().copied());
+    for score in scores {
+        if !(-SCORE_BOUND..=SCORE_BOUND).contains(&score) {
+            return Err(number_reason(score));
+        }
+    }
+    let labels = verdict.votes.keys().chain(&verdict.label);
+    check_labels([&*verdict.landmark].into_iter().chain(labels.map(|label| &**label)))
+}
+
+fn check_place(x_m: f64, y_m: f64) -> Result<(), RejectReason> {
+    if in_world(x_m) && in_world(y_m) { Ok(()) } else { Err(RejectReason::NotFinite) }
+}
+
+fn check_covariance(covariance: Covariance) -> Result<(), RejectReason> {
+    if covariance.is_valid() { Ok(()) } else { Err(RejectReason::NotFinite) }
+}
+
+fn check_confidence(confidence: f64) -> Result<(), RejectReason> {
+    if (0.0..=1.0).contains(&confidence) { Ok(()) } else { Err(RejectReason::ConfidenceOutOfRange) }
+}
+
+fn check_labels<'a>(labels: impl IntoIterator<Item = &'a str>) -> Result<(), RejectReason> {
+    if labels.into_iter().all(is_label) { Ok(()) } else { Err(RejectReason::InvalidLabel) }
+}
+
+fn check_integers(values: impl IntoIterator<Item = u64>) -> Result<(), RejectReason> {
+    if values.into_iter().all(|value| value <= MAX_INTEGER) { Ok(()) } else { Err(RejectReason::OutOfRange) }
+}
+
+/// The reason for a number outside its bounds.
+fn number_reason(value: f64) -> RejectReason {
+    if value.is_finite() { RejectReason::OutOfRange } else { RejectReason::NotFinite }
+}
+
+fn in_world(coordinate_m: f64) -> bool {
+    coordinate_m.abs() <= WORLD_BOUND_M
+}
+
+fn is_label(text: &str) -> bool {
+    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
+}
+
+#[cfg(test)]
+mod tests;
