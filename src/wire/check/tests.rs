@@ -59,7 +59,13 @@ fn verdicts() -> Verdicts {
 
 fn reputations() -> Reputations {
     let reputation = Reputation { score: 0.62, correct: 410, incorrect: 22 };
-    Reputations { schema: SCHEMA_VERSION, epoch: 3, round: 88, reputations: [(edge(), reputation)].into() }
+    Reputations {
+        schema: SCHEMA_VERSION,
+        aggregator: None,
+        epoch: 3,
+        round: 88,
+        reputations: [(edge(), reputation)].into(),
+    }
 }
 
 fn status() -> NodeStatus {
