@@ -1,15 +1,17 @@
 //! From what happens in a node to the election's inputs, and from its effects to the node's parts.
 
+mod effects;
+
 use std::collections::{BTreeMap, HashMap};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::election::{Body, Effect, Election, ElectionMessage, Health, Input};
+use ecod::election::{Election, ElectionMessage, Health, Input};
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{Encoding, NodeState, NodeStatus, Role};
+use ecod::wire::{NodeState, NodeStatus, Role};
 use ractor::{ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -20,10 +22,8 @@ use super::routes::{Brokers, Routes};
 use super::{LeaderElectionArguments, LeaderElectionMessage, Leadership, Parts};
 use crate::clock;
 use crate::counters::Counters;
-use crate::fuser::FuserMessage;
 use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
-use crate::membership::{Member, MembershipEvent, MembershipMessage};
-use crate::reputation_keeper::ReputationKeeperMessage;
+use crate::membership::{Member, MembershipEvent};
 use crate::state_file::StateFile;
 
 /// The election, what it was told last, and what came of it.
@@ -72,9 +72,6 @@ const STATE_PATIENCE: Duration = Duration::from_millis(1000);
 /// Time between two looks at what a handover waits for.
 const PREPARE_STEP: Duration = Duration::from_millis(50);
 
-/// How long a disk may take before the node goes on without it.
-const DISK_PATIENCE: Duration = Duration::from_secs(1);
-
 /// A timer later than this was overslept; what waits in the sockets is then dealt with first, for as long as below.
 const OVERSLEPT: Duration = Duration::from_millis(20);
 const DRAIN_TIME: Duration = Duration::from_millis(10);
@@ -101,8 +98,8 @@ impl ElectionDriver {
             health: Health::default(),
             routes: Routes::new(plane),
             runs: HashMap::new(),
+            taken: status.aggregator.clone().map(|aggregator| Epoch::new(status.epoch, aggregator)),
             status,
-            taken: None,
             preparing: None,
             parts,
             leadership,
@@ -340,64 +337,6 @@ impl ElectionDriver {
     async fn feed(&mut self, input: Input) -> Result<(), ActorProcessingErr> {
         let effects = self.election.handle(input, clock::now());
         self.carry_out(effects).await
-    }
-
-    async fn carry_out(&mut self, effects: Vec<Effect>) -> Result<(), ActorProcessingErr> {
-        for effect in effects {
-            match effect {
-                Effect::PersistTerm { term } => {
-                    if let Some(file) = self.term_file.clone() {
-                        self.save(file, term).await;
-                    }
-                }
-                Effect::Send { to, message } => {
-                    // The next round is the other's unless it stays away for a whole period.
-                    if matches!(message.body, Body::Yield { .. }) {
-                        self.parts.fuser.send(FuserMessage::HoldRound);
-                    }
-                    let payload = message.encode(Encoding::Cbor).into();
-                    self.parts.membership.send(MembershipMessage::Send { to, payload });
-                }
-                Effect::Lead { epoch, first_round, on_time } => {
-                    tracing::info!(%epoch, first_round, on_time, "leading");
-                    self.preparing = None;
-                    self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, on_time });
-                }
-                Effect::StopPublishing { epoch } => {
-                    tracing::info!(%epoch, "no longer leading");
-                    self.parts.fuser.send(FuserMessage::StopPublishing);
-                }
-                Effect::Prepare { leader } => {
-                    tracing::info!(%leader, "preparing to take over");
-                    let has_state = self.parts.keeper.holder().is_none();
-                    self.preparing = Some(Preparing { leader, since: clock::now(), has_state });
-                    self.myself.send_after(CONNECT_TIME, || LeaderElectionMessage::CheckPrepared);
-                }
-                Effect::SendState { to } => {
-                    self.parts.keeper.send(ReputationKeeperMessage::SendSnapshot { to });
-                }
-                // States, compared as a whole in `reflect`.
-                Effect::Follow { .. } | Effect::Seek | Effect::AnnounceStandby { .. } => {}
-            }
-        }
-        Ok(())
-    }
-
-    /// Waits until the term is on disk; a disk that fails or hangs is logged, and the node goes on as one without disk.
-    async fn save(&mut self, file: StateFile, term: u64) {
-        let path = file.path().to_owned();
-        let writing = tokio::task::spawn_blocking(move || file.save(&term));
-        let written = match tokio::time::timeout(DISK_PATIENCE, writing).await {
-            Ok(written) => written.map_err(std::io::Error::other).flatten(),
-            Err(elapsed) => Err(elapsed.into()),
-        };
-        match written {
-            Ok(()) => self.disk_failed = false,
-            Err(error) if !std::mem::replace(&mut self.disk_failed, true) => {
-                tracing::warn!(path = %path.display(), %error, "term not saved");
-            }
-            Err(_) => {}
-        }
     }
 
     fn set_timer(&mut self, after: Duration) {

@@ -1,33 +1,28 @@
 //! How the parts of a node are made, connected, started and stopped.
 
+mod arguments;
+
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::aggregator::Aggregator;
-use ecod::election::ElectionConfig;
 use ecod::names::NodeName;
 use ecod::vote::VoteMode;
-use ecod::wire::{NodeState as NodeCondition, NodeStatus, SCHEMA_VERSION};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
 use tokio::sync::watch;
 use uuid::Uuid;
 
 use super::seats::{Part, Seats};
 use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker};
-use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
-use crate::follower::{Follower, FollowerArguments, FollowerMessage, Newest};
-use crate::fuser::{Fuser, FuserArguments, FuserMessage};
-use crate::gateway::{self, Gateway, GatewayArguments, Incoming, Subscriber};
-use crate::leader_election::{
-    LeaderElection, LeaderElectionArguments, LeaderElectionMessage, Leadership, Parts, saved_term,
-};
-use crate::membership::{EventSink, FrameCounters, Member, Membership, MembershipArguments, MembershipMessage};
-use crate::reputation_keeper::{ReputationKeeper, ReputationKeeperArguments, ReputationKeeperMessage, SharedBook};
+use crate::follower::{Follower, Newest};
+use crate::fuser::Fuser;
+use crate::gateway::Gateway;
+use crate::leader_election::{LeaderElection, LeaderElectionMessage, Leadership};
+use crate::membership::{FrameCounters, Member, Membership, MembershipMessage};
+use crate::reputation_keeper::{ReputationKeeper, SharedBook};
 use crate::seat::Seat;
-use crate::state_file::StateFile;
 #[cfg(feature = "camera")]
 use crate::{
     camera,
@@ -226,134 +221,6 @@ impl Assembly {
         self.seats.membership.take(actor);
         Ok(id)
     }
-
-    fn membership_arguments(&self) -> MembershipArguments {
-        let election = self.seats.election.clone();
-        let events: EventSink = Arc::new(move |event| {
-            election.send(LeaderElectionMessage::Membership { event });
-        });
-        MembershipArguments {
-            name: self.name.clone(),
-            cell: self.config.cell.clone(),
-            run: clock::now().micros(),
-            role: self.config.role,
-            broker: *self.broker_address.borrow(),
-            config: self.config.membership.clone(),
-            events,
-            members: self.members.clone(),
-            counters: self.frames(),
-        }
-    }
-
-    fn gateway_arguments(&self) -> GatewayArguments {
-        GatewayArguments {
-            cell: self.config.cell.clone(),
-            part: if self.config.may_lead() { gateway::Part::Candidate } else { gateway::Part::Follower },
-            status: self.status(),
-            mqtt: self.config.mqtt.clone(),
-            counters: self.counters(),
-            subscriber: self.subscriber(),
-            seed: self.run.as_u64_pair().1,
-        }
-    }
-
-    /// Takes what comes in to the part that deals with it.
-    fn subscriber(&self) -> Subscriber {
-        let Seats { fuser, follower, keeper, election, .. } = self.seats.clone();
-        Arc::new(move |delivery| {
-            match &delivery.message {
-                Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
-                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
-                Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
-                Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
-                Incoming::Ledger(share) => {
-                    election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
-                    keeper.send(ReputationKeeperMessage::Merge { delivery })
-                }
-                Incoming::Link { broker, state } => {
-                    election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
-                }
-                Incoming::Status(status) => {
-                    election.send(LeaderElectionMessage::TakeStatus { status: Arc::clone(status) })
-                }
-            };
-        })
-    }
-
-    fn follower_arguments(&self) -> FollowerArguments {
-        FollowerArguments {
-            newest: self.newest.clone(),
-            log: self.config.map_log.clone(),
-            least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
-            leadership: self.leadership(),
-            election: self.seats.election.clone(),
-            counters: self.counters(),
-        }
-    }
-
-    fn keeper_arguments(&self) -> ReputationKeeperArguments {
-        ReputationKeeperArguments {
-            name: self.name.clone(),
-            cell: self.config.cell.clone(),
-            reputation: self.config.fusion.reputation.clone(),
-            config: self.config.reputations.clone(),
-            book: self.book.clone(),
-            file: self.state_file("reputations"),
-            newest: self.newest.reputations.subscribe(),
-            gateway: self.seats.gateway.clone(),
-            fuser: self.seats.fuser.clone(),
-            counters: self.counters(),
-        }
-    }
-
-    /// A fuser starts with the evidence that the keeper has.
-    fn fuser_arguments(&self) -> FuserArguments {
-        let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
-        let mut aggregator = Aggregator::standby(fusion, landmarks, clock::now());
-        aggregator.adopt(&self.book.open().ledger);
-        FuserArguments {
-            aggregator,
-            gateway: self.seats.gateway.clone(),
-            keeper: self.seats.keeper.clone(),
-            counters: self.counters(),
-        }
-    }
-
-    fn election_arguments(&self) -> LeaderElectionArguments {
-        let Seats { membership, gateway, fuser, keeper, broker, .. } = self.seats.clone();
-        LeaderElectionArguments {
-            config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
-            term_file: self.state_file("term"),
-            round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
-            plane: self.config.data_plane(),
-            status: self.status(),
-            own_broker: self.broker_address(),
-            members: self.members(),
-            parts: Parts { membership, gateway, fuser, keeper, broker },
-            leadership: self.leadership.clone(),
-            counters: self.counters(),
-        }
-    }
-
-    fn state_file(&self, what: &str) -> Option<StateFile> {
-        let directory = self.config.state_dir.as_deref()?;
-        Some(StateFile::new(directory, &self.config.cell, &self.name, what))
-    }
-
-    /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
-    fn status(&self) -> NodeStatus {
-        let leadership = self.leadership.borrow();
-        NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: self.name.clone(),
-            id: self.run,
-            role: self.config.role,
-            state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
-            epoch: leadership.epoch.as_ref().map_or(0, |epoch| epoch.term),
-            aggregator: leadership.leader().cloned(),
-            version: env!("CARGO_PKG_VERSION").into(),
-        }
-    }
 }
 
 fn seat<M: Message>(
@@ -386,27 +253,5 @@ async fn stop<M: Message>(seat: &Seat<M>) {
     if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT)).await {
         tracing::debug!(%error, "part did not stop in time");
         actor.kill();
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use ecod::epoch::Epoch;
-    use ecod::wire::Role;
-
-    use super::*;
-    use crate::leader_election::Position;
-
-    #[test]
-    fn a_part_started_anew_still_says_whom_the_node_follows() {
-        let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
-        let assembly = Assembly::new(config, watch::Sender::new(None));
-        assert_eq!((assembly.status().epoch, assembly.status().aggregator), (0, None));
-        let epoch = Some(Epoch::new(7, NodeName::from_static("edge")));
-        assembly.leadership.send_replace(Leadership { position: Position::Following, epoch, standby: None });
-        assert_eq!(
-            (assembly.status().epoch, assembly.status().aggregator.as_ref().map(NodeName::as_str)),
-            (7, Some("edge"))
-        );
     }
 }

@@ -1,0 +1,188 @@
+//! What each part is given at its start.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::aggregator::Aggregator;
+use ecod::election::ElectionConfig;
+use ecod::epoch::Epoch;
+use ecod::wire::{NodeState as NodeCondition, NodeStatus, SCHEMA_VERSION};
+
+use super::Assembly;
+use crate::clock;
+use crate::follower::{FollowerArguments, FollowerMessage};
+use crate::fuser::{FuserArguments, FuserMessage};
+use crate::gateway::{self, GatewayArguments, Incoming, Subscriber};
+use crate::leader_election::{LeaderElectionArguments, LeaderElectionMessage, Parts, saved_term};
+use crate::membership::{EventSink, MembershipArguments};
+use crate::node::Seats;
+use crate::reputation_keeper::{ReputationKeeperArguments, ReputationKeeperMessage};
+use crate::state_file::StateFile;
+
+impl Assembly {
+    pub(super) fn membership_arguments(&self) -> MembershipArguments {
+        let election = self.seats.election.clone();
+        let events: EventSink = Arc::new(move |event| {
+            election.send(LeaderElectionMessage::Membership { event });
+        });
+        MembershipArguments {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+            run: clock::now().micros(),
+            role: self.config.role,
+            broker: *self.broker_address.borrow(),
+            config: self.config.membership.clone(),
+            events,
+            members: self.members.clone(),
+            counters: self.frames(),
+        }
+    }
+
+    pub(super) fn gateway_arguments(&self) -> GatewayArguments {
+        GatewayArguments {
+            cell: self.config.cell.clone(),
+            part: if self.config.may_lead() { gateway::Part::Candidate } else { gateway::Part::Follower },
+            status: self.status(),
+            mqtt: self.config.mqtt.clone(),
+            counters: self.counters(),
+            subscriber: self.subscriber(),
+            seed: self.run.as_u64_pair().1,
+        }
+    }
+
+    /// Takes what comes in to the part that deals with it.
+    fn subscriber(&self) -> Subscriber {
+        let Seats { fuser, follower, keeper, election, .. } = self.seats.clone();
+        Arc::new(move |delivery| {
+            match &delivery.message {
+                Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
+                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
+                Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
+                Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
+                Incoming::Ledger(share) => {
+                    election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
+                    keeper.send(ReputationKeeperMessage::Merge { delivery })
+                }
+                Incoming::Link { broker, state } => {
+                    election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
+                }
+                Incoming::Status(status) => {
+                    election.send(LeaderElectionMessage::TakeStatus { status: Arc::clone(status) })
+                }
+            };
+        })
+    }
+
+    pub(super) fn follower_arguments(&self) -> FollowerArguments {
+        FollowerArguments {
+            newest: self.newest.clone(),
+            log: self.config.map_log.clone(),
+            least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
+            leadership: self.leadership(),
+            election: self.seats.election.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    pub(super) fn keeper_arguments(&self) -> ReputationKeeperArguments {
+        ReputationKeeperArguments {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+            reputation: self.config.fusion.reputation.clone(),
+            config: self.config.reputations.clone(),
+            book: self.book.clone(),
+            file: self.state_file("reputations"),
+            newest: self.newest.reputations.subscribe(),
+            gateway: self.seats.gateway.clone(),
+            fuser: self.seats.fuser.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    /// A fuser starts with the evidence that the keeper has.
+    pub(super) fn fuser_arguments(&self) -> FuserArguments {
+        let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
+        let mut aggregator = Aggregator::standby(fusion, landmarks, clock::now());
+        aggregator.adopt(&self.book.open().ledger);
+        FuserArguments {
+            aggregator,
+            gateway: self.seats.gateway.clone(),
+            keeper: self.seats.keeper.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
+        let Seats { membership, gateway, fuser, keeper, broker, .. } = self.seats.clone();
+        LeaderElectionArguments {
+            config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+            term_file: self.state_file("term"),
+            round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
+            plane: self.config.data_plane(),
+            status: self.status(),
+            own_broker: self.broker_address(),
+            members: self.members(),
+            parts: Parts { membership, gateway, fuser, keeper, broker },
+            leadership: self.leadership.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    fn state_file(&self, what: &str) -> Option<StateFile> {
+        let directory = self.config.state_dir.as_deref()?;
+        Some(StateFile::new(directory, &self.config.cell, &self.name, what))
+    }
+
+    /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
+    fn status(&self) -> NodeStatus {
+        let newest = self.newest.map.borrow();
+        let taken = newest.as_ref().map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()));
+        let leadership = self.leadership.borrow();
+        let epoch = leadership.epoch.clone().filter(|_| leadership.leader().is_some()).or(taken);
+        NodeStatus {
+            schema: SCHEMA_VERSION,
+            node: self.name.clone(),
+            id: self.run,
+            role: self.config.role,
+            state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
+            epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
+            aggregator: epoch.map(|epoch| epoch.leader),
+            version: env!("CARGO_PKG_VERSION").into(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::time::Timestamp;
+    use ecod::wire::{GlobalMap, Role};
+
+    use ecod::names::NodeName;
+    use tokio::sync::watch;
+
+    use super::*;
+    use crate::config::NodeConfig;
+    use crate::follower::ReceivedMap;
+
+    #[test]
+    fn a_part_started_anew_still_says_whom_the_node_follows() {
+        let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
+        let assembly = Assembly::new(config, watch::Sender::new(None));
+        assert_eq!((assembly.status().epoch, assembly.status().aggregator), (0, None));
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("edge"),
+            epoch: 7,
+            round: 1,
+            fused_at_us: Timestamp(0),
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+        };
+        assembly.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
+        assert_eq!(
+            (assembly.status().epoch, assembly.status().aggregator.as_ref().map(NodeName::as_str)),
+            (7, Some("edge"))
+        );
+    }
+}
