@@ -1,0 +1,402 @@
+//! A cell of real processes, one edge and its vehicles, and what a trial does to it.
+
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+use std::fs::{self, File};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail, ensure};
+use ecod::names::NodeName;
+use ecod_actors::clock;
+use tempfile::TempDir;
+
+use crate::analysis::{Accepted, NodeRun};
+use crate::logs;
+use crate::network::{self, Bridged};
+use crate::process::{Process, command};
+
+/// The program under test.
+const PROGRAM: &str = env!("CARGO_BIN_EXE_ecod-node");
+
+/// Debian's external broker.
+const MOSQUITTO: &str = "/usr/sbin/mosquitto";
+
+/// The edge's place in the cell.
+pub(crate) const EDGE: usize = 0;
+
+/// Time for all processes to start and agree.
+const START_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// How long everything must have been well before a fault.
+const SETTLED: Duration = Duration::from_millis(1500);
+
+/// What a cell consists of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Plan {
+    /// One edge and vehicles.
+    pub(crate) nodes: usize,
+    /// Whether the edge is started at all.
+    pub(crate) edge: bool,
+    /// Whether all use mosquitto.
+    pub(crate) external_broker: bool,
+    /// Whether the brokers of the nodes are used beside it.
+    pub(crate) fallback: bool,
+    /// Whether every node has a network namespace.
+    pub(crate) bridged: bool,
+}
+
+/// Running nodes with their files; all end with it.
+#[derive(Debug)]
+pub(crate) struct Cell {
+    nodes: Vec<Node>,
+    busy: Vec<Process>,
+    mosquitto: Option<Process>,
+    network: Option<Bridged>,
+    directory: TempDir,
+    apart: Vec<usize>,
+    unreached: Option<usize>,
+    lossy: bool,
+}
+
+#[derive(Debug)]
+struct Node {
+    name: NodeName,
+    directory: PathBuf,
+    namespace: Option<String>,
+    process: Option<Process>,
+    paused: bool,
+    runs: usize,
+}
+
+/// Whether there is a mosquitto here.
+pub(crate) fn has_mosquitto() -> bool {
+    Path::new(MOSQUITTO).exists()
+}
+
+impl Cell {
+    /// Writes the configurations and starts all processes.
+    pub(crate) fn start(plan: &Plan) -> anyhow::Result<Self> {
+        let directory = tempfile::Builder::new().prefix("ecod-trial-").tempdir()?;
+        let network = plan.bridged.then(|| Bridged::new(plan.nodes)).transpose()?;
+        let mut cell = Self {
+            nodes: Vec::new(),
+            busy: Vec::new(),
+            mosquitto: None,
+            network,
+            directory,
+            apart: Vec::new(),
+            unreached: None,
+            lossy: false,
+        };
+        let mut ports = Ports::new();
+        let broker = if plan.external_broker { Some(cell.start_mosquitto(&mut ports)?) } else { None };
+        let frames = cell.directory.path().join("frames");
+        fs::create_dir(&frames)?;
+        fs::write(frames.join("0.ppm"), frame())?;
+        fs::write(cell.directory.path().join("detections.jsonl"), DETECTIONS)?;
+        let addresses = (0..plan.nodes).map(|node| ports.of(node, plan.bridged)).collect::<anyhow::Result<Vec<_>>>()?;
+        for (index, address) in addresses.iter().enumerate() {
+            let name = if index == EDGE { "edge".to_owned() } else { format!("v{index:02}") };
+            let home = cell.directory.path().join(&name);
+            fs::create_dir(&home)?;
+            let text = configuration(plan, index, &name, *address, &addresses, broker, cell.directory.path());
+            fs::write(home.join("node.toml"), text)?;
+            cell.nodes.push(Node {
+                name: NodeName::new(name)?,
+                directory: home,
+                namespace: plan.bridged.then(|| network::namespace(index)),
+                process: None,
+                paused: false,
+                runs: 0,
+            });
+        }
+        for index in (0..plan.nodes).filter(|index| plan.edge || *index != EDGE) {
+            cell.nodes[index].start()?;
+        }
+        Ok(cell)
+    }
+
+    /// Waits until all follow one leader, the edge if it runs, and have done so for a while.
+    pub(crate) async fn settle(&mut self) -> anyhow::Result<()> {
+        let started = Instant::now();
+        let mut well_since: Option<Instant> = None;
+        loop {
+            match self.disagreement()? {
+                None if well_since.is_some_and(|since| since.elapsed() > SETTLED) => return Ok(()),
+                None => well_since = well_since.or(Some(Instant::now())),
+                Some(why) => {
+                    well_since = None;
+                    ensure!(started.elapsed() < START_TIMEOUT, "the cell does not settle: {why}");
+                }
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    }
+
+    /// What keeps the cell from being well.
+    fn disagreement(&mut self) -> anyhow::Result<Option<String>> {
+        let mut leaders = BTreeSet::new();
+        for node in &mut self.nodes {
+            let Some(process) = &mut node.process else { continue };
+            if let Some(status) = process.ended()? {
+                bail!("{} ended with {status}: {}", node.name, node.last_words());
+            }
+            match logs::last_accepted(&node.map_log())? {
+                Some(map) if clock::now().since(map.at) < Duration::from_millis(400) => leaders.insert(map.epoch),
+                _ => return Ok(Some(format!("{} gets no maps", node.name))),
+            };
+        }
+        let edge = &self.nodes[EDGE];
+        let wanted = edge.process.as_ref().map(|_| &edge.name);
+        Ok(match leaders.first() {
+            Some(leader) if leaders.len() == 1 && wanted.is_none_or(|edge| *edge == leader.leader) => None,
+            _ => Some(format!("leaders are {leaders:?}")),
+        })
+    }
+
+    pub(crate) fn kill(&mut self, node: usize) -> anyhow::Result<()> {
+        let process = self.nodes[node].process.take().context("the process does not run")?;
+        process.kill()
+    }
+
+    /// Starts a killed node again, with its files.
+    pub(crate) fn restart(&mut self, node: usize) -> anyhow::Result<()> {
+        self.nodes[node].start()
+    }
+
+    pub(crate) fn pause(&mut self, node: usize, paused: bool) -> anyhow::Result<()> {
+        let node = &mut self.nodes[node];
+        let process = node.process.as_ref().context("the process does not run")?;
+        node.paused = paused;
+        if paused { process.pause() } else { process.resume() }
+    }
+
+    pub(crate) fn kill_mosquitto(&mut self) -> anyhow::Result<()> {
+        self.mosquitto.take().context("there is no external broker")?.kill()
+    }
+
+    /// Starts so many processes that do nothing but compute, or ends them.
+    pub(crate) fn busy(&mut self, loops: usize) -> anyhow::Result<()> {
+        self.busy.clear();
+        let shell = Path::new("/bin/sh");
+        for _ in 0..loops {
+            self.busy.push(Process::start(command(shell, None).args(["-c", "while :; do :; done"]))?);
+        }
+        Ok(())
+    }
+
+    /// Cuts the network in two, the edge being on the larger side, or heals it.
+    pub(crate) fn split(&mut self, split: bool) -> anyhow::Result<()> {
+        let half = self.nodes.len() - self.nodes.len() / 2;
+        self.apart = if split { (half..self.nodes.len()).collect() } else { Vec::new() };
+        self.bridged()?.split(&self.apart)
+    }
+
+    /// The leader's packets do not reach the last vehicle, or do again.
+    pub(crate) fn cut_one_way(&mut self, cut: bool) -> anyhow::Result<()> {
+        let last = self.nodes.len() - 1;
+        self.unreached = cut.then_some(last);
+        self.bridged()?.cut_one_way(EDGE, last, cut)
+    }
+
+    /// So many percent of all packets are lost from now on.
+    pub(crate) fn lose(&mut self, percent: u8) -> anyhow::Result<()> {
+        self.lossy = percent > 0;
+        self.bridged()?.lose(percent)
+    }
+
+    /// Whoever leads, by what its own log says last.
+    pub(crate) fn leader(&self) -> anyhow::Result<usize> {
+        let newest = self.newest()?.context("there are no maps")?;
+        self.index(&newest.epoch.leader)
+    }
+
+    /// Whom the leader has named to follow it.
+    pub(crate) fn standby(&self) -> anyhow::Result<usize> {
+        let leader = &self.nodes[self.leader()?];
+        let standby = logs::standby(&leader.log())?;
+        self.index(&standby.with_context(|| format!("{} has named no standby", leader.name))?)
+    }
+
+    /// Groups of nodes that run and reach each other; none while packets are lost at random.
+    pub(crate) fn components(&self) -> Vec<BTreeSet<NodeName>> {
+        let runs = |index: &usize| {
+            let node = &self.nodes[*index];
+            node.process.is_some() && !node.paused && !self.lossy
+        };
+        let reached = (0..self.nodes.len()).filter(|index| runs(index) && self.unreached != Some(*index));
+        let (apart, together): (Vec<_>, Vec<_>) = reached.partition(|index| self.apart.contains(index));
+        let names = |side: Vec<usize>| side.into_iter().map(|index| self.nodes[index].name.clone()).collect();
+        [together, apart].into_iter().filter(|side| !side.is_empty()).map(names).collect()
+    }
+
+    /// The vehicles that run; the edge serves them but is none.
+    pub(crate) fn vehicles(&self) -> BTreeSet<NodeName> {
+        let vehicles = self.nodes.iter().skip(1).filter(|node| node.process.is_some());
+        vehicles.map(|node| node.name.clone()).collect()
+    }
+
+    /// The vehicle that the leader does not reach, if there is one.
+    pub(crate) fn unreached(&self) -> Option<&NodeName> {
+        self.unreached.map(|node| &self.nodes[node].name)
+    }
+
+    /// What every run of every process accepted.
+    pub(crate) fn runs(&self) -> anyhow::Result<Vec<NodeRun>> {
+        let runs = self.nodes.iter().flat_map(|node| (1..=node.runs).map(move |run| (node, run)));
+        let read = |(node, run): (&Node, usize)| {
+            Ok(NodeRun { node: node.name.clone(), accepted: logs::accepted(&node.map_log_of(run))? })
+        };
+        runs.map(read).collect()
+    }
+
+    /// Leaves configurations and logs where they are, and says where.
+    pub(crate) fn keep_files(self) -> PathBuf {
+        let Self { directory, .. } = self;
+        directory.keep()
+    }
+
+    fn newest(&self) -> anyhow::Result<Option<Accepted>> {
+        let running = self.nodes.iter().filter(|node| node.process.is_some());
+        let maps = running.map(|node| logs::last_accepted(&node.map_log())).collect::<anyhow::Result<Vec<_>>>()?;
+        Ok(maps.into_iter().flatten().max_by_key(|map| map.at))
+    }
+
+    fn index(&self, name: &NodeName) -> anyhow::Result<usize> {
+        let index = self.nodes.iter().position(|node| node.name == *name);
+        index.with_context(|| format!("{name} is no node of the cell"))
+    }
+
+    fn bridged(&self) -> anyhow::Result<&Bridged> {
+        self.network.as_ref().context("the cell is on loopback")
+    }
+
+    fn start_mosquitto(&mut self, ports: &mut Ports) -> anyhow::Result<SocketAddr> {
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, ports.free()?));
+        let file = self.directory.path().join("mosquitto.conf");
+        let listener = format!("listener {} {}", address.port(), address.ip());
+        fs::write(&file, format!("{listener}\nuser root\nset_tcp_nodelay true\nallow_anonymous true\n"))?;
+        self.mosquitto = Some(Process::start(command(Path::new(MOSQUITTO), None).arg("-c").arg(file))?);
+        Ok(address)
+    }
+}
+
+impl Node {
+    fn start(&mut self) -> anyhow::Result<()> {
+        self.runs += 1;
+        let log = File::options().create(true).append(true).open(self.log())?;
+        let mut command: Command = command(Path::new(PROGRAM), self.namespace.as_deref());
+        command.env_clear().envs(std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")));
+        command.arg("--config").arg(self.directory.join("node.toml")).arg("--map-log").arg(self.map_log());
+        self.process = Some(Process::start(command.stderr(log).current_dir(&self.directory))?);
+        Ok(())
+    }
+
+    fn log(&self) -> PathBuf {
+        self.directory.join("node.log")
+    }
+
+    fn map_log(&self) -> PathBuf {
+        self.map_log_of(self.runs)
+    }
+
+    fn map_log_of(&self, run: usize) -> PathBuf {
+        self.directory.join(format!("maps.{run}.jsonl"))
+    }
+
+    fn last_words(&self) -> String {
+        let text = fs::read_to_string(self.log()).unwrap_or_default();
+        text.lines().last().unwrap_or("nothing logged").to_owned()
+    }
+}
+
+/// Where a node's broker listens and where it gossips.
+#[derive(Debug, Clone, Copy)]
+struct Addresses {
+    broker: SocketAddr,
+    gossip: SocketAddr,
+}
+
+/// Hands out ports that are free now, from below those that the system gives to outgoing connections.
+struct Ports {
+    next: u16,
+}
+
+impl Ports {
+    const FIRST: u16 = 18_000;
+    const LAST: u16 = 32_000;
+
+    /// Starts somewhere else in every process.
+    fn new() -> Self {
+        let span = u32::from(Self::LAST - Self::FIRST);
+        Self { next: Self::FIRST + (clock::now().micros() as u32 % span) as u16 }
+    }
+
+    fn free(&mut self) -> anyhow::Result<u16> {
+        for _ in Self::FIRST..Self::LAST {
+            self.next = if self.next >= Self::LAST { Self::FIRST } else { self.next + 1 };
+            let address = (Ipv4Addr::LOCALHOST, self.next);
+            if TcpListener::bind(address).is_ok() && UdpSocket::bind(address).is_ok() {
+                return Ok(self.next);
+            }
+        }
+        bail!("no free port on loopback")
+    }
+
+    fn of(&mut self, node: usize, bridged: bool) -> anyhow::Result<Addresses> {
+        let (ip, broker, gossip) = if bridged {
+            (network::address(node), 1883, 17_884)
+        } else {
+            (Ipv4Addr::LOCALHOST, self.free()?, self.free()?)
+        };
+        Ok(Addresses { broker: (ip, broker).into(), gossip: (ip, gossip).into() })
+    }
+}
+
+/// One object ahead of the vehicle in every frame.
+const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]
+"#;
+
+/// A grey image: the vehicles see by recorded detections, but all else is as with a camera.
+fn frame() -> Vec<u8> {
+    let mut ppm = b"P6 16 16 255\n".to_vec();
+    ppm.extend([128; 16 * 16 * 3]);
+    ppm
+}
+
+/// On loopback the nodes find each other by seeds; where each has a network interface of its own, by multicast.
+fn configuration(
+    plan: &Plan,
+    index: usize,
+    name: &str,
+    own: Addresses,
+    all: &[Addresses],
+    broker: Option<SocketAddr>,
+    shared: &Path,
+) -> String {
+    let role = if index == EDGE { "edge" } else { "auto" };
+    let seeds: Vec<_> = all.iter().take(3).map(|seed| format!("\"{}\"", seed.gossip)).collect();
+    let seeds = if plan.bridged { String::new() } else { seeds.join(", ") };
+    let mut text = format!(
+        "name = \"{name}\"\ncell = \"trial\"\nrole = \"{role}\"\nlisten = \"{}\"\nstate_dir = \"state\"\n\n\
+         [membership]\nkey = \"a key for trials\"\nbind = \"{}\"\nseeds = [{seeds}]\n\n\
+         [membership.multicast]\nenabled = {}\n",
+        own.broker, own.gossip, plan.bridged
+    );
+    if let Some(broker) = broker {
+        let _ = write!(text, "\n[mqtt]\nbroker = \"{broker}\"\nfallback_to_embedded = {}\n", plan.fallback);
+    }
+    if index != EDGE {
+        let (frames, detections) = (shared.join("frames"), shared.join("detections.jsonl"));
+        let _ = write!(
+            text,
+            "\n[camera.source]\nkind = \"images\"\npath = {frames:?}\nlooping = true\n\n\
+             [camera.detector]\nkind = \"recorded\"\npath = {detections:?}\nlooping = true\n\n\
+             [camera.projection.sizes.default]\nwidth_m = 0.5\nheight_m = 0.5\n"
+        );
+    }
+    text + "\n[[landmarks]]\nid = \"ahead\"\nx_m = 6.0\ny_m = 0.0\n"
+}

@@ -1,0 +1,179 @@
+//! Failover as vehicles see it: cells of real processes, killed, stopped, cut off and starved, again and again.
+//!
+//! `make trials` runs it; `TRIALS=n` is the number of trials of each scenario and cell size (default 20),
+//! `SCENARIOS=a,b` and `NODES=2,5` run those only. What cannot be run on this machine is skipped and said to be. The
+//! results are printed and written to `target/trials.json`; the files of a trial that went wrong are kept.
+
+mod analysis;
+mod cell;
+mod logs;
+mod network;
+mod process;
+mod report;
+mod scenario;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use ecod_actors::clock;
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::analysis::{Phase, Verdict, judge};
+use crate::cell::{Cell, EDGE, Plan};
+use crate::report::{Outcome, table};
+use crate::scenario::{Cure, Fault, Needs, SCENARIOS, Scenario, Step, Who};
+
+/// Cell sizes, the edge included.
+const NODES: [usize; 4] = [2, 5, 16, 32];
+
+#[test]
+#[ignore = "takes minutes to hours: make trials"]
+fn trials() {
+    // Processes end with the thread that started them: all are started by this one.
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let outcome = runtime.block_on(async {
+        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        tokio::select! {
+            outcome = run_all() => outcome,
+            _ = interrupt.recv() => bail!("interrupted"),
+            _ = terminate.recv() => bail!("terminated"),
+        }
+    });
+    if let Err(error) = outcome {
+        panic!("{error:#}");
+    }
+}
+
+async fn run_all() -> anyhow::Result<()> {
+    let trials: usize = std::env::var("TRIALS").ok().map_or(Ok(20), |text| text.parse()).context("TRIALS")?;
+    let (scenarios, sizes) = (filter("SCENARIOS"), filter("NODES"));
+    let known = |name: &String| SCENARIOS.iter().any(|scenario| scenario.name == name);
+    if let Some(unknown) = scenarios.iter().flatten().find(|name| !known(name)) {
+        let names: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
+        bail!("no scenario {unknown}; there are {}", names.join(", "));
+    }
+    let chosen =
+        |list: &Option<Vec<String>>, item: &str| list.as_ref().is_none_or(|list| list.iter().any(|i| i == item));
+    let mut outcomes = Vec::new();
+    for scenario in SCENARIOS.iter().filter(|scenario| chosen(&scenarios, scenario.name)) {
+        if let Some(lack) = lacking(scenario.needs) {
+            println!("{}: skipped, {lack}", scenario.name);
+            continue;
+        }
+        for nodes in NODES.into_iter().filter(|nodes| chosen(&sizes, &nodes.to_string())) {
+            if nodes < scenario.least_nodes {
+                continue;
+            }
+            let mut verdicts = Vec::new();
+            for trial in 1..=trials {
+                verdicts.push(run(scenario, nodes, trial, trials).await?);
+            }
+            outcomes.push(Outcome::new(scenario, nodes, &verdicts));
+            write(&outcomes)?;
+        }
+    }
+    println!("\n{}", table(&outcomes));
+    let misses: Vec<String> = outcomes.iter().flat_map(Outcome::misses).collect();
+    if misses.is_empty() { Ok(()) } else { bail!("bars missed: {}", misses.join("; ")) }
+}
+
+/// One trial, told in one line.
+async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> anyhow::Result<Verdict> {
+    let plan = Plan {
+        nodes,
+        edge: scenario.edge,
+        external_broker: matches!(scenario.needs, Needs::Mosquitto | Needs::MosquittoAndFallback),
+        fallback: scenario.needs == Needs::MosquittoAndFallback,
+        bridged: matches!(scenario.needs, Needs::Namespaces | Needs::PacketFilter),
+    };
+    let mut cell = Cell::start(&plan)?;
+    let outcome = perform(scenario, &mut cell).await;
+    let label = format!("{}, {nodes} nodes, trial {trial} of {trials}", scenario.name);
+    match outcome {
+        Ok(verdict) => {
+            let gap = verdict.gap.map_or_else(|| "none".to_owned(), |gap| format!("{} ms", gap.as_millis()));
+            println!("{label}: gap {gap}");
+            let wrong = !Outcome::new(scenario, nodes, std::slice::from_ref(&verdict)).misses().is_empty();
+            if wrong {
+                println!("    {verdict:?}, files in {}", cell.keep_files().display());
+            }
+            Ok(verdict)
+        }
+        Err(error) => Err(error).with_context(|| format!("{label}, files in {}", cell.keep_files().display())),
+    }
+}
+
+async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict> {
+    cell.settle().await?;
+    let mut phases = Vec::new();
+    for step in scenario.script {
+        let from = clock::now();
+        apply(step.fault, cell)?;
+        tokio::time::sleep(step.watch).await;
+        phases.push(phase(step, from, cell));
+    }
+    Ok(judge(&cell.runs()?, &phases))
+}
+
+fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
+    match fault {
+        Fault::Kill(victims) => {
+            let find = |who: &Who| match who {
+                Who::Edge => Ok(EDGE),
+                Who::Leader => cell.leader(),
+                Who::Standby => cell.standby(),
+            };
+            let victims = victims.iter().map(find).collect::<anyhow::Result<Vec<_>>>()?;
+            victims.into_iter().try_for_each(|victim| cell.kill(victim))
+        }
+        Fault::RestartEdge => cell.restart(EDGE),
+        Fault::PauseEdge => cell.pause(EDGE, true),
+        Fault::ResumeEdge => cell.pause(EDGE, false),
+        Fault::KillExternalBroker => cell.kill_mosquitto(),
+        Fault::Busy(loops) => cell.busy(loops),
+        Fault::Split => cell.split(true),
+        Fault::CutOneWay => cell.cut_one_way(true),
+        Fault::Lose(percent) => cell.lose(percent),
+        Fault::Heal(Cure::Split) => cell.split(false),
+        Fault::Heal(Cure::OneWay) => cell.cut_one_way(false),
+        Fault::Heal(Cure::Loss) => cell.lose(0),
+    }
+}
+
+fn phase(step: &Step, from: ecod::time::Timestamp, cell: &Cell) -> Phase {
+    let mut measured = if step.measured { cell.vehicles() } else { Default::default() };
+    if let Some(unreached) = cell.unreached() {
+        measured.remove(unreached);
+    }
+    let changes = step.changes.0..=step.changes.1;
+    Phase { from, until: clock::now(), changes, components: cell.components(), measured }
+}
+
+/// Why a scenario cannot be run here, if it cannot.
+fn lacking(needs: Needs) -> Option<&'static str> {
+    let namespaces = || (!network::has_namespaces()).then_some("network namespaces cannot be made here");
+    match needs {
+        Needs::Loopback => None,
+        Needs::Mosquitto | Needs::MosquittoAndFallback => {
+            (!cell::has_mosquitto()).then_some("mosquitto is not installed")
+        }
+        Needs::Namespaces => namespaces(),
+        Needs::PacketFilter => {
+            namespaces().or_else(|| (!network::has_packet_filter()).then_some("nftables is not installed"))
+        }
+    }
+}
+
+/// The parts of a list in the environment.
+fn filter(key: &str) -> Option<Vec<String>> {
+    let list = std::env::var(key).ok().filter(|list| !list.trim().is_empty())?;
+    Some(list.split(',').map(|item| item.trim().to_owned()).collect())
+}
+
+fn write(outcomes: &[Outcome]) -> anyhow::Result<()> {
+    let target = std::env::var_os("CARGO_TARGET_DIR").map(PathBuf::from);
+    let target = target.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../target"));
+    let file = target.join("trials.json");
+    let text = serde_json::to_string_pretty(outcomes)? + "\n";
+    std::fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))
+}

@@ -1,0 +1,138 @@
+//! The results of all trials: for programs as JSON, for people as a table, and against the bars.
+
+use std::time::Duration;
+
+use serde::Serialize;
+
+use crate::analysis::{Verdict, percentile};
+use crate::scenario::Scenario;
+
+/// All trials of one scenario with one number of nodes.
+#[derive(Debug, Serialize)]
+pub(crate) struct Outcome {
+    scenario: &'static str,
+    nodes: usize,
+    trials: usize,
+    gap_ms: Gaps,
+    stale_accepted: u64,
+    missed_rounds: u64,
+    unrecovered: usize,
+    double_leader_after_quiet: usize,
+    false_failovers: u64,
+    #[serde(skip)]
+    gap_bar_ms: Option<u64>,
+    #[serde(skip)]
+    seamless: bool,
+}
+
+#[derive(Debug, Serialize)]
+struct Gaps {
+    p50: Option<u64>,
+    p99: Option<u64>,
+    max: Option<u64>,
+}
+
+impl Outcome {
+    pub(crate) fn new(scenario: &Scenario, nodes: usize, verdicts: &[Verdict]) -> Self {
+        let mut gaps: Vec<Duration> = verdicts.iter().filter_map(|verdict| verdict.gap).collect();
+        gaps.sort_unstable();
+        let gap = |percent| percentile(&gaps, percent).map(|gap| gap.as_millis() as u64);
+        Self {
+            scenario: scenario.name,
+            nodes,
+            trials: verdicts.len(),
+            gap_ms: Gaps { p50: gap(50), p99: gap(99), max: gap(100) },
+            stale_accepted: verdicts.iter().map(|verdict| verdict.stale_accepted).sum(),
+            missed_rounds: verdicts.iter().map(|verdict| verdict.missed_rounds).sum(),
+            unrecovered: verdicts.iter().filter(|verdict| verdict.unrecovered).count(),
+            double_leader_after_quiet: verdicts.iter().filter(|verdict| verdict.double_leader).count(),
+            false_failovers: verdicts.iter().map(|verdict| verdict.false_failovers).sum(),
+            gap_bar_ms: scenario.gap.limit(nodes).map(|limit| limit.as_millis() as u64),
+            seamless: scenario.seamless,
+        }
+    }
+
+    /// The bars that were missed, in words.
+    pub(crate) fn misses(&self) -> Vec<String> {
+        let gap = self.gap_bar_ms.filter(|bar| self.gap_ms.p99.is_none_or(|p99| p99 > *bar));
+        let gap = gap.map(|bar| format!("gap p99 {} ms, at most {bar}", number(self.gap_ms.p99)));
+        let none = |what: &str, count: u64| (count > 0).then(|| format!("{what} {count}, must be 0"));
+        let counts = [
+            none("stale_accepted", self.stale_accepted),
+            self.seamless.then_some(()).and_then(|()| none("missed_rounds", self.missed_rounds)),
+            none("unrecovered", self.unrecovered as u64),
+            none("double_leader_after_quiet", self.double_leader_after_quiet as u64),
+            none("false_failovers", self.false_failovers),
+        ];
+        gap.into_iter().chain(counts.into_iter().flatten()).collect()
+    }
+}
+
+/// A line for each outcome, with its bars.
+pub(crate) fn table(outcomes: &[Outcome]) -> String {
+    let mut text = format!(
+        "{:<29}{:>6}{:>7}{:>7}{:>7}{:>7}{:>6}{:>7}{:>7}{:>12}{:>8}{:>7}\n",
+        "scenario", "nodes", "trials", "p50", "p99", "max", "bar", "stale", "missed", "unrecovered", "double", "false"
+    );
+    for outcome in outcomes {
+        let Outcome { scenario, nodes, trials, gap_ms, stale_accepted, missed_rounds, unrecovered, .. } = outcome;
+        let mark = if outcome.misses().is_empty() { "" } else { "  MISSED" };
+        text += &format!(
+            "{scenario:<29}{nodes:>6}{trials:>7}{:>7}{:>7}{:>7}{:>6}{stale_accepted:>7}{missed_rounds:>7}{unrecovered:>12}{:>8}{:>7}{mark}\n",
+            number(gap_ms.p50),
+            number(gap_ms.p99),
+            number(gap_ms.max),
+            number(outcome.gap_bar_ms),
+            outcome.double_leader_after_quiet,
+            outcome.false_failovers,
+        );
+    }
+    text + "gaps in ms, of the worst vehicle, the period of 100 ms included; bar: the most that p99 may be\n"
+}
+
+fn number(value: Option<u64>) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| value.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scenario::SCENARIOS;
+
+    fn outcome(name: &str, verdict: Verdict) -> Outcome {
+        let scenario = SCENARIOS.iter().find(|scenario| scenario.name == name).unwrap();
+        Outcome::new(scenario, 5, &[Verdict { gap: Some(Duration::from_millis(150)), ..verdict }])
+    }
+
+    #[test]
+    fn a_missed_bar_is_named() {
+        assert!(outcome("edge_sigkill", Verdict::default()).misses().is_empty());
+        let slow =
+            Outcome::new(&SCENARIOS[0], 5, &[Verdict { gap: Some(Duration::from_millis(201)), ..Verdict::default() }]);
+        assert_eq!(slow.misses(), ["gap p99 201 ms, at most 200"]);
+        assert_eq!(Outcome::new(&SCENARIOS[0], 5, &[Verdict::default()]).misses(), ["gap p99 - ms, at most 200"]);
+        let wrong = Verdict { unrecovered: true, false_failovers: 2, ..Verdict::default() };
+        assert_eq!(
+            outcome("six_busy_loops", wrong).misses(),
+            ["unrecovered 1, must be 0", "false_failovers 2, must be 0"]
+        );
+    }
+
+    #[test]
+    fn rounds_may_be_missed_when_a_process_dies_but_not_when_it_hands_over() {
+        let missed = Verdict { missed_rounds: 1, ..Verdict::default() };
+        assert!(outcome("edge_sigkill", missed.clone()).misses().is_empty());
+        assert_eq!(outcome("edge_restart", missed).misses(), ["missed_rounds 1, must be 0"]);
+    }
+
+    #[test]
+    fn the_file_has_the_promised_keys_and_whole_milliseconds() {
+        let json = serde_json::to_value([outcome("edge_sigkill", Verdict::default())]).unwrap();
+        let expected = serde_json::json!([{
+            "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "gap_ms": {"p50": 150, "p99": 150, "max": 150},
+            "stale_accepted": 0, "missed_rounds": 0, "unrecovered": 0, "double_leader_after_quiet": 0,
+            "false_failovers": 0,
+        }]);
+        assert_eq!(json, expected);
+    }
+}
