@@ -7,7 +7,7 @@ BUILD := $(or $(CARGO_TARGET_DIR),target)
 SETS ?= examples/crowd_labels
 PASSES ?= 50
 
-.PHONY: help setup demo testbed eval-labels liars test lint doc audit bench core-only replay-check edge-only clean
+.PHONY: help setup demo testbed eval-labels liars test sim trials lint doc audit bench core-only replay-check edge-only clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -37,6 +37,13 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 
 test: setup ## all tests
 	cargo test --locked --workspace
+
+sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of SEED=n
+	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election_sim -- --nocapture
+
+trials: PACKAGES += iproute2 nftables
+trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
+	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact trials --nocapture
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
