@@ -25,10 +25,11 @@ pub(super) struct HealthMonitor {
 }
 
 /// What the parts answered when asked.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Probe {
     broker_serves: bool,
-    gateway_answers: bool,
+    /// How the gateway's links are; none when it does not answer.
+    links: Option<BTreeMap<BrokerAddress, LinkState>>,
     fuser_runs: bool,
 }
 
@@ -61,7 +62,19 @@ impl HealthMonitor {
         self.links.clear();
     }
 
+    /// Notes the answers. They make up for a link that came up before there was anyone to be told.
     pub(super) fn note_probe(&mut self, probe: Probe) {
+        for (broker, state) in probe.links.iter().flatten() {
+            match state {
+                LinkState::Up => {
+                    self.links.insert(broker.clone(), LinkState::Up);
+                }
+                // That it is refused is news of its own, which may still be under way.
+                LinkState::Down | LinkState::Refused => {
+                    self.links.entry(broker.clone()).and_modify(|known| *known = LinkState::Down);
+                }
+            }
+        }
         self.probe = probe;
     }
 
@@ -85,7 +98,7 @@ impl HealthMonitor {
         Health {
             broker: external || embedded,
             fuser: self.probe.fuser_runs && now.since(self.round_closed_at) < patience,
-            gateway: self.probe.gateway_answers && (external || (embedded && up(brokers.own.as_ref()))),
+            gateway: self.probe.links.is_some() && (external || (embedded && up(brokers.own.as_ref()))),
             load_percent: self.load_percent,
         }
     }
@@ -101,7 +114,7 @@ pub(super) fn probe(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
             ask(&gateway, |reply| GatewayMessage::Links { reply }),
         );
         let broker_serves = matches!(health, Some(BrokerHealth::Serving(_)));
-        let probe = Probe { broker_serves, gateway_answers: links.is_some(), fuser_runs };
+        let probe = Probe { broker_serves, links, fuser_runs };
         if election.cast(LeaderElectionMessage::NoteProbe { probe }).is_err() {
             tracing::debug!("the election ended before its parts answered");
         }
@@ -137,7 +150,7 @@ mod tests {
 
     fn monitor(counters: &Counters, now: Timestamp) -> HealthMonitor {
         let mut monitor = HealthMonitor::default();
-        monitor.note_probe(Probe { broker_serves: true, gateway_answers: true, fuser_runs: true });
+        monitor.note_probe(Probe { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true });
         counters.count(Event::RoundDue);
         monitor.look(counters, now);
         monitor
@@ -169,6 +182,21 @@ mod tests {
         assert!(!monitor.health(&plane, &brokers, PERIOD, later).fuser, "no rounds");
         monitor.note_link(&address(1), LinkState::Down);
         assert!(!monitor.health(&plane, &brokers, PERIOD, now).gateway);
+    }
+
+    #[test]
+    fn a_link_that_came_up_unnoticed_is_found_by_asking() {
+        let now = Timestamp(60_000_000);
+        let mut monitor = monitor(&Counters::default(), now);
+        let plane = DataPlane { external: None, embedded: true };
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        let links = |state| Some(BTreeMap::from([(address(1), state)]));
+        let probe = |state| Probe { broker_serves: true, links: links(state), fuser_runs: true };
+        monitor.note_probe(probe(LinkState::Up));
+        assert!(monitor.health(&plane, &brokers, PERIOD, now).is_fit());
+        monitor.note_probe(probe(LinkState::Down));
+        assert!(!monitor.health(&plane, &brokers, PERIOD, now).is_fit());
+        assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
     }
 
     #[test]
