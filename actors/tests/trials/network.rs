@@ -78,7 +78,7 @@ impl Bridged {
             "delete table inet trials\n".to_owned()
         } else {
             let rule = format!("iifname \"eth0\" numgen random mod 100 < {percent} drop");
-            format!("table inet trials {{ chain input {{ type filter hook input priority 0; {rule}; }} }}\n")
+            format!("table inet trials {{\nchain input {{\ntype filter hook input priority 0; {rule}; }}\n}}\n")
         };
         (0..self.nodes).try_for_each(|node| nft(&namespace(node), &rules))
     }
