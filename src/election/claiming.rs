@@ -155,15 +155,21 @@ impl Election {
     }
 
     /// When it is this node's turn to claim; `None` when it may not lead.
+    ///
+    /// The successors come first, in the order in which the lost leader named them: it heard them all, whereas what a
+    /// follower knows of others may be as old as their first greeting.
     fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
-        let standing = self.standing();
+        let (now, standing) = (self.clock.now(), self.standing());
         standing.may_lead().then(|| {
-            let turn = |name: &NodeName| seeking.order.iter().position(|next| next == name).unwrap_or(usize::MAX);
-            let place =
-                |name: &NodeName, standing: Standing| (turn(name), standing.class(), standing.load, name.clone());
-            let own = place(&self.id, standing);
-            let before = self.peers.candidates(self.clock.now()).filter(|&(name, other)| place(name, other) < own);
-            seeking.since + self.config.claim_step() * u32::try_from(before.count()).unwrap_or(u32::MAX)
+            let there = |name: &&NodeName| **name == self.id || self.peers.may_succeed(name, now);
+            let named: Vec<&NodeName> = seeking.order.iter().filter(there).collect();
+            let before = named.iter().position(|name| **name == self.id).unwrap_or_else(|| {
+                let place = |name: &NodeName, standing: Standing| (standing.class(), standing.load, name.clone());
+                let own = place(&self.id, standing);
+                let others = self.peers.candidates(now).filter(|(name, _)| !named.contains(name));
+                named.len() + others.filter(|&(name, other)| place(name, other) < own).count()
+            });
+            seeking.since + self.config.claim_step() * u32::try_from(before).unwrap_or(u32::MAX)
         })
     }
 }

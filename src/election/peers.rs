@@ -140,6 +140,13 @@ impl Peers {
         })
     }
 
+    /// Whether a peer that a leader named its successor could still lead: the leader's word outweighs what the peer
+    /// said of itself long ago.
+    pub(super) fn may_succeed(&self, name: &NodeName, now: Timestamp) -> bool {
+        let unfit = |peer: &Peer| peer.standing.is_some_and(|standing| !standing.may_lead()) && self.hears(name, now);
+        self.table.get(name).is_some_and(|peer| peer.gone_until.is_none_or(|until| now >= until) && !unfit(peer))
+    }
+
     /// Everyone who could lead, in no order of preference.
     pub(super) fn candidates(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, Standing)> {
         self.table

@@ -195,7 +195,8 @@ impl World {
         node.election = Some(election);
         let life = node.life;
         self.arm(index);
-        let after = self.random.between(5 * MS, 20 * MS);
+        // A node is met by others before it has found its own parts fit.
+        let after = self.random.between(5 * MS, 300 * MS);
         self.push(after, Event::Broker { to: index, life, works: true });
     }
 
