@@ -1,33 +1,40 @@
 //! A whole cell on this machine: one process for the edge and one for each vehicle, watched from outside.
 //!
 //! ```text
-//! demo ── spawns ──> ecod-node --role edge     (embedded broker on loopback)
-//!      ── spawns ──> ecod-node --role cav × n  (each renders, detects, projects, publishes, logs the maps it gets)
-//!      ── listens to every report, to tell what each vehicle would have known alone
+//! demo ── spawns ──> ecod-node --role edge
+//!      ── spawns ──> ecod-node --role auto × n  (each renders, detects, projects, publishes, logs the maps it gets)
+//!      ── listens to every report on all brokers, to tell what each vehicle would have known alone
+//!      ── kills the edge half-way and starts it again a second later
 //! ```
 
 mod observer;
 mod process;
+mod reign;
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod::aggregator::{Aggregator, Fused};
+use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::testbed::{Cav, Scene, Testbed};
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, ReportKind};
+use ecod::wire::{GlobalMap, ReportKind, Role};
 
 pub use self::observer::ObservedReport;
 use self::observer::Observer;
 use self::process::NodeProcess;
+pub use self::reign::Reign;
+use self::reign::reigns;
 use crate::clock;
+use crate::config::NodeConfig;
 use crate::follower::ReceivedMap;
 use crate::frame_source::SourceConfig;
+use crate::membership::MembershipConfig;
 use crate::testbed::score::{SceneResult, Score};
 use crate::testbed::setup;
 
@@ -63,6 +70,10 @@ pub struct DemoResult {
     pub last_map: Option<GlobalMap>,
     /// The vehicles' reports.
     pub reports: Vec<ObservedReport>,
+    /// From when on the maps are judged.
+    pub from: Timestamp,
+    /// Who led when.
+    pub reigns: Vec<Reign>,
 }
 
 /// How far a running demo is.
@@ -70,12 +81,33 @@ pub struct DemoResult {
 pub struct Progress {
     /// Time judged so far.
     pub elapsed: Duration,
-    /// Reports seen so far.
-    pub reports: usize,
+    /// What there is to tell.
+    pub news: News,
+}
+
+/// What happens in a running demo.
+#[derive(Debug, Clone, Copy)]
+pub enum News {
+    /// So many reports were seen so far.
+    Reports(usize),
+    /// The edge's process was killed.
+    EdgeKilled,
+    /// The edge's process was started again.
+    EdgeStarted,
 }
 
 /// Time for all nodes to start and see.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// Time for which the edge is gone.
+const EDGE_GONE: Duration = Duration::from_secs(1);
+
+/// Where a node listens: its broker, and for other nodes.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    broker: SocketAddr,
+    gossip: SocketAddr,
+}
 
 /// Time from the first reports of all vehicles to the first map that is judged: the memory of PACE.
 const SETTLING: Duration = Duration::from_secs(1);
@@ -87,12 +119,17 @@ impl Demo<'_> {
     /// When a node does not start or ends early, `progress` fails, or a file cannot be written; all nodes are stopped in any case.
     pub async fn run(&self, progress: impl Fn(Progress) -> anyhow::Result<()>) -> anyhow::Result<DemoResult> {
         fs::create_dir_all(self.directory).with_context(|| format!("cannot make {}", self.directory.display()))?;
-        let broker = free_address()?;
-        let mut nodes = vec![self.start_edge(broker)?];
-        for cav in &self.scene.cavs {
-            nodes.push(self.start_cav(cav, broker)?);
+        let state = self.directory.join("state");
+        if state.exists() {
+            fs::remove_dir_all(&state).with_context(|| format!("cannot remove {}", state.display()))?;
         }
-        let observer = Observer::start(broker, setup::unused_name(self.scene, "observer")).await?;
+        let places = free_places(self.scene.cavs.len() + 1)?;
+        let mut nodes = vec![self.start_node(setup::edge(self.testbed, self.scene), &places, 0)?];
+        for (index, cav) in self.scene.cavs.iter().enumerate() {
+            nodes.push(self.start_cav(cav, &places, index + 1)?);
+        }
+        let brokers = places.iter().map(|place| place.broker.into()).collect();
+        let observer = Observer::start(brokers, setup::unused_name(self.scene, "observer")).await?;
         let outcome = self.watch(&mut nodes, &observer, progress).await;
         for node in nodes.iter_mut().rev() {
             node.stop().await;
@@ -102,7 +139,8 @@ impl Demo<'_> {
         self.evaluate(reports, from, until)
     }
 
-    /// Waits for reports of all vehicles, then for the time to be judged, and says when that was.
+    /// Waits for reports of all vehicles and maps of the edge, then for the time to be judged, in which the edge is
+    /// killed and started again, and says when that was.
     async fn watch(
         &self,
         nodes: &mut [NodeProcess],
@@ -110,38 +148,55 @@ impl Demo<'_> {
         progress: impl Fn(Progress) -> anyhow::Result<()>,
     ) -> anyhow::Result<(Timestamp, Timestamp)> {
         let started = clock::now();
-        while observer.reporters() < self.scene.cavs.len() {
+        let edge = setup::edge(self.testbed, self.scene).name;
+        while observer.reporters() < self.scene.cavs.len() || observer.leader() != edge {
             if clock::now().since(started) > START_TIMEOUT {
-                bail!(
-                    "only {} of {} vehicles reported within {START_TIMEOUT:?}",
-                    observer.reporters(),
-                    self.scene.cavs.len()
-                );
+                let (reporters, leader) = (observer.reporters(), observer.leader());
+                let leader = leader.map_or_else(|| "nobody".to_owned(), |leader| leader.to_string());
+                let vehicles = self.scene.cavs.len();
+                bail!("after {START_TIMEOUT:?} {reporters} of {vehicles} vehicles report and {leader} leads");
             }
             check(nodes)?;
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
         tokio::time::sleep(SETTLING).await;
         let from = clock::now();
+        let (killed_at, started_at) = (from + self.duration / 2, from + self.duration / 2 + EDGE_GONE);
+        let mut next_progress = from;
         while clock::now().since(from) < self.duration {
-            tokio::time::sleep(Duration::from_secs(1)).await;
+            tokio::time::sleep(Duration::from_millis(50)).await;
             check(nodes)?;
-            progress(Progress { elapsed: clock::now().since(from), reports: observer.reports() })?;
+            let (now, edge) = (clock::now(), &mut nodes[0]);
+            let tell = |news| progress(Progress { elapsed: now.since(from), news });
+            if edge.starts() == 1 && !edge.is_killed() && now >= killed_at {
+                edge.kill().await?;
+                tell(News::EdgeKilled)?;
+            } else if edge.is_killed() && now >= started_at {
+                edge.restart()?;
+                tell(News::EdgeStarted)?;
+            } else if now >= next_progress {
+                next_progress = now + Duration::from_secs(1);
+                tell(News::Reports(observer.reports()))?;
+            }
         }
         Ok((from, clock::now()))
     }
 
     fn evaluate(&self, reports: Vec<ObservedReport>, from: Timestamp, until: Timestamp) -> anyhow::Result<DemoResult> {
         let within = |time: Timestamp| from <= time && time <= until;
-        let mut maps: BTreeMap<(u64, u64), GlobalMap> = BTreeMap::new();
-        let (mut received, mut ages) = (0, Vec::new());
+        let mut maps: BTreeMap<(Epoch, u64), GlobalMap> = BTreeMap::new();
+        let (mut ages, mut logs) = (Vec::new(), Vec::new());
         for cav in &self.scene.cavs {
-            for line in read_map_log(&self.map_log(cav))?.into_iter().filter(|line| within(line.map.fused_at_us)) {
-                received += 1;
+            let mut log = read_map_log(&self.map_log(cav))?;
+            log.retain(|line| within(line.map.fused_at_us));
+            for line in &log {
                 ages.extend(line.map.oldest_capture_us.map(|capture| line.received_at.since(capture)));
-                maps.insert((line.map.epoch, line.map.round), GlobalMap::clone(&line.map));
+                let epoch = Epoch::new(line.map.epoch, line.map.aggregator.clone());
+                maps.insert((epoch, line.map.round), GlobalMap::clone(&line.map));
             }
+            logs.push(log);
         }
+        let received: usize = logs.iter().map(Vec::len).sum();
         let mut fused = Score::default();
         maps.values().for_each(|map| fused.judge(self.testbed, self.scene, map));
         ages.sort();
@@ -152,6 +207,8 @@ impl Demo<'_> {
             median_age: ages.get(ages.len() / 2).copied().unwrap_or_default(),
             last_map: maps.into_values().next_back(),
             reports,
+            from,
+            reigns: reigns(self.testbed, self.scene, logs.iter().map(Vec::as_slice)),
         })
     }
 
@@ -175,13 +232,19 @@ impl Demo<'_> {
         self.scene.cavs.iter().map(alone).collect()
     }
 
-    fn start_edge(&self, broker: SocketAddr) -> anyhow::Result<NodeProcess> {
-        let mut config = setup::edge(self.testbed, self.scene);
-        config.listen = Some(broker);
-        NodeProcess::start(self.program, &config, self.directory)
+    /// Starts a node that finds the others by seeds.
+    fn start_node(&self, config: NodeConfig, places: &[Place], index: usize) -> anyhow::Result<NodeProcess> {
+        let membership = MembershipConfig {
+            bind: Some(places[index].gossip),
+            seeds: places.iter().map(|place| place.gossip.to_string()).collect(),
+            ..config.membership
+        };
+        let listen = Some(places[index].broker);
+        let state_dir = Some(self.directory.join("state"));
+        NodeProcess::start(self.program, &NodeConfig { listen, state_dir, membership, ..config }, self.directory)
     }
 
-    fn start_cav(&self, cav: &Cav, broker: SocketAddr) -> anyhow::Result<NodeProcess> {
+    fn start_cav(&self, cav: &Cav, places: &[Place], index: usize) -> anyhow::Result<NodeProcess> {
         let source = SourceConfig::Testbed {
             scenes: self.file.into(),
             scene: self.scene.name.clone(),
@@ -189,13 +252,13 @@ impl Demo<'_> {
             seed: 1,
         };
         let mut config = setup::cav(self.testbed, self.scene, cav, source);
-        config.mqtt.broker = Some(broker.into());
+        config.role = Role::Auto;
         let log = self.map_log(cav);
         if log.exists() {
             fs::remove_file(&log).with_context(|| format!("cannot remove {}", log.display()))?;
         }
         config.map_log = Some(log);
-        NodeProcess::start(self.program, &config, self.directory)
+        self.start_node(config, places, index)
     }
 
     fn map_log(&self, cav: &Cav) -> PathBuf {
@@ -203,10 +266,15 @@ impl Demo<'_> {
     }
 }
 
-/// A port that nothing listens on now.
-fn free_address() -> anyhow::Result<SocketAddr> {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port on loopback")?;
-    listener.local_addr().context("no free port on loopback")
+/// Addresses on which nothing listens now, no two the same.
+fn free_places(count: usize) -> anyhow::Result<Vec<Place>> {
+    let sockets: std::io::Result<Vec<_>> = (0..count)
+        .map(|_| Ok((TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?, UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?)))
+        .collect();
+    let place = |(broker, gossip): &(TcpListener, UdpSocket)| {
+        Ok(Place { broker: broker.local_addr()?, gossip: gossip.local_addr()? })
+    };
+    sockets.and_then(|sockets| sockets.iter().map(place).collect()).context("no free port on loopback")
 }
 
 fn check(nodes: &mut [NodeProcess]) -> anyhow::Result<()> {

@@ -7,12 +7,13 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 use ecod::testbed::Scene;
+use ecod::time::Timestamp;
 use nalgebra::Point2;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::testbed::{Results, check_writable, read, select};
 use super::{Failure, print, write_json};
-use crate::demo::{Demo, DemoResult};
+use crate::demo::{Demo, DemoResult, News, Reign};
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
 
@@ -42,7 +43,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let results_file = arguments.out.join("result.json");
     fs::create_dir_all(&arguments.out).with_context(|| format!("cannot make {}", arguments.out.display()))?;
     check_writable(&results_file)?;
-    print(&format!("a cell on this machine: 1 edge with its MQTT broker, {}\n\n", vehicles(&scenes)))?;
+    print(&format!("a cell on this machine: 1 edge, killed half-way, {}\n\n", vehicles(&scenes)))?;
     let mut results = Vec::with_capacity(scenes.len());
     let count = scenes.len();
     for (index, scene) in scenes.into_iter().enumerate() {
@@ -57,7 +58,12 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         };
         print(&format!("[{}/{count}] {}: starting {} processes\n", index + 1, scene.name, scene.cavs.len() + 1))?;
         let outcome = runtime.block_on(until_signalled(demo.run(|progress| {
-            print(&format!("        {:2.0} s, {} reports\n", progress.elapsed.as_secs_f64(), progress.reports))
+            let news = match progress.news {
+                News::Reports(reports) => format!("{reports} reports"),
+                News::EdgeKilled => "the edge is killed".to_owned(),
+                News::EdgeStarted => "the edge is started again".to_owned(),
+            };
+            print(&format!("        {:4.1} s, {news}\n", progress.elapsed.as_secs_f64()))
         })));
         let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
         print(&format!(
@@ -66,6 +72,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             outcome.missed,
             outcome.median_age.as_secs_f64() * 1e3,
         ))?;
+        print(&leaders(&outcome))?;
         let picture = arguments.out.join(format!("{}.svg", file_name(&scene.name)));
         let svg = birdseye(&testbed, scene, &detections(&outcome), outcome.last_map.as_ref()).context("picture")?;
         fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
@@ -74,6 +81,19 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     print(&format!("\n{}\n", table(&results)))?;
     write_json(&results_file, &Results { scenes: &results })?;
     Ok(print(&format!("pictures, results, configurations and logs: {}\n", arguments.out.display()))?)
+}
+
+/// Who led when, how right its maps were, and what the change cost the vehicles.
+fn leaders(outcome: &DemoResult) -> String {
+    let line = |reign: &Reign| {
+        let since = |time: Timestamp| time.since(outcome.from).as_secs_f64();
+        let (leader, from, until) = (&reign.epoch.leader, since(reign.from), since(reign.until));
+        let gap = reign.gap.map_or_else(String::new, |gap| {
+            format!(", {} ms after the last map of the one before (worst vehicle)", gap.as_millis())
+        });
+        format!("        {leader} led from {from:.1} to {until:.1} s, {:.1} % right{gap}\n", reign.score.accuracy_pct())
+    };
+    outcome.reigns.iter().map(line).collect()
 }
 
 /// Runs a scene; SIGINT and SIGTERM end it and, with it, its processes.
@@ -94,7 +114,7 @@ fn file_name(scene: &str) -> String {
 
 fn vehicles(scenes: &[&Scene]) -> String {
     let most = scenes.iter().map(|scene| scene.cavs.len()).max().unwrap_or(0);
-    format!("{most} vehicles that render, detect, project and publish, {} scenes", scenes.len())
+    format!("{most} vehicles that see, report and may lead, {} scenes", scenes.len())
 }
 
 /// Where every vehicle placed what it detected.

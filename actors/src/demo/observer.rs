@@ -1,7 +1,6 @@
-//! Listens to every report of the cell.
+//! Listens to every report of the cell, on whichever brokers it comes, and notes who leads.
 
 use std::collections::BTreeSet;
-use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use ecod::names::NodeName;
@@ -11,7 +10,7 @@ use ractor::{Actor, ActorRef};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-use crate::gateway::{Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part};
+use crate::gateway::{BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part};
 
 /// A report and when it came.
 #[derive(Debug, Clone)]
@@ -26,13 +25,20 @@ pub struct ObservedReport {
 pub(super) struct Observer {
     gateway: ActorRef<GatewayMessage>,
     ended: JoinHandle<()>,
-    reports: Arc<Mutex<Vec<ObservedReport>>>,
+    seen: Arc<Mutex<Seen>>,
+}
+
+#[derive(Default)]
+struct Seen {
+    reports: Vec<ObservedReport>,
+    known: BTreeSet<(NodeName, u64)>,
+    leader: Option<NodeName>,
 }
 
 impl Observer {
-    pub(super) async fn start(broker: SocketAddr, name: NodeName) -> anyhow::Result<Self> {
-        let reports: Arc<Mutex<Vec<ObservedReport>>> = Arc::default();
-        let kept = Arc::clone(&reports);
+    pub(super) async fn start(brokers: Vec<BrokerAddress>, name: NodeName) -> anyhow::Result<Self> {
+        let seen: Arc<Mutex<Seen>> = Arc::default();
+        let kept = Arc::clone(&seen);
         let status = NodeStatus {
             schema: SCHEMA_VERSION,
             node: name,
@@ -49,26 +55,27 @@ impl Observer {
             status,
             mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },
             counters: Arc::default(),
-            subscriber: Arc::new(move |Delivery { message, received_at, .. }| {
-                if let Incoming::Report { report, .. } = message {
-                    lock(&kept).push(ObservedReport { report, received_at });
-                }
-            }),
+            subscriber: Arc::new(move |delivery| lock(&kept).take(delivery)),
             seed: 1,
         };
         let (gateway, ended) = Actor::spawn(None, Gateway, arguments).await?;
-        gateway.cast(GatewayMessage::SetBrokers { addresses: vec![broker.into()] })?;
-        Ok(Self { gateway, ended, reports })
+        gateway.cast(GatewayMessage::SetBrokers { addresses: brokers })?;
+        Ok(Self { gateway, ended, seen })
     }
 
     /// How many vehicles have reported.
     pub(super) fn reporters(&self) -> usize {
-        lock(&self.reports).iter().map(|observed| observed.report.node.clone()).collect::<BTreeSet<_>>().len()
+        lock(&self.seen).reports.iter().map(|observed| observed.report.node.clone()).collect::<BTreeSet<_>>().len()
+    }
+
+    /// Whose map came last.
+    pub(super) fn leader(&self) -> Option<NodeName> {
+        lock(&self.seen).leader.clone()
     }
 
     /// How many reports have come.
     pub(super) fn reports(&self) -> usize {
-        lock(&self.reports).len()
+        lock(&self.seen).reports.len()
     }
 
     /// Ends listening and gives all reports in the order of receipt.
@@ -77,7 +84,20 @@ impl Observer {
         if self.ended.await.is_err() {
             tracing::warn!("the observer did not end well");
         }
-        std::mem::take(&mut lock(&self.reports))
+        std::mem::take(&mut lock(&self.seen).reports)
+    }
+}
+
+impl Seen {
+    /// A vehicle sends each report to leader and standby; one is kept.
+    fn take(&mut self, Delivery { message, received_at, .. }: Delivery) {
+        match message {
+            Incoming::Report { report, .. } if self.known.insert((report.node.clone(), report.seq)) => {
+                self.reports.push(ObservedReport { report, received_at });
+            }
+            Incoming::Map(map) => self.leader = Some(map.aggregator.clone()),
+            _ => {}
+        }
     }
 }
 

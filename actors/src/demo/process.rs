@@ -16,8 +16,12 @@ use crate::config::NodeConfig;
 #[derive(Debug)]
 pub(super) struct NodeProcess {
     name: String,
-    child: Child,
+    program: PathBuf,
+    file: PathBuf,
     log: PathBuf,
+    child: Child,
+    starts: u32,
+    killed: bool,
 }
 
 /// How long a node may take to stop.
@@ -30,29 +34,39 @@ impl NodeProcess {
         let (file, log) = (directory.join(format!("{name}.toml")), directory.join(format!("{name}.log")));
         let text = toml::to_string(config).context("the configuration cannot be written as TOML")?;
         fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))?;
-        let output = File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
-        let mut command = Command::new(program);
-        // The node is what its file says, whatever the environment says to others.
-        for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
-            command.env_remove(key);
-        }
-        let child = command
-            .arg("--config")
-            .arg(&file)
-            // The pipe is never written to; it closes with this process, however that ends, and so ends the node.
-            .arg("--stop-at-eof")
-            .stdin(Stdio::piped())
-            .stdout(Stdio::null())
-            .stderr(output)
-            .kill_on_drop(true)
-            .spawn()
-            .with_context(|| format!("cannot start {}", program.display()))?;
-        Ok(Self { name, child, log })
+        File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
+        let child = spawn(program, &file, &log)?;
+        Ok(Self { name, program: program.into(), file, log, child, starts: 1, killed: false })
     }
 
-    /// An error when the process has ended.
+    /// Starts the node again, with its configuration; the log goes on.
+    pub(super) fn restart(&mut self) -> anyhow::Result<()> {
+        self.child = spawn(&self.program, &self.file, &self.log)?;
+        self.starts += 1;
+        self.killed = false;
+        Ok(())
+    }
+
+    /// SIGKILL: the node has no time for farewells.
+    pub(super) async fn kill(&mut self) -> anyhow::Result<()> {
+        self.killed = true;
+        self.child.kill().await.with_context(|| format!("cannot kill node {}", self.name))
+    }
+
+    pub(super) fn is_killed(&self) -> bool {
+        self.killed
+    }
+
+    /// How often the node was started.
+    pub(super) fn starts(&self) -> u32 {
+        self.starts
+    }
+
+    /// An error when the process has ended by itself.
     pub(super) fn check(&mut self) -> anyhow::Result<()> {
-        if let Some(status) = self.child.try_wait()? {
+        if !self.killed
+            && let Some(status) = self.child.try_wait()?
+        {
             let log = fs::read_to_string(&self.log).unwrap_or_default();
             let last = log.lines().last().unwrap_or("nothing logged");
             bail!("node {} ended with {status}: {last}", self.name);
@@ -73,4 +87,25 @@ impl NodeProcess {
             }
         }
     }
+}
+
+fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
+    let output = File::options().append(true).open(log);
+    let output = output.with_context(|| format!("cannot write {}", log.display()))?;
+    let mut command = Command::new(program);
+    // The node is what its file says, whatever the environment says to others.
+    for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+        command.env_remove(key);
+    }
+    command
+        .arg("--config")
+        .arg(file)
+        // The pipe is never written to; it closes with this process, however that ends, and so ends the node.
+        .arg("--stop-at-eof")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(output)
+        .kill_on_drop(true)
+        .spawn()
+        .with_context(|| format!("cannot start {}", program.display()))
 }

@@ -51,6 +51,8 @@ pub(crate) struct Verdict {
     pub(crate) unrecovered: bool,
     /// Whether a component had two leaders at the end of a phase.
     pub(crate) double_leader: bool,
+    /// Whether the reputations after the trial differ from those before; judged by the caller.
+    pub(crate) reputations_changed: bool,
     /// New leaderships beyond those that the faults explain, and expected ones that did not come about.
     pub(crate) false_failovers: u64,
 }

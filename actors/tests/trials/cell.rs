@@ -1,9 +1,8 @@
 //! A cell of real processes, one edge and its vehicles, and what a trial does to it.
 
 use std::collections::BTreeSet;
-use std::fmt::Write as _;
 use std::fs::{self, File};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -17,6 +16,7 @@ use crate::analysis::{Accepted, NodeRun};
 use crate::logs;
 use crate::network::{self, Bridged};
 use crate::process::{Process, command};
+use crate::settings::{DETECTIONS, Ports, configuration, frame};
 
 /// The program under test.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_ecod-node");
@@ -64,6 +64,7 @@ pub(crate) struct Cell {
 #[derive(Debug)]
 struct Node {
     name: NodeName,
+    broker: SocketAddr,
     directory: PathBuf,
     namespace: Option<String>,
     process: Option<Process>,
@@ -106,6 +107,7 @@ impl Cell {
             fs::write(home.join("node.toml"), text)?;
             cell.nodes.push(Node {
                 name: NodeName::new(name)?,
+                broker: address.broker,
                 directory: home,
                 namespace: plan.bridged.then(|| network::namespace(index)),
                 process: None,
@@ -244,6 +246,11 @@ impl Cell {
         self.unreached.map(|node| &self.nodes[node].name)
     }
 
+    /// Where the nodes' brokers listen.
+    pub(crate) fn brokers(&self) -> Vec<SocketAddr> {
+        self.nodes.iter().map(|node| node.broker).collect()
+    }
+
     /// What every run of every process accepted.
     pub(crate) fn runs(&self) -> anyhow::Result<Vec<NodeRun>> {
         let runs = self.nodes.iter().flat_map(|node| (1..=node.runs).map(move |run| (node, run)));
@@ -311,92 +318,4 @@ impl Node {
         let text = fs::read_to_string(self.log()).unwrap_or_default();
         text.lines().last().unwrap_or("nothing logged").to_owned()
     }
-}
-
-/// Where a node's broker listens and where it gossips.
-#[derive(Debug, Clone, Copy)]
-struct Addresses {
-    broker: SocketAddr,
-    gossip: SocketAddr,
-}
-
-/// Hands out ports that are free now, from below those that the system gives to outgoing connections.
-struct Ports {
-    next: u16,
-}
-
-impl Ports {
-    const FIRST: u16 = 18_000;
-    const LAST: u16 = 32_000;
-
-    /// Starts somewhere else in every process.
-    fn new() -> Self {
-        let span = u32::from(Self::LAST - Self::FIRST);
-        Self { next: Self::FIRST + (clock::now().micros() as u32 % span) as u16 }
-    }
-
-    fn free(&mut self) -> anyhow::Result<u16> {
-        for _ in Self::FIRST..Self::LAST {
-            self.next = if self.next >= Self::LAST { Self::FIRST } else { self.next + 1 };
-            let address = (Ipv4Addr::LOCALHOST, self.next);
-            if TcpListener::bind(address).is_ok() && UdpSocket::bind(address).is_ok() {
-                return Ok(self.next);
-            }
-        }
-        bail!("no free port on loopback")
-    }
-
-    fn of(&mut self, node: usize, bridged: bool) -> anyhow::Result<Addresses> {
-        let (ip, broker, gossip) = if bridged {
-            (network::address(node), 1883, 17_884)
-        } else {
-            (Ipv4Addr::LOCALHOST, self.free()?, self.free()?)
-        };
-        Ok(Addresses { broker: (ip, broker).into(), gossip: (ip, gossip).into() })
-    }
-}
-
-/// One object ahead of the vehicle in every frame.
-const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]
-"#;
-
-/// A grey image: the vehicles see by recorded detections, but all else is as with a camera.
-fn frame() -> Vec<u8> {
-    let mut ppm = b"P6 16 16 255\n".to_vec();
-    ppm.extend([128; 16 * 16 * 3]);
-    ppm
-}
-
-/// On loopback the nodes find each other by seeds; where each has a network interface of its own, by multicast.
-fn configuration(
-    plan: &Plan,
-    index: usize,
-    name: &str,
-    own: Addresses,
-    all: &[Addresses],
-    broker: Option<SocketAddr>,
-    shared: &Path,
-) -> String {
-    let role = if index == EDGE { "edge" } else { "auto" };
-    let seeds: Vec<_> = all.iter().take(3).map(|seed| format!("\"{}\"", seed.gossip)).collect();
-    let seeds = if plan.bridged { String::new() } else { seeds.join(", ") };
-    let mut text = format!(
-        "name = \"{name}\"\ncell = \"trial\"\nrole = \"{role}\"\nlisten = \"{}\"\nstate_dir = \"state\"\n\n\
-         [membership]\nkey = \"a key for trials\"\nbind = \"{}\"\nseeds = [{seeds}]\n\n\
-         [membership.multicast]\nenabled = {}\n",
-        own.broker, own.gossip, plan.bridged
-    );
-    if let Some(broker) = broker {
-        let _ = write!(text, "\n[mqtt]\nbroker = \"{broker}\"\nfallback_to_embedded = {}\n", plan.fallback);
-    }
-    if index != EDGE {
-        let (frames, detections) = (shared.join("frames"), shared.join("detections.jsonl"));
-        let _ = write!(
-            text,
-            "\n[camera.source]\nkind = \"images\"\npath = {frames:?}\nlooping = true\n\n\
-             [camera.detector]\nkind = \"recorded\"\npath = {detections:?}\nlooping = true\n\n\
-             [camera.projection.sizes.default]\nwidth_m = 0.5\nheight_m = 0.5\n"
-        );
-    }
-    text + "\n[[landmarks]]\nid = \"ahead\"\nx_m = 6.0\ny_m = 0.0\n"
 }

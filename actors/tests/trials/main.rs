@@ -11,6 +11,8 @@ mod network;
 mod process;
 mod report;
 mod scenario;
+mod settings;
+mod voters;
 
 use std::path::{Path, PathBuf};
 
@@ -22,6 +24,7 @@ use crate::analysis::{Phase, Verdict, judge};
 use crate::cell::{Cell, EDGE, Plan};
 use crate::report::{Outcome, table};
 use crate::scenario::{Cure, Fault, Needs, SCENARIOS, Scenario, Step, Who};
+use crate::voters::Voters;
 
 /// Cell sizes, the edge included.
 const NODES: [usize; 4] = [2, 5, 16, 32];
@@ -105,6 +108,11 @@ async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> 
 
 async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict> {
     cell.settle().await?;
+    let mut voters = if scenario.votes { Some(Voters::connect(cell.brokers()).await?) } else { None };
+    let before = match &mut voters {
+        Some(voters) => Some(voters.vote().await?),
+        None => None,
+    };
     let mut phases = Vec::new();
     for step in scenario.script {
         let from = clock::now();
@@ -112,7 +120,12 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
         tokio::time::sleep(step.watch).await;
         phases.push(phase(step, from, cell));
     }
-    Ok(judge(&cell.runs()?, &phases))
+    let after = voters.as_ref().and_then(Voters::newest);
+    let reputations_changed = match (before, after) {
+        (Some(before), Some(after)) => after.epoch <= before.epoch || after.reputations != before.reputations,
+        (before, after) => before.is_some() || after.is_some(),
+    };
+    Ok(Verdict { reputations_changed, ..judge(&cell.runs()?, &phases) })
 }
 
 fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {

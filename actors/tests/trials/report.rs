@@ -19,6 +19,7 @@ pub(crate) struct Outcome {
     unrecovered: usize,
     double_leader_after_quiet: usize,
     false_failovers: u64,
+    reputations_changed: usize,
     #[serde(skip)]
     gap_bar_ms: Option<u64>,
     #[serde(skip)]
@@ -47,6 +48,7 @@ impl Outcome {
             unrecovered: verdicts.iter().filter(|verdict| verdict.unrecovered).count(),
             double_leader_after_quiet: verdicts.iter().filter(|verdict| verdict.double_leader).count(),
             false_failovers: verdicts.iter().map(|verdict| verdict.false_failovers).sum(),
+            reputations_changed: verdicts.iter().filter(|verdict| verdict.reputations_changed).count(),
             gap_bar_ms: scenario.gap.limit(nodes).map(|limit| limit.as_millis() as u64),
             seamless: scenario.seamless,
         }
@@ -63,6 +65,7 @@ impl Outcome {
             none("unrecovered", self.unrecovered as u64),
             none("double_leader_after_quiet", self.double_leader_after_quiet as u64),
             none("false_failovers", self.false_failovers),
+            none("reputations_changed", self.reputations_changed as u64),
         ];
         gap.into_iter().chain(counts.into_iter().flatten()).collect()
     }
@@ -99,9 +102,10 @@ mod tests {
     use super::*;
     use crate::scenario::SCENARIOS;
 
-    fn outcome(name: &str, verdict: Verdict) -> Outcome {
+    fn outcome(name: &str, mut verdict: Verdict) -> Outcome {
         let scenario = SCENARIOS.iter().find(|scenario| scenario.name == name).unwrap();
-        Outcome::new(scenario, 5, &[Verdict { gap: Some(Duration::from_millis(150)), ..verdict }])
+        verdict.gap = Some(Duration::from_millis(150));
+        Outcome::new(scenario, 5, &[verdict])
     }
 
     #[test]
@@ -131,7 +135,7 @@ mod tests {
         let expected = serde_json::json!([{
             "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "gap_ms": {"p50": 150, "p99": 150, "max": 150},
             "stale_accepted": 0, "missed_rounds": 0, "unrecovered": 0, "double_leader_after_quiet": 0,
-            "false_failovers": 0,
+            "false_failovers": 0, "reputations_changed": 0,
         }]);
         assert_eq!(json, expected);
     }

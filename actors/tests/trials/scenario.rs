@@ -88,6 +88,8 @@ pub(crate) struct Scenario {
     pub(crate) edge: bool,
     pub(crate) script: &'static [Step],
     pub(crate) gap: GapBar,
+    /// Whether vehicles vote beforehand, and what is known of them must not change.
+    pub(crate) votes: bool,
     /// Whether no measured vehicle may miss a round or get one twice.
     pub(crate) seamless: bool,
 }
@@ -111,11 +113,12 @@ const BASE: Scenario = Scenario {
     edge: true,
     script: &[],
     gap: GapBar::None,
+    votes: false,
     seamless: false,
 };
 
 /// All scenarios in the order of running.
-pub(crate) const SCENARIOS: [Scenario; 11] = [
+pub(crate) const SCENARIOS: [Scenario; 12] = [
     Scenario {
         name: "edge_sigkill",
         script: &[measured(Fault::Kill(&[Who::Edge]), 2, (1, 1))],
@@ -147,6 +150,13 @@ pub(crate) const SCENARIOS: [Scenario; 11] = [
         name: "edge_restart",
         script: &[step(Fault::Kill(&[Who::Edge]), 2, (1, 1)), measured(Fault::RestartEdge, 8, (1, 1))],
         seamless: true,
+        ..BASE
+    },
+    Scenario {
+        name: "edge_sigkill_after_votes",
+        script: &[measured(Fault::Kill(&[Who::Edge]), 4, (1, 1))],
+        gap: GapBar::Killed,
+        votes: true,
         ..BASE
     },
     Scenario {

@@ -1,0 +1,120 @@
+//! Vehicles that vote, played by the harness, and the reputations that the cell publishes of them.
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use ecod::names::NodeName;
+use ecod::wire::{NodeState, NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
+use ecod_actors::clock;
+use ecod_actors::gateway::{
+    Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, ReportKind,
+};
+use ractor::{Actor, ActorRef};
+use uuid::Uuid;
+
+use crate::settings::{CELL, LANDMARK};
+
+/// Two agree, one does not.
+const VOTES: [(&str, &str); 3] = [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")];
+
+const VOTING: Duration = Duration::from_secs(4);
+const VOTE_PERIOD: Duration = Duration::from_millis(100);
+
+/// Longer than it takes to settle the last votes, publish what came of them, and tell the other candidates.
+const SETTLING: Duration = Duration::from_secs(4);
+
+/// A connection to every broker of the cell.
+pub(crate) struct Voters {
+    gateway: ActorRef<GatewayMessage>,
+    newest: Arc<Mutex<Option<Arc<Reputations>>>>,
+    seq: u64,
+}
+
+impl Voters {
+    pub(crate) async fn connect(brokers: Vec<SocketAddr>) -> anyhow::Result<Self> {
+        let newest: Arc<Mutex<Option<Arc<Reputations>>>> = Arc::default();
+        let kept = Arc::clone(&newest);
+        let status = NodeStatus {
+            schema: SCHEMA_VERSION,
+            node: NodeName::from_static("voters"),
+            id: Uuid::now_v7(),
+            role: Role::Cav,
+            state: NodeState::Following,
+            epoch: 0,
+            aggregator: None,
+            version: env!("CARGO_PKG_VERSION").into(),
+        };
+        let arguments = GatewayArguments {
+            cell: NodeName::from_static(CELL),
+            part: Part::Follower,
+            status,
+            mqtt: MqttConfig::default(),
+            counters: Arc::default(),
+            subscriber: Arc::new(move |Delivery { message, .. }| {
+                if let Incoming::Reputations(reputations) = message {
+                    keep(&mut lock(&kept), reputations);
+                }
+            }),
+            seed: 1,
+        };
+        let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
+        gateway.cast(GatewayMessage::SetBrokers { addresses: brokers.into_iter().map(Into::into).collect() })?;
+        Ok(Self { gateway, newest, seq: 0 })
+    }
+
+    /// Votes for a while, lets the votes settle, and gives the reputations that came of them.
+    pub(crate) async fn vote(&mut self) -> anyhow::Result<Reputations> {
+        let started = Instant::now();
+        while started.elapsed() < VOTING {
+            self.seq += 1;
+            for (node, label) in VOTES {
+                let report = Arc::new(vote(NodeName::from_static(node), label, self.seq));
+                self.gateway.cast(GatewayMessage::PublishReport { kind: ReportKind::VoteDetections, report })?;
+            }
+            tokio::time::sleep(VOTE_PERIOD).await;
+        }
+        tokio::time::sleep(SETTLING).await;
+        let reputations = self.newest().context("no reputations are published")?;
+        let told = |node| reputations.reputations.get(&NodeName::from_static(node));
+        let unmasked = told("liar").is_some_and(|r| r.incorrect > 0) && told("euclid").is_some_and(|r| r.correct > 0);
+        ensure!(unmasked, "the votes did not become reputations: {reputations:?}");
+        Ok(reputations)
+    }
+
+    /// The reputations of the latest leadership that has published any.
+    pub(crate) fn newest(&self) -> Option<Reputations> {
+        lock(&self.newest).as_deref().cloned()
+    }
+}
+
+impl Drop for Voters {
+    fn drop(&mut self) {
+        self.gateway.stop(None);
+    }
+}
+
+fn keep(newest: &mut Option<Arc<Reputations>>, reputations: Arc<Reputations>) {
+    let order = |r: &Reputations| (r.epoch, r.round);
+    if newest.as_ref().is_none_or(|known| order(known) <= order(&reputations)) {
+        *newest = Some(reputations);
+    }
+}
+
+fn vote(node: NodeName, label: &str, seq: u64) -> ObjectReport {
+    let object = PerceivedObject {
+        label: label.into(),
+        confidence: 0.9,
+        x_m: 6.0,
+        y_m: 0.0,
+        covariance_m2: None,
+        landmark: Some(LANDMARK.into()),
+    };
+    let (schema, captured_at_us) = (SCHEMA_VERSION, clock::now());
+    ObjectReport { schema, node, seq, captured_at_us, pose: None, objects: vec![object], seen: None }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
