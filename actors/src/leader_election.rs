@@ -131,7 +131,7 @@ pub struct LeaderElectionArguments {
     pub counters: Arc<Counters>,
 }
 
-/// Drives an [`Election`].
+/// Drives an [`Election`](ecod::election::Election).
 #[derive(Debug, Default)]
 pub struct LeaderElection;
 
