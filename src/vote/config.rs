@@ -129,7 +129,8 @@ pub struct WeightedConfig {
     pub visibility_at_max_range: f64,
     /// Older landmarks that are judged again per fresh vote, in votes; default 8. More settles sooner, costs more.
     pub revisit_votes: f64,
-    /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 10.
+    /// Weight, in votes, of stated confidences against what they proved to be worth; default 10. More believes them
+    /// for longer.
     pub calibration_votes: f64,
 }
 
