@@ -1,5 +1,7 @@
 //! What a stated confidence is worth, learned from agreement with the other vehicles.
 
+use std::collections::BTreeSet;
+
 const BANDS: usize = 10;
 const STEPS: usize = 20;
 /// Weight, in votes, of the middle rank against a vehicle's own record of confidences.
@@ -75,6 +77,13 @@ impl Calibration {
         scale.total += 1.0;
     }
 
+    /// Forgets which confidences vehicles stated; their numbers may stand for others from now on.
+    pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
+        for &vehicle in vehicles {
+            self.scales.get_mut(vehicle).into_iter().for_each(|scale| *scale = Scale::default());
+        }
+    }
+
     /// Band of a vote: the rank of its confidence among the vehicle's.
     pub(super) fn band(&self, vehicle: usize, confidence: f64) -> usize {
         let (stated, total) = self.scales.get(vehicle).map_or(([0.0; STEPS], 0.0), |s| (s.stated, s.total));
@@ -127,12 +136,7 @@ impl Calibration {
                 band += width;
             }
         }
-        Weights {
-            ratios,
-            votes,
-            mean: self.stated.0 / self.stated.1.max(1.0),
-            prior_votes: self.prior_votes,
-        }
+        Weights { ratios, votes, mean: self.stated.0 / self.stated.1.max(1.0), prior_votes: self.prior_votes }
     }
 }
 

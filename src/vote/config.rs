@@ -29,7 +29,8 @@ pub struct VoteConfig {
     pub weighted: WeightedConfig,
     /// Most landmarks; an open cell forgets the oldest beyond it. Default 1024. Bounds memory.
     pub max_landmarks: usize,
-    /// Most vehicles; reports of others are rejected. Default 256. Bounds memory.
+    /// Most vehicles; beyond it, long silent ones make room, or else reports of others are rejected. Default 256. Bounds
+    /// memory.
     pub max_vehicles: usize,
     /// Most distinct labels of the cell; votes for others are ignored. Default 256. Bounds memory.
     pub max_labels: usize,
