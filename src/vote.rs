@@ -4,8 +4,8 @@
 //! round; [`Vote::refine`] goes over the stored votes again. Equal calls give equal results.
 //!
 //! What is not counted, without error: objects at unknown landmarks of a closed cell, without a landmark, of zero
-//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report whose `seq` and capture time are
-//! not newer than the last of its vehicle is rejected. Of several objects that one report has at one landmark, the most
+//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report of which neither `seq` nor capture
+//! time is newer than the last of its vehicle is rejected, unless the vehicle's clock was set back. Of several objects that one report has at one landmark, the most
 //! confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
 
 mod ballot;
@@ -18,7 +18,8 @@ mod paper;
 mod visibility;
 mod weighted;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
 
 pub use config::{PaperConfig, VoteConfig, VoteMode, WeightedConfig};
 pub use paper::{PaperTally, REPUTATION_RANGE};
@@ -53,7 +54,26 @@ pub struct Round {
 struct Heard {
     seq: u64,
     captured_at: Timestamp,
+    received_at: Timestamp,
     frames: u32,
+}
+
+/// How much older than the last a report can be for having been overtaken; what is older yet is from a clock that was
+/// set back. As long as [`crate::window::ReportWindow`] admits reports by default.
+const MOST_OVERTAKEN: Duration = Duration::from_secs(3);
+/// How long a vehicle must have been silent to be forgotten for another, unproven or proven.
+const RETENTION: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(600)];
+/// Part of the vehicles that is forgotten at once when room is short, so that the cost per newcomer stays small.
+const FORGOTTEN_AT_ONCE: usize = 8;
+
+impl Heard {
+    /// Whether `report` was made later. A restarted node counts from the start again, but time goes on; a clock that is
+    /// set right may go back, but counting goes on; if both happen, only the size of the step tells.
+    fn is_before(&self, report: &ObjectReport) -> bool {
+        report.captured_at_us > self.captured_at
+            || report.seq > self.seq
+            || self.captured_at.since(report.captured_at_us) > MOST_OVERTAKEN
+    }
 }
 
 /// The voting machine of a cell.
@@ -94,17 +114,19 @@ impl Vote {
     pub fn observe(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
         report.validate(&Limits::default())?;
         let frames = match self.heard.get(&report.node) {
-            // A restarted node counts from the start again, but time goes on.
-            Some(last) if report.captured_at_us < last.captured_at => return Err(RejectReason::OutOfOrder),
-            Some(last) if report.captured_at_us == last.captured_at && report.seq <= last.seq => {
-                return Err(RejectReason::OutOfOrder);
+            Some(last) if last.is_before(report) => last.frames,
+            Some(_) => return Err(RejectReason::OutOfOrder),
+            None => {
+                self.make_room(received_at)?;
+                0
             }
-            Some(last) if report.seq == last.seq => return Err(RejectReason::OutOfOrder),
-            Some(last) => last.frames,
-            None if self.heard.len() >= self.config.max_vehicles => return Err(RejectReason::TooManyVehicles),
-            None => 0,
         };
-        let heard = Heard { seq: report.seq, captured_at: report.captured_at_us, frames: frames.saturating_add(1) };
+        let heard = Heard {
+            seq: report.seq,
+            captured_at: report.captured_at_us,
+            received_at,
+            frames: frames.saturating_add(1),
+        };
         self.heard.insert(report.node.clone(), heard);
         let mut objects: Vec<&PerceivedObject> = report.objects.iter().collect();
         if matches!(self.tally, Tally::Weighted(_)) {
@@ -115,6 +137,32 @@ impl Vote {
             if !self.count(report, object, pose, received_at) {
                 self.ignored += 1;
             }
+        }
+        Ok(())
+    }
+
+    /// Forgets vehicles that have been silent if there are as many as there may be: unproven ones before proven ones,
+    /// the longest silent first.
+    fn make_room(&mut self, now: Timestamp) -> Result<(), RejectReason> {
+        if self.heard.len() < self.config.max_vehicles {
+            return Ok(());
+        }
+        let standing = |(node, last): (&NodeName, &Heard)| {
+            let is_proven = matches!(&self.tally, Tally::Weighted(tally) if tally.is_proven(node));
+            (is_proven, last.received_at, node.clone())
+        };
+        let mut silent: Vec<_> = self.heard.iter().map(standing).collect();
+        silent.retain(|(is_proven, last, _)| now.since(*last) >= RETENTION[usize::from(*is_proven)]);
+        silent.sort();
+        silent.truncate(self.config.max_vehicles.div_ceil(FORGOTTEN_AT_ONCE));
+        let nodes: BTreeSet<NodeName> = silent.into_iter().map(|(.., node)| node).collect();
+        if nodes.is_empty() {
+            return Err(RejectReason::TooManyVehicles);
+        }
+        self.heard.retain(|node, _| !nodes.contains(node));
+        match &mut self.tally {
+            Tally::Paper(tally) => tally.forget_vehicles(&nodes),
+            Tally::Weighted(tally) => tally.forget_vehicles(&nodes),
         }
         Ok(())
     }

@@ -298,6 +298,73 @@ fn four_of_nine_that_copy_one_wrong_label_are_found_out() {
     assert!((4..9).all(|v| reputations[&name(&format!("v{v}"))].score > 0.6));
 }
 
+#[test]
+fn names_used_up_do_not_lock_newcomers_out() {
+    let mut vote = Vote::new(VoteConfig { max_vehicles: 8, ..VoteConfig::default() }, Vec::new());
+    let minute = |n: u64| START + Duration::from_secs(60 * n);
+    let mut round = |n: u64, node: &str, label: &str| {
+        let at = minute(n);
+        let result = vote.observe(&report(node, n, at, &[("x", label, 0.9)]), at);
+        if node == "c" {
+            vote.close(at);
+        }
+        (result, vote.reputations().keys().cloned().collect::<Vec<_>>())
+    };
+    for n in 0..20 {
+        for node in ["a", "b", "c"] {
+            round(n, node, "cup").0.unwrap();
+        }
+    }
+    // One minute later each, an attacker comes under one name after the other.
+    for n in 20..60 {
+        round(n, &format!("new-{n}"), "mouse").0.unwrap();
+    }
+    let (_, known) = round(60, "newcomer", "cup");
+    assert!(
+        known.len() <= 8 && ["a", "b", "c", "newcomer"].iter().all(|node| known.contains(&name(node))),
+        "{known:?}"
+    );
+    // All at once, they must wait for silence.
+    let last = (0..9).map(|n| round(61, &format!("rush-{n}"), "mouse").0).last();
+    assert_eq!(last, Some(Err(RejectReason::TooManyVehicles)));
+}
+
+#[test]
+fn a_number_that_a_forgotten_vehicle_leaves_carries_nothing_of_it() {
+    let config = VoteConfig { max_vehicles: 3, ..VoteConfig::default() };
+    let mut vote = Vote::new(config, Vec::new());
+    for n in 0..50 {
+        let at = START + Duration::from_secs(3 * n);
+        for (node, label) in [("liar", "mouse"), ("a", "cup"), ("b", "cup")].into_iter().skip(usize::from(n == 49)) {
+            vote.observe(&report(node, n, at, &[("x", label, 0.9)]), at).unwrap();
+        }
+        vote.close(at);
+    }
+    let at = START + Duration::from_secs(1000);
+    for (node, label) in [("fresh", "cup"), ("a", "cup"), ("b", "cup")] {
+        vote.observe(&report(node, 99, at, &[("x", label, 0.9)]), at).unwrap();
+    }
+    vote.close(at);
+    let reputations = vote.reputations();
+    assert_eq!(reputations.len(), 3);
+    let fresh = &reputations[&name("fresh")];
+    assert!(fresh.incorrect == 0 && fresh.score > 0.5, "{fresh:?}");
+}
+
+#[test]
+fn a_vehicle_whose_clock_is_set_back_goes_on_voting() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    let at = |s: u64| START + Duration::from_secs(s);
+    vote.observe(&report("a", 7, at(3600), &[("x", "cup", 0.9)]), at(0)).unwrap();
+    vote.observe(&report("a", 8, at(1), &[("x", "mouse", 0.9)]), at(1)).unwrap();
+    assert_eq!(vote.close(at(1)).verdicts[0].label.as_deref(), Some("mouse"));
+    // Restarted besides, it also counts from the start.
+    vote.observe(&report("b", 7, at(3600), &[("y", "cup", 0.9)]), at(1)).unwrap();
+    vote.observe(&report("b", 1, at(1), &[("y", "mouse", 0.9)]), at(1)).unwrap();
+    let verdicts = vote.close(at(1)).verdicts;
+    assert_eq!(verdicts.iter().find(|v| v.landmark.as_str() == "y").unwrap().label.as_deref(), Some("mouse"));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]

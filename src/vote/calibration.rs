@@ -1,11 +1,16 @@
 //! What a stated confidence is worth, learned from agreement with the other vehicles.
 
+use std::collections::BTreeSet;
+
 const BANDS: usize = 10;
 const STEPS: usize = 20;
 /// Weight, in votes, of the middle rank against a vehicle's own record of confidences.
 const RANK_PRIOR_VOTES: f64 = 5.0;
 /// Weight, in votes, of the overall rate of agreement against a band's own.
 const BAND_PRIOR_VOTES: f64 = 100.0;
+/// Spread of pooled bands, in variances of one vote, that is not taken for knowledge: three times what ten equal bands
+/// come to by chance, 1/2 + … + 1/10 (Barlow et al. 1972).
+const NOISE: f64 = 6.0;
 /// Votes over which the memory of what confidences are worth fades to 1/e.
 const MEMORY_VOTES: f64 = 20_000.0;
 /// Least and most that a vote weighs for its confidence.
@@ -42,8 +47,9 @@ struct Scale {
 /// How good a vehicle is on the whole is its reputation; its confidence tells which of its votes are the better ones.
 /// So a vote's band is the rank of its confidence among all of the vehicle's. Its weight is the log-odds of being right
 /// in that band against the log-odds over all bands, made non-decreasing by pooling adjacent violators (Barlow et al.
-/// 1972; Zadrozny & Elkan 2002): confidence that misleads ends up weighing nothing. Until a band has evidence, the
-/// weight is the stated confidence against the mean of all.
+/// 1972; Zadrozny & Elkan 2002): confidence that misleads ends up weighing nothing. Of what then differs between bands
+/// only the part beyond chance is kept (James & Stein 1961): confidence that says nothing ends up so too. Until there is
+/// evidence, the weight is the stated confidence against the mean of all.
 #[derive(Debug, Clone)]
 pub(super) struct Calibration {
     live: Bands,
@@ -69,6 +75,13 @@ impl Calibration {
         let scale = &mut self.scales[vehicle];
         scale.stated[step(confidence)] += 1.0;
         scale.total += 1.0;
+    }
+
+    /// Forgets which confidences vehicles stated; their numbers may stand for others from now on.
+    pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
+        for &vehicle in vehicles {
+            self.scales.get_mut(vehicle).into_iter().for_each(|scale| *scale = Scale::default());
+        }
     }
 
     /// Band of a vote: the rank of its confidence among the vehicle's.
@@ -115,18 +128,15 @@ impl Calibration {
         let mut ratios = [1.0; BANDS];
         if overall > 0.1 {
             let mut band = 0;
-            for (agreed, votes, width) in pooled(&bands) {
-                let ratio = shrunk(agreed, votes) / overall;
+            let pools = pooled(&bands);
+            let kept = beyond_noise(&pools);
+            for (agreed, votes, width) in pools {
+                let ratio = 1.0 + kept * (shrunk(agreed, votes) / overall - 1.0);
                 ratios[band..band + width].fill(ratio.clamp(WEIGHT_RANGE.0, WEIGHT_RANGE.1));
                 band += width;
             }
         }
-        Weights {
-            ratios,
-            votes: bands.votes,
-            mean: self.stated.0 / self.stated.1.max(1.0),
-            prior_votes: self.prior_votes,
-        }
+        Weights { ratios, votes, mean: self.stated.0 / self.stated.1.max(1.0), prior_votes: self.prior_votes }
     }
 }
 
@@ -146,6 +156,16 @@ fn pooled(bands: &Bands) -> Vec<(f64, f64, usize)> {
     pools
 }
 
+/// Part of the difference between pools that is kept: James–Stein shrinkage (positive part) towards one rate for all.
+fn beyond_noise(pools: &[(f64, f64, usize)]) -> f64 {
+    let with_votes = || pools.iter().filter(|(_, votes, _)| *votes > 0.0);
+    let (agreed, votes) = with_votes().fold((0.0, 0.0), |(a, n), (agreed, votes, _)| (a + agreed, n + votes));
+    let rate = agreed / f64::max(votes, 1e-9);
+    let spread: f64 = with_votes().map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2)).sum();
+    let noise = NOISE * rate * (1.0 - rate);
+    if spread > noise { 1.0 - noise / spread } else { 0.0 }
+}
+
 fn odds(rate: f64) -> f64 {
     let rate = rate.clamp(1e-6, 1.0 - 1e-6);
     (rate / (1.0 - rate)).ln()
@@ -159,7 +179,7 @@ fn step(confidence: f64) -> usize {
 #[derive(Debug, Clone)]
 pub(super) struct Weights {
     ratios: [f64; BANDS],
-    votes: [f64; BANDS],
+    votes: f64,
     mean: f64,
     prior_votes: f64,
 }
@@ -167,7 +187,7 @@ pub(super) struct Weights {
 impl Weights {
     /// Weight of a vote of the stated confidence; 1 when all votes have the same confidence.
     pub(super) fn of(&self, band: usize, confidence: f64) -> f64 {
-        let n = self.votes[band];
+        let n = self.votes;
         let (low, high) = WEIGHT_RANGE;
         let stated = if self.mean > 0.0 { (confidence / self.mean).clamp(low, high) } else { 1.0 };
         (n * self.ratios[band] + self.prior_votes * stated) / (n + self.prior_votes)
@@ -215,6 +235,16 @@ mod tests {
         let calibration = learned((0..4000).map(|n| if n % 2 == 0 { (0, 0.9, n % 4 == 0) } else { (0, 0.4, true) }));
         let (high, low) = (weight(&calibration, 0, 0.9), weight(&calibration, 0, 0.4));
         assert!((high - 1.0).abs() < 0.05 && (low - 1.0).abs() < 0.05, "{high} {low}");
+    }
+
+    #[test]
+    fn confidence_that_says_nothing_weighs_nothing() {
+        // Agreement and confidence repeat with periods that have no common factor.
+        let calibration = learned((0..2000).map(|n| (0, f64::from(n % 19) / 19.0 + 0.02, n % 7 > 1)));
+        for step in 0..19 {
+            let weight = weight(&calibration, 0, f64::from(step) / 19.0 + 0.02);
+            assert!((weight - 1.0).abs() < 0.02, "{weight}");
+        }
     }
 
     #[test]

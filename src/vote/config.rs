@@ -29,7 +29,8 @@ pub struct VoteConfig {
     pub weighted: WeightedConfig,
     /// Most landmarks; an open cell forgets the oldest beyond it. Default 1024. Bounds memory.
     pub max_landmarks: usize,
-    /// Most vehicles; reports of others are rejected. Default 256. Bounds memory.
+    /// Most vehicles; beyond it, long silent ones make room, or else reports of others are rejected. Default 256. Bounds
+    /// memory.
     pub max_vehicles: usize,
     /// Most distinct labels of the cell; votes for others are ignored. Default 256. Bounds memory.
     pub max_labels: usize,
@@ -129,7 +130,8 @@ pub struct WeightedConfig {
     pub visibility_at_max_range: f64,
     /// Older landmarks that are judged again per fresh vote, in votes; default 8. More settles sooner, costs more.
     pub revisit_votes: f64,
-    /// Weight, in votes, of a stated confidence against what its band proved to be worth; default 10.
+    /// Weight, in votes, of stated confidences against what they proved to be worth; default 10. More believes them
+    /// for longer.
     pub calibration_votes: f64,
 }
 

@@ -9,14 +9,18 @@
 //! Two groups that contradict each other could each be the honest one. The group that more *vehicles* belong to is
 //! taken for it, however closely the others agree: that is what bounds the number of liars at fewer than half.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::confusion::LabelIndex;
 
 /// Most others on a landmark that a vote is compared with; bounds the cost of a vote.
 const MOST_COMPARED: usize = 8;
+/// The same over stored votes.
+const MOST_COMPARED_STORED: usize = 32;
 /// Standard deviations by which agreement must exceed what is explained.
 const SIGNIFICANCE: f64 = 4.0;
+/// The same over stored votes: all of a pair's count, and many pairs are tested at once (one in 3 million by chance).
+const SIGNIFICANCE_STORED: f64 = 5.0;
 /// Agreement κ from which two vehicles belong to one group as much as they can: more closeness earns no more say.
 const SAME_GROUP: f64 = 0.3;
 /// Weight, in comparisons, of doubt about two vehicles' agreement and of the typical reliability against a vehicle's.
@@ -43,10 +47,10 @@ impl Pair {
     }
 
     /// The part ρ of a vote that is not its own where κ = `explained` is expected.
-    fn excess(&self, explained: f64) -> f64 {
+    fn excess(&self, explained: f64, significance: f64) -> f64 {
         let expected = self.chance + (self.met - self.chance) * explained;
         let deviation = (expected * (1.0 - expected / self.met).max(0.0) + 1.0).sqrt();
-        if self.agreed - expected > SIGNIFICANCE * deviation {
+        if self.agreed - expected > significance * deviation {
             ((self.kappa() - explained) / (1.0 - explained)).clamp(0.0, 1.0)
         } else {
             0.0
@@ -67,6 +71,8 @@ pub(super) struct Groups {
 #[derive(Debug, Clone)]
 pub(super) struct Dependence {
     memory: f64,
+    most_compared: usize,
+    significance: f64,
     pairs: BTreeMap<(usize, usize), Pair>,
     stated: Vec<f64>,
     total: f64,
@@ -83,6 +89,8 @@ impl Dependence {
     pub(super) fn new(memory: f64) -> Self {
         Self {
             memory,
+            most_compared: MOST_COMPARED,
+            significance: SIGNIFICANCE,
             pairs: BTreeMap::new(),
             stated: Vec::new(),
             total: 0.0,
@@ -90,6 +98,22 @@ impl Dependence {
             compared: 0,
             tenure: Vec::new(),
             partners: Vec::new(),
+        }
+    }
+
+    /// As [`Self::new`], for all stored votes together: nothing fades.
+    pub(super) fn of_stored() -> Self {
+        let (most_compared, significance) = (MOST_COMPARED_STORED, SIGNIFICANCE_STORED);
+        Self { most_compared, significance, ..Self::new(f64::INFINITY) }
+    }
+
+    /// Forgets vehicles; their numbers may stand for others from now on.
+    pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
+        self.pairs.retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
+        self.partners.iter_mut().for_each(|partners| partners.retain(|(other, _)| !vehicles.contains(other)));
+        for &vehicle in vehicles {
+            self.tenure.get_mut(vehicle).into_iter().for_each(|tenure| *tenure = 0.0);
+            self.partners.get_mut(vehicle).into_iter().for_each(Vec::clear);
         }
     }
 
@@ -102,7 +126,7 @@ impl Dependence {
             self.tenure[vehicle] += f64::from(is_new);
         }
         let distances = votes.len() / 2;
-        for step in 0..distances.min(MOST_COMPARED) {
+        for step in 0..distances.min(self.most_compared) {
             let distance = 1 + (self.compared / votes.len() + step) % distances;
             let half_turn = 2 * distance == votes.len();
             for place in 0..if half_turn { distance } else { votes.len() } {
@@ -169,7 +193,7 @@ impl Dependence {
         for _ in 0..FACTOR_STEPS {
             factors = next_factors(&factors, &belonging, &pairs, &rhos);
             for (rho, (one, other, pair)) in rhos.iter_mut().zip(&pairs) {
-                *rho = pair.excess(factors[*one] * factors[*other]);
+                *rho = pair.excess(factors[*one] * factors[*other], self.significance);
             }
         }
         self.partners = vec![Vec::new(); vehicles];

@@ -215,7 +215,7 @@ impl Model {
         candidates.iter().zip(logs).map(|(&label, p)| (label, p / total)).collect()
     }
 
-    fn is_newcomer(&self, vehicle: usize) -> bool {
+    pub(super) fn is_newcomer(&self, vehicle: usize) -> bool {
         self.witnesses[vehicle].evidence() < self.config.probation_votes
     }
 

@@ -51,6 +51,11 @@ impl PaperTally {
         self.scores.remove(landmark);
     }
 
+    /// Forgets vehicles' reputations; what they said stays in the sums.
+    pub fn forget_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
+        self.vehicles.retain(|node, _| !nodes.contains(node));
+    }
+
     /// Adds r_v · c_ω · k for one detection.
     pub fn add(&mut self, landmark: &LandmarkId, node: &NodeName, label: &Label, confidence: f64, visibility: f64) {
         let vehicle = self.vehicles.entry(node.clone()).or_insert_with(|| Vehicle::new(&self.config));

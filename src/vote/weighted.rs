@@ -1,5 +1,7 @@
 //! The default tally: learned reputation × calibrated confidence × visibility.
 
+mod refine;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
@@ -24,6 +26,8 @@ pub(super) struct WeightedTally {
     dependence: Dependence,
     vehicles: BTreeMap<NodeName, usize>,
     names: Vec<NodeName>,
+    /// Numbers of forgotten vehicles.
+    free: Vec<usize>,
     records: Vec<(u64, u64)>,
     labels: Vec<Label>,
     label_numbers: BTreeMap<Label, LabelIndex>,
@@ -44,6 +48,7 @@ impl WeightedTally {
             config,
             vehicles: BTreeMap::new(),
             names: Vec::new(),
+            free: Vec::new(),
             records: Vec::new(),
             labels: Vec::new(),
             label_numbers: BTreeMap::new(),
@@ -68,8 +73,36 @@ impl WeightedTally {
         self.touched.remove(landmark);
     }
 
+    /// Whether a vehicle has voted often enough to be trusted on its own.
+    pub(super) fn is_proven(&self, node: &NodeName) -> bool {
+        self.vehicles.get(node).is_some_and(|&vehicle| !self.model.is_newcomer(vehicle))
+    }
+
+    /// Forgets vehicles with their votes and all that is known of them; others take their numbers.
+    pub(super) fn forget_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
+        let gone: BTreeSet<usize> = nodes.iter().filter_map(|node| self.vehicles.remove(node)).collect();
+        let is_theirs = |cast: &Cast| gone.contains(&cast.vehicle);
+        let landmarks: Vec<_> =
+            self.ballots.iter().filter(|(_, b)| b.casts.iter().any(is_theirs)).map(|(l, _)| l.clone()).collect();
+        for landmark in landmarks {
+            self.retire(&landmark, is_theirs);
+        }
+        self.dependence.forget(&gone);
+        self.calibration.forget(&gone);
+        for &vehicle in &gone {
+            self.records[vehicle] = (0, 0);
+            self.model.witnesses[vehicle] = Witness::default();
+        }
+        self.free.extend(gone);
+    }
+
     fn vehicle(&mut self, node: &NodeName) -> usize {
         if let Some(&vehicle) = self.vehicles.get(node) {
+            return vehicle;
+        }
+        if let Some(vehicle) = self.free.pop() {
+            self.vehicles.insert(node.clone(), vehicle);
+            self.names[vehicle] = node.clone();
             return vehicle;
         }
         let vehicle = self.names.len();
@@ -267,51 +300,6 @@ impl WeightedTally {
             self.revisit_after = Some(landmark);
         }
         changed
-    }
-
-    /// Judges all stored votes `passes` times over, starting from majorities (Dawid & Skene 1979).
-    pub(super) fn refine(&mut self, passes: u32) {
-        let mut dependence = Dependence::new(self.config.pair_memory_votes);
-        let mut calibration = Calibration::new(self.config.calibration_votes);
-        let mut by_name = vec![0; self.names.len()];
-        self.vehicles.values().enumerate().for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
-        for ballot in self.ballots.values_mut() {
-            ballot.casts.iter_mut().for_each(|cast| cast.compared = false);
-            ballot.compare(&mut dependence, &mut calibration, |vehicle| by_name[vehicle]);
-        }
-        dependence.fit(&vec![true; self.names.len()]);
-        self.start_from_majorities(&dependence, &calibration);
-        for _ in 0..passes {
-            self.model.prepare(0..self.names.len());
-            let weights = calibration.weights();
-            for ballot in self.ballots.values_mut() {
-                ballot.weigh(&dependence, &calibration, &weights);
-                ballot.posterior = self.model.posterior(&ballot.words(), &ballot.candidates());
-            }
-            calibration.clear_live();
-            self.ballots.values_mut().for_each(|ballot| ballot.agree(&self.model, &mut calibration));
-            self.model.clear_live();
-            for ballot in self.ballots.values_mut() {
-                self.model.count(&ballot.words(), &ballot.posterior, 1.0);
-                ballot.shown = None;
-                ballot.show(0.0);
-            }
-        }
-        self.calibration.take_live(calibration);
-    }
-
-    fn start_from_majorities(&mut self, dependence: &Dependence, calibration: &Calibration) {
-        let weights = calibration.weights();
-        self.model.clear_live();
-        self.calibration.clear_live();
-        for ballot in self.ballots.values_mut() {
-            ballot.shown = None;
-            ballot.counted = true;
-            ballot.weigh(dependence, calibration, &weights);
-            ballot.casts.iter_mut().for_each(|cast| cast.agreement = None);
-            ballot.posterior = ballot.majority();
-            self.model.count(&ballot.words(), &ballot.posterior, 1.0);
-        }
     }
 
     pub(super) fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
