@@ -4,9 +4,9 @@
 //! round; [`Vote::refine`] goes over the stored votes again. Equal calls give equal results.
 //!
 //! What is not counted, without error: objects at unknown landmarks of a closed cell, without a landmark, of zero
-//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report whose `seq` and capture time are
-//! not newer than the last of its vehicle is rejected. Of several objects that one report has at one landmark, the most
-//! confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
+//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report that was captured before the last of
+//! its vehicle, or with it and has no higher `seq`, is rejected. Of several objects that one report has at one landmark,
+//! the most confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
 
 mod ballot;
 mod calibration;
@@ -95,11 +95,9 @@ impl Vote {
         report.validate(&Limits::default())?;
         let frames = match self.heard.get(&report.node) {
             // A restarted node counts from the start again, but time goes on.
-            Some(last) if report.captured_at_us < last.captured_at => return Err(RejectReason::OutOfOrder),
-            Some(last) if report.captured_at_us == last.captured_at && report.seq <= last.seq => {
+            Some(last) if (report.captured_at_us, report.seq) <= (last.captured_at, last.seq) => {
                 return Err(RejectReason::OutOfOrder);
             }
-            Some(last) if report.seq == last.seq => return Err(RejectReason::OutOfOrder),
             Some(last) => last.frames,
             None if self.heard.len() >= self.config.max_vehicles => return Err(RejectReason::TooManyVehicles),
             None => 0,

@@ -23,7 +23,7 @@ use ecod::testbed::{Cav, Recording};
 use ecod::time::Timestamp;
 use ecod::view::ViewConfig;
 use ecod::vote::{VoteConfig, VoteMode};
-use ecod::wire::{ObjectReport, RejectReason, ReportKind};
+use ecod::wire::{ObjectReport, ReportKind};
 use nalgebra::Point2;
 use serde::Serialize;
 use serde_json::json;
@@ -198,9 +198,8 @@ fn vote(recording: &Recording, reports: &[ObjectReport], mode: VoteMode) -> anyh
     }
     let (mut rest, summary) = replay.finish();
     fused.append(&mut rest);
-    if let Some((reason, count)) = summary.rejected.first_key_value() {
-        let reason: &RejectReason = reason;
-        anyhow::bail!("{count} reports were rejected: {reason}");
+    if let Some((reason, rejections)) = summary.rejected.first_key_value() {
+        anyhow::bail!("{} reports were rejected: {reason}", rejections.lines);
     }
     let index = LandmarkIndex::new(landmarks, GATE.radius_m);
     let mut evaluation = Evaluation::new(truth(recording)?).with_landmarks(index, GATE);
