@@ -6,8 +6,8 @@
 //! The machine behind it is the [`Aggregator`] of a live node.
 //!
 //! A line that is ahead of most of the [`LOOKAHEAD`] lines after it, by more than clocks may differ, does not move the time
-//! and is rejected: one vehicle with a wrong clock must not make all others stale. A silence costs at most ten seconds'
-//! rounds; then time goes on at the next line. Memory is bounded by the cell and not by the recording.
+//! and, without passes, is rejected: one vehicle with a wrong clock must not make all others stale. A silence costs at
+//! most ten seconds' rounds; then time goes on at the next line. Memory is bounded by the cell and not by the recording.
 
 mod clock;
 mod line;
@@ -53,8 +53,8 @@ pub struct ReplayConfig {
     pub landmarks: Vec<Landmark>,
     /// Bounds of a line.
     pub limits: Limits,
-    /// Go over the stored votes so many times at the end and write only the verdicts of the last pass. Time plays no
-    /// part then, but for which vote of a vehicle at a location is its last: that one counts.
+    /// Go over the stored votes so many times at the end and write only the verdicts of the last pass. Times play no
+    /// part then: of each vehicle, the vote that comes last in the recording counts at each location.
     pub passes: Option<u32>,
 }
 
@@ -129,7 +129,6 @@ impl Replay {
         if config.passes.is_some() {
             let FusionConfig { algorithms, window, vote, .. } = &mut config.fusion;
             *algorithms = Algorithms::Vote;
-            (window.max_age_s, window.max_clock_offset_s) = (FOREVER_S, FOREVER_S);
             (vote.weighted.freshness_s, vote.weighted.hysteresis) = (FOREVER_S, 0.0);
             vote.max_landmarks = MAX_VOTED_ON;
             vote.max_vehicles = vote.max_vehicles.max(window.max_vehicles);
@@ -196,14 +195,18 @@ impl Replay {
     /// Takes the oldest of the lines that were read ahead.
     fn next(&mut self) -> Vec<FusedLine> {
         let mut output = Vec::new();
-        let Some((number, line)) = self.ahead.pop_front() else { return output };
-        if !self.clock.is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at)) {
+        let Some((number, mut line)) = self.ahead.pop_front() else { return output };
+        let is_plausible = self.clock.is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at));
+        if !is_plausible && self.config.passes.is_none() {
             self.reject(number, RejectReason::FromTheFuture);
             return output;
         }
         let before = self.clock.now();
-        let is_late = self.clock.advance(line.at);
+        let is_late = is_plausible && self.clock.advance(line.at);
         let now = self.clock.now();
+        if self.config.passes.is_some() {
+            (line.report.captured_at_us, line.report.seq) = (now, number);
+        }
         self.catch_up(before, now, &mut output);
         self.learn(&line);
         match self.cell(now).report(line.kind, &line.report, now) {

@@ -189,7 +189,8 @@ fn with_passes_neither_time_nor_the_number_of_vehicles_keeps_a_vote_out() {
     };
     let by_step: Vec<_> = (0..10).flat_map(|step| (0..300).map(move |vehicle| votes(vehicle, step))).collect();
     let by_vehicle = (0..300).flat_map(|vehicle| (0..10).map(move |step| votes(vehicle, step)));
-    let (output, summary) = replay(config.clone(), by_vehicle);
+    let backwards = by_vehicle.collect::<Vec<_>>().into_iter().rev();
+    let (output, summary) = replay(config.clone(), backwards);
     assert_eq!((rejected(&summary), output.len()), (vec![], 1));
     assert_eq!(verdict_labels(&output), verdict_labels(&replay(config, &by_step).0));
     assert_eq!(verdict_labels(&output).len(), 10);
