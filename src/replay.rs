@@ -6,8 +6,8 @@
 //! The machine behind it is the [`Aggregator`] of a live node.
 //!
 //! A line that is ahead of most of the [`LOOKAHEAD`] lines after it, by more than clocks may differ, does not move the time
-//! and is rejected: one vehicle with a wrong clock must not make all others stale. A silence costs at most ten seconds'
-//! rounds; then time goes on at the next line. Memory is bounded by the cell and not by the recording.
+//! and, without passes, is rejected: one vehicle with a wrong clock must not make all others stale. A silence costs at
+//! most ten seconds' rounds; then time goes on at the next line. Memory is bounded by the cell and not by the recording.
 
 mod clock;
 mod line;
@@ -33,6 +33,12 @@ pub const LOOKAHEAD: usize = 64;
 /// Most locations that an open cell learns for PACE; they are never forgotten.
 const MAX_LEARNT: usize = 4096;
 
+/// Most locations that an open cell keeps for VOTE unless its configuration says otherwise: nobody floods a file.
+const MAX_VOTED_ON: usize = 1_000_000;
+
+/// Longer than any recording, in seconds.
+const FOREVER_S: f64 = 1e12;
+
 /// Silence that is replayed round by round, at least.
 const SILENCE: Duration = Duration::from_secs(10);
 
@@ -47,16 +53,19 @@ pub struct ReplayConfig {
     pub landmarks: Vec<Landmark>,
     /// Bounds of a line.
     pub limits: Limits,
-    /// Go over the stored votes so many times at the end and write only the verdicts of the last pass. Votes do not
-    /// grow stale then, and the last one of each vehicle at each location counts.
+    /// Go over the stored votes so many times at the end and write only the verdicts of the last pass. Times play no
+    /// part then: of each vehicle, the vote that comes last in the recording counts at each location.
     pub passes: Option<u32>,
 }
 
 impl Default for ReplayConfig {
     fn default() -> Self {
+        let mut fusion = FusionConfig::default();
+        fusion.vote.max_landmarks = MAX_VOTED_ON;
+        fusion.vote.max_vehicles = fusion.window.max_vehicles;
         Self {
             aggregator: NodeName::from_static("replay"),
-            fusion: FusionConfig::default(),
+            fusion,
             landmarks: Vec::new(),
             limits: Limits::default(),
             passes: None,
@@ -70,7 +79,7 @@ pub struct Summary {
     /// Lines that are not blank.
     pub lines: u64,
     /// Lines that were not used, by reason.
-    pub rejected: BTreeMap<RejectReason, u64>,
+    pub rejected: BTreeMap<RejectReason, Rejections>,
     /// Lines that were used and whose own time is before that of a line before them.
     pub late: u64,
     /// Objects of used lines that voted for nothing; see [`crate::vote`].
@@ -82,8 +91,17 @@ pub struct Summary {
 impl Summary {
     /// Lines that were used.
     pub fn used(&self) -> u64 {
-        self.lines - self.rejected.values().sum::<u64>()
+        self.lines - self.rejected.values().map(|rejections| rejections.lines).sum::<u64>()
     }
+}
+
+/// Lines that were not used for one reason.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Rejections {
+    /// How many.
+    pub lines: u64,
+    /// Number of the first in the input, from 1, blank lines included.
+    pub first_line: u64,
 }
 
 /// Replays a recording; see the module.
@@ -91,7 +109,8 @@ impl Summary {
 pub struct Replay {
     config: ReplayConfig,
     clock: VirtualClock,
-    ahead: VecDeque<Line>,
+    /// Lines that were read ahead, with their numbers.
+    ahead: VecDeque<(u64, Line)>,
     cell: Option<Aggregator>,
     /// By kind, whether any report came.
     heard: [bool; ReportKind::COUNT],
@@ -99,6 +118,8 @@ pub struct Replay {
     learnt: HashSet<LandmarkId>,
     /// Whether a report waits for its round to close.
     pending: bool,
+    /// Number of the newest line, blank ones included.
+    number: u64,
     summary: Summary,
 }
 
@@ -106,11 +127,11 @@ impl Replay {
     /// A cell that has heard nothing; `config` is taken as valid.
     pub fn new(mut config: ReplayConfig) -> Self {
         if config.passes.is_some() {
-            let vote = &mut config.fusion.vote;
-            config.fusion.algorithms = Algorithms::Vote;
-            vote.weighted.freshness_s = 1e12;
-            vote.weighted.hysteresis = 0.0;
-            vote.max_landmarks = vote.max_landmarks.max(1_000_000);
+            let FusionConfig { algorithms, window, vote, .. } = &mut config.fusion;
+            *algorithms = Algorithms::Vote;
+            (vote.weighted.freshness_s, vote.weighted.hysteresis) = (FOREVER_S, 0.0);
+            vote.max_landmarks = MAX_VOTED_ON;
+            vote.max_vehicles = vote.max_vehicles.max(window.max_vehicles);
         }
         Self {
             clock: VirtualClock::new(config.fusion.window.max_clock_offset_s),
@@ -120,27 +141,30 @@ impl Replay {
             heard: [false; ReportKind::COUNT],
             learnt: HashSet::new(),
             pending: false,
+            number: 0,
             summary: Summary::default(),
         }
     }
 
     /// Takes the next line, without its end; returns what has come of the lines so far. Blank lines are passed over.
     pub fn line(&mut self, text: &[u8]) -> Vec<FusedLine> {
+        self.number += 1;
         if text.trim_ascii().is_empty() {
             return Vec::new();
         }
         self.summary.lines += 1;
         match Line::read(text, &self.config.limits) {
-            Ok(line) => self.ahead.push_back(line),
-            Err(reason) => self.reject(reason),
+            Ok(line) => self.ahead.push_back((self.number, line)),
+            Err(reason) => self.reject(self.number, reason),
         }
         if self.ahead.len() > LOOKAHEAD { self.next() } else { Vec::new() }
     }
 
     /// Counts a line that was too large to be read at all.
     pub fn oversized_line(&mut self) {
+        self.number += 1;
         self.summary.lines += 1;
-        self.reject(RejectReason::TooLarge);
+        self.reject(self.number, RejectReason::TooLarge);
     }
 
     /// Takes the lines that were read ahead and closes the last round.
@@ -162,21 +186,27 @@ impl Replay {
         (output, self.summary)
     }
 
-    fn reject(&mut self, reason: RejectReason) {
-        *self.summary.rejected.entry(reason).or_default() += 1;
+    fn reject(&mut self, number: u64, reason: RejectReason) {
+        let rejections = self.summary.rejected.entry(reason).or_insert(Rejections { lines: 0, first_line: number });
+        rejections.lines += 1;
+        rejections.first_line = rejections.first_line.min(number);
     }
 
     /// Takes the oldest of the lines that were read ahead.
     fn next(&mut self) -> Vec<FusedLine> {
         let mut output = Vec::new();
-        let Some(line) = self.ahead.pop_front() else { return output };
-        if !self.clock.is_plausible(line.at, self.ahead.iter().map(|line| line.at)) {
-            self.reject(RejectReason::FromTheFuture);
+        let Some((number, mut line)) = self.ahead.pop_front() else { return output };
+        let is_plausible = self.clock.is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at));
+        if !is_plausible && self.config.passes.is_none() {
+            self.reject(number, RejectReason::FromTheFuture);
             return output;
         }
         let before = self.clock.now();
-        let is_late = self.clock.advance(line.at);
+        let is_late = is_plausible && self.clock.advance(line.at);
         let now = self.clock.now();
+        if self.config.passes.is_some() {
+            (line.report.captured_at_us, line.report.seq) = (now, number);
+        }
         self.catch_up(before, now, &mut output);
         self.learn(&line);
         match self.cell(now).report(line.kind, &line.report, now) {
@@ -186,7 +216,7 @@ impl Replay {
                 self.pending = fused.is_none();
                 self.emit(fused, &mut output);
             }
-            Err(reason) => self.reject(reason),
+            Err(reason) => self.reject(number, reason),
         }
         output
     }

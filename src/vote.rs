@@ -4,9 +4,15 @@
 //! round; [`Vote::refine`] goes over the stored votes again. Equal calls give equal results.
 //!
 //! What is not counted, without error: objects at unknown landmarks of a closed cell, without a landmark, of zero
+<<<<<<< HEAD
 //! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report of which neither `seq` nor capture
 //! time is newer than the last of its vehicle is rejected, unless the vehicle's clock was set back. Of several objects that one report has at one landmark, the most
 //! confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
+=======
+//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report that was captured before the last of
+//! its vehicle, or with it and has no higher `seq`, is rejected. Of several objects that one report has at one landmark,
+//! the most confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
+>>>>>>> review3
 
 mod ballot;
 mod calibration;
@@ -114,12 +120,22 @@ impl Vote {
     pub fn observe(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
         report.validate(&Limits::default())?;
         let frames = match self.heard.get(&report.node) {
+<<<<<<< HEAD
             Some(last) if last.is_before(report) => last.frames,
             Some(_) => return Err(RejectReason::OutOfOrder),
             None => {
                 self.make_room(received_at)?;
                 0
             }
+=======
+            // A restarted node counts from the start again, but time goes on.
+            Some(last) if (report.captured_at_us, report.seq) <= (last.captured_at, last.seq) => {
+                return Err(RejectReason::OutOfOrder);
+            }
+            Some(last) => last.frames,
+            None if self.heard.len() >= self.config.max_vehicles => return Err(RejectReason::TooManyVehicles),
+            None => 0,
+>>>>>>> review3
         };
         let heard = Heard {
             seq: report.seq,

@@ -43,6 +43,16 @@ fn a_report_that_comes_twice_is_rejected_and_changes_nothing() {
 }
 
 #[test]
+fn a_vehicle_that_does_not_count_its_reports_is_heard_by_their_times() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    for (ms, label) in [(0, "cup"), (100, "mouse")] {
+        let at = START + Duration::from_millis(ms);
+        vote.observe(&report("a", 0, at, &[("x", label, 0.9)]), at).unwrap();
+        assert_eq!(vote.close(at).verdicts[0].label.as_deref(), Some(label));
+    }
+}
+
+#[test]
 fn a_vehicle_has_one_vote_however_often_it_publishes() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     for n in 0..10 {

@@ -202,3 +202,21 @@ fn the_recorded_intersection_is_judged_right() {
     let replayed = ecod(&["replay", "--input", text(&reports), "--output", "-"]);
     assert!(said(&replayed).starts_with("12 lines, 12 used, "), "{}", said(&replayed));
 }
+
+#[cfg(feature = "camera")]
+#[test]
+fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_intersection() {
+    let folder = TempDir::new().unwrap();
+    let recorded = fs::read_to_string(example("testbed/vote_recording.json")).unwrap();
+    let mut silent: Value = serde_json::from_str(&recorded).unwrap();
+    silent["frames"]["euclid"].as_array_mut().unwrap().truncate(1);
+    let renamed = recorded.replace("mouse", "remote").replace("\"cup\"", "\"bottle\"");
+    for scene in [renamed, silent.to_string()] {
+        let (scenes, out) = (folder.path().join("scenes.json"), folder.path().join("result.json"));
+        fs::write(&scenes, scene).unwrap();
+        let run = ecod(&["testbed", "--scenes", text(&scenes), "--scene", "recording", "--out", text(&out)]);
+        assert!(run.status.success(), "{}", said(&run));
+        let result: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        assert_eq!(result["scenes"][0]["vote_accuracy_pct"].as_f64(), Some(100.0), "{result}");
+    }
+}

@@ -45,7 +45,7 @@ fn replay(config: ReplayConfig, lines: impl IntoIterator<Item = impl AsRef<[u8]>
 }
 
 fn rejected(summary: &Summary) -> Vec<(RejectReason, u64)> {
-    summary.rejected.iter().map(|(reason, count)| (*reason, *count)).collect()
+    summary.rejected.iter().map(|(reason, rejections)| (*reason, rejections.lines)).collect()
 }
 
 fn map_labels(output: &[FusedLine]) -> Vec<(String, Option<String>)> {
@@ -106,7 +106,7 @@ fn every_bad_line_has_its_reason_and_ends_nothing() {
     for reason in lines.iter().filter_map(|(_, reason)| *reason) {
         *expected.entry(reason).or_default() += 1;
     }
-    assert_eq!(summary.rejected, expected);
+    assert_eq!(rejected(&summary), expected.into_iter().collect::<Vec<_>>());
     assert_eq!((summary.lines, summary.used(), output.len()), (10, 1, 1));
 }
 
@@ -178,6 +178,36 @@ fn passes_go_over_all_votes_however_old() {
     let pace = line(&report("a", 0, &[("x", "car")]), &[]);
     let (output, summary) = replay(ReplayConfig { passes: Some(5), ..ReplayConfig::default() }, [pace]);
     assert_eq!((output.len(), rejected(&summary)), (1, vec![(RejectReason::NotFused, 1)]));
+}
+
+#[test]
+fn with_passes_neither_time_nor_the_number_of_vehicles_keeps_a_vote_out() {
+    let config = ReplayConfig { passes: Some(5), ..ReplayConfig::default() };
+    let votes = |vehicle: u64, step: u64| {
+        let label = if vehicle % 3 == 0 { "mouse" } else { "cup" };
+        vote_line(&report(&format!("v{vehicle}"), step * 1000, &[(&format!("item-{step}"), label)]))
+    };
+    let by_step: Vec<_> = (0..10).flat_map(|step| (0..300).map(move |vehicle| votes(vehicle, step))).collect();
+    let by_vehicle = (0..300).flat_map(|vehicle| (0..10).map(move |step| votes(vehicle, step)));
+    let backwards = by_vehicle.collect::<Vec<_>>().into_iter().rev();
+    let (output, summary) = replay(config.clone(), backwards);
+    assert_eq!((rejected(&summary), output.len()), (vec![], 1));
+    assert_eq!(verdict_labels(&output), verdict_labels(&replay(config, &by_step).0));
+    assert_eq!(verdict_labels(&output).len(), 10);
+}
+
+#[test]
+fn a_recording_without_times_gets_a_verdict_on_every_item() {
+    let items =
+        (0..3000u64).map(|item| vote_line(&report(&format!("v{item}"), 0, &[(&format!("item-{item}"), "cup")])));
+    let (output, summary) = replay(ReplayConfig::default(), items);
+    assert_eq!((rejected(&summary), verdict_labels(&output).len()), (vec![], 3000));
+}
+
+#[test]
+fn the_first_line_of_a_kind_of_junk_is_told() {
+    let (_, summary) = replay(ReplayConfig::default(), ["", "junk", "{}", "[]"]);
+    assert_eq!(summary.rejected[&RejectReason::Malformed], Rejections { lines: 3, first_line: 2 });
 }
 
 /// Reports of the recorded lot's vehicles, of both kinds, with disagreement.

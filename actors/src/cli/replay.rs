@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
-use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
+use ecod::replay::{FusedLine, Rejections, Replay, ReplayConfig, Summary};
 
 use super::Failure;
 use crate::config::NodeConfig;
@@ -96,8 +96,8 @@ fn flush(sink: &mut dyn Write) -> io::Result<()> {
 fn report(summary: &Summary) {
     let Summary { lines, rejected, late, ignored_votes, written } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
-    for (reason, count) in rejected {
-        eprintln!("rejected {reason} {count}");
+    for (reason, Rejections { lines, first_line }) in rejected {
+        eprintln!("rejected {reason} {lines}, the first in line {first_line}");
     }
     if *late > 0 {
         eprintln!("used although earlier than a line before {late}");

@@ -13,7 +13,8 @@ use std::time::Duration;
 use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::camera::Mount;
 use ecod::eval::{Evaluation, Scores, Truth};
-use ecod::landmark::{Gate, LandmarkIndex};
+use ecod::geometry::{Pose, wrap_angle};
+use ecod::landmark::{Gate, Landmark, LandmarkIndex};
 use ecod::names::{Label, LandmarkId, NodeName};
 use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ecod::replay::{FusedLine, Replay, ReplayConfig};
@@ -22,7 +23,8 @@ use ecod::testbed::{Cav, Recording};
 use ecod::time::Timestamp;
 use ecod::view::ViewConfig;
 use ecod::vote::{VoteConfig, VoteMode};
-use ecod::wire::{ObjectReport, RejectReason, ReportKind};
+use ecod::wire::{ObjectReport, ReportKind};
+use nalgebra::Point2;
 use serde::Serialize;
 use serde_json::json;
 
@@ -52,10 +54,14 @@ const SIZES: [(&str, f64, f64); 16] = [
     ("truck", 3.0, 0.3),
     ("tv", 0.5, 0.3),
 ];
-/// The same for any other label.
-const ANY_SIZE: (f64, f64) = (0.11, 0.5);
-/// Which location an object is taken for.
-const GATE: Gate = Gate { radius_m: 0.2, sigmas: 3.0, floor_m: 0.02 };
+/// Height in metres of what has any other label, to find its bearing with.
+const ANY_HEIGHT_M: f64 = 0.11;
+/// Which location an object of known size is taken for.
+const GATE: Gate = Gate { radius_m: 0.5, sigmas: 3.0, floor_m: 0.02 };
+/// How far in radians an object of unknown size may be beside a location that it is taken for.
+const MAX_BESIDE_RAD: f64 = 0.15;
+/// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.
+const MAX_HEIGHT_FACTOR: f64 = 5.0;
 
 /// What came of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -146,11 +152,29 @@ pub fn reports(recording: &Recording) -> Vec<ObjectReport> {
     for frame in 0..recording.frame_count() {
         for (vehicle, frames) in vehicles.iter_mut().zip(&recording.frames) {
             if let Some(detections) = frames.get(frame) {
-                reports.push(vehicle.report(detections.clone(), captured_at(frame)));
+                let mut report = vehicle.report(detections.clone(), captured_at(frame));
+                name_by_bearing(&mut report, landmarks.landmarks());
+                reports.push(report);
             }
         }
     }
     reports
+}
+
+/// Takes every object of unknown size for the location that is least beside it.
+fn name_by_bearing(report: &mut ObjectReport, landmarks: &[Landmark]) {
+    let Some(camera) = report.pose.map(Pose::from) else { return };
+    let is_known = |label: &Label| SIZES.iter().any(|(known, ..)| label == known);
+    for object in report.objects.iter_mut().filter(|object| !is_known(&object.label)) {
+        let (range_m, bearing_rad) = camera.range_bearing(&Point2::new(object.x_m, object.y_m));
+        let beside_rad = |landmark: &Landmark| {
+            let (to_landmark_m, towards_rad) = camera.range_bearing(&landmark.position);
+            let is_of_a_size = (1.0 / MAX_HEIGHT_FACTOR..=MAX_HEIGHT_FACTOR).contains(&(to_landmark_m / range_m));
+            Some(wrap_angle(towards_rad - bearing_rad).abs()).filter(|rad| is_of_a_size && *rad <= MAX_BESIDE_RAD)
+        };
+        let near = landmarks.iter().filter_map(|landmark| Some((beside_rad(landmark)?, &landmark.id)));
+        object.landmark = near.min_by(|(a, _), (b, _)| a.total_cmp(b)).map(|(_, id)| id.clone());
+    }
 }
 
 /// A report as a line of a recording that `replay` reads.
@@ -174,9 +198,8 @@ fn vote(recording: &Recording, reports: &[ObjectReport], mode: VoteMode) -> anyh
     }
     let (mut rest, summary) = replay.finish();
     fused.append(&mut rest);
-    if let Some((reason, count)) = summary.rejected.first_key_value() {
-        let reason: &RejectReason = reason;
-        anyhow::bail!("{count} reports were rejected: {reason}");
+    if let Some((reason, rejections)) = summary.rejected.first_key_value() {
+        anyhow::bail!("{} reports were rejected: {reason}", rejections.lines);
     }
     let index = LandmarkIndex::new(landmarks, GATE.radius_m);
     let mut evaluation = Evaluation::new(truth(recording)?).with_landmarks(index, GATE);
@@ -218,13 +241,13 @@ fn captured_at(frame: usize) -> Timestamp {
     START + FRAME_INTERVAL * u32::try_from(frame).unwrap_or(u32::MAX)
 }
 
-/// A round closes with the last vehicle's report of a frame.
+/// A round closes with the last vehicle's report of a frame, at the latest within the time of the next.
 fn fusion(mode: VoteMode) -> FusionConfig {
     let mut vote = VoteConfig { mode, ..VoteConfig::default() };
     vote.paper.frames_per_verdict = 1;
     FusionConfig {
         algorithms: Algorithms::Vote,
-        round: RoundConfig { period_s: 0.5, ..RoundConfig::default() },
+        round: RoundConfig { period_s: FRAME_INTERVAL.as_secs_f64(), ..RoundConfig::default() },
         vote,
         ..FusionConfig::default()
     }
@@ -242,7 +265,7 @@ fn perception(recording: &Recording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -
     let labels = SIZES.map(|(label, height_m, relative_sigma)| (label.into(), size(height_m, relative_sigma)));
     let projection = ProjectionConfig {
         ranging: Ranging::BoxHeight,
-        sizes: ObjectSizes { default: Some(size(ANY_SIZE.0, ANY_SIZE.1)), labels: labels.into() },
+        sizes: ObjectSizes { default: Some(size(ANY_HEIGHT_M, 1.0)), labels: labels.into() },
         pixel_sigma_px: 4.0,
         heading_sigma_rad: 0.05,
         position_sigma_m: 0.02,
