@@ -4,6 +4,7 @@
 //! implementations behind it: [`paper`](PaceMode::Paper) is the formulas of the paper, [`bayes`](PaceMode::Bayes), the
 //! default, keeps the evidence of each vehicle as log-odds. `docs/algorithms.md` compares them.
 
+mod assignment;
 mod bayes;
 mod grouping;
 mod paper;
@@ -49,7 +50,8 @@ pub struct PaceConfig {
     /// map that vehicles do not know of.
     pub position_floor_m: f64,
     /// Whether at most one object of a report is taken for one landmark. Default true: two plates cannot share one
-    /// parking spot.
+    /// parking spot, and where gates overlap the nearer landmark may be another's. False lets every object count where
+    /// it is nearest.
     pub one_to_one: bool,
     /// Age in seconds beyond which a vehicle's last look at a landmark no longer counts. Default 1.0.
     pub max_age_s: f64,

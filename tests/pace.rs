@@ -145,6 +145,18 @@ fn two_plates_cannot_share_a_spot() {
 }
 
 #[test]
+fn a_row_of_cars_seen_from_a_wrong_pose_is_kept_in_order() {
+    let config = PaceConfig { gate_m: 1.0, ..PaceConfig::default() };
+    let mut pace = pace(config, (0..3).map(|n| landmark(n, f64::from(n as u32), 0.0)).collect());
+    let row = vec![object("A", 0.9, 0.55, 0.0), object("B", 0.9, 1.6, 0.0), object("C", 0.9, 1.9, 0.0)];
+    pace.observe(&report("a", row, &[]), START);
+    assert_eq!(labels(&pace.close(START).landmarks), [Some("A"), Some("B"), Some("C")]);
+    let row = vec![object("D", 0.9, 0.05, 0.0), object("E", 0.9, 0.4, 0.0)];
+    pace.observe(&report("a", row, &[]), frame(20));
+    assert_eq!(labels(&pace.close(frame(20)).landmarks), [Some("D"), Some("E"), None], "second choice");
+}
+
+#[test]
 fn a_detection_goes_to_one_landmark_only() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0), landmark(1, 0.6, 0.0)]);
     pace.observe(&report("a", vec![object("car", 0.9, 0.25, 0.0)], &[]), START);

@@ -93,26 +93,35 @@ impl LandmarkIndex {
     /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
     /// with where objects stand.
     pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
-        let reads_sign_of = |near: &GridPoint| {
-            let sign = || self.landmarks[near.landmark as usize].vacancy.as_ref();
-            near.has_sign && sign().is_some_and(|sign| sign.label == *label)
-        };
-        let near = |grid: &'_ Grid, is_vacancy_sign: bool| {
-            grid.within(*point, gate.radius_m)
-                .filter(|(near, _)| reads_sign_of(near) == is_vacancy_sign)
-                .map(|(near, offset)| Candidate {
+        self.candidates(label, *point, *covariance, *gate).min_by(Candidate::compare)
+    }
+
+    /// All landmarks that explain a detection, as for [`Self::best`], in no particular order.
+    pub fn candidates<'a>(
+        &'a self,
+        label: &'a Label,
+        point: Point2<f64>,
+        covariance: Covariance,
+        gate: Gate,
+    ) -> impl Iterator<Item = Candidate> + 'a {
+        let near = move |grid: &'a Grid, is_vacancy_sign: bool| {
+            grid.within(point, gate.radius_m)
+                .filter(move |(near, _)| self.reads_sign(label, near) == is_vacancy_sign)
+                .map(move |(near, offset)| Candidate {
                     landmark: near.landmark as usize,
                     is_vacancy_sign,
                     mahalanobis_squared: covariance.mahalanobis_squared(&offset, gate.floor_m),
                 })
-                .filter(|candidate| candidate.mahalanobis_squared <= gate.sigmas * gate.sigmas)
-                .min_by(Candidate::compare)
+                .filter(move |candidate| candidate.mahalanobis_squared <= gate.sigmas * gate.sigmas)
         };
-        let object = near(&self.objects, false);
-        if self.vacancy_signs.is_empty() {
-            return object;
-        }
-        object.into_iter().chain(near(&self.vacancy_signs, true)).min_by(Candidate::compare)
+        let signs = Some(&self.vacancy_signs).filter(|signs| !signs.is_empty());
+        near(&self.objects, false).chain(signs.into_iter().flat_map(move |signs| near(signs, true)))
+    }
+
+    /// Whether a label is what the vacancy sign of a landmark reads.
+    fn reads_sign(&self, label: &Label, near: &GridPoint) -> bool {
+        let sign = || self.landmarks[near.landmark as usize].vacancy.as_ref();
+        near.has_sign && sign().is_some_and(|sign| sign.label == *label)
     }
 }
 

@@ -25,6 +25,7 @@ use smallvec::SmallVec;
 
 use self::evidence::{Look, Sighting, Vehicle, Worth};
 use self::tally::{NamedLook, Tally, WeightedMean};
+use super::assignment::{Pairing, one_to_one};
 use super::grouping::{ByPlace, Grouping, Place};
 use super::{PaceConfig, PaceRound};
 use crate::landmark::{Candidate, Landmark, LandmarkIndex};
@@ -107,28 +108,32 @@ impl BayesPace {
         sightings
     }
 
-    /// The objects at their best landmarks; with `one_to_one` the nearest object keeps a contested place.
+    /// The objects at their nearest places, with `one_to_one` settled so that they share none; ascending by place.
     fn associate<'a>(&self, objects: &'a [PerceivedObject]) -> Vec<Sighting<'a>> {
         let gate = self.config.gate();
-        let best = |object: &'a PerceivedObject| {
-            let point = Point2::new(object.x_m, object.y_m);
-            let best = self.landmarks.best(&object.label, &point, &self.config.covariance(object), &gate)?;
-            Some((best, object))
+        let pairing = |object, candidate: Candidate| Pairing {
+            place: Place::of(&candidate),
+            object,
+            distance_squared: candidate.mahalanobis_squared,
         };
-        let mut pairs: Vec<(Candidate, &PerceivedObject)> = objects.iter().filter_map(best).collect();
-        pairs.sort_by(|(a, _), (b, _)| {
-            (a.landmark, a.is_vacancy_sign)
-                .cmp(&(b.landmark, b.is_vacancy_sign))
-                .then(a.mahalanobis_squared.total_cmp(&b.mahalanobis_squared))
-        });
+        let point = |object: &PerceivedObject| Point2::new(object.x_m, object.y_m);
+        let wish = |object: &'a PerceivedObject| {
+            let covariance = self.config.covariance(object);
+            Some(pairing(object, self.landmarks.best(&object.label, &point(object), &covariance, &gate)?))
+        };
+        let pairings = |object: &'a PerceivedObject| {
+            let covariance = self.config.covariance(object);
+            let candidates = self.landmarks.candidates(&object.label, point(object), covariance, gate);
+            candidates.map(move |candidate| pairing(object, candidate))
+        };
+        let mut wishes: Vec<_> = objects.iter().filter_map(wish).collect();
+        wishes.sort_by(|a, b| a.place.cmp(&b.place).then(a.distance_squared.total_cmp(&b.distance_squared)));
         if self.config.one_to_one {
-            pairs.dedup_by_key(|(candidate, _)| (candidate.landmark, candidate.is_vacancy_sign));
+            wishes = one_to_one(wishes, pairings, self.config.gate_sigmas);
         }
-        let mut sightings = Vec::with_capacity(2 * pairs.len());
-        sightings.extend(pairs.into_iter().map(|(best, object)| Sighting {
-            place: if best.is_vacancy_sign { Place::vacancy_sign(best.landmark) } else { Place::object(best.landmark) },
-            found: Some(object),
-        }));
+        let mut sightings = Vec::with_capacity(2 * wishes.len());
+        sightings
+            .extend(wishes.into_iter().map(|pairing| Sighting { place: pairing.place, found: Some(pairing.object) }));
         sightings
     }
 

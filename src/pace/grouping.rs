@@ -3,7 +3,7 @@
 use crate::names::NodeName;
 
 /// Something that vehicles look at, counted from 0.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Place(pub(super) u32);
 
 impl Place {

@@ -4,6 +4,7 @@ use nalgebra::Point2;
 use smallvec::SmallVec;
 
 use crate::geometry::Covariance;
+use crate::landmark::Candidate;
 use crate::names::{Label, NodeName};
 use crate::pace::PaceConfig;
 use crate::pace::grouping::{Held, Place};
@@ -12,6 +13,14 @@ use crate::wire::PerceivedObject;
 
 /// A vehicle can look at the object and at the vacancy sign of a landmark, in configuration order.
 impl Place {
+    pub(super) fn of(candidate: &Candidate) -> Self {
+        if candidate.is_vacancy_sign {
+            Self::vacancy_sign(candidate.landmark)
+        } else {
+            Self::object(candidate.landmark)
+        }
+    }
+
     pub(super) fn object(landmark: usize) -> Self {
         Self(2 * landmark as u32)
     }

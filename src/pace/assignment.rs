@@ -1,0 +1,232 @@
+//! At most one object of a report for each place, and one place for each object.
+//!
+//! Every object would like the place it is nearest to. Where no two want the same, that is the assignment, and it costs
+//! nothing to see. Objects that contest a place are settled together with all that they could displace, so that the
+//! sum of the benefits 1 − d²/g² is the greatest possible, d the distance and g the gate in standard deviations: the
+//! global nearest neighbour (Blackman, Popoli, "Design and Analysis of Modern Tracking Systems", 1999, chapter 6.4),
+//! by the algorithm of Kuhn and Munkres. An object that gets no place is left out.
+
+use std::collections::BTreeMap;
+
+use hashbrown::{HashMap, HashSet};
+use pathfinding::kuhn_munkres::kuhn_munkres;
+use pathfinding::matrix::Matrix;
+use pathfinding::undirected::connected_components::separate_components;
+
+use super::grouping::Place;
+use crate::wire::PerceivedObject;
+
+/// An object at a place within its gate.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pairing<'a> {
+    pub(super) place: Place,
+    pub(super) object: &'a PerceivedObject,
+    /// Squared distance in standard deviations.
+    pub(super) distance_squared: f64,
+}
+
+/// Objects or places in one contest, whichever are fewer, beyond which the nearest object keeps each place: the time to
+/// settle a contest grows with the square of this. Contests are of a handful, unless a report is made up.
+const LARGEST_CONTEST: usize = 64;
+
+/// Settles all contests of one report.
+///
+/// `wishes` is each object at its nearest place, ascending by place and distance; `pairings` lists all places that an
+/// object can take, within a gate of `gate_sigmas` standard deviations. The result is ascending by place.
+pub(super) fn one_to_one<'a, I>(
+    wishes: Vec<Pairing<'a>>,
+    pairings: impl Fn(&'a PerceivedObject) -> I,
+    gate_sigmas: f64,
+) -> Vec<Pairing<'a>>
+where
+    I: Iterator<Item = Pairing<'a>>,
+{
+    let mut contested: Vec<_> =
+        wishes.windows(2).filter(|pair| pair[0].place == pair[1].place).map(|pair| pair[0].place).collect();
+    if contested.is_empty() {
+        return wishes;
+    }
+    contested.dedup();
+    // All that could be displaced: whoever wants a contested place, the other places that these could take, whoever wants
+    // those, and so on. Everyone else keeps the place wanted, the best there is.
+    let mut reached: HashSet<Place> = contested.iter().copied().collect();
+    let mut contestants = Vec::new();
+    while let Some(place) = contested.pop() {
+        let first = wishes.partition_point(|wish| wish.place < place);
+        for wish in wishes[first..].iter().take_while(|wish| wish.place == place) {
+            let pairings: Vec<_> = pairings(wish.object).collect();
+            contested.extend(pairings.iter().map(|pairing| pairing.place).filter(|place| reached.insert(*place)));
+            contestants.push(Contestant { wish: *wish, pairings });
+        }
+    }
+    let mut settled: Vec<_> = wishes.into_iter().filter(|wish| !reached.contains(&wish.place)).collect();
+    for contest in contests(contestants) {
+        settle(&contest, gate_sigmas, &mut settled);
+    }
+    settled.sort_by_key(|pairing| pairing.place);
+    settled
+}
+
+/// An object that may be displaced.
+struct Contestant<'a> {
+    wish: Pairing<'a>,
+    /// The wish and all others.
+    pairings: Vec<Pairing<'a>>,
+}
+
+/// Contestants that have no place in common, not even by way of others, are in different contests.
+fn contests(contestants: Vec<Contestant<'_>>) -> impl Iterator<Item = Vec<Contestant<'_>>> {
+    let places: Vec<Vec<Place>> = contestants
+        .iter()
+        .map(|contestant| contestant.pairings.iter().map(|pairing| pairing.place).collect())
+        .collect();
+    let (_, contest_of) = separate_components(&places);
+    let mut contests: BTreeMap<usize, Vec<_>> = BTreeMap::new();
+    for (contestant, contest) in contestants.into_iter().zip(contest_of) {
+        contests.entry(contest).or_default().push(contestant);
+    }
+    contests.into_values()
+}
+
+/// Adds the best pairings of one contest to `settled`.
+fn settle<'a>(contestants: &[Contestant<'a>], gate_sigmas: f64, settled: &mut Vec<Pairing<'a>>) {
+    let mut columns = HashMap::new();
+    for pairing in contestants.iter().flat_map(|contestant| &contestant.pairings) {
+        let next = columns.len();
+        columns.entry(pairing.place).or_insert(next);
+    }
+    let (objects, places) = (contestants.len(), columns.len());
+    if objects.min(places) > LARGEST_CONTEST {
+        // They come place by place, the nearest first.
+        let mut nearest: Vec<_> = contestants.iter().map(|contestant| contestant.wish).collect();
+        nearest.dedup_by_key(|wish| wish.place);
+        settled.extend(nearest);
+        return;
+    }
+    // The algorithm wants at least as many columns as rows.
+    let cell = |object: usize, place: usize| if objects <= places { (object, place) } else { (place, object) };
+    let pairings = || {
+        let numbered = contestants.iter().enumerate();
+        let columns = &columns;
+        numbered.flat_map(move |(object, contestant)| {
+            contestant.pairings.iter().map(move |pairing| (cell(object, columns[&pairing.place]), *pairing))
+        })
+    };
+    let mut benefits = Matrix::new(objects.min(places), objects.max(places), 0);
+    for (cell, pairing) in pairings() {
+        benefits[cell] = benefit(pairing.distance_squared, gate_sigmas);
+    }
+    let (_, column_of) = kuhn_munkres(&benefits);
+    settled.extend(pairings().filter(|((row, column), _)| column_of[*row] == *column).map(|(_, pairing)| pairing));
+}
+
+/// 1 − d²/g² in units of 2⁻⁴⁰, and more than nothing for whatever is within the gate.
+fn benefit(distance_squared: f64, gate_sigmas: f64) -> i64 {
+    const UNIT: f64 = (1i64 << 40) as f64;
+    ((1.0 - distance_squared / (gate_sigmas * gate_sigmas)) * UNIT) as i64 + 1
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const GATE_SIGMAS: f64 = 4.0;
+
+    /// The distances of an object, in whole standard deviations squared, by place; 16 is the gate.
+    type Distances = Vec<(u32, u32)>;
+
+    fn objects(count: usize) -> Vec<PerceivedObject> {
+        let object = |label: usize| PerceivedObject {
+            label: label.to_string().into(),
+            confidence: 0.9,
+            x_m: 0.0,
+            y_m: 0.0,
+            covariance_m2: None,
+            landmark: None,
+        };
+        (0..count).map(object).collect()
+    }
+
+    /// (object, place) of the assignment, by object.
+    fn assigned(distances: &[Distances]) -> Vec<(usize, u32)> {
+        let objects = objects(distances.len());
+        let index = |object: &PerceivedObject| object.label.parse::<usize>().unwrap();
+        let pairings = |object| {
+            distances[index(object)].iter().map(move |(place, squared)| Pairing {
+                place: Place(*place),
+                object,
+                distance_squared: f64::from(*squared),
+            })
+        };
+        let key = |pairing: &Pairing<'_>| (pairing.distance_squared as u32, pairing.place);
+        let mut wishes: Vec<_> = objects.iter().filter_map(|object| pairings(object).min_by_key(key)).collect();
+        wishes.sort_by_key(|wish| (wish.place, wish.distance_squared as u32));
+        let settled = one_to_one(wishes, pairings, GATE_SIGMAS);
+        assert!(settled.is_sorted_by(|a, b| a.place < b.place), "ascending, and one object for a place");
+        let mut assigned: Vec<_> = settled.iter().map(|pairing| (index(pairing.object), pairing.place.0)).collect();
+        assigned.sort_unstable();
+        assigned
+    }
+
+    fn total(distances: &[Distances], assigned: &[(usize, u32)]) -> u32 {
+        assigned.iter().map(|(object, place)| 16 - distance(&distances[*object], *place)).sum()
+    }
+
+    fn distance(distances: &Distances, place: u32) -> u32 {
+        distances.iter().find(|(at, _)| *at == place).unwrap().1
+    }
+
+    /// The greatest benefit of any assignment of the objects to places that are free.
+    fn brute_force(distances: &[Distances], taken: &mut Vec<u32>) -> u32 {
+        let Some((first, others)) = distances.split_first() else { return 0 };
+        let mut best = brute_force(others, taken);
+        for (place, squared) in first {
+            if !taken.contains(place) {
+                taken.push(*place);
+                best = best.max(16 - squared + brute_force(others, taken));
+                taken.pop();
+            }
+        }
+        best
+    }
+
+    fn any_distances() -> impl Strategy<Value = Vec<Distances>> {
+        let object = prop::collection::btree_map(0..7u32, 0..=16u32, 0..5).prop_map(|map| map.into_iter().collect());
+        prop::collection::vec(object, 0..8)
+    }
+
+    proptest! {
+        #[test]
+        fn no_other_assignment_is_better(distances in any_distances()) {
+            let assigned = assigned(&distances);
+            prop_assert!(assigned.is_sorted_by(|a, b| a.0 < b.0), "one place for an object");
+            prop_assert_eq!(total(&distances, &assigned), brute_force(&distances, &mut Vec::new()));
+        }
+    }
+
+    #[test]
+    fn the_loser_of_a_contest_takes_its_second_choice() {
+        assert_eq!(assigned(&[vec![(0, 1), (1, 9)], vec![(0, 4), (1, 5)]]), [(0, 0), (1, 1)]);
+    }
+
+    #[test]
+    fn a_contest_is_settled_for_the_good_of_all() {
+        let row = [vec![(0, 4)], vec![(0, 3), (1, 4)], vec![(1, 2), (2, 4)]];
+        assert_eq!(assigned(&row), [(0, 0), (1, 1), (2, 2)], "the nearest gives way, or one has no place");
+    }
+
+    #[test]
+    fn whoever_has_no_place_left_is_left_out() {
+        assert_eq!(assigned(&[vec![(3, 5)], vec![(3, 1)], vec![(3, 2)]]), [(1, 3)]);
+    }
+
+    #[test]
+    fn the_nearest_keep_their_places_in_an_enormous_contest() {
+        let count = 2 * LARGEST_CONTEST as u32;
+        let crowd: Vec<_> = (0..count).flat_map(|n| [vec![(n, 1), (n + 1, 3)], vec![(n, 2), (n + 1, 4)]]).collect();
+        let nearest: Vec<_> = (0..count).map(|n| (2 * n as usize, n)).collect();
+        assert_eq!(assigned(&crowd), nearest);
+    }
+}
