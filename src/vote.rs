@@ -4,15 +4,10 @@
 //! round; [`Vote::refine`] goes over the stored votes again. Equal calls give equal results.
 //!
 //! What is not counted, without error: objects at unknown landmarks of a closed cell, without a landmark, of zero
-<<<<<<< HEAD
 //! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report of which neither `seq` nor capture
-//! time is newer than the last of its vehicle is rejected, unless the vehicle's clock was set back. Of several objects that one report has at one landmark, the most
-//! confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
-=======
-//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report that was captured before the last of
-//! its vehicle, or with it and has no higher `seq`, is rejected. Of several objects that one report has at one landmark,
-//! the most confident votes in `weighted` mode; in `paper` mode all do, as in the paper's sum.
->>>>>>> review3
+//! time is newer than the last of its vehicle is rejected, unless the vehicle's clock was set back. Of several objects
+//! that one report has at one landmark, the most confident votes in `weighted` mode; in `paper` mode all do, as in the
+//! paper's sum.
 
 mod ballot;
 mod calibration;
@@ -120,22 +115,12 @@ impl Vote {
     pub fn observe(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
         report.validate(&Limits::default())?;
         let frames = match self.heard.get(&report.node) {
-<<<<<<< HEAD
             Some(last) if last.is_before(report) => last.frames,
             Some(_) => return Err(RejectReason::OutOfOrder),
             None => {
                 self.make_room(received_at)?;
                 0
             }
-=======
-            // A restarted node counts from the start again, but time goes on.
-            Some(last) if (report.captured_at_us, report.seq) <= (last.captured_at, last.seq) => {
-                return Err(RejectReason::OutOfOrder);
-            }
-            Some(last) => last.frames,
-            None if self.heard.len() >= self.config.max_vehicles => return Err(RejectReason::TooManyVehicles),
-            None => 0,
->>>>>>> review3
         };
         let heard = Heard {
             seq: report.seq,
@@ -208,8 +193,7 @@ impl Vote {
         let synonym = place.and_then(|l| l.synonyms.iter().find(|s| s.from == object.label));
         let label = synonym.map_or(object.label.clone(), |s| s.label.clone());
         let geometry = pose.map(|p| p.range_bearing(&position));
-        let max_range = self.config.max_range_m;
-        if geometry.is_some_and(|(distance, _)| distance > max_range) {
+        if geometry.is_some_and(|(distance, _)| distance > self.max_range_m()) {
             return false;
         }
         if let Tally::Weighted(tally) = &self.tally
@@ -222,15 +206,22 @@ impl Vote {
         }
         match &mut self.tally {
             Tally::Paper(tally) => {
-                let k = geometry.map_or(1.0, |(d, a)| visibility::paper(&self.config.paper, max_range, d, a));
+                let k = geometry.map_or(1.0, |(d, a)| visibility::paper(&self.config.paper, d, a));
                 tally.add(landmark, &report.node, &label, object.confidence, k);
             }
             Tally::Weighted(tally) => {
-                let k = geometry.map_or(1.0, |(d, a)| visibility::falling(&self.config.weighted, max_range, d, a));
+                let k = geometry.map_or(1.0, |(d, a)| visibility::falling(&self.config.weighted, d, a));
                 tally.cast(landmark, &report.node, (&label, object.confidence, k), at);
             }
         }
         true
+    }
+
+    fn max_range_m(&self) -> f64 {
+        match self.config.mode {
+            VoteMode::Paper => self.config.paper.max_range_m,
+            VoteMode::Weighted => self.config.weighted.max_range_m,
+        }
     }
 
     fn open_landmark(&mut self, landmark: &LandmarkId) {

@@ -21,8 +21,6 @@ pub enum VoteMode {
 pub struct VoteConfig {
     /// Which tally; default `weighted`.
     pub mode: VoteMode,
-    /// Distance in metres beyond which a vote is ignored; default 2.54 (100 in, the paper's d_max).
-    pub max_range_m: f64,
     /// Settings of `paper` mode.
     pub paper: PaperConfig,
     /// Settings of `weighted` mode.
@@ -40,7 +38,6 @@ impl Default for VoteConfig {
     fn default() -> Self {
         Self {
             mode: VoteMode::Weighted,
-            max_range_m: 2.54,
             paper: PaperConfig::default(),
             weighted: WeightedConfig::default(),
             max_landmarks: 1024,
@@ -56,7 +53,6 @@ impl VoteConfig {
     /// # Errors
     /// [`ConfigError`] naming the first value out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
         check_range("max_landmarks", self.max_landmarks as f64, 1.0, 1e6)?;
         check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e5)?;
         check_range("max_labels", self.max_labels as f64, 1.0, 65_535.0)?;
@@ -69,6 +65,8 @@ impl VoteConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PaperConfig {
+    /// Distance d_max in metres beyond which a vote is ignored; default 2.54, the 100 in of the paper's testbed.
+    pub max_range_m: f64,
     /// Weight p_d of distance against angle, 0 to 1; default 0.7.
     pub distance_weight: f64,
     /// Reputation r_v at the start; default 0.5.
@@ -81,12 +79,13 @@ pub struct PaperConfig {
 
 impl Default for PaperConfig {
     fn default() -> Self {
-        Self { distance_weight: 0.7, initial_reputation: 0.5, step: 0.01, frames_per_verdict: 5 }
+        Self { max_range_m: 2.54, distance_weight: 0.7, initial_reputation: 0.5, step: 0.01, frames_per_verdict: 5 }
     }
 }
 
 impl PaperConfig {
     fn validate(&self) -> Result<(), ConfigError> {
+        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
         check_range("distance_weight", self.distance_weight, 0.0, 1.0)?;
         check_range("initial_reputation", self.initial_reputation, 0.3, 1.0)?;
         check_range("step", self.step, 0.0, 1.0)?;
@@ -124,6 +123,8 @@ pub struct WeightedConfig {
     pub newcomer_share: f64,
     /// Probability by which a label must lead the one shown to replace it; default 0.1. More flickers less, reacts later.
     pub hysteresis: f64,
+    /// Distance in metres beyond which a vote is ignored; default 50. What a detector tells reliably.
+    pub max_range_m: f64,
     /// Angle off the camera's axis in radians at which visibility has halved; default 0.8.
     pub half_visibility_rad: f64,
     /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the square of the distance.
@@ -149,6 +150,7 @@ impl Default for WeightedConfig {
             probation_votes: 10.0,
             newcomer_share: 0.5,
             hysteresis: 0.1,
+            max_range_m: 50.0,
             half_visibility_rad: 0.8,
             visibility_at_max_range: 0.3,
             revisit_votes: 8.0,
@@ -170,6 +172,7 @@ impl WeightedConfig {
         check_range("probation_votes", self.probation_votes, 0.0, 1e6)?;
         check_range("newcomer_share", self.newcomer_share, 0.0, 1e9)?;
         check_range("hysteresis", self.hysteresis, 0.0, 0.99)?;
+        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
         check_range("half_visibility_rad", self.half_visibility_rad, 1e-3, 10.0)?;
         check_range("visibility_at_max_range", self.visibility_at_max_range, 1e-3, 1.0)?;
         check_range("revisit_votes", self.revisit_votes, 0.0, 1e6)?;

@@ -7,14 +7,14 @@ use super::config::{PaperConfig, WeightedConfig};
 /// The paper's visibility, equation k(ρ,v) = p_d (1 − d/d_max) + (1 − p_d) θ/360°: it *grows* off-axis, as printed.
 ///
 /// `angle_rad` is the deviation from the camera's axis; its sign is ignored.
-pub fn paper(config: &PaperConfig, max_range_m: f64, distance_m: f64, angle_rad: f64) -> f64 {
+pub fn paper(config: &PaperConfig, distance_m: f64, angle_rad: f64) -> f64 {
     let p = config.distance_weight;
-    p * (1.0 - distance_m / max_range_m) + (1.0 - p) * (angle_rad.abs() / TAU)
+    p * (1.0 - distance_m / config.max_range_m) + (1.0 - p) * (angle_rad.abs() / TAU)
 }
 
 /// Visibility in 0 to 1 that falls with the squared distance and, as a bell, off-axis.
-pub fn falling(config: &WeightedConfig, max_range_m: f64, distance_m: f64, angle_rad: f64) -> f64 {
-    let distance = (distance_m / max_range_m).clamp(0.0, 1.0);
+pub fn falling(config: &WeightedConfig, distance_m: f64, angle_rad: f64) -> f64 {
+    let distance = (distance_m / config.max_range_m).clamp(0.0, 1.0);
     let angle = angle_rad / config.half_visibility_rad;
     (1.0 - (1.0 - config.visibility_at_max_range) * distance * distance) * (-LN_2 * angle * angle).exp()
 }
@@ -26,17 +26,17 @@ mod tests {
     #[test]
     fn the_papers_visibility_is_the_printed_formula() {
         let config = PaperConfig::default();
-        let k = paper(&config, 2.54, 1.27, -90f64.to_radians());
+        let k = paper(&config, 1.27, -90f64.to_radians());
         assert!((k - (0.7 * 0.5 + 0.3 * 0.25)).abs() < 1e-12);
     }
 
     #[test]
     fn visibility_falls_off_axis_and_with_distance() {
-        let config = WeightedConfig::default();
-        assert_eq!(falling(&config, 2.0, 0.0, 0.0), 1.0);
-        assert!((falling(&config, 2.0, 0.0, 0.8) - 0.5).abs() < 1e-12);
-        assert!((falling(&config, 2.0, 2.0, 0.0) - 0.3).abs() < 1e-12);
-        assert!(falling(&config, 2.0, 1.0, 0.3) < falling(&config, 2.0, 0.5, 0.3));
-        assert_eq!(falling(&config, 2.0, 1.0, 0.3), falling(&config, 2.0, 1.0, -0.3));
+        let config = WeightedConfig { max_range_m: 2.0, ..WeightedConfig::default() };
+        assert_eq!(falling(&config, 0.0, 0.0), 1.0);
+        assert!((falling(&config, 0.0, 0.8) - 0.5).abs() < 1e-12);
+        assert!((falling(&config, 2.0, 0.0) - 0.3).abs() < 1e-12);
+        assert!(falling(&config, 1.0, 0.3) < falling(&config, 0.5, 0.3));
+        assert_eq!(falling(&config, 1.0, 0.3), falling(&config, 1.0, -0.3));
     }
 }

@@ -245,6 +245,7 @@ fn captured_at(frame: usize) -> Timestamp {
 fn fusion(mode: VoteMode) -> FusionConfig {
     let mut vote = VoteConfig { mode, ..VoteConfig::default() };
     vote.paper.frames_per_verdict = 1;
+    vote.weighted.max_range_m = vote.paper.max_range_m;
     FusionConfig {
         algorithms: Algorithms::Vote,
         round: RoundConfig { period_s: FRAME_INTERVAL.as_secs_f64(), ..RoundConfig::default() },
