@@ -184,7 +184,7 @@ fn passes_go_over_all_votes_however_old() {
 fn with_passes_neither_time_nor_the_number_of_vehicles_keeps_a_vote_out() {
     let config = ReplayConfig { passes: Some(5), ..ReplayConfig::default() };
     let votes = |vehicle: u64, step: u64| {
-        let label = if vehicle % 3 == 0 { "mouse" } else { "cup" };
+        let label = if vehicle.is_multiple_of(3) { "mouse" } else { "cup" };
         vote_line(&report(&format!("v{vehicle}"), step * 1000, &[(&format!("item-{step}"), label)]))
     };
     let by_step: Vec<_> = (0..10).flat_map(|step| (0..300).map(move |vehicle| votes(vehicle, step))).collect();
