@@ -179,7 +179,7 @@ impl Cell {
             loop {
                 if let Some(epoch) = self.epoch()
                     && self.nodes.contains_key(epoch.leader.as_str())
-                    && (epoch.leader == "edge" || !self.nodes.contains_key("edge"))
+                    && (epoch.leader.as_str() == "edge" || !self.nodes.contains_key("edge"))
                 {
                     return epoch;
                 }
