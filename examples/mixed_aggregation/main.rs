@@ -24,7 +24,8 @@ use cell::{Cell, Record};
 /// The places of the cell and metres east; nobody is at the last.
 const PLACES: [(&str, f64); 3] = [("slot-0", 0.0), ("slot-1", 3.0), ("slot-2", 6.0)];
 
-/// What each vehicle reads at which places; all have all places in view, and noether misreads the first.
+/// What each vehicle reads at which places; all have all places in view, and noether misreads the first: without euclid,
+/// the map cannot tell who is right.
 const SEEN: [(&str, &[(usize, &str)]); 3] = [
     ("euclid", &[(0, "ABC123"), (1, "XYZ789")]),
     ("gauss", &[(0, "ABC123"), (1, "XYZ789")]),
