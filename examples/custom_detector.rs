@@ -67,15 +67,7 @@ async fn main() -> anyhow::Result<()> {
         Some(directory) => PathBuf::from(directory),
         None => draw(drawn.path())?,
     };
-    let spot = LandmarkConfig {
-        id: "spot".into(),
-        x_m: 1.0,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: Default::default(),
-    };
-    let cell = NodeConfig { landmarks: vec![spot], ..NodeConfig::default() };
+    let cell = NodeConfig { landmarks: vec![LandmarkConfig::at("spot", 1.0, 0.0)], ..NodeConfig::default() };
     let edge = node::start(NodeConfig {
         name: Some(NodeName::new("edge")?),
         role: Role::Edge,

@@ -9,16 +9,8 @@ use ecod::time::Timestamp;
 use ecod::wire::{ObjectReport, ReportKind, decode_report};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let slot = |id: &str, x_m: f64| LandmarkConfig {
-        id: id.into(),
-        x_m,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: Default::default(),
-    };
-    let landmarks = [slot("slot-0", 0.0), slot("slot-1", 3.0), slot("slot-2", 6.0)];
-    let landmarks = landmarks.iter().map(Landmark::from).collect();
+    let slots = [("slot-0", 0.0), ("slot-1", 3.0), ("slot-2", 6.0)];
+    let landmarks = slots.map(|(id, x_m)| Landmark::from(&LandmarkConfig::at(id, x_m, 0.0))).into();
 
     // Time is an argument: equal inputs give equal maps.
     let start = Timestamp(1_732_154_400_000_000);

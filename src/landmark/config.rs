@@ -44,6 +44,11 @@ pub struct VacancyConfig {
 }
 
 impl LandmarkConfig {
+    /// A location that can be read from all around, without a sign or other labels; `x_m` east and `y_m` north.
+    pub fn at(id: impl Into<LandmarkId>, x_m: f64, y_m: f64) -> Self {
+        Self { id: id.into(), x_m, y_m, facing_deg: None, vacancy: None, synonyms: BTreeMap::new() }
+    }
+
     /// Checks one location.
     ///
     /// # Errors

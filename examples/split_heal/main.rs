@@ -1,0 +1,189 @@
+//! A cell of four vehicles that falls in two and heals: two leaders, two maps, then one again, and no evidence lost.
+//!
+//! `cargo run --example split_heal`
+//!
+//! A simulation: election, aggregator and ledger of each vehicle are those that a node runs, and what travels is encoded
+//! and decoded, but time is a number and the network a queue, so that every run is the same. Cells of real processes
+//! are split by `make trials`, in network namespaces.
+//!
+//! Euclid and gauss see slot-0, noether and turing slot-1, and all read a sign, which turing gets wrong. The program
+//! fails unless, in the end, one leads and every ledger holds the evidence of both sides once.
+
+mod vehicle;
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::Duration;
+
+use anyhow::ensure;
+use ecod::aggregator::FusionConfig;
+use ecod::election::Input;
+use ecod::landmark::{Landmark, LandmarkConfig};
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION};
+
+use vehicle::{Payload, Vehicle};
+
+/// Places and metres east.
+const PLACES: [(&str, f64); 3] = [("slot-0", 0.0), ("slot-1", 3.0), ("sign", 6.0)];
+
+/// What each vehicle reads at which places.
+const SEEN: [(&str, [(usize, &str); 2]); 4] = [
+    ("euclid", [(0, "ABC123"), (2, "stop")]),
+    ("gauss", [(0, "ABC123"), (2, "stop")]),
+    ("noether", [(1, "XYZ789"), (2, "stop")]),
+    ("turing", [(1, "XYZ789"), (2, "yield")]),
+];
+
+const START: Timestamp = Timestamp(1_732_154_400_000_000);
+const REPORT_MS: u64 = 100;
+/// What a packet takes, and how finely time passes.
+const TRAVEL: Duration = Duration::from_millis(1);
+/// Until the memberships know who is gone or back.
+const NOTICE_MS: u64 = 300;
+
+fn main() -> anyhow::Result<()> {
+    let mut cell = Cell::new();
+    println!("{:>7}  {:<26}{:<37}map at turing", "time", "event", "map at gauss");
+    cell.split(false, "the vehicles start")?;
+    cell.run_for(7700)?;
+    cell.tell("all is well");
+    cell.split(true, "the network splits")?;
+    cell.run_for(7700)?;
+    cell.tell("both sides go on");
+    cell.split(false, "the network heals")?;
+    cell.run_for(7700)?;
+    cell.tell("all is well");
+    cell.check()
+}
+
+struct Packet {
+    due: Timestamp,
+    from: usize,
+    to: usize,
+    payload: Payload,
+}
+
+struct Cell {
+    now: Timestamp,
+    vehicles: Vec<Vehicle>,
+    packets: VecDeque<Packet>,
+    is_split: bool,
+}
+
+impl Cell {
+    fn new() -> Self {
+        let mut fusion = FusionConfig::default();
+        // A vehicle's vote counts as evidence once in this time.
+        fusion.vote.weighted.freshness_s = 0.5;
+        let landmarks = PLACES.map(|(id, x_m)| Landmark::from(&LandmarkConfig::at(id, x_m, 0.0)));
+        let vehicle = |(name, _)| Vehicle::new(NodeName::from_static(name), fusion.clone(), landmarks.to_vec(), START);
+        Self { now: START, vehicles: SEEN.map(vehicle).into(), packets: VecDeque::new(), is_split: false }
+    }
+
+    /// Cuts or mends the links between the halves; the memberships find out a while later.
+    fn split(&mut self, is_split: bool, event: &str) -> anyhow::Result<()> {
+        self.is_split = is_split;
+        self.tell(event);
+        self.run_for(NOTICE_MS)?;
+        for node in 0..SEEN.len() {
+            for other in (0..SEEN.len()).filter(|other| *other != node) {
+                let (peer, is_linked) = (self.vehicles[other].name.clone(), self.is_linked(node, other));
+                let input = if is_linked { Input::PeerAlive { peer } } else { Input::PeerDown { peer } };
+                self.vehicles[node].handle(input, self.now);
+            }
+        }
+        Ok(())
+    }
+
+    fn is_linked(&self, a: usize, b: usize) -> bool {
+        !self.is_split || (a < 2) == (b < 2)
+    }
+
+    fn run_for(&mut self, ms: u64) -> anyhow::Result<()> {
+        for _ in 0..ms {
+            self.now = self.now + TRAVEL;
+            while let Some(Packet { from, to, payload, .. }) = self.packets.pop_front_if(|next| next.due <= self.now) {
+                let sender = self.vehicles[from].name.clone();
+                self.vehicles[to].receive(&sender, &payload, self.now)?;
+            }
+            for node in 0..SEEN.len() {
+                if self.now.micros().is_multiple_of(REPORT_MS * 1000) {
+                    self.vehicles[node].report(&report(node, self.now), self.now)?;
+                }
+                self.vehicles[node].tick(self.now)?;
+                self.post(node);
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes what the vehicle sends as far as links reach, and tells its news.
+    fn post(&mut self, from: usize) {
+        for (addressee, payload) in std::mem::take(&mut self.vehicles[from].outbox) {
+            for to in (0..SEEN.len()).filter(|to| *to != from) {
+                let is_meant = addressee.as_ref().is_none_or(|name| *name == self.vehicles[to].name);
+                if is_meant && self.is_linked(from, to) {
+                    self.packets.push_back(Packet { due: self.now + TRAVEL, from, to, payload: payload.clone() });
+                }
+            }
+        }
+        for event in std::mem::take(&mut self.vehicles[from].news) {
+            self.tell(&event);
+        }
+    }
+
+    /// Says what happened and what map each side has.
+    fn tell(&self, event: &str) {
+        let view = |vehicle: &Vehicle| {
+            let Some(map) = &vehicle.map else { return "none".to_owned() };
+            let labels = map.landmarks.iter().map(|place| place.label.as_deref().unwrap_or("?"));
+            format!("{}@{} #{} {}", map.aggregator, map.epoch, map.round, labels.collect::<Vec<_>>().join(" "))
+        };
+        let seconds = self.now.since(START).as_secs_f64();
+        println!("{seconds:>5.2} s  {event:<26}{:<37}{}", view(&self.vehicles[1]), view(&self.vehicles[3]));
+    }
+
+    /// One leads, all have its map, and every ledger holds what was settled in every leadership once.
+    fn check(&self) -> anyhow::Result<()> {
+        println!("\nvotes settled, and in the ledgers of the vehicles");
+        let settled: BTreeMap<_, _> = self.vehicles.iter().flat_map(|vehicle| &vehicle.settled).collect();
+        for (epoch, settled) in settled {
+            let held = |vehicle: &Vehicle| {
+                let lane = vehicle.ledger.entries().filter(|e| e.epoch == epoch.term && e.aggregator == epoch.leader);
+                lane.map(|entry| entry.correct + entry.incorrect).sum::<u64>()
+            };
+            let held: Vec<_> = self.vehicles.iter().map(held).collect();
+            println!("{:<10}{settled:>4}  {held:?}", epoch.to_string());
+            ensure!(*settled > 0, "{epoch} settled nothing");
+            ensure!(held.iter().all(|held| held == settled), "evidence of {epoch} was lost or counted twice");
+        }
+        let leaders = self.vehicles.iter().filter(|vehicle| vehicle.election.is_leading()).count();
+        let sources = self.vehicles.iter().map(|vehicle| vehicle.map.as_ref().map(|map| (map.epoch, &map.aggregator)));
+        let sources: BTreeSet<_> = sources.collect();
+        ensure!(leaders == 1 && sources.len() == 1, "{leaders} lead, and maps come from {sources:?}");
+        Ok(())
+    }
+}
+
+/// What a vehicle sees.
+fn report(node: usize, now: Timestamp) -> ObjectReport {
+    let (name, seen) = SEEN[node];
+    let object = |(place, label): (usize, &str)| PerceivedObject {
+        label: label.into(),
+        confidence: 0.9,
+        x_m: PLACES[place].1,
+        y_m: 0.0,
+        covariance_m2: None,
+        landmark: Some(PLACES[place].0.into()),
+    };
+    ObjectReport {
+        schema: SCHEMA_VERSION,
+        node: NodeName::from_static(name),
+        seq: now.since(START).as_millis() as u64,
+        captured_at_us: now,
+        pose: None,
+        objects: seen.map(object).into(),
+        seen: None,
+    }
+}
