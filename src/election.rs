@@ -39,7 +39,8 @@
 //! for a lost packet. Moreover the beat carries what a successor needs, its round and its successors, and proves that
 //! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as
 //! its cost per node does not grow with the cell; what it finds enters as [`Input::PeerAlive`] and [`Input::PeerDown`].
-//! To keep a leader's packets few, only its successors get every beat, the others every fifth.
+//! To keep a leader's packets few, only its standby gets every beat, its other successors every eighth, and everyone else
+//! one each `idle_beat_ms`.
 
 mod claiming;
 mod clock;

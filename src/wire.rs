@@ -281,6 +281,9 @@ pub struct NodeStatus {
     /// The aggregator it follows, or itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub aggregator: Option<NodeName>,
+    /// Whether its broker, fuser and gateway work, so that it could lead; absent on a node that never leads.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fit: Option<bool>,
     /// Version of the software.
     pub version: String,
 }

@@ -106,6 +106,7 @@ async fn join(
         state: NodeState::Following,
         epoch: 0,
         aggregator: None,
+        fit: None,
         version: env!("CARGO_PKG_VERSION").to_owned(),
     };
     let arguments = GatewayArguments {

@@ -7,7 +7,8 @@
 //! ```
 //!
 //! A broker that cannot start is an answer to whoever asked, not a failure of the actor: the node decides whether
-//! another address, an external broker or giving up is right.
+//! another address, an external broker or giving up is right. One that ended by itself ends the actor as soon as anyone
+//! asks how it is, so that the node starts both anew.
 
 mod embedded;
 mod retained;
@@ -47,7 +48,7 @@ pub enum BrokerHealth {
     Stopped,
     /// Accepts clients at this address.
     Serving(SocketAddr),
-    /// Was started, but has ended by itself; a node without its broker must not lead.
+    /// Was started, but has ended by itself; a node without its broker must not lead. The actor ends with this answer.
     Dead,
 }
 
@@ -88,7 +89,13 @@ impl Actor for Broker {
                 broker.stop();
                 answer(reply, ());
             }
-            BrokerMessage::Health { reply } => answer(reply, broker.health()),
+            BrokerMessage::Health { reply } => {
+                let health = broker.health();
+                answer(reply, health);
+                if health == BrokerHealth::Dead {
+                    return Err("broker ended by itself".into());
+                }
+            }
         }
         Ok(())
     }
@@ -106,5 +113,33 @@ impl Actor for Broker {
 fn answer<T: Send + 'static>(reply: RpcReplyPort<T>, value: T) {
     if reply.send(value).is_err() {
         tracing::debug!("nobody waited for the broker's answer");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug)]
+    struct Fallen;
+
+    impl Mqtt for Fallen {
+        fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
+            Ok(address)
+        }
+
+        fn stop(&mut self) {}
+
+        fn health(&self) -> BrokerHealth {
+            BrokerHealth::Dead
+        }
+    }
+
+    #[tokio::test]
+    async fn a_broker_that_ended_by_itself_ends_its_actor_so_that_it_is_started_anew() {
+        let (actor, ended) = Actor::spawn(None, Broker, Box::new(Fallen) as Box<dyn Mqtt>).await.unwrap();
+        let health = ractor::call!(actor, |reply| BrokerMessage::Health { reply }).unwrap();
+        assert_eq!(health, BrokerHealth::Dead);
+        ended.await.unwrap();
     }
 }

@@ -32,6 +32,8 @@ pub enum Event {
     BrokerRefused,
     /// A map newer than all before was taken.
     MapAccepted,
+    /// A map, verdicts or reputations of the leadership taken last came again, as all do that have two ways here.
+    Repeated,
     /// An object voted for nothing, such as at an unknown landmark.
     VoteIgnored,
     /// Verdicts newer than all before were taken.
@@ -58,7 +60,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 23] = [
+    pub const ALL: [Self; 24] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -71,6 +73,7 @@ impl Event {
         Self::ConnectFailed,
         Self::BrokerRefused,
         Self::MapAccepted,
+        Self::Repeated,
         Self::VoteIgnored,
         Self::VerdictsAccepted,
         Self::ReputationsAccepted,
@@ -99,6 +102,7 @@ impl Event {
             Self::ConnectFailed => "connect_failed",
             Self::BrokerRefused => "broker_refused",
             Self::MapAccepted => "map_accepted",
+            Self::Repeated => "repeated",
             Self::VoteIgnored => "vote_ignored",
             Self::VerdictsAccepted => "verdicts_accepted",
             Self::ReputationsAccepted => "reputations_accepted",

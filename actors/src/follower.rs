@@ -24,7 +24,7 @@ use crate::counters::{Counters, Event};
 use crate::gateway::{Delivery, Incoming};
 use crate::leader_election::{LeaderElectionMessage, Leadership};
 use crate::seat::Seat;
-use gate::{Gate, MEMORY};
+use gate::{Gate, MEMORY, Refusal};
 
 /// What the follower is asked to do.
 #[derive(Debug)]
@@ -145,8 +145,10 @@ impl Actor for Follower {
             Incoming::Reputations(reputations) => state.take_reputations(reputations, delivery.received_at),
             _ => Ok(()),
         };
-        if let Err(reason) = taken {
-            state.counters.reject(reason);
+        match taken {
+            Ok(()) => {}
+            Err(Refusal::Repeated) => state.counters.count(Event::Repeated),
+            Err(Refusal::Superseded) => state.counters.reject(RejectReason::Superseded),
         }
         Ok(())
     }
@@ -159,7 +161,7 @@ impl FollowerState {
         Self { newest, maps, verdicts, reputations, log, leadership, election, counters }
     }
 
-    fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), RejectReason> {
+    fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         self.maps.admit(&epoch, map.round, received_at, self.may_lead(&epoch))?;
         self.counters.count(Event::MapAccepted);
@@ -170,7 +172,7 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), RejectReason> {
+    fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
         self.verdicts.admit(&epoch, verdicts.round, received_at, self.may_lead(&epoch))?;
         self.counters.count(Event::VerdictsAccepted);
@@ -181,7 +183,7 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), RejectReason> {
+    fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), Refusal> {
         let aggregator = reputations.aggregator.clone().unwrap_or(UNNAMED);
         let epoch = Epoch::new(reputations.epoch, aggregator);
         self.reputations.admit(&epoch, reputations.round, received_at, self.may_lead(&epoch))?;
@@ -252,11 +254,11 @@ mod tests {
         let second = |n: u64| Timestamp(n * 1_000_000);
         let accepted = |follower: &FollowerState| follower.newest.map.borrow().as_ref().map(|newest| newest.map.epoch);
         assert_eq!(follower.take_map(&map(u64::MAX, 1), second(0)), Ok(()));
-        assert_eq!(follower.take_map(&map(7, 1), second(1)), Err(RejectReason::Superseded));
+        assert_eq!(follower.take_map(&map(7, 1), second(1)), Err(Refusal::Superseded));
         assert_eq!(accepted(&follower), Some(u64::MAX));
         assert_eq!(follower.take_map(&map(7, 2), second(4)), Ok(()));
         assert_eq!(accepted(&follower), Some(7));
-        assert_eq!(follower.take_map(&map(7, 2), second(5)), Err(RejectReason::Superseded), "not taken twice");
+        assert_eq!(follower.take_map(&map(7, 2), second(5)), Err(Refusal::Repeated), "not taken twice");
     }
 
     #[test]
@@ -271,7 +273,7 @@ mod tests {
         assert_eq!(follower.take_reputations(&reputations(7, 1, None), now), Ok(()));
         assert_eq!(follower.take_reputations(&reputations(7, 1, Some("edge")), now), Ok(()));
         let late = follower.take_reputations(&reputations(7, 2, None), now);
-        assert_eq!(late, Err(RejectReason::Superseded));
+        assert_eq!(late, Err(Refusal::Superseded));
         let newest = follower.newest.reputations.borrow().as_ref().map(|newest| newest.message.aggregator.clone());
         assert_eq!(newest, Some(Some(NodeName::from_static("edge"))));
     }
@@ -281,6 +283,6 @@ mod tests {
         let epoch = Some(Epoch::new(8, NodeName::from_static("euclid")));
         let mut follower = follower(Leadership { position: Position::Following, epoch, standby: None });
         assert_eq!(follower.take_map(&map(8, 1), Timestamp(0)), Ok(()));
-        assert_eq!(follower.take_map(&map(7, 99), Timestamp(9_000_000)), Err(RejectReason::Superseded));
+        assert_eq!(follower.take_map(&map(7, 99), Timestamp(9_000_000)), Err(Refusal::Superseded));
     }
 }

@@ -10,13 +10,14 @@
 //! ```
 //!
 //! [`ecod::election::Election`] decides; the actor carries out its effects in their order, a term being on disk before
-//! anything that follows it. What is a state rather than an event (links, status, watch) is not carried out effect by
+//! the node leads in it. What is a state rather than an event (links, status, watch) is not carried out effect by
 //! effect but compared with what the election says now.
 
 mod driver;
 mod health;
 mod leadership;
 mod routes;
+mod terms;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -29,10 +30,11 @@ use ecod::wire::NodeStatus;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
-pub use driver::{ElectionDriver, saved_term};
+pub use driver::ElectionDriver;
 pub use health::Probe;
 pub use leadership::{Leadership, Position};
 pub use routes::DataPlane;
+pub use terms::saved_term;
 
 use crate::broker::BrokerMessage;
 use crate::counters::Counters;

@@ -73,7 +73,8 @@ impl Health {
 /// What the actor must do, in the order given.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Effect {
-    /// Write the term to disk; carry out later effects only when it is there.
+    /// Write the term to disk; it must be there before an [`Effect::Lead`] in it, and all that follows that, is carried
+    /// out. It mostly comes long before.
     PersistTerm {
         /// To be given to [`crate::election::Election::new`] after a restart.
         term: u64,

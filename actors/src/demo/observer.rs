@@ -47,6 +47,7 @@ impl Observer {
             state: NodeState::Following,
             epoch: 0,
             aggregator: None,
+            fit: None,
             version: env!("CARGO_PKG_VERSION").into(),
         };
         let arguments = GatewayArguments {

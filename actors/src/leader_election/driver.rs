@@ -19,19 +19,19 @@ use uuid::Uuid;
 
 use super::health::{self, HealthMonitor, Probe};
 use super::routes::{Brokers, Routes};
+use super::terms::{TermWriter, saved_term};
 use super::{LeaderElectionArguments, LeaderElectionMessage, Leadership, Parts};
 use crate::clock;
 use crate::counters::Counters;
 use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
 use crate::membership::{Member, MembershipEvent};
-use crate::state_file::StateFile;
 
 /// The election, what it was told last, and what came of it.
 pub struct ElectionDriver {
     election: Election,
     name: NodeName,
     role: Role,
-    term_file: Option<StateFile>,
+    terms: TermWriter,
     round_period: Duration,
     members: BTreeMap<NodeName, Member>,
     all_members: watch::Receiver<Vec<Member>>,
@@ -42,6 +42,8 @@ pub struct ElectionDriver {
     /// The last living run of each node, as brokers tell it.
     runs: HashMap<NodeName, Uuid>,
     status: NodeStatus,
+    /// Whether the gateway knows the status.
+    status_told: bool,
     /// The epoch of the last round, which a node without word from the election says it follows.
     taken: Option<Epoch>,
     preparing: Option<Preparing>,
@@ -51,7 +53,6 @@ pub struct ElectionDriver {
     alarm: Timestamp,
     timer: Option<AbortHandle>,
     drained: bool,
-    disk_failed: bool,
     myself: ActorRef<LeaderElectionMessage>,
 }
 
@@ -72,14 +73,12 @@ const STATE_PATIENCE: Duration = Duration::from_millis(1000);
 /// Time between two looks at what a handover waits for.
 const PREPARE_STEP: Duration = Duration::from_millis(50);
 
+/// Most nodes whose runs are remembered: brokers may tell of any number of names.
+const MAX_RUNS: usize = 4096;
+
 /// A timer later than this was overslept; what waits in the sockets is then dealt with first, for as long as below.
 const OVERSLEPT: Duration = Duration::from_millis(20);
 const DRAIN_TIME: Duration = Duration::from_millis(10);
-
-/// The highest term that an earlier run of the node knew; 0 without any.
-pub fn saved_term(file: Option<&StateFile>) -> u64 {
-    file.and_then(|file| file.load(|_| true)).unwrap_or(0)
-}
 
 impl ElectionDriver {
     pub(super) fn new(arguments: LeaderElectionArguments, myself: ActorRef<LeaderElectionMessage>) -> Self {
@@ -89,7 +88,7 @@ impl ElectionDriver {
             election: Election::new(config, name.clone(), saved_term(term_file.as_ref()), clock::now()),
             name,
             role,
-            term_file,
+            terms: TermWriter::new(term_file),
             round_period: arguments.round_period,
             members: BTreeMap::new(),
             all_members: arguments.members,
@@ -100,6 +99,7 @@ impl ElectionDriver {
             runs: HashMap::new(),
             taken: status.aggregator.clone().map(|aggregator| Epoch::new(status.epoch, aggregator)),
             status,
+            status_told: false,
             preparing: None,
             parts,
             leadership,
@@ -107,7 +107,6 @@ impl ElectionDriver {
             alarm: Timestamp(u64::MAX),
             timer: None,
             drained: false,
-            disk_failed: false,
             myself,
         }
     }
@@ -165,7 +164,9 @@ impl ElectionDriver {
     pub(super) async fn take_status(&mut self, status: &NodeStatus) -> Result<(), ActorProcessingErr> {
         let peer = status.node.clone();
         if status.state != NodeState::Offline {
-            self.runs.insert(peer, status.id);
+            if self.runs.len() < MAX_RUNS || self.runs.contains_key(&peer) {
+                self.runs.insert(peer, status.id);
+            }
             return Ok(());
         }
         let ended = self.runs.remove(&peer) == Some(status.id);
@@ -202,7 +203,7 @@ impl ElectionDriver {
     pub(super) async fn note_gateway_restart(&mut self) -> Result<(), ActorProcessingErr> {
         self.routes.forget();
         self.monitor.forget_links();
-        self.status.epoch = u64::MAX;
+        self.status_told = false;
         self.update_health().await
     }
 
@@ -255,7 +256,9 @@ impl ElectionDriver {
 
     /// Gives up the lead, if this node has it, so that the next one need not find out.
     pub(super) async fn leave(&mut self) -> Result<(), ActorProcessingErr> {
-        self.feed(Input::Leave).await
+        self.feed(Input::Leave).await?;
+        self.terms.settle(u64::MAX).await;
+        Ok(())
     }
 
     /// Makes links, status, watch and timer what the election says now.
@@ -300,10 +303,12 @@ impl ElectionDriver {
             state,
             epoch: epoch.map_or(0, |epoch| epoch.term),
             aggregator: epoch.map(|epoch| epoch.leader.clone()),
+            fit: (self.role != Role::Cav).then(|| self.health.is_fit()),
             ..self.status.clone()
         };
-        if status != self.status {
+        if status != self.status || !self.status_told {
             self.status = status.clone();
+            self.status_told = true;
             self.parts.gateway.send(GatewayMessage::PublishStatus { status });
         }
     }

@@ -38,6 +38,7 @@ pub(super) struct Sessions {
     proofs: Answers,
     greetings: Throttle,
     max_peers: usize,
+    other_key_seen: bool,
     counters: Arc<FrameCounters>,
 }
 
@@ -111,6 +112,7 @@ impl Sessions {
             proofs: Answers::new(now),
             greetings: Throttle::new(GREETINGS, STEADY, now),
             max_peers,
+            other_key_seen: false,
             counters,
         }
     }
@@ -159,7 +161,10 @@ impl Sessions {
         if head.sender == self.own {
             return if head.kind == Kind::Hello { Ok(Opened::Nothing) } else { Err(FrameEvent::Replayed) };
         }
-        let body = self.unseal(&head, frame).ok_or(FrameEvent::BadSeal)?;
+        let Some(body) = self.unseal(&head, frame) else {
+            self.note_other_key(head.kind, from);
+            return Err(FrameEvent::BadSeal);
+        };
         if head.kind == Kind::Hello {
             return self.greeted(&head, &decode(&body)?, from, now, roster);
         }
@@ -178,6 +183,13 @@ impl Sessions {
                 Ok(Opened::Stranger)
             }
             kind => self.hear(&head.sender, kind, body, now),
+        }
+    }
+
+    /// A greeting, which all with the key can read, is in another key: said once, as it goes on for ever.
+    fn note_other_key(&mut self, kind: Kind, from: SocketAddr) {
+        if kind == Kind::Hello && !std::mem::replace(&mut self.other_key_seen, true) {
+            tracing::warn!(%from, "a node of this cell has another key, or none; it is not heard");
         }
     }
 

@@ -214,7 +214,8 @@ impl Assembly {
     }
 
     async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let (actor, _) = Actor::spawn_linked(None, Membership, self.membership_arguments(), supervisor).await?;
+        let (actor, _) =
+            Actor::spawn_linked(None, Membership, self.membership_arguments(), supervisor).await.map_err(cause)?;
         let address = ractor::call!(actor, |reply| MembershipMessage::Address { reply })?;
         self.gossip_address.send_replace(Some(address));
         let id = actor.get_id();

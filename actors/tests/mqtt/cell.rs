@@ -67,6 +67,7 @@ impl Node {
             state: NodeState::Following,
             epoch: 1,
             aggregator: None,
+            fit: None,
             version: "0.1.0".to_owned(),
         };
         let arguments = GatewayArguments {

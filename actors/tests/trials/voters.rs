@@ -44,6 +44,7 @@ impl Voters {
             state: NodeState::Following,
             epoch: 0,
             aggregator: None,
+            fit: None,
             version: env!("CARGO_PKG_VERSION").into(),
         };
         let arguments = GatewayArguments {

@@ -72,6 +72,7 @@ fn status() -> NodeStatus {
         state: NodeState::Aggregating,
         epoch: 3,
         aggregator: Some(edge()),
+        fit: Some(true),
         version: "0.1.0".into(),
     }
 }

@@ -147,6 +147,7 @@ impl Assembly {
             state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
             epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
             aggregator: epoch.map(|epoch| epoch.leader),
+            fit: self.config.may_lead().then_some(false),
             version: env!("CARGO_PKG_VERSION").into(),
         }
     }
