@@ -10,7 +10,7 @@
 
 mod cell;
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, ensure};
 use ecod::epoch::Epoch;
@@ -74,8 +74,8 @@ fn main() -> anyhow::Result<()> {
 
 /// Carries out the script; every step has a line when it is done and one when all are served again.
 async fn play(cell: &mut Cell) -> anyhow::Result<()> {
-    let started = Instant::now();
-    let age = || started.elapsed().as_secs_f64();
+    let started = clock::now();
+    let age = || clock::now().since(started).as_secs_f64();
     println!("{:>7}  {:<34}{:>8}  {:<20}votes", "time", "event", "gap", "map");
     for step in SCRIPT {
         let from = clock::now();
