@@ -209,6 +209,7 @@ impl Cell {
 
     fn converges(&self) -> bool {
         let mut quiet = self.clone();
+        // A peer that fell silent counts as heard for 2.5 idle beats (6.25 s); then come `stable_ms` and a handover.
         quiet.run_quietly(14_000);
         let running = || quiet.nodes.iter().filter_map(|node| node.election.as_ref());
         let candidates = quiet.nodes.iter().take(3).any(|node| node.election.is_some());

@@ -170,7 +170,7 @@ impl Actor for ReputationKeeper {
             ReputationKeeperMessage::Merge { delivery } => state.merge(&delivery),
             ReputationKeeperMessage::SendSnapshot { to } => {
                 tracing::info!(%to, "sharing all evidence");
-                state.share_all();
+                state.send_snapshot();
             }
             ReputationKeeperMessage::Tick => state.tick().await,
         }
@@ -283,16 +283,26 @@ impl ReputationKeeperState {
         self.share(&self.entries().collect::<Vec<_>>());
     }
 
-    fn share(&self, entries: &[LedgerEntry]) {
-        for entries in entries.chunks(MAX_SHARE_ENTRIES) {
-            let share = LedgerShare {
-                schema: SCHEMA_VERSION,
-                node: self.arguments.name.clone(),
-                epoch: self.leads.as_ref().map(|epoch| epoch.term),
-                entries: entries.to_vec(),
-            };
-            self.arguments.gateway.send(GatewayMessage::PublishShare { share });
+    /// Shares all evidence, and that there is none: whoever takes over waits for it.
+    fn send_snapshot(&self) {
+        if self.entries().next().is_none() {
+            self.publish_share(&[]);
         }
+        self.share_all();
+    }
+
+    fn share(&self, entries: &[LedgerEntry]) {
+        entries.chunks(MAX_SHARE_ENTRIES).for_each(|entries| self.publish_share(entries));
+    }
+
+    fn publish_share(&self, entries: &[LedgerEntry]) {
+        let share = LedgerShare {
+            schema: SCHEMA_VERSION,
+            node: self.arguments.name.clone(),
+            epoch: self.leads.as_ref().map(|epoch| epoch.term),
+            entries: entries.to_vec(),
+        };
+        self.arguments.gateway.send(GatewayMessage::PublishShare { share });
     }
 
     /// Saves what has changed; a disk that fails or hangs is counted, and the node goes on.

@@ -111,6 +111,7 @@ fn a_one_way_link_does_not_flap() {
             if from != to {
                 world.plan(0, Fault::Cut { from, to });
             }
+            // As long as the election takes to settle, see docs/election.md, and more.
             world.run_for(20 * SECOND);
             let after = world.led.len();
             ensure(after <= before + 2, "the lead moved more than twice")?;
