@@ -141,18 +141,7 @@ impl WeightedTally {
         let (vehicle, label) = (self.vehicle(node), self.label(label));
         let freshness = Duration::from_secs_f64(self.config.freshness_s);
         let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
-        let (mut since, mut compared) = (at, false);
-        if let Some(earlier) = earlier {
-            if at.since(earlier.since) >= freshness {
-                self.retire(landmark, |c| c.vehicle == vehicle);
-            } else {
-                (since, compared) = (earlier.since, earlier.compared);
-                self.uncount(landmark);
-            }
-        } else {
-            self.uncount(landmark);
-        }
-        let cast = Cast {
+        let first = Cast {
             vehicle,
             label,
             confidence,
@@ -160,11 +149,27 @@ impl WeightedTally {
             weight: 1.0,
             own: 1.0,
             at,
-            since,
+            since: at,
             band: 0,
             agreement: None,
             judged: false,
-            compared,
+            compared: false,
+        };
+        let cast = match earlier {
+            Some(earlier) if at.since(earlier.since) >= freshness => {
+                self.settle_all(landmark);
+                first
+            }
+            Some(Cast { since, compared, .. }) => {
+                self.uncount(landmark);
+                let said_before = earlier.filter(|earlier| earlier.label == label);
+                let rest = said_before.map_or(first, |earlier| Cast { confidence, visibility, at, ..earlier });
+                Cast { since, compared, agreement: None, ..rest }
+            }
+            None => {
+                self.uncount(landmark);
+                first
+            }
         };
         let ballot = self.ballots.entry(landmark.clone()).or_default();
         match ballot.casts.binary_search_by_key(&vehicle, |c| c.vehicle) {
@@ -190,35 +195,45 @@ impl WeightedTally {
         }
     }
 
-    /// Turns the votes that `is_past` selects into fading evidence and a record, and removes them.
+    /// Removes the votes that `is_past` selects, once all on the landmark have become evidence.
     fn retire(&mut self, landmark: &LandmarkId, is_past: impl Fn(&Cast) -> bool) {
         if !self.ballots.get(landmark).is_some_and(|b| b.casts.iter().any(&is_past)) {
             return;
         }
-        self.uncount(landmark);
+        self.settle_all(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        let (posterior, is_witnessed) = (ballot.posterior.clone(), ballot.is_witnessed());
-        let (past, casts) = std::mem::take(&mut ballot.casts).into_iter().partition(is_past);
-        ballot.casts = casts;
-        let shown = ballot.shown;
-        let past: Vec<Cast> = past;
+        ballot.casts.retain(|cast| !is_past(cast));
         if ballot.casts.is_empty() {
             ballot.shown = None;
             ballot.posterior.clear();
         }
-        for cast in past.iter().filter(|cast| cast.judged && is_witnessed) {
+    }
+
+    /// Turns the judged votes on a landmark into fading evidence and a record; they begin to count anew. All at once: were
+    /// each settled in its turn, the first would for a while be judged by evidence that the others still lack.
+    fn settle_all(&mut self, landmark: &LandmarkId) {
+        self.uncount(landmark);
+        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
+        if ballot.is_witnessed() {
+            let judged = ballot.casts.iter().filter(|cast| cast.judged);
             // Judged by the others: a vehicle that decides alone must not prove itself right.
-            let others = self.model.without(&posterior, &cast.word());
-            self.model.settle(&cast.word(), &others);
-            self.calibration.settle(cast.band, probability(&others, cast.label));
-            let correct = shown == Some(cast.label);
-            let record = &mut self.records[cast.vehicle];
-            *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
-            self.evidence.push(Evidence {
-                node: self.names[cast.vehicle].clone(),
-                label: self.labels[usize::from(cast.label)].clone(),
-                correct,
-            });
+            let settled: Vec<_> =
+                judged.map(|cast| (*cast, self.model.without(&ballot.posterior, &cast.word()))).collect();
+            for (cast, others) in settled {
+                self.model.settle(&cast.word(), &others);
+                self.calibration.settle(cast.band, probability(&others, cast.label));
+                let correct = ballot.shown == Some(cast.label);
+                let record = &mut self.records[cast.vehicle];
+                *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
+                self.evidence.push(Evidence {
+                    node: self.names[cast.vehicle].clone(),
+                    label: self.labels[usize::from(cast.label)].clone(),
+                    correct,
+                });
+            }
+        }
+        for cast in &mut ballot.casts {
+            (cast.since, cast.judged, cast.compared) = (cast.at, false, false);
         }
         self.touched.insert(landmark.clone());
     }
