@@ -242,18 +242,21 @@ impl Model {
         }
     }
 
-    /// Moves one word, not at present counted as live, to the fading evidence.
-    pub(super) fn settle(&mut self, word: &Word, posterior: &[(LabelIndex, f64)]) {
+    /// Moves one word, not at present counted as live, to the fading evidence: the vehicle's by what `others` say, the
+    /// fleet's by what all say, or few vehicles that outvote one would together seem wrong more often than right.
+    pub(super) fn settle(&mut self, word: &Word, others: &[(LabelIndex, f64)], all: &[(LabelIndex, f64)]) {
         let fade = 1.0 - 1.0 / self.config.memory_votes;
         let fleet_fade = 1.0 - 1.0 / (self.config.memory_votes * self.witnesses.len().max(1) as f64);
         let witness = &mut self.witnesses[word.vehicle];
-        let right = posterior.iter().find(|(truth, _)| *truth == word.label).map_or(0.0, |(_, p)| *p);
+        let right = others.iter().find(|(truth, _)| *truth == word.label).map_or(0.0, |(_, p)| *p);
         witness.watch(right);
         witness.settled.fade(fade);
         witness.inherited.fade(fade);
         self.settled.fade(fleet_fade);
-        for &(truth, p) in posterior {
+        for &(truth, p) in others {
             witness.settled.add(truth, word.label, p * word.weight.min(1.0));
+        }
+        for &(truth, p) in all {
             self.settled.add(truth, word.label, p * word.weight.min(1.0));
         }
     }

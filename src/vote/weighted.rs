@@ -220,7 +220,7 @@ impl WeightedTally {
             let settled: Vec<_> =
                 judged.map(|cast| (*cast, self.model.without(&ballot.posterior, &cast.word()))).collect();
             for (cast, others) in settled {
-                self.model.settle(&cast.word(), &others);
+                self.model.settle(&cast.word(), &others, &ballot.posterior);
                 self.calibration.settle(cast.band, probability(&others, cast.label));
                 let correct = ballot.shown == Some(cast.label);
                 let record = &mut self.records[cast.vehicle];
