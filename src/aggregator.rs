@@ -22,7 +22,7 @@ use crate::landmark::{Landmark, LandmarkIndex};
 use crate::names::NodeName;
 use crate::pace::Pace;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::round::RoundTrigger;
+use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
 use crate::vote::{Vote, VoteMode};
 use crate::window::ReportWindow;
@@ -79,16 +79,15 @@ impl Aggregator {
     /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
     pub fn new(name: NodeName, epoch: u64, config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
         let mut aggregator = Self::standby(config, landmarks, now);
-        aggregator.lead(Epoch::new(epoch, name), 1, true, now);
+        aggregator.lead(Epoch::new(epoch, name), 1, FirstRound::OnTime, now);
         aggregator
     }
 
-    /// Leads from `now` on: the next round is number `first_round` of `epoch`, due a period later if the round before
-    /// it was closed `on_time`, else at once.
-    pub fn lead(&mut self, epoch: Epoch, first_round: u64, on_time: bool, now: Timestamp) {
+    /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says.
+    pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {
         self.leads = Some(epoch);
         self.next_round = first_round;
-        self.rounds.start(on_time, now);
+        self.rounds.start(first, now);
     }
 
     /// Lets the present round last its whole period: whoever takes the lead over has that long to say so.
@@ -333,12 +332,16 @@ mod tests {
             assert_eq!(cell.tick(at(step * 50 + 20)), None);
         }
         let epoch = Epoch::new(3, NodeName::from_static("gauss"));
-        cell.lead(epoch.clone(), 88, false, at(1030));
+        cell.lead(epoch.clone(), 88, FirstRound::Overdue, at(1030));
         let first = cell.tick(at(1030)).expect("due at once");
         assert_eq!((first.epoch.clone(), first.round, shown(&first)), (epoch.clone(), 88, (Some("cup"), Some("cup"))));
-        cell.lead(epoch, 89, true, at(1040));
+        cell.lead(epoch, 89, FirstRound::OnTime, at(1040));
         assert_eq!(cell.tick(at(1139)), None);
         assert_eq!(cell.tick(at(1140)).map(|fused| fused.round), Some(89));
+        cell.lead(Epoch::new(4, NodeName::from_static("gauss")), 90, FirstRound::AfterConnects, at(1140));
+        assert_eq!(cell.report(ReportKind::Detections, &report("euclid", "cup", 1150), at(1150)), Ok(None));
+        assert_eq!(cell.tick(at(1164)), None, "the others are still connecting");
+        assert_eq!(cell.tick(at(1165)).map(|fused| fused.round), Some(90));
         cell.stand_by();
         assert_eq!(cell.tick(at(1300)), None);
     }

@@ -36,17 +36,8 @@ impl Voters {
     pub(crate) async fn connect(brokers: Vec<SocketAddr>) -> anyhow::Result<Self> {
         let newest: Arc<Mutex<Option<Arc<Reputations>>>> = Arc::default();
         let kept = Arc::clone(&newest);
-        let status = NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: NodeName::from_static("voters"),
-            id: Uuid::now_v7(),
-            role: Role::Cav,
-            state: NodeState::Following,
-            epoch: 0,
-            aggregator: None,
-            fit: None,
-            version: env!("CARGO_PKG_VERSION").into(),
-        };
+        let status =
+            NodeStatus::starting(NodeName::from_static("voters"), Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static(CELL),
             part: Part::Follower,

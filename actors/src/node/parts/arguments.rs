@@ -140,15 +140,11 @@ impl Assembly {
         let leadership = self.leadership.borrow();
         let epoch = leadership.epoch.clone().filter(|_| leadership.leader().is_some()).or(taken);
         NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: self.name.clone(),
-            id: self.run,
-            role: self.config.role,
             state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
             epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
             aggregator: epoch.map(|epoch| epoch.leader),
             fit: self.config.may_lead().then_some(false),
-            version: env!("CARGO_PKG_VERSION").into(),
+            ..NodeStatus::starting(self.name.clone(), self.run, self.config.role, env!("CARGO_PKG_VERSION"))
         }
     }
 }
