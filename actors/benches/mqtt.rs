@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::Context;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
 use ecod_actors::bench::two_hop::{self, Load};
 use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
 use ecod_actors::clock;

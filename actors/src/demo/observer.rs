@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{NodeState, NodeStatus, ObjectReport, Role, SCHEMA_VERSION};
+use ecod::wire::{NodeStatus, ObjectReport, Role};
 use ractor::{Actor, ActorRef};
 use tokio::task::JoinHandle;
 use uuid::Uuid;

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use ecod::names::NodeName;
-use ecod::wire::{NodeState, NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
+use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
 use ecod_actors::clock;
 use ecod_actors::gateway::{
     Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, ReportKind,

@@ -26,7 +26,7 @@ impl ElectionDriver {
                 }
                 Effect::Lead { epoch, first_round, first } => {
                     self.terms.settle(epoch.term).await;
-                    tracing::info!(%epoch, first_round, first, "leading");
+                    tracing::info!(%epoch, first_round, ?first, "leading");
                     self.preparing = None;
                     self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, first });
                 }

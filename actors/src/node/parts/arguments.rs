@@ -6,7 +6,7 @@ use std::time::Duration;
 use ecod::aggregator::Aggregator;
 use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
-use ecod::wire::{NodeState as NodeCondition, NodeStatus, SCHEMA_VERSION};
+use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
 use super::Assembly;
 use crate::clock;
