@@ -152,7 +152,7 @@ impl Assembly {
 #[cfg(test)]
 mod tests {
     use ecod::time::Timestamp;
-    use ecod::wire::{GlobalMap, Role};
+    use ecod::wire::{GlobalMap, Role, SCHEMA_VERSION};
 
     use ecod::names::NodeName;
     use tokio::sync::watch;
