@@ -4,8 +4,9 @@
 //! [`Aggregator::deadline`]; either may close a round and return what it made. The live node and the replay of a log
 //! run this same machine.
 //!
-//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time. In
-//! VOTE's `paper` mode verdicts come with the rounds in which a packet of frames is complete, and only with them.
+//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time. Where
+//! both run, verdicts come from the first vote on. In VOTE's `paper` mode verdicts come with the rounds in which a packet
+//! of frames is complete, and only with them.
 //!
 //! A standby runs the machine without leading: it takes reports and closes rounds, but nothing comes out. From
 //! [`Aggregator::lead`] on its rounds count, with all the evidence it has gathered.
@@ -55,6 +56,8 @@ pub struct Aggregator {
     pace: Option<Pace>,
     vote: Option<Vote>,
     by_packets: bool,
+    /// Whether anyone has voted: a cell that runs both algorithms spares its network verdicts about nothing until then.
+    voted: bool,
 }
 
 impl Aggregator {
@@ -73,6 +76,7 @@ impl Aggregator {
             pace,
             vote,
             by_packets,
+            voted: false,
         }
     }
 
@@ -126,6 +130,7 @@ impl Aggregator {
                 let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
                 window.admit(report, now)?;
                 vote.observe(report, now)?;
+                self.voted = true;
             }
         }
         Ok(if self.rounds.report(kind, &report.node, now) { self.close(now) } else { None })
@@ -192,7 +197,8 @@ impl Aggregator {
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
         let by_packets = self.by_packets;
-        let is_due = |vote: &&mut Vote| !by_packets || vote.is_packet_complete();
+        let wanted = self.voted || pace.is_none();
+        let is_due = |vote: &&mut Vote| if by_packets { vote.is_packet_complete() } else { wanted };
         let vote = self.vote.as_mut().filter(is_due).map(|vote| vote.close(now));
         let epoch = self.leads.clone()?;
         if pace.is_none() && vote.is_none() {
@@ -312,6 +318,17 @@ mod tests {
             assert_eq!(fused.map.is_some(), algorithms.pace());
             assert_eq!(fused.verdicts.is_some(), algorithms.vote());
         }
+    }
+
+    #[test]
+    fn where_both_run_verdicts_come_from_the_first_vote_on() {
+        let mut cell = leader(FusionConfig::default());
+        cell.report(Detections, &report("euclid", "cup", 10), at(12)).unwrap();
+        let silent = cell.tick(at(100)).unwrap();
+        assert!(silent.map.is_some() && silent.verdicts.is_none());
+        cell.report(VoteDetections, &report("euclid", "cup", 110), at(112)).unwrap();
+        assert!(cell.tick(at(200)).unwrap().verdicts.is_some());
+        assert!(cell.tick(at(20_000)).unwrap().verdicts.is_some(), "silence is a verdict once there were votes");
     }
 
     #[test]
