@@ -285,8 +285,16 @@ impl Election {
             State::Following(following) if following.epoch.leader == message.from => {
                 let leads = message.epoch.as_ref() == Some(&following.epoch);
                 if !leads && !matches!(message.body, Body::Beat { .. }) {
-                    self.close(following.epoch.clone());
-                    self.lose_leader(now);
+                    let ended = following.epoch.clone();
+                    let follows = message.epoch.clone().filter(|next| {
+                        *next > ended && next.leader != message.from && next.leader != self.id && !self.is_over(next)
+                    });
+                    self.close(ended);
+                    // Whom the leader of old follows, its followers follow on its word: none of them need claim.
+                    match follows {
+                        Some(next) => self.adopt(next, now, now),
+                        None => self.lose_leader(now),
+                    }
                 }
             }
             State::Leading(leading) if message.hears_you => {
