@@ -1,10 +1,11 @@
 # `make demo` and `make test` do everything on a fresh Debian 12 machine with git, make and a Rust toolchain.
 
-PACKAGES := build-essential ca-certificates clang cmake gstreamer1.0-plugins-base libopencv-dev mosquitto pkg-config
+PACKAGES := build-essential ca-certificates clang cmake gstreamer1.0-plugins-base libopencv-dev pkg-config
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 SECONDS_PER_SCENE ?= 15
 BUILD := $(or $(CARGO_TARGET_DIR),target)
 SETS ?= examples/crowd_labels
+VERDICTS ?= 200
 PASSES ?= 50
 
 .PHONY: help setup demo testbed eval-labels liars test sim trials lint doc audit bench core-only replay-check edge-only clean
@@ -26,7 +27,8 @@ demo: setup ## run a whole cell as separate processes on this machine and print 
 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
 	cargo build --release --locked --bin ecod-node
-	for setup in 1 2; do target/release/ecod-node testbed --scenes examples/testbed/pace_setup$$setup.json --out target/testbed-setup$$setup.json; done
+	for setup in 1 2; do target/release/ecod-node testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
+	    --at-least 99 --out target/testbed-setup$$setup.json || exit; done
 	target/release/ecod-node testbed --scenes examples/testbed/vote_recording.json --out target/testbed-vote.json
 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
@@ -35,13 +37,15 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
 
+# Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
+test: PACKAGES += mosquitto
 test: setup ## all tests
 	cargo test --locked --workspace
 
 sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of SEED=n
 	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election_sim -- --nocapture
 
-trials: PACKAGES += iproute2 nftables
+trials: PACKAGES += iproute2 mosquitto nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
 	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact trials --nocapture
 

@@ -72,7 +72,23 @@ impl Projection {
         &self.intrinsics
     }
 
-    /// Places a detection seen from `camera`.
+    /// Checks that the image's edge does not cut the box where the distance is judged by it: call it with the box in
+    /// the image as taken, before distortion is removed.
+    ///
+    /// # Errors
+    /// [`ProjectionError::Clipped`].
+    pub fn check_whole(&self, detection: &Detection) -> Result<(), ProjectionError> {
+        let bounds = &detection.bounding_box;
+        let cut = match self.config.ranging {
+            Ranging::Corners if detection.corners.is_some() => false,
+            Ranging::Corners | Ranging::BoxHeight => pinhole::is_cut_in_height(bounds, &self.intrinsics),
+            Ranging::BoxWidth => pinhole::is_cut_in_width(bounds, &self.intrinsics),
+            Ranging::Paper => false,
+        };
+        if cut { Err(ProjectionError::Clipped(detection.label.clone())) } else { Ok(()) }
+    }
+
+    /// Places a detection seen from `camera`, whose distortion has been removed; see also [`Self::check_whole`].
     ///
     /// `target` is the middle of the detection's corners in the camera frame, in metres, where corners have been
     /// solved for it; used by [`Ranging::Corners`] only.
@@ -92,8 +108,8 @@ impl Projection {
         let size = self.config.sizes.of(label).ok_or_else(|| ProjectionError::UnknownSize(label.clone()))?;
         let sight = match (self.config.ranging, target) {
             (Ranging::Corners, Some(target)) => pinhole::from_target(detection, target)?,
-            (Ranging::Corners | Ranging::BoxHeight, _) => pinhole::from_height(detection, size, &self.intrinsics)?,
-            (Ranging::BoxWidth, _) => pinhole::from_width(detection, size, &self.intrinsics)?,
+            (Ranging::Corners | Ranging::BoxHeight, _) => pinhole::from_height(detection, size, &self.intrinsics),
+            (Ranging::BoxWidth, _) => pinhole::from_width(detection, size, &self.intrinsics),
             (Ranging::Paper, _) => paper(detection, size, &self.intrinsics)?,
         };
         let direction_rad = camera.heading_rad + sight.bearing_rad;

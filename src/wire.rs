@@ -27,7 +27,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-pub use check::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, Payload, check_fused_at};
+pub use check::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, Payload, check_fused_at, is_label};
 pub use codec::{Encoding, decode, decode_report, encode};
 pub use ledger::{MAX_SHARE_ENTRIES, decode_share};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};

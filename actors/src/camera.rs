@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context;
 use ecod::camera::{Intrinsics, Mount};
@@ -91,6 +92,12 @@ impl CameraConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.source.validate().map_err(|error| error.within("source"))?;
         self.capture.validate().map_err(|error| error.within("capture"))?;
+        if let SourceConfig::Images { fps, .. } = self.source
+            && fps * self.capture.stall_timeout_s <= 1.0
+        {
+            let least = format!("above 1 / capture.stall_timeout_s, {}", 1.0 / self.capture.stall_timeout_s);
+            return Err(ConfigError::new("source.fps", fps, least));
+        }
         check_range("optics.width_px", f64::from(self.optics.width_px), 16.0, 16_384.0)?;
         check_range("optics.height_px", f64::from(self.optics.height_px), 16.0, 16_384.0)?;
         check_range("optics.horizontal_fov_deg", self.optics.horizontal_fov_deg, 1.0, 175.0)?;
@@ -161,9 +168,10 @@ pub fn detector(
 ) -> anyhow::Result<DetectorArguments> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let source = camera.source.clone();
+    let patience = Duration::from_secs_f64(camera.capture.stall_timeout_s);
     let lens = camera.optics.lens().context("key `camera.optics.calibration`")?;
     Ok(DetectorArguments {
-        open: Arc::new(move || source.open()),
+        open: Arc::new(move || source.open(patience)),
         capture: camera.capture.clone(),
         detect: camera.detector.build().context("key `camera.detector`")?,
         optics: ImageSize::from(&lens.intrinsics),

@@ -283,7 +283,10 @@ fn from_environment(error: &figment::Error) -> bool {
     error.metadata.as_ref().is_some_and(|metadata| metadata.name.contains("environment variable"))
 }
 
-/// Every error with its key and where it was read, and without any password.
+/// Keys whose values are shown to nobody.
+const SECRETS: [&str; 2] = ["password", "key"];
+
+/// Every error with its key and where it was read, and without any secret.
 fn describe(errors: figment::Error) -> String {
     let describe = |error: figment::Error| {
         let key = error.path.join(".");
@@ -299,11 +302,14 @@ fn describe(errors: figment::Error) -> String {
         };
         let reason = match &error.kind {
             figment::error::Kind::InvalidType(..) | figment::error::Kind::InvalidValue(..)
-                if key.ends_with("password") =>
+                if SECRETS.iter().any(|secret| key.ends_with(secret)) =>
             {
                 "must be text in quotes".to_owned()
             }
-            kind => without_passwords(&kind.to_string()),
+            figment::error::Kind::Message(text) if text == "invalid socket address syntax" => {
+                "must be an IP address and a port, such as 0.0.0.0:1883".to_owned()
+            }
+            kind => without_secrets(&kind.to_string()),
         };
         // Without a key, the file itself cannot be read as TOML.
         if key.is_empty() {
@@ -316,11 +322,12 @@ fn describe(errors: figment::Error) -> String {
 }
 
 /// Errors in the syntax of TOML quote the line that they are about.
-fn without_passwords(text: &str) -> String {
-    let lines = text.lines().map(|line| match line.split_once("password") {
-        Some((before, after)) if after.contains('=') => format!("{before}password = ***"),
+fn without_secrets(text: &str) -> String {
+    let hide = |line: &str, secret: &str| match line.split_once(secret) {
+        Some((before, after)) if after.contains('=') => format!("{before}{secret} = ***"),
         _ => line.to_owned(),
-    });
+    };
+    let lines = text.lines().map(|line| SECRETS.iter().fold(line.to_owned(), |line, secret| hide(&line, secret)));
     lines.collect::<Vec<_>>().join("\n")
 }
 
@@ -394,6 +401,14 @@ mod tests {
         assert!(printed.contains("# `mqtt.password` is set but not shown") && !printed.contains("hush"), "{printed}");
         let read = load(&printed).unwrap();
         assert_eq!((read.mqtt.user.as_deref(), read.mqtt.password), (Some("u"), None));
+    }
+
+    #[test]
+    fn no_error_shows_a_cell_key() {
+        for key in ["4711471147114711", "\"4711471147114711"] {
+            let error = load(&format!("role = \"edge\"\n[membership]\nkey = {key}")).unwrap_err().to_string();
+            assert!(error.contains("key") && !error.contains("4711"), "{error}");
+        }
     }
 
     #[test]

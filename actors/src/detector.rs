@@ -62,6 +62,8 @@ pub struct DetectorState {
     optics: ImageSize,
     /// The last mismatch, told of once.
     mismatch: Option<SizeMismatch>,
+    /// Whether the last frame could not be looked at: the first in a row is told of.
+    failing: bool,
     projector: Seat<ProjectorMessage>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
@@ -80,7 +82,7 @@ impl Actor for Detector {
         let DetectorArguments { open, capture, detect, optics, projector, counters } = arguments;
         let capture = Capture::start(open, capture)?;
         let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters)));
-        Ok(DetectorState { detect: Some(detect), optics, mismatch: None, projector, counters, pump })
+        Ok(DetectorState { detect: Some(detect), optics, mismatch: None, failing: false, projector, counters, pump })
     }
 
     async fn handle(
@@ -100,6 +102,7 @@ impl Actor for Detector {
         state.detect = Some(detect);
         match outcome {
             Ok(mut detections) => {
+                state.failing = false;
                 if state.fits(size, &mut detections) {
                     state.counters.count(Event::FrameDetected);
                     state.projector.send(ProjectorMessage::Report { detections, captured_at });
@@ -109,7 +112,9 @@ impl Actor for Detector {
             }
             Err(error) => {
                 state.counters.count(Event::FrameFailed);
-                tracing::debug!(%error, "frame not used");
+                if !std::mem::replace(&mut state.failing, true) {
+                    tracing::warn!(%error, "frame not used, the first in a row");
+                }
             }
         }
         drop(turn);

@@ -128,15 +128,15 @@ pub enum SourceConfig {
 }
 
 impl SourceConfig {
-    /// Opens the source; may block for as long as the camera does.
+    /// Opens the source; may block for as long as the camera does. A network camera is given `patience`.
     ///
     /// # Errors
     /// [`FrameError::Open`] naming the source and what is wrong.
-    pub fn open(&self) -> Result<Box<dyn FrameSource>, FrameError> {
+    pub fn open(&self, patience: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
         match self {
             Self::V4l2 { device, width, height, fps } => Ok(Box::new(Video::device(device, *width, *height, *fps)?)),
             Self::Gstreamer { pipeline } => Ok(Box::new(Video::pipeline(pipeline)?)),
-            Self::Url { url } => Ok(Box::new(Video::url(url)?)),
+            Self::Url { url } => Ok(Box::new(Video::url(url, patience)?)),
             Self::Video { path, looping } => Ok(Box::new(Video::file(path, *looping)?)),
             Self::Images { path, fps, looping } => Ok(Box::new(ImageSequence::open(path, *fps, *looping)?)),
             Self::Testbed { scenes, scene, cav, seed } => {
@@ -170,7 +170,9 @@ impl SourceConfig {
             Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => {
                 Err(ConfigError::new("pipeline", pipeline, "a pipeline that ends in appsink"))
             }
-            Self::Url { url } if !url.contains("://") => Err(ConfigError::new("url", url, "an rtsp or http address")),
+            Self::Url { url } if !url.contains("://") => {
+                Err(ConfigError::new("url", video::without_credentials(url), "an rtsp or http address"))
+            }
             _ => Ok(()),
         }
     }

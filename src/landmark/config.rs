@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::{Landmark, Synonym, VacancySign};
 use crate::config::{ConfigError, check_range};
 use crate::names::{Label, LandmarkId, MAX_NAME_BYTES};
+use crate::wire::is_label;
 
 /// One known location.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,6 +30,11 @@ pub struct LandmarkConfig {
     /// Labels that count as another one here, such as `vase = "sports ball"`. Default: none.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,
+}
+
+fn check_label(key: &str, text: &str) -> Result<(), ConfigError> {
+    let allowed = format!("1 to {MAX_NAME_BYTES} bytes without control characters");
+    if is_label(text) { Ok(()) } else { Err(ConfigError::new(key, format!("{text:?}"), allowed)) }
 }
 
 /// A vacancy sign.
@@ -54,15 +60,18 @@ impl LandmarkConfig {
     /// # Errors
     /// [`ConfigError`] naming the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        if !(1..=MAX_NAME_BYTES).contains(&self.id.len()) {
-            return Err(ConfigError::new("id", format!("{:?}", self.id), format!("1 to {MAX_NAME_BYTES} bytes long")));
-        }
+        check_label("id", &self.id)?;
+        self.synonyms.iter().try_for_each(|(other, label)| {
+            check_label("synonyms", other)?;
+            check_label("synonyms", label)
+        })?;
         check_range("x_m", self.x_m, -1e8, 1e8)?;
         check_range("y_m", self.y_m, -1e8, 1e8)?;
         check_range("facing_deg", self.facing_deg.unwrap_or(0.0), -360.0, 360.0)?;
         if let Some(sign) = &self.vacancy {
             check_range("vacancy.x_m", sign.x_m, -1e8, 1e8)?;
             check_range("vacancy.y_m", sign.y_m, -1e8, 1e8)?;
+            check_label("vacancy.label", &sign.label)?;
         }
         Ok(())
     }
@@ -116,6 +125,26 @@ impl From<&Landmark> for LandmarkConfig {
             facing_deg: landmark.facing_rad.map(f64::to_degrees),
             vacancy: landmark.vacancy.as_ref().map(sign),
             synonyms: landmark.synonyms.iter().map(|s| (s.from.clone(), s.label.clone())).collect(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_that_no_receiver_would_take_are_refused() {
+        let place = LandmarkConfig::at("slot-0", 0.0, 0.0);
+        assert_eq!(place.validate(), Ok(()));
+        let sign = |label: &str| Some(VacancyConfig { label: label.into(), x_m: 0.0, y_m: 0.0 });
+        for (wrong, key) in [
+            (LandmarkConfig { id: "a\tb".into(), ..place.clone() }, "id"),
+            (LandmarkConfig { vacancy: sign(""), ..place.clone() }, "vacancy.label"),
+            (LandmarkConfig { vacancy: sign(&"x".repeat(65)), ..place.clone() }, "vacancy.label"),
+            (LandmarkConfig { synonyms: [("".into(), "cup".into())].into(), ..place.clone() }, "synonyms"),
+        ] {
+            assert_eq!(wrong.validate().unwrap_err().key, key);
         }
     }
 }

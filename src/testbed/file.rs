@@ -13,6 +13,7 @@ use super::{Camera, Cav, Placard, RecordedRun, Scene, Spot, Testbed};
 use crate::camera::Intrinsics;
 use crate::geometry::{Pose, wrap_angle};
 use crate::names::{Label, MAX_NAME_BYTES, NodeName};
+use crate::wire::is_label;
 
 const METRES_PER_INCH: f64 = 0.0254;
 /// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is rendered.
@@ -95,10 +96,13 @@ impl Place {
     }
 
     pub(super) fn label(&self, key: &str, text: String) -> Result<Label, TestbedError> {
-        if (1..=MAX_NAME_BYTES).contains(&text.len()) {
+        if is_label(&text) {
             Ok(text.into())
         } else {
-            Err(self.error(key, format_args!("is {text:?}, must have 1 to {MAX_NAME_BYTES} bytes")))
+            Err(self.error(
+                key,
+                format_args!("is {text:?}, must have 1 to {MAX_NAME_BYTES} bytes and no control characters"),
+            ))
         }
     }
 }

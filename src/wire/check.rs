@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 
 use super::{
     FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_SHARE_ENTRIES, NodeStatus, ObjectReport,
-    PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
+    PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
 };
 use crate::geometry::Covariance;
 use crate::names::{Label, MAX_NAME_BYTES};
@@ -184,14 +184,22 @@ impl ObjectReport {
         }
         self.view.map_or(Ok(()), check_view)?;
         check_labels(seen.iter().map(|id| &**id))?;
-        self.objects.iter().try_for_each(|object| {
-            check_place(object.x_m, object.y_m)?;
-            object.covariance().map_or(Ok(()), check_covariance)?;
-            check_confidence(object.confidence)?;
-            check_motion(object.velocity_mps, object.heading_rad, object.size_m)?;
-            check_scores(&object.scores)?;
-            check_labels([&*object.label].into_iter().chain(object.landmark.as_deref()))
-        })
+        self.objects.iter().try_for_each(PerceivedObject::validate)
+    }
+}
+
+impl PerceivedObject {
+    /// Checks numbers and labels.
+    ///
+    /// # Errors
+    /// The first reason found.
+    pub fn validate(&self) -> Result<(), RejectReason> {
+        check_place(self.x_m, self.y_m)?;
+        self.covariance().map_or(Ok(()), check_covariance)?;
+        check_confidence(self.confidence)?;
+        check_motion(self.velocity_mps, self.heading_rad, self.size_m)?;
+        check_scores(&self.scores)?;
+        check_labels([&*self.label].into_iter().chain(self.landmark.as_deref()))
     }
 }
 
@@ -278,7 +286,11 @@ fn check_covariance(covariance: Covariance) -> Result<(), RejectReason> {
 }
 
 fn check_confidence(confidence: f64) -> Result<(), RejectReason> {
-    if (0.0..=1.0).contains(&confidence) { Ok(()) } else { Err(RejectReason::ConfidenceOutOfRange) }
+    match confidence {
+        0.0..=1.0 => Ok(()),
+        _ if confidence.is_finite() => Err(RejectReason::ConfidenceOutOfRange),
+        _ => Err(RejectReason::NotFinite),
+    }
 }
 
 fn check_labels<'a>(labels: impl IntoIterator<Item = &'a str>) -> Result<(), RejectReason> {
@@ -298,7 +310,8 @@ fn in_world(coordinate_m: f64) -> bool {
     coordinate_m.abs() <= WORLD_BOUND_M
 }
 
-fn is_label(text: &str) -> bool {
+/// Whether a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
+pub fn is_label(text: &str) -> bool {
     (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
 }
 

@@ -133,7 +133,7 @@ mod tests {
             (|r| r.objects[0].covariance_m2 = Some([1.0, 2.0, 1.0]), RejectReason::NotFinite),
             (|r| r.objects[0].confidence = 2.0, RejectReason::ConfidenceOutOfRange),
             (|r| r.objects[0].confidence = -0.1, RejectReason::ConfidenceOutOfRange),
-            (|r| r.objects[0].confidence = f64::NAN, RejectReason::ConfidenceOutOfRange),
+            (|r| r.objects[0].confidence = f64::NAN, RejectReason::NotFinite),
             (|r| r.objects[0].label = "".into(), RejectReason::InvalidLabel),
             (|r| r.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
             (|r| r.objects[0].landmark = Some("a\nb".into()), RejectReason::InvalidLabel),

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::testbed::{Recording, Scene, Testbed};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -39,6 +39,9 @@ pub(super) struct TestbedArguments {
     /// Write the vehicles' reports on recorded detections to this file, as `replay` reads them
     #[arg(long, value_name = "FILE")]
     pub(super) reports: Option<PathBuf>,
+    /// Fail if fewer spots than this percentage are right in any scene, fused, of all and of the occupied ones
+    #[arg(long, value_name = "PCT")]
+    pub(super) at_least: Option<f64>,
     /// Write the results to this file (JSON)
     #[arg(long, value_name = "FILE")]
     pub(super) out: Option<PathBuf>,
@@ -72,7 +75,12 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     if let Some(out) = &arguments.out {
         write_json(out, &Results { scenes: &results })?;
     }
-    Ok(())
+    let least = arguments.at_least.unwrap_or(0.0);
+    match results.iter().find(|scene| scene.occupied_accuracy_pct.unwrap_or(100.0).min(scene.pace_accuracy_pct) < least)
+    {
+        Some(scene) => Err(anyhow!("scene {}: fewer than {least} % of the spots are right", scene.name).into()),
+        None => Ok(()),
+    }
 }
 
 /// Reads a scene file.

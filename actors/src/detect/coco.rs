@@ -46,7 +46,7 @@ impl CocoConfig {
     /// # Errors
     /// [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("threshold", self.threshold.into(), 0.01, 1.0)?;
+        check_range("threshold", self.threshold.into(), f64::from(0.01f32), 1.0)?;
         check_range("max_overlap", self.max_overlap.into(), 0.0, 1.0)
     }
 }

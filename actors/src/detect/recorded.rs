@@ -11,6 +11,8 @@
 use std::path::{Path, PathBuf};
 
 use ecod::detection::Detection;
+use ecod::names::MAX_NAME_BYTES;
+use ecod::wire::is_label;
 use serde::{Deserialize, Serialize};
 
 use super::{Detect, DetectError};
@@ -91,6 +93,9 @@ fn read_line(path: &Path, line: usize, text: &str) -> Result<Vec<Detection>, Rec
         if !bounding_box.is_valid() {
             return Err(malformed(format!("the box of {label:?} has no area")));
         }
+        if !is_label(label) {
+            return Err(malformed(format!("the label {label:?} is no text of 1 to {MAX_NAME_BYTES} bytes")));
+        }
         if !(0.0..=1.0).contains(confidence) {
             return Err(malformed(format!("the confidence of {label:?} is {confidence}, must be 0 to 1")));
         }
@@ -131,7 +136,9 @@ mod tests {
 
     #[test]
     fn a_bad_recording_is_named_with_its_line() {
-        for bad in ["{", r#"{"label":"cup"}"#, &CUP.replace("0.9", "1.9"), &CUP.replace("30", "0")] {
+        for bad in
+            ["{", r#"{"label":"cup"}"#, &CUP.replace("0.9", "1.9"), &CUP.replace("30", "0"), &CUP.replace("cup", "")]
+        {
             let error = open(&format!("[]\n{bad}\n"), false).expect_err("malformed").to_string();
             assert!(error.contains("line 2: "), "{error}");
         }

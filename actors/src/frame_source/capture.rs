@@ -229,6 +229,9 @@ impl Keeper {
                 Ok(Event::Read(_, Err(error))) => return Outcome::Failed(error),
                 Ok(Event::Read(_, Ok(frame))) => {
                     deadline = Instant::now() + stall_timeout;
+                    if matches!(*self.status.borrow(), CaptureStatus::Failed { .. }) {
+                        tracing::info!("frame source runs again");
+                    }
                     self.status.send_if_modified(|status| {
                         std::mem::replace(status, CaptureStatus::Running) != CaptureStatus::Running
                     });

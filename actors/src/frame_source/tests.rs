@@ -1,4 +1,5 @@
 use std::path::Path;
+use std::time::Duration;
 
 use opencv::core::{CV_8UC3, Mat, MatTraitConst, Scalar, Size, Vec3b};
 use opencv::imgcodecs;
@@ -16,7 +17,7 @@ fn brightness(frame: &Frame) -> u8 {
 }
 
 fn open(toml: &str) -> Result<Box<dyn FrameSource>, FrameError> {
-    toml::from_str::<SourceConfig>(toml).unwrap().open()
+    toml::from_str::<SourceConfig>(toml).unwrap().open(Duration::from_secs(5))
 }
 
 /// Brightness of all frames up to the error that ends them.

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::path::Path;
+use std::time::Duration;
 
 use opencv::core::{Mat, Vector};
 use opencv::prelude::*;
@@ -11,8 +12,6 @@ use super::{FrameError, FrameSource, Pace};
 use crate::clock;
 use crate::frame::Frame;
 
-/// How long a network camera may take to answer, in milliseconds.
-const NETWORK_TIMEOUT_MS: i32 = 5_000;
 /// Rate of a video file that does not say.
 const FALLBACK_FPS: f64 = 25.0;
 
@@ -60,13 +59,11 @@ impl Video {
         Self::live(pipeline.into(), || VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER))
     }
 
-    pub(super) fn url(url: &str) -> Result<Self, FrameError> {
-        let timeouts = [
-            videoio::CAP_PROP_OPEN_TIMEOUT_MSEC,
-            NETWORK_TIMEOUT_MS,
-            videoio::CAP_PROP_READ_TIMEOUT_MSEC,
-            NETWORK_TIMEOUT_MS,
-        ];
+    /// A network camera that may take `patience` to open, and as long for each frame.
+    pub(super) fn url(url: &str, patience: Duration) -> Result<Self, FrameError> {
+        let patience_ms = i32::try_from(patience.as_millis()).unwrap_or(i32::MAX);
+        let properties = [videoio::CAP_PROP_OPEN_TIMEOUT_MSEC, videoio::CAP_PROP_READ_TIMEOUT_MSEC];
+        let timeouts: Vec<i32> = properties.into_iter().flat_map(|property| [property, patience_ms]).collect();
         Self::live(without_credentials(url), || {
             VideoCapture::from_file_with_params(url, videoio::CAP_FFMPEG, &Vector::from_slice(&timeouts))
         })
@@ -129,7 +126,7 @@ pub(super) fn without_credentials(url: &str) -> String {
             let host_start = rest[..host_end].rfind('@').map_or(0, |at| at + 1);
             format!("{scheme}://{}", &rest[host_start..])
         }
-        None => url.to_owned(),
+        None => url.rsplit('@').next().unwrap_or_default().to_owned(),
     }
 }
 

@@ -72,7 +72,9 @@ impl Link {
         gateway: ActorRef<GatewayMessage>,
     ) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
-        let task = tokio::spawn(Task { id, broker: broker.clone(), setup, gateway, told: None }.run(backoff));
+        let task = tokio::spawn(
+            Task { id, broker: broker.clone(), setup, gateway, told: None, told_oversized: false }.run(backoff),
+        );
         Self { broker, state: LinkState::Down, client: None, abort: task.abort_handle(), task: Some(task) }
     }
 
@@ -108,6 +110,7 @@ struct Task {
     gateway: ActorRef<GatewayMessage>,
     /// What the broker refused, as last told of.
     told: Option<String>,
+    told_oversized: bool,
 }
 
 impl Task {
@@ -129,6 +132,11 @@ impl Task {
             }
             if error.is_oversized() {
                 self.setup.counters.reject(RejectReason::TooLarge);
+                if !std::mem::replace(&mut self.told_oversized, true) {
+                    let limit = self.setup.config.max_packet_bytes();
+                    tracing::warn!(broker = %self.broker, limit, "link lost to a packet that is too large; if it is \
+                        retained it comes again and again: remove it, and have the broker limit its messages");
+                }
             }
             if !self.tell(LinkNews::Lost(state)) {
                 return;

@@ -43,7 +43,8 @@ impl<'a> Tally<'a> {
     /// The label with the most evidence, or the published one unless it is behind by the lead.
     pub(super) fn winner(&self, published: Option<&Label>, switch_lead: f64) -> Option<Winner<'a>> {
         let best = self.labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then_with(|| b.0.cmp(a.0)))?;
-        let kept = self.labels.iter().find(|(label, nats)| Some(*label) == published && *nats > best.1 - switch_lead);
+        let holds = |nats: f64| nats > best.1 - switch_lead && nats > 0.0;
+        let kept = self.labels.iter().find(|(label, nats)| Some(*label) == published && holds(*nats));
         let (label, nats) = kept.unwrap_or(best);
         let total: f64 = self.labels.iter().map(|(_, nats)| (nats - best.1).exp()).sum();
         let posterior = (nats - best.1).exp() / (total + (-best.1).exp());
@@ -80,5 +81,21 @@ impl WeightedMean {
         let determinant = xx * yy - xy * xy;
         let position = Point2::new(yy * sum.x - xy * sum.y, xx * sum.y - xy * sum.x) / determinant;
         (position.x.is_finite() && position.y.is_finite()).then_some(position)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_label_that_is_no_longer_believed_gives_way_to_one_that_is() {
+        let (car, van) = (Label::from("car"), Label::from("van"));
+        let winner = |nats_of_car: f64| {
+            let tally = Tally { labels: [(&car, nats_of_car), (&van, 0.3)].into_iter().collect() };
+            tally.winner(Some(&car), 0.5).map(|winner| winner.label.clone())
+        };
+        assert_eq!(winner(0.1), Some(car.clone()), "van does not lead by 0.5 nats");
+        assert_eq!(winner(-0.1), Some(van.clone()));
     }
 }

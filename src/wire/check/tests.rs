@@ -114,7 +114,7 @@ fn each_flaw_of_a_map_has_its_reason() {
             (|m| m.landmarks[0].x_m = f64::NAN, RejectReason::NotFinite),
             (|m| m.landmarks[0].y_m = 1e9, RejectReason::NotFinite),
             (|m| m.landmarks[0].confidence = 1.01, RejectReason::ConfidenceOutOfRange),
-            (|m| m.landmarks[0].confidence = f64::NAN, RejectReason::ConfidenceOutOfRange),
+            (|m| m.landmarks[0].confidence = f64::NAN, RejectReason::NotFinite),
             (|m| m.landmarks[0].id = "".into(), RejectReason::InvalidLabel),
             (|m| m.landmarks[0].label = Some("a\tb".into()), RejectReason::InvalidLabel),
             (|m| m.objects[0].x_m = f64::NEG_INFINITY, RejectReason::NotFinite),
