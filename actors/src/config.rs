@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use crate::broker::BrokerConfig;
 #[cfg(feature = "camera")]
 use crate::camera::CameraConfig;
+use crate::dashboard::DashboardConfig;
 use crate::gateway::MqttConfig;
 use crate::leader_election::DataPlane;
 use crate::membership::MembershipConfig;
@@ -58,6 +59,8 @@ pub struct NodeConfig {
     pub fusion: FusionConfig,
     /// How often reputations are published, saved and replicated; used by aggregators.
     pub reputations: ReputationKeeperConfig,
+    /// A web page with the cell, metrics and health.
+    pub dashboard: DashboardConfig,
     /// The camera and what is made of its frames. Default none.
     #[cfg(feature = "camera")]
     pub camera: Option<CameraConfig>,
@@ -93,6 +96,7 @@ impl Default for NodeConfig {
             broker: BrokerConfig::default(),
             fusion: FusionConfig::default(),
             reputations: ReputationKeeperConfig::default(),
+            dashboard: DashboardConfig::default(),
             #[cfg(feature = "camera")]
             camera: None,
             landmarks: Vec::new(),
@@ -180,6 +184,7 @@ impl NodeConfig {
         }
         self.fusion.validate().map_err(|error| error.within("fusion"))?;
         self.reputations.validate().map_err(|error| error.within("reputations"))?;
+        self.dashboard.validate().map_err(|error| error.within("dashboard"))?;
         #[cfg(feature = "camera")]
         if let Some(camera) = &self.camera {
             camera.validate().map_err(|error| error.within("camera"))?;
@@ -196,6 +201,9 @@ impl NodeConfig {
         let mut comment = String::new();
         if shown.mqtt.password.take().is_some() {
             comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
+        }
+        if shown.dashboard.token.take().is_some() {
+            comment.push_str("# `dashboard.token` is set but not shown: add it, or set ECOD_DASHBOARD__TOKEN\n");
         }
         if shown.membership.key.take().is_some() {
             comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");

@@ -54,13 +54,19 @@ pub enum Event {
     FrameFailed,
     /// A camera frame gave way to a later one.
     FrameSkipped,
+    /// A browser's request was refused: a wrong or missing token, a foreign host name, or no room.
+    BrowserRefused,
+    /// A browser's request was refused because too many were made lately.
+    BrowserThrottled,
+    /// The dashboard's address could not be listened on.
+    DashboardNotBound,
     /// A detection could not be placed in the world and was left out of its report.
     DetectionUnplaced,
 }
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 24] = [
+    pub const ALL: [Self; 27] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -84,6 +90,9 @@ impl Event {
         Self::FrameDetected,
         Self::FrameFailed,
         Self::FrameSkipped,
+        Self::BrowserRefused,
+        Self::BrowserThrottled,
+        Self::DashboardNotBound,
         Self::DetectionUnplaced,
     ];
 
@@ -113,6 +122,9 @@ impl Event {
             Self::FrameDetected => "frame_detected",
             Self::FrameFailed => "frame_failed",
             Self::FrameSkipped => "frame_skipped",
+            Self::BrowserRefused => "browser_refused",
+            Self::BrowserThrottled => "browser_throttled",
+            Self::DashboardNotBound => "dashboard_not_bound",
             Self::DetectionUnplaced => "detection_unplaced",
         }
     }

@@ -20,6 +20,7 @@ mod config;
 mod connection;
 mod inbox;
 mod link;
+mod part;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -39,11 +40,13 @@ pub use config::{HiddenSecret, MqttConfig, MqttVersion, Secret};
 pub use ecod::wire::ReportKind;
 pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
+pub use part::Part;
 
 use crate::counters::{Counters, Event};
-use connection::{Handling, LastWill};
+use connection::{Handling, LastWill, last_will};
 use inbox::Inbox;
 use link::{Link, LinkId, LinkNews, LinkSetup};
+use part::REPORTS;
 
 /// What the gateway is asked to do.
 pub enum GatewayMessage {
@@ -56,6 +59,12 @@ pub enum GatewayMessage {
     SetReportBrokers {
         /// Brokers to which all vehicles send.
         addresses: Vec<BrokerAddress>,
+    },
+    /// Take reports from every broker, to be looked at, or no longer so; whoever wants them asks again from time to time,
+    /// as a gateway that is started anew has forgotten it.
+    WatchReports {
+        /// Whether they are wanted.
+        wanted: bool,
     },
     /// Hand messages to another subscriber from now on, such as after a receiver's restart.
     SetSubscriber {
@@ -106,15 +115,6 @@ pub enum GatewayMessage {
     },
 }
 
-/// Which topics a node takes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Part {
-    /// Maps, verdicts, reputations and statuses.
-    Follower,
-    /// Also reports and evidence: the node aggregates or may have to.
-    Candidate,
-}
-
 /// What a gateway needs to know at its start.
 pub struct GatewayArguments {
     /// The cell's name.
@@ -144,6 +144,8 @@ pub struct GatewayState {
     part: Part,
     encoding: Encoding,
     report_brokers: Option<Vec<BrokerAddress>>,
+    /// Whether reports are taken from every broker.
+    watches_reports: bool,
     status: NodeStatus,
     status_topic: String,
     status_payload: Bytes,
@@ -183,10 +185,11 @@ impl Actor for Gateway {
         match message {
             GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
             GatewayMessage::SetReportBrokers { addresses } => state.report_brokers = Some(addresses),
+            GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
                 state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
-                if state.part == Part::Candidate {
+                if state.part == Part::Candidate || state.watches_reports {
                     inbox.deliver_local(Incoming::Report { kind, report });
                 }
             }
@@ -248,6 +251,7 @@ impl GatewayState {
         let setup = LinkSetup { client_id, filters, will, config: mqtt, inbox: Arc::new(inbox), counters, seed };
         Self {
             report_brokers: None,
+            watches_reports: false,
             topics,
             part,
             encoding,
@@ -280,9 +284,30 @@ impl GatewayState {
     }
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
-        let reports = self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
+        let reports = self.watches_reports || self.takes_reports_of(broker);
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
         self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
+    }
+
+    /// Whether a candidate needs the reports that go to this broker.
+    fn takes_reports_of(&self, broker: &BrokerAddress) -> bool {
+        let among = |brokers: &Vec<BrokerAddress>| brokers.contains(broker);
+        self.part == Part::Candidate && self.report_brokers.as_ref().is_none_or(among)
+    }
+
+    fn watch_reports(&mut self, wanted: bool) {
+        if self.watches_reports == wanted {
+            return;
+        }
+        self.watches_reports = wanted;
+        let reports = REPORTS.map(|level| self.topics.filter(level));
+        for link in self.links.values().filter(|link| !self.takes_reports_of(&link.broker)) {
+            let told = link.client.as_ref().map(|client| match wanted {
+                true => client.subscribe(&self.filters(&link.broker)),
+                false => client.unsubscribe(&reports),
+            });
+            tracing::debug!(broker = %link.broker, wanted, ?told, "reports to be looked at");
+        }
     }
 
     fn set_status(&mut self, status: NodeStatus) {
@@ -371,29 +396,3 @@ impl GatewayState {
 
 /// Most runs of this node's name that are told of.
 const MAX_NAMESAKES: usize = 16;
-
-/// What the broker is to say when the node falls silent.
-fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
-    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
-}
-
-/// Where vehicles report.
-const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
-
-impl Part {
-    /// Reports come last: wherever they are left out, a level keeps its place, by which a broker names it.
-    fn levels(self) -> &'static [&'static str] {
-        match self {
-            Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
-            Self::Candidate => &[
-                "global_detections",
-                "global_verdicts",
-                "reputations",
-                "nodes/+",
-                "ledger/+",
-                "detections/+",
-                "vote_detections/+",
-            ],
-        }
-    }
-}

@@ -14,6 +14,7 @@ pub mod config;
 #[cfg(feature = "camera")]
 pub mod corner_pose;
 pub mod counters;
+pub mod dashboard;
 #[cfg(feature = "camera")]
 pub mod demo;
 #[cfg(feature = "camera")]

@@ -36,6 +36,7 @@ pub use config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
 pub use counters::{FrameCounters, FrameEvent};
 pub use key::KeyError;
 pub use socket::BindError;
+pub(crate) use throttle::Throttle;
 
 use crate::clock;
 use key::{CellKey, SessionId};

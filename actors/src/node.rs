@@ -9,6 +9,7 @@
 //! ├─ ReputationKeeper  publishes and keeps reputations    may lead, in a cell that runs VOTE
 //! ├─ Fuser             closes rounds: maps and verdicts   may lead; publishes only while leading
 //! ├─ LeaderElection    who leads, and what follows        always
+//! ├─ Dashboard         page, metrics and health           if it has an address
 //! ├─ Projector         detections -> report               with a camera
 //! └─ Detector          frames -> detections               with a camera
 //! ```
@@ -79,6 +80,7 @@ pub struct NodeHandle {
     gossip: watch::Receiver<Option<SocketAddr>>,
     members: watch::Receiver<Vec<Member>>,
     leadership: watch::Receiver<Leadership>,
+    dashboard: watch::Receiver<Option<SocketAddr>>,
     seats: Seats,
     counters: Arc<Counters>,
 }
@@ -95,11 +97,24 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let assembly = Assembly::new(config, failed);
     let (newest, broker, gossip) = (assembly.newest(), assembly.broker_address(), assembly.gossip_address());
     let (members, leadership) = (assembly.members(), assembly.leadership());
+    let dashboard = assembly.dashboard_address();
     let (seats, counters) = (assembly.seats().clone(), assembly.counters());
     let started = Actor::spawn(None, Node, assembly).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
-    Ok(NodeHandle { supervisor, ended, failure, newest, broker, gossip, members, leadership, seats, counters })
+    Ok(NodeHandle {
+        supervisor,
+        ended,
+        failure,
+        newest,
+        broker,
+        gossip,
+        members,
+        leadership,
+        dashboard,
+        seats,
+        counters,
+    })
 }
 
 impl NodeHandle {
@@ -136,6 +151,11 @@ impl NodeHandle {
     /// Who leads the cell, as it changes.
     pub fn leadership(&self) -> watch::Receiver<Leadership> {
         self.leadership.clone()
+    }
+
+    /// Where the dashboard listens, as soon as it does.
+    pub fn dashboard_address(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.dashboard.clone()
     }
 
     /// Where the node's actors are reached.

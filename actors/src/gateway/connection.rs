@@ -4,6 +4,7 @@ use std::io;
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
 use rumqttc::v5::mqttbytes::QoS as QoS5;
 use rumqttc::{QoS as QoS4, v5};
 
@@ -111,6 +112,11 @@ pub(super) struct LastWill {
     pub(super) payload: Bytes,
 }
 
+/// The will's payload of a node with this status.
+pub(super) fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
+    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
+}
+
 /// Prepares a connection; the first poll makes it.
 pub(super) fn open(
     address: &BrokerAddress,
@@ -186,6 +192,14 @@ impl Client {
                 )
                 .is_ok(),
         }
+    }
+
+    /// Queues the end of subscriptions; false when there is no room for all.
+    pub(super) fn unsubscribe(&self, filters: &[String]) -> bool {
+        filters.iter().all(|filter| match self {
+            Self::V311(client) => client.try_unsubscribe(filter).is_ok(),
+            Self::V5(client) => client.try_unsubscribe(filter).is_ok(),
+        })
     }
 
     /// Queues the farewell, after which the broker does not publish the last will; false when there is no room.

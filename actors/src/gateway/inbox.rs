@@ -22,7 +22,7 @@ use crate::counters::{Counters, Event};
 /// of maps, verdicts and reputations, by epoch and round; a status says the same twice.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Incoming {
-    /// A vehicle's report; only candidates for aggregation get these.
+    /// A vehicle's report; only candidates for aggregation get these, and nodes that watch.
     Report {
         /// What it is for.
         kind: ReportKind,

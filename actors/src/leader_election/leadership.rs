@@ -16,7 +16,8 @@ pub struct Leadership {
 }
 
 /// A node's place in its cell.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Position {
     /// It knows of no leader.
     #[default]

@@ -48,7 +48,7 @@ const MAX_ANSWERED: usize = 256;
 
 /// Allows a burst, then a steady rate.
 #[derive(Debug, Clone)]
-pub(super) struct Throttle {
+pub(crate) struct Throttle {
     left: u32,
     burst: u32,
     interval: Duration,
@@ -56,12 +56,12 @@ pub(super) struct Throttle {
 }
 
 impl Throttle {
-    pub(super) fn new(burst: u32, interval: Duration, now: Timestamp) -> Self {
+    pub(crate) fn new(burst: u32, interval: Duration, now: Timestamp) -> Self {
         Self { left: burst, burst, interval, filled: now }
     }
 
     /// Whether one more is allowed now.
-    pub(super) fn allow(&mut self, now: Timestamp) -> bool {
+    pub(crate) fn allow(&mut self, now: Timestamp) -> bool {
         let earned = now.since(self.filled).as_micros() / self.interval.as_micros().max(1);
         let earned = u32::try_from(earned).unwrap_or(u32::MAX);
         self.filled =

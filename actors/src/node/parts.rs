@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::names::NodeName;
+use ecod::time::Timestamp;
 use ecod::vote::VoteMode;
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
 use tokio::sync::watch;
@@ -14,8 +15,10 @@ use uuid::Uuid;
 
 use super::seats::{Part, Seats};
 use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker};
+use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
+use crate::dashboard::{Dashboard, Feed};
 use crate::follower::{Follower, Newest};
 use crate::fuser::Fuser;
 use crate::gateway::Gateway;
@@ -35,6 +38,7 @@ pub(super) struct Assembly {
     config: NodeConfig,
     name: NodeName,
     run: Uuid,
+    started_at: Timestamp,
     seats: Seats,
     counters: Arc<Counters>,
     newest: Newest,
@@ -44,6 +48,8 @@ pub(super) struct Assembly {
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
+    feed: Arc<Feed>,
+    dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
 }
 
@@ -61,6 +67,7 @@ impl Assembly {
             name: config.name.clone().unwrap_or(NodeName::from_static("node")),
             config,
             run: Uuid::now_v7(),
+            started_at: clock::now(),
             seats: Seats::default(),
             counters: Arc::default(),
             newest: Newest::default(),
@@ -70,6 +77,8 @@ impl Assembly {
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
+            feed: Arc::default(),
+            dashboard_address: watch::Sender::new(None),
             failed,
         }
     }
@@ -92,6 +101,10 @@ impl Assembly {
 
     pub(super) fn gossip_address(&self) -> watch::Receiver<Option<SocketAddr>> {
         self.gossip_address.subscribe()
+    }
+
+    pub(super) fn dashboard_address(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.dashboard_address.subscribe()
     }
 
     pub(super) fn frames(&self) -> Arc<FrameCounters> {
@@ -121,6 +134,7 @@ impl Assembly {
             parts.push(Part::Fuser);
         }
         parts.push(Part::LeaderElection);
+        parts.extend(self.config.dashboard.listen.map(|_| Part::Dashboard));
         #[cfg(feature = "camera")]
         if self.config.camera.is_some() {
             parts.extend([Part::Projector, Part::Detector]);
@@ -158,6 +172,10 @@ impl Assembly {
                 let started = Actor::spawn_linked(None, LeaderElection, self.election_arguments(), supervisor).await;
                 seat(&self.seats.election, started)
             }
+            Part::Dashboard => {
+                let arguments = self.dashboard_arguments();
+                seat(&self.seats.dashboard, Actor::spawn_linked(None, Dashboard, arguments, supervisor).await)
+            }
             #[cfg(feature = "camera")]
             Part::Projector => {
                 let arguments = ProjectorArguments {
@@ -183,6 +201,7 @@ impl Assembly {
             stop(&self.seats.detector).await;
             stop(&self.seats.projector).await;
         }
+        stop(&self.seats.dashboard).await;
         stop(&self.seats.election).await;
         stop(&self.seats.fuser).await;
         stop(&self.seats.keeper).await;

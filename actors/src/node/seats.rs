@@ -1,6 +1,7 @@
 //! The parts of a node and where each is reached.
 
 use crate::broker::BrokerMessage;
+use crate::dashboard::DashboardMessage;
 use crate::follower::FollowerMessage;
 use crate::fuser::FuserMessage;
 use crate::gateway::GatewayMessage;
@@ -28,6 +29,8 @@ pub enum Part {
     Fuser,
     /// The node's part in the election.
     LeaderElection,
+    /// The node's page.
+    Dashboard,
     /// The maker of reports.
     #[cfg(feature = "camera")]
     Projector,
@@ -53,6 +56,8 @@ pub struct Seats {
     pub fuser: Seat<FuserMessage>,
     /// The election's.
     pub election: Seat<LeaderElectionMessage>,
+    /// The dashboard's.
+    pub dashboard: Seat<DashboardMessage>,
     /// The projector's.
     #[cfg(feature = "camera")]
     pub projector: Seat<ProjectorMessage>,

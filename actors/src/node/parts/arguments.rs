@@ -1,19 +1,22 @@
 //! What each part is given at its start.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
 use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
+use ecod::landmark::Landmark;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
 use super::Assembly;
 use crate::clock;
+use crate::dashboard::{DashboardArguments, LandmarkFacts, NodeFacts, Sources};
 use crate::follower::{FollowerArguments, FollowerMessage};
 use crate::fuser::{FuserArguments, FuserMessage};
 use crate::gateway::{self, GatewayArguments, Incoming, Subscriber};
-use crate::leader_election::{LeaderElectionArguments, LeaderElectionMessage, Parts, saved_term};
+use crate::leader_election::{LeaderElectionArguments, LeaderElectionMessage, Parts, Position, saved_term};
 use crate::membership::{EventSink, MembershipArguments};
 use crate::node::Seats;
 use crate::reputation_keeper::{ReputationKeeperArguments, ReputationKeeperMessage};
@@ -53,8 +56,16 @@ impl Assembly {
     /// Takes what comes in to the part that deals with it.
     fn subscriber(&self) -> Subscriber {
         let Seats { fuser, follower, keeper, election, .. } = self.seats.clone();
+        let (name, feed, leadership) = (self.name.clone(), Arc::clone(&self.feed), self.leadership());
         Arc::new(move |delivery| {
+            feed.note(&delivery.message, delivery.received_at);
             match &delivery.message {
+                // Evidence is for those that lead now or next; others that get it only look at it.
+                Incoming::Report { report, .. }
+                    if feed.watches() && report.node != name && leadership.borrow().position == Position::Following =>
+                {
+                    true
+                }
                 Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
                 Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
@@ -126,6 +137,39 @@ impl Assembly {
             leadership: self.leadership.clone(),
             counters: self.counters(),
         }
+    }
+
+    pub(super) fn dashboard_arguments(&self) -> DashboardArguments {
+        let landmark = |landmark: Landmark| LandmarkFacts {
+            id: landmark.id,
+            x_m: landmark.position.x,
+            y_m: landmark.position.y,
+            facing_rad: landmark.facing_rad,
+        };
+        let node = NodeFacts {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+            role: self.config.role,
+            version: env!("CARGO_PKG_VERSION"),
+            started_at_us: self.started_at,
+            round_period_s: self.config.fusion.round.period_s,
+        };
+        let sources = Sources {
+            node,
+            landmarks: self.config.landmarks().into_iter().map(landmark).collect(),
+            newest: self.newest.clone(),
+            leadership: self.leadership(),
+            members: self.members(),
+            plane: self.config.data_plane(),
+            counters: self.counters(),
+            frames: self.frames(),
+            feed: Arc::clone(&self.feed),
+            gateway: self.seats.gateway.clone(),
+            broker: self.seats.broker.clone(),
+        };
+        let config = self.config.dashboard.clone();
+        let listen = config.listen.unwrap_or(SocketAddr::from(([127, 0, 0, 1], 0)));
+        DashboardArguments { config, listen, sources, bound: self.dashboard_address.clone() }
     }
 
     fn state_file(&self, what: &str) -> Option<StateFile> {

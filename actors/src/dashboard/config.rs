@@ -1,0 +1,74 @@
+//! Where the dashboard listens and who may look.
+
+use std::net::SocketAddr;
+
+use ecod::config::{ConfigError, check_range};
+use serde::{Deserialize, Serialize};
+
+use crate::gateway::Secret;
+
+/// A node's web page, metrics and health.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DashboardConfig {
+    /// Where the page is served, port 0 for a free one, which the log names. Default none: no page. An address that
+    /// other machines reach needs a token.
+    pub listen: Option<SocketAddr>,
+    /// What who looks has to know, at least 12 characters. Default none, which only a loopback address allows. Give it as
+    /// `ECOD_DASHBOARD__TOKEN` rather than in a file that others read.
+    pub token: Option<Secret>,
+    /// Most pictures of the cell a second that browsers get; default 10. Less costs less, more shows more of a fast cell.
+    pub max_rate_hz: f64,
+    /// Most connections at a time; default 64. A browser's tab takes one for as long as it is open.
+    pub max_connections: usize,
+}
+
+/// The shortest token.
+const MIN_TOKEN_BYTES: usize = 12;
+
+impl Default for DashboardConfig {
+    fn default() -> Self {
+        Self { listen: None, token: None, max_rate_hz: 10.0, max_connections: 64 }
+    }
+}
+
+impl DashboardConfig {
+    /// Checks every value and that strangers stay outside.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the key, the value and what is allowed.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("max_rate_hz", self.max_rate_hz, 0.1, 60.0)?;
+        check_range("max_connections", self.max_connections as f64, 4.0, 4096.0)?;
+        match (&self.token, self.listen) {
+            (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => {
+                Err(ConfigError::new("token", "a short text", format!("at least {MIN_TOKEN_BYTES} characters")))
+            }
+            (None, Some(address)) if !address.ip().is_loopback() => {
+                Err(ConfigError::new("token", "nothing", format!("a secret, as other machines reach {address}")))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn validate(listen: &str, token: Option<&str>) -> Result<(), ConfigError> {
+        let (listen, token) = (listen.parse().ok(), token.map(Secret::new));
+        DashboardConfig { listen, token, ..DashboardConfig::default() }.validate()
+    }
+
+    #[test]
+    fn an_address_that_others_reach_needs_a_token() {
+        validate("127.0.0.1:8080", None).unwrap();
+        validate("[::1]:8080", None).unwrap();
+        for address in ["0.0.0.0:8080", "10.0.0.2:8080", "[::]:8080"] {
+            assert_eq!(validate(address, None).unwrap_err().key, "token", "{address}");
+            validate(address, Some("a long enough token")).unwrap();
+        }
+        assert_eq!(validate("127.0.0.1:8080", Some("short")).unwrap_err().key, "token");
+    }
+}

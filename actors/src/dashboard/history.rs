@@ -1,0 +1,196 @@
+//! What the node saw over time: who led, how late the maps came, how far vehicles were trusted.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::Reputations;
+use serde::Serialize;
+
+use crate::leader_election::{Leadership, Position};
+
+/// A span of time in which one node led, as this node saw it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(super) struct Reign {
+    /// The leader.
+    pub leader: NodeName,
+    /// Its term.
+    pub epoch: u64,
+    /// When this node took it for the leader.
+    pub from_us: Timestamp,
+    /// When it no longer did; absent while it does.
+    pub until_us: Option<Timestamp>,
+    /// Milliseconds from the last round accepted before to the first of this leader; absent for the first leader, or
+    /// until then.
+    pub gap_ms: Option<u64>,
+}
+
+/// What one span of [`SAMPLE_PERIOD`] came to.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(super) struct Sample {
+    /// When the span ended.
+    pub at_us: Timestamp,
+    /// Rounds accepted in it.
+    pub rounds: u32,
+    /// Milliseconds from the oldest capture in a map to its receipt, median; absent without such a map.
+    pub latency_p50_ms: Option<f64>,
+    /// The same, largest.
+    pub latency_max_ms: Option<f64>,
+    /// Reputation of every vehicle shown.
+    pub reputations: BTreeMap<NodeName, f64>,
+}
+
+/// Leaders and samples, the oldest first.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(super) struct History {
+    /// Who led.
+    pub reigns: VecDeque<Reign>,
+    /// How it went.
+    pub samples: VecDeque<Sample>,
+    /// How often the leader changed since the node started.
+    pub failovers: u64,
+    #[serde(skip)]
+    last_round: Option<(Epoch, Timestamp)>,
+    #[serde(skip)]
+    latencies_ms: Vec<f64>,
+    #[serde(skip)]
+    rounds: u32,
+}
+
+/// How often a sample is taken.
+pub(super) const SAMPLE_PERIOD: Duration = Duration::from_secs(2);
+
+/// Most samples kept: ten minutes.
+pub(super) const MAX_SAMPLES: usize = 300;
+
+/// Most reigns kept.
+pub(super) const MAX_REIGNS: usize = 32;
+
+/// Most vehicles in a sample.
+pub(super) const MAX_VEHICLES: usize = 64;
+
+/// Most latencies of one span that are looked at.
+const MAX_LATENCIES: usize = 256;
+
+impl History {
+    /// The same without samples up to a time, for whoever has those.
+    pub(super) fn since(&self, time: Timestamp) -> Self {
+        let samples = self.samples.iter().filter(|sample| sample.at_us > time).cloned().collect();
+        Self { samples, reigns: self.reigns.clone(), failovers: self.failovers, ..Self::default() }
+    }
+
+    /// Notes who leads now.
+    pub(super) fn note_leadership(&mut self, leadership: &Leadership, now: Timestamp) {
+        let present = leadership.epoch.as_ref().filter(|_| leadership.position != Position::Seeking);
+        if let Some(open) = self.reigns.back_mut().filter(|reign| reign.until_us.is_none()) {
+            if present.is_some_and(|epoch| *epoch == Epoch::new(open.epoch, open.leader.clone())) {
+                return;
+            }
+            open.until_us = Some(now);
+        }
+        let Some(epoch) = present else { return };
+        let changed = self.reigns.back().is_some_and(|last| last.leader != epoch.leader);
+        self.failovers += u64::from(changed);
+        let (leader, epoch) = (epoch.leader.clone(), epoch.term);
+        push(&mut self.reigns, Reign { leader, epoch, from_us: now, until_us: None, gap_ms: None }, MAX_REIGNS);
+    }
+
+    /// Notes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
+    pub(super) fn note_round(&mut self, epoch: &Epoch, captured_at: Option<Timestamp>, received_at: Timestamp) {
+        self.rounds = self.rounds.saturating_add(1);
+        let latency = captured_at.map(|captured_at| received_at.since(captured_at));
+        if self.latencies_ms.len() < MAX_LATENCIES {
+            self.latencies_ms.extend(latency.map(|latency| latency.as_secs_f64() * 1e3));
+        }
+        let before = self.last_round.replace((epoch.clone(), received_at));
+        let Some((last, last_at)) = before.filter(|(last, _)| last != epoch) else { return };
+        let gap = u64::try_from(received_at.since(last_at).as_millis()).ok();
+        let of_this = |reign: &&mut Reign| reign.leader == epoch.leader && reign.epoch == epoch.term;
+        if let Some(reign) = self.reigns.iter_mut().rev().find(of_this) {
+            reign.gap_ms = reign.gap_ms.or(gap);
+        }
+        tracing::debug!(%last, %epoch, gap_ms = gap, "rounds of another leader");
+    }
+
+    /// Closes a span.
+    pub(super) fn sample(&mut self, reputations: Option<&Reputations>, now: Timestamp) {
+        let mut latencies = std::mem::take(&mut self.latencies_ms);
+        latencies.sort_by(f64::total_cmp);
+        let reputations = reputations.into_iter().flat_map(|r| &r.reputations).take(MAX_VEHICLES);
+        let sample = Sample {
+            at_us: now,
+            rounds: std::mem::take(&mut self.rounds),
+            latency_p50_ms: latencies.get(latencies.len() / 2).copied(),
+            latency_max_ms: latencies.last().copied(),
+            reputations: reputations.map(|(name, reputation)| (name.clone(), reputation.score)).collect(),
+        };
+        push(&mut self.samples, sample, MAX_SAMPLES);
+    }
+}
+
+fn push<T>(kept: &mut VecDeque<T>, item: T, most: usize) {
+    if kept.len() >= most {
+        kept.pop_front();
+    }
+    kept.push_back(item);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn led_by(leader: &'static str, term: u64) -> Leadership {
+        let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
+        Leadership { position: Position::Following, epoch, standby: None }
+    }
+
+    fn seconds(n: u64) -> Timestamp {
+        Timestamp(n * 1_000_000)
+    }
+
+    #[test]
+    fn a_failover_ends_one_reign_and_begins_another_with_its_gap() {
+        let mut history = History::default();
+        let epoch = |leader, term| Epoch::new(term, NodeName::from_static(leader));
+        history.note_leadership(&led_by("edge", 3), seconds(1));
+        history.note_round(&epoch("edge", 3), None, seconds(9));
+        history.note_leadership(&led_by("edge", 3), seconds(9));
+        let seeking = Leadership { position: Position::Seeking, ..led_by("edge", 3) };
+        history.note_leadership(&seeking, seconds(10));
+        history.note_leadership(&led_by("euclid", 4), seconds(11));
+        history.note_round(&epoch("euclid", 4), None, seconds(12));
+        history.note_round(&epoch("euclid", 4), None, seconds(14));
+        let reign = |leader, epoch, from, until: Option<u64>, gap_ms| {
+            let leader = NodeName::from_static(leader);
+            Reign { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
+        };
+        assert_eq!(history.reigns, [reign("edge", 3, 1, Some(10), None), reign("euclid", 4, 11, None, Some(3000))]);
+        assert_eq!(history.failovers, 1);
+    }
+
+    #[test]
+    fn a_leader_that_is_found_again_is_no_failover() {
+        let mut history = History::default();
+        history.note_leadership(&led_by("edge", 3), seconds(1));
+        history.note_leadership(&Leadership::default(), seconds(2));
+        history.note_leadership(&led_by("edge", 4), seconds(3));
+        assert_eq!((history.reigns.len(), history.failovers), (2, 0));
+    }
+
+    #[test]
+    fn a_long_run_is_kept_in_bounds() {
+        let mut history = History::default();
+        for n in 0..1000 {
+            history.note_leadership(&led_by(if n % 2 == 0 { "edge" } else { "euclid" }, n), seconds(n));
+            (0..1000).for_each(|_| {
+                history.note_round(&Epoch::new(n, NodeName::from_static("edge")), Some(seconds(n)), seconds(n))
+            });
+            assert!(history.latencies_ms.len() <= MAX_LATENCIES);
+            history.sample(None, seconds(n));
+        }
+        assert_eq!((history.reigns.len(), history.samples.len()), (MAX_REIGNS, MAX_SAMPLES));
+        assert_eq!(history.samples.back().map(|sample| sample.rounds), Some(1000));
+    }
+}

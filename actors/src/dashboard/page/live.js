@@ -1,0 +1,91 @@
+// The connection to the node: pictures as they come, history now and then, and word of when nothing comes.
+
+/// A longer silence means that the connection is lost: the node sends at least one picture a second.
+const SILENCE_MS = 3000;
+const HISTORY_MS = 2000;
+
+export class Live {
+  picture = null;
+  history = { reigns: [], samples: [], failovers: 0 };
+  landmarks = [];
+  refused = false;
+  #source = null;
+  #heard = 0;
+
+  constructor(onPicture, onHistory) {
+    this.onPicture = onPicture;
+    this.onHistory = onHistory;
+    document.addEventListener("visibilitychange", () => this.#follow());
+    setInterval(() => this.#check(), 500);
+    setInterval(() => this.#refresh(), HISTORY_MS);
+    this.#follow();
+    this.#refresh();
+  }
+
+  /// Whether pictures come.
+  get connected() {
+    return performance.now() - this.#heard < SILENCE_MS;
+  }
+
+  /// The node's time now, in microseconds, as far as the last picture tells.
+  get now() {
+    return this.picture ? this.picture.now_us + (performance.now() - this.#heard) * 1000 : 0;
+  }
+
+  /// A page that nobody looks at takes no connection.
+  #follow() {
+    if (document.hidden) return this.#close();
+    if (this.#source) return;
+    this.#source = new EventSource("/api/events");
+    this.#source.addEventListener("picture", (event) => {
+      const picture = JSON.parse(event.data);
+      const restarted = this.picture?.node.started_at_us !== picture.node.started_at_us;
+      this.picture = picture;
+      this.#heard = performance.now();
+      this.refused = false;
+      if (restarted) this.#restart();
+      this.onPicture();
+    });
+  }
+
+  #close() {
+    this.#source?.close();
+    this.#source = null;
+  }
+
+  /// A browser gives up on some errors, and does not notice every lost connection.
+  #check() {
+    const silent = performance.now() - this.#heard > 2 * SILENCE_MS;
+    if (!document.hidden && (this.#source?.readyState === EventSource.CLOSED || (silent && this.picture && Math.random() < 0.1))) {
+      this.#close();
+      this.#follow();
+    }
+    this.onPicture();
+  }
+
+  async #restart() {
+    this.history = { reigns: [], samples: [], failovers: 0 };
+    this.landmarks = (await this.#get("/api/landmarks")) ?? this.landmarks;
+    this.#refresh();
+  }
+
+  async #refresh() {
+    if (document.hidden) return;
+    const since = this.history.samples.at(-1)?.at_us ?? 0;
+    const news = await this.#get(`/api/history?since=${since}`);
+    if (!news) return;
+    const samples = [...this.history.samples, ...news.samples.filter((sample) => sample.at_us > since)].slice(-300);
+    this.history = { ...news, samples };
+    this.onHistory();
+  }
+
+  async #get(path) {
+    try {
+      const answer = await fetch(path);
+      this.refused = answer.status === 401;
+      return answer.ok ? await answer.json() : null;
+    } catch {
+      return null;
+    }
+  }
+}

@@ -1,0 +1,121 @@
+// From pictures to the page. The map follows every picture; text changes four times a second, so that it can be read.
+
+import { chart } from "./charts.js";
+import { byId, span, text } from "./dom.js";
+import { Live } from "./live.js";
+import { BirdsEye, colours } from "./map.js";
+import * as tables from "./tables.js";
+
+const TEXT_MS = 250;
+let [queued, textAt, told] = [false, 0, {}];
+
+const live = new Live(draw, drawHistory);
+const map = new BirdsEye(draw);
+
+byId("as-table").onclick = ({ target }) => {
+  const asTable = byId("map-table").hidden;
+  byId("map-table").hidden = !asTable;
+  byId("map-frame").hidden = asTable;
+  target.setAttribute("aria-pressed", String(asTable));
+  textAt = 0;
+  draw();
+};
+
+function draw() {
+  if (queued) return;
+  queued = true;
+  requestAnimationFrame(() => {
+    queued = false;
+    drawState();
+    if (!live.picture) return;
+    const scene = arrange(live.picture, live.landmarks, live.now);
+    if (!byId("map-frame").hidden) map.draw(scene);
+    if (performance.now() - textAt < TEXT_MS) return;
+    textAt = performance.now();
+    drawText(live.picture, scene);
+  });
+}
+
+/// What of the picture is on the map, joined with where places are and what colours vehicles have.
+function arrange(picture, landmarks, now) {
+  const colour = colours(picture.vehicles.map((vehicle) => vehicle.report.node).concat(Object.keys(picture.reputations?.message.reputations ?? {})));
+  const known = new Map(landmarks.map((landmark) => [landmark.id, landmark]));
+  const verdicts = new Map((picture.verdicts?.message.verdicts ?? []).map((verdict) => [verdict.landmark, verdict]));
+  const fused = picture.map?.message.landmarks ?? [];
+  const source = fused.length > 0 ? fused : landmarks.map((l) => ({ ...l, label: verdicts.get(l.id)?.label ?? null, confidence: 0, contributors: verdicts.get(l.id)?.contributors ?? [] }));
+  const places = source.map((place) => {
+    const empty = (place.observers ?? []).length > 0;
+    const state = place.label !== null ? "full" : empty ? "" : "unknown";
+    return { ...place, facing_rad: known.get(place.id)?.facing_rad, state, words: empty ? "seen empty" : "not seen" };
+  });
+  const vehicles = picture.vehicles.map(({ kind, received_at_us, report }) => ({
+    key: `${report.node} ${kind}`, node: report.node, kind, received_at_us, seq: report.seq, pose: report.pose, objects: report.objects,
+    inView: report.seen?.length, seen: (report.seen ?? []).map((id) => known.get(id)).filter(Boolean), colour: colour.get(report.node),
+  }));
+  return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };
+}
+
+function drawText(picture, scene) {
+  const { now } = scene;
+  text(byId("cell"), picture.node.cell);
+  text(byId("node"), picture.node.name);
+  document.title = `${picture.node.cell} seen by ${picture.node.name}, ECOD`;
+  const sample = live.history.samples.at(-1);
+  tables.tiles(picture, now, sample ? sample.rounds / 2 : null);
+  if (!byId("map-table").hidden) tables.places(scene);
+  tables.verdicts(picture.verdicts, now);
+  tables.vehicles(scene.vehicles, now);
+  tables.reputations(picture.reputations, scene.colour);
+  tables.reigns(live.history, now);
+  tables.nodes(picture);
+  tables.drops(picture);
+  text(byId("about"), `ECOD ${picture.node.version}, role ${picture.node.role}, up ${span((now - picture.node.started_at_us) / 1e6)}`);
+}
+
+/// Whether what is shown is true now, in colour and in words.
+function drawState() {
+  const { picture } = live;
+  const [look, words] = !picture ? (live.refused ? ["stale", "Sign in"] : ["waiting", "Connecting"])
+    : !live.connected ? ["stale", `Connection lost, ${span((live.now - picture.now_us) / 1e6).replace(/\.\d/, "")} old`]
+    : picture.readiness.ready ? ["live", `Live, ${picture.readiness.reason}`] : ["unready", sentence(picture.readiness.reason)];
+  byId("state").className = `state ${look}`;
+  text(byId("state-text"), words);
+  const stale = picture !== null && (!live.connected || !picture.readiness.ready);
+  document.body.classList.toggle("stale-data", stale);
+  const notice = live.refused ? "This page needs the node's token: open it with ?token= and the token."
+    : picture && !live.connected ? "The node does not answer. What is shown is what it said last."
+    : stale ? `What is shown may be out of date: ${picture.readiness.reason}.` : "";
+  text(byId("notice"), notice);
+  byId("notice").hidden = notice === "";
+  announce(picture);
+}
+
+/// Says changes of the leader aloud; the state beside it is said by itself.
+function announce(picture) {
+  const leader = picture?.leadership.leader;
+  if (leader && told.leader && leader !== told.leader) text(byId("announcer"), `${leader} leads now, in place of ${told.leader}`);
+  told = { leader: leader ?? told.leader };
+}
+
+function drawHistory() {
+  const { samples } = live.history;
+  if (samples.length === 0) return;
+  const now = samples.at(-1).at_us;
+  const line = (name, colour, of, style = "line") => ({ name, colour, class: style, points: samples.map((sample) => [sample.at_us, of(sample) ?? null]) });
+  tables.latency(samples);
+  chart(byId("latency-chart"), {
+    now, label: "Latency of maps over ten minutes, median and largest, in milliseconds", unit: "",
+    lines: [line("largest", 7, (s) => s.latency_max_ms, "line soft"), line("median", 0, (s) => s.latency_p50_ms)],
+  });
+  chart(byId("rounds-chart"), { now, label: "Rounds accepted a second over ten minutes", lines: [line("rounds", 2, (s) => s.rounds / 2)] });
+  const names = Object.keys(samples.at(-1).reputations);
+  if (names.length > 0 && live.picture) {
+    const { colour } = arrange(live.picture, [], now);
+    chart(byId("reputation-chart"), {
+      now, label: "Reputation of each vehicle over ten minutes", ceiling: 1, names: true,
+      lines: names.map((name) => line(name, colour.get(name) ?? 7, (s) => s.reputations[name])),
+    });
+  }
+}
+
+const sentence = (words) => words.charAt(0).toUpperCase() + words.slice(1);

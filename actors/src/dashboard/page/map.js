@@ -1,0 +1,251 @@
+// The bird's-eye view: world metres to screen pixels, signs of constant size, labels that do not cover each other.
+
+import { byId, keyed, set, span, svg, text } from "./dom.js";
+
+/// Where the error ellipse of a plane normal distribution holds 95 %: the square root of its χ² quantile.
+const SIGMAS_95 = 2.4477;
+/// More places or objects than this are only in the table.
+const MAX_DRAWN = 2000;
+const OLD_S = 2;
+const MARGIN_PX = 56;
+
+/// Colours by name, in the order of the alphabet.
+export const colours = (names) => new Map([...names].sort().map((name, index) => [name, index % 8]));
+
+export class BirdsEye {
+  #picture = byId("map");
+  #layers = {};
+  #bounds = null;
+  #zoom = 1;
+  #shift = [0, 0];
+
+  constructor(redraw) {
+    this.redraw = redraw;
+    for (const name of ["grid", "views", "places", "dots", "objects", "vehicles", "labels", "scale"]) {
+      this.#layers[name] = this.#picture.appendChild(svg("g"));
+    }
+    byId("zoom-in").onclick = () => this.#zoomBy(1.4);
+    byId("zoom-out").onclick = () => this.#zoomBy(1 / 1.4);
+    byId("fit").onclick = () => this.#fit();
+    this.#picture.addEventListener("keydown", (event) => this.#key(event));
+    this.#picture.addEventListener("wheel", (event) => {
+      if (!event.ctrlKey) return;
+      event.preventDefault();
+      this.#zoomBy(event.deltaY < 0 ? 1.15 : 1 / 1.15);
+    }, { passive: false });
+    this.#drag();
+    new ResizeObserver(redraw).observe(this.#picture);
+  }
+
+  /// Draws { places, objects, vehicles, now }.
+  draw(scene) {
+    const box = this.#picture.getBoundingClientRect();
+    const empty = scene.places.length + scene.objects.length + scene.vehicles.length === 0;
+    byId("map-empty").hidden = !empty;
+    if (box.width < 40 || empty) return;
+    set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene) });
+    const at = this.#projection(scene, box);
+    const labels = new Labels(box);
+    this.#grid(at, box);
+    this.#places(scene.places.slice(0, MAX_DRAWN), at, labels);
+    this.#objects(scene.objects.slice(0, MAX_DRAWN), at, labels);
+    this.#vehicles(scene.vehicles, scene.now, at, labels);
+    keyed(this.#layers.labels, labels.placed, (label) => label.key, () => svg("text"), (element, label) => {
+      set(element, { x: label.x, y: label.y, "text-anchor": label.anchor, class: label.class });
+      text(element, label.text);
+    });
+  }
+
+  /// The bounds only grow, so that the map stands still while vehicles come and go; Fit takes them anew.
+  #projection(scene, box) {
+    const points = [...scene.places, ...scene.objects, ...scene.vehicles.flatMap((v) => [v.pose, ...v.objects])].filter(Boolean);
+    const [xs, ys] = [points.map((p) => p.x_m), points.map((p) => p.y_m)];
+    const b = this.#bounds ?? [Infinity, Infinity, -Infinity, -Infinity];
+    this.#bounds = [xs.reduce(min, b[0]), ys.reduce(min, b[1]), xs.reduce(max, b[2]), ys.reduce(max, b[3])];
+    const [left, bottom, right, top] = this.#bounds;
+    const fit = Math.min((box.width - 2 * MARGIN_PX) / Math.max(right - left, 1e-3), (box.height - 2 * MARGIN_PX) / Math.max(top - bottom, 1e-3));
+    const scale = Math.min(fit, 4000) * this.#zoom;
+    const [cx, cy] = [box.width / 2 + this.#shift[0], box.height / 2 + this.#shift[1]];
+    const at = (p) => [cx + (p.x_m - (left + right) / 2) * scale, cy - (p.y_m - (bottom + top) / 2) * scale];
+    return Object.assign(at, { scale });
+  }
+
+  #grid(at, box) {
+    const step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(80 / at.scale))).find((n) => n * at.scale >= 70);
+    const [zeroX, zeroY] = at({ x_m: 0, y_m: 0 });
+    const lines = [];
+    const px = step * at.scale;
+    for (let x = ((zeroX % px) + px) % px; x < box.width; x += px) lines.push({ x1: x, x2: x, y1: 0, y2: box.height });
+    for (let y = ((zeroY % px) + px) % px; y < box.height; y += px) lines.push({ x1: 0, x2: box.width, y1: y, y2: y });
+    keyed(this.#layers.grid, lines.map((line, index) => ({ line, index })), (l) => l.index, () => svg("line", { class: "grid" }), (element, l) => set(element, l.line));
+    keyed(this.#layers.scale, [0], () => 0, () => {
+      const g = svg("g");
+      g.append(svg("path", { class: "rule" }), svg("text", { class: "scale dim" }));
+      return g;
+    }, (g) => {
+      const y = box.height - 12;
+      set(g.firstChild, { d: `M12 ${y - 5}v5h${px.toFixed(1)}v-5` });
+      set(g.lastChild, { x: 18 + px, y });
+      text(g.lastChild, step >= 1 ? `${step} m` : `${+(step * 100).toFixed(1)} cm`);
+    });
+  }
+
+  #places(places, at, labels) {
+    keyed(this.#layers.places, places, (place) => place.id, () => {
+      const g = svg("g");
+      g.append(svg("line", { class: "facing" }), svg("rect", { width: 11, height: 11, rx: 3 }), svg("title"));
+      return g;
+    }, (g, place) => {
+      const [x, y] = at(place);
+      const [line, sign, title] = g.children;
+      const facing = place.facing_rad ?? null;
+      const reach = facing === null ? 0 : 13;
+      set(line, { x1: x, y1: y, x2: x + reach * Math.cos(facing ?? 0), y2: y - reach * Math.sin(facing ?? 0) });
+      set(sign, { x: x - 5.5, y: y - 5.5, class: `place ${place.state}` });
+      text(title, `${place.id}: ${place.label ?? place.words}`);
+      labels.put(`place ${place.id}`, place.label ?? place.id, x, y, 9, place.label ? "" : "dim");
+    });
+  }
+
+  #objects(objects, at, labels) {
+    keyed(this.#layers.objects, objects, (object) => object.id, () => {
+      const g = svg("g");
+      g.append(svg("ellipse", { class: "ellipse" }), svg("circle", { class: "centre", r: 2.5 }), svg("title"));
+      return g;
+    }, (g, object) => {
+      const [x, y] = at(object);
+      const { a, b, turn } = ellipse(object.covariance_m2);
+      const [around, centre, title] = g.children;
+      const degrees = ((-turn * 180) / Math.PI).toFixed(1);
+      set(around, { rx: Math.max(a * at.scale, 5), ry: Math.max(b * at.scale, 5), transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
+      set(centre, { cx: x, cy: y });
+      text(title, `${object.label}, ${Math.round(object.confidence * 100)} %, ± ${a.toFixed(2)} m, seen by ${object.contributors.join(", ")}`);
+      labels.put(`object ${object.id}`, object.label, x, y, 9, "");
+    });
+  }
+
+  #vehicles(vehicles, now, at, labels) {
+    const posed = vehicles.filter((vehicle) => vehicle.pose);
+    const old = (vehicle) => ((now - vehicle.received_at_us) / 1e6 > OLD_S ? "old" : "");
+    keyed(this.#layers.views, posed, (v) => v.key, () => svg("path"), (path, v) => {
+      set(path, { class: `view c${v.colour} ${old(v)}`, d: wedge(v, at) });
+    });
+    const dots = vehicles.flatMap((v) => v.objects.map((object, index) => ({ ...object, key: `${v.key} ${index}`, of: v })));
+    keyed(this.#layers.dots, dots.slice(0, MAX_DRAWN), (dot) => dot.key, () => svg("circle", { r: 3.5 }), (circle, dot) => {
+      const [cx, cy] = at(dot);
+      set(circle, { cx, cy, class: `dot c${dot.of.colour} ${old(dot.of)}` });
+    });
+    keyed(this.#layers.vehicles, posed, (v) => v.key, () => {
+      const g = svg("g");
+      g.append(svg("path", { class: "body", d: "M12 0L-8 7.5L-4 0L-8 -7.5Z" }), svg("title"));
+      return g;
+    }, (g, v) => {
+      const [x, y] = at(v.pose);
+      const degrees = ((-v.pose.heading_rad * 180) / Math.PI).toFixed(1);
+      set(g, { class: `c${v.colour} ${old(v)}` });
+      set(g.firstChild, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
+      text(g.lastChild, `${v.node}, report ${span((now - v.received_at_us) / 1e6)} old`);
+      labels.put(`vehicle ${v.node}`, v.node, x, y, 14, `vehicle c${v.colour} ${old(v)}`);
+    });
+  }
+
+  #zoomBy(factor) {
+    const zoom = Math.min(Math.max(this.#zoom * factor, 0.2), 60);
+    this.#shift = this.#shift.map((shift) => (shift * zoom) / this.#zoom);
+    this.#zoom = zoom;
+    this.redraw();
+  }
+
+  #fit() {
+    [this.#zoom, this.#shift, this.#bounds] = [1, [0, 0], null];
+    this.redraw();
+  }
+
+  #key(event) {
+    const move = { ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40] }[event.key];
+    if (move) this.#shift = [this.#shift[0] + move[0], this.#shift[1] + move[1]];
+    else if (event.key === "+" || event.key === "=") return this.#zoomBy(1.4);
+    else if (event.key === "-") return this.#zoomBy(1 / 1.4);
+    else if (event.key === "0") return this.#fit();
+    else return;
+    event.preventDefault();
+    this.redraw();
+  }
+
+  #drag() {
+    let last = null;
+    this.#picture.addEventListener("pointerdown", (event) => {
+      if (event.pointerType === "touch") return;
+      last = [event.clientX, event.clientY];
+      this.#picture.setPointerCapture(event.pointerId);
+      this.#picture.classList.add("dragging");
+    });
+    this.#picture.addEventListener("pointermove", (event) => {
+      if (!last) return;
+      this.#shift = [this.#shift[0] + event.clientX - last[0], this.#shift[1] + event.clientY - last[1]];
+      last = [event.clientX, event.clientY];
+      this.redraw();
+    });
+    for (const end of ["pointerup", "pointercancel"]) {
+      this.#picture.addEventListener(end, () => {
+        last = null;
+        this.#picture.classList.remove("dragging");
+      });
+    }
+  }
+}
+
+const min = (a, b) => Math.min(a, b);
+const max = (a, b) => Math.max(a, b);
+
+/// Half axes in metres and the direction of the longer, of the ellipse that holds 95 %.
+function ellipse([xx, xy, yy]) {
+  const mean = (xx + yy) / 2;
+  const spread = Math.hypot((xx - yy) / 2, xy);
+  return { a: SIGMAS_95 * Math.sqrt(mean + spread), b: SIGMAS_95 * Math.sqrt(Math.max(mean - spread, 0)), turn: Math.atan2(2 * xy, xx - yy) / 2 };
+}
+
+/// The field of view, as far as the vehicle sees anything; without a known width, what it saw.
+function wedge(vehicle, at) {
+  const { pose, objects, seen } = vehicle;
+  const rays = [...objects, ...seen].map((p) => [Math.hypot(p.x_m - pose.x_m, p.y_m - pose.y_m), turn(Math.atan2(p.y_m - pose.y_m, p.x_m - pose.x_m) - pose.heading_rad)]);
+  const reach = Math.max(rays.reduce((far, [range]) => Math.max(far, range), 0) * 1.1, 60 / at.scale);
+  const half = pose.fov_rad ? pose.fov_rad / 2 : rays.reduce((wide, [, bearing]) => Math.max(wide, Math.abs(bearing)), 0) + 0.05;
+  const point = (bearing) => at({ x_m: pose.x_m + reach * Math.cos(pose.heading_rad + bearing), y_m: pose.y_m + reach * Math.sin(pose.heading_rad + bearing) }).map((c) => c.toFixed(1)).join(" ");
+  const r = (reach * at.scale).toFixed(1);
+  const [x, y] = at(pose).map((c) => c.toFixed(1));
+  return `M${x} ${y}L${point(-half)}A${r} ${r} 0 ${half > Math.PI / 2 ? 1 : 0} 0 ${point(half)}Z`;
+}
+
+const turn = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
+
+/// The map in a sentence, for those who do not see it.
+function describe({ places, objects, vehicles }) {
+  const labelled = places.filter((place) => place.label).length;
+  return `Map of ${places.length} places, ${labelled} with a label, ${objects.length} other objects and ${vehicles.length} vehicles`;
+}
+
+/// Puts labels beside their signs where they cover no other label; one that finds no room is left out.
+class Labels {
+  placed = [];
+  #taken = [];
+
+  constructor(box) {
+    this.box = box;
+  }
+
+  put(key, words, x, y, gap, style) {
+    const shown = words.length > 18 ? words.slice(0, 17) + "…" : words;
+    const width = shown.length * 7 + 4;
+    const places = [["start", x + gap, y + 4], ["end", x - gap, y + 4], ["middle", x, y - gap - 2], ["middle", x, y + gap + 11]];
+    for (const [anchor, lx, ly] of places) {
+      const left = anchor === "start" ? lx : anchor === "end" ? lx - width : lx - width / 2;
+      const area = [left, ly - 11, left + width, ly + 3];
+      const outside = area[0] < 0 || area[2] > this.box.width || area[1] < 0 || area[3] > this.box.height;
+      if (outside || this.#taken.some((t) => area[0] < t[2] && area[2] > t[0] && area[1] < t[3] && area[3] > t[1])) continue;
+      this.#taken.push(area);
+      this.placed.push({ key, text: shown, x: lx, y: ly, anchor, class: style });
+      return;
+    }
+  }
+}

@@ -1,0 +1,133 @@
+// Everything on the page that is text.
+
+import { byId, clock, milliseconds, n, rows, span, text } from "./dom.js";
+
+const percent = (value) => `${Math.round(value * 100)} %`;
+const list = (names) => (names.length > 3 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(", ") || "–");
+
+function fill(name, items, key, cells) {
+  rows(byId(name), items, key, cells);
+  const empty = byId(`${name}-empty`);
+  if (empty) {
+    empty.hidden = items.length > 0;
+    byId(name).parentElement.hidden = items.length === 0;
+  }
+}
+
+export function tiles({ leadership, map, verdicts }, now, perSecond) {
+  const { leader, epoch, since_us, standby, position, failovers } = leadership;
+  text(byId("leader"), leader ?? "nobody");
+  const mine = { leading: ", this node", standing_by: "", following: "", seeking: "" }[position];
+  text(byId("leader-more"), leader ? `epoch ${epoch}${mine}, for ${since_us ? span((now - since_us) / 1e6) : "–"}` : "no leader known");
+  text(byId("standby"), standby ?? "–");
+  text(byId("standby-more"), position === "standing_by" ? "this node leads next" : standby ? "leads if the leader fails" : "nobody named");
+  const newest = map ?? verdicts;
+  text(byId("round"), newest ? String(newest.message.round) : "–");
+  text(byId("round-more"), newest ? `${span((now - newest.received_at_us) / 1e6)} ago${perSecond === null ? "" : `, ${perSecond.toFixed(1)} a second`}` : "none yet");
+  text(byId("failovers"), failovers === 1 ? "1 change of leader" : `${failovers} changes of leader`);
+}
+
+export function latency(samples) {
+  const last = samples.filter((sample) => sample.latency_p50_ms !== null).slice(-5);
+  const middle = last.map((sample) => sample.latency_p50_ms).sort((a, b) => a - b)[last.length >> 1];
+  const most = Math.max(...last.map((sample) => sample.latency_max_ms));
+  text(byId("latency"), last.length ? milliseconds(middle) : "–");
+  text(byId("latency-more"), last.length ? `median of 10 s, at most ${milliseconds(most)}` : "oldest capture in the map");
+}
+
+export function places(scene) {
+  const entries = [
+    ...scene.places.map((place) => ({ ...place, name: place.id })),
+    ...scene.objects.map((object) => ({ ...object, name: `object ${object.id.slice(0, 4)}` })),
+  ];
+  rows(byId("places"), entries, (entry) => entry.id, (entry) => [
+    entry.name, entry.label ?? { text: entry.words ?? "–", class: "dim" }, n(entry.label ? percent(entry.confidence) : "–"),
+    n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), { text: list(entry.contributors ?? []), class: "dim" },
+  ]);
+}
+
+export function verdicts(received, now) {
+  const all = received?.message.verdicts ?? [];
+  fill("verdicts", all, (verdict) => verdict.landmark, (verdict) => {
+    const votes = Object.entries(verdict.votes).sort((a, b) => b[1] - a[1]);
+    const close = verdict.label !== null && votes.length > 1 && verdict.margin < 0.25 * verdict.score;
+    return [
+      verdict.landmark, verdict.label ?? { text: "nothing", class: "dim" },
+      { text: votes.map(([label, score]) => `${label} ${score.toFixed(2)}`).join(", ") || "–", class: "dim" },
+      { text: verdict.margin.toFixed(2) + (close ? " close" : ""), class: close ? "n warn" : "n" },
+    ];
+  });
+  text(byId("verdicts-age"), received ? `${span((now - received.received_at_us) / 1e6)} ago` : "");
+}
+
+export function vehicles(entries, now) {
+  fill("vehicles", entries, (vehicle) => vehicle.key, (vehicle) => {
+    const age = (now - vehicle.received_at_us) / 1e6;
+    const kind = vehicle.kind === "vote_detections" ? " votes" : "";
+    return [
+      { text: vehicle.node + kind, colour: vehicle.colour }, n(vehicle.objects.length), n(vehicle.inView ?? "–"), n(vehicle.seq),
+      { text: span(age), class: age > 2 ? "n bad" : "n" },
+    ];
+  });
+  text(byId("vehicles-count"), entries.length ? `${new Set(entries.map((entry) => entry.node)).size}` : "");
+}
+
+export function reputations(received, colour) {
+  const all = Object.entries(received?.message.reputations ?? {});
+  fill("reputations", all, ([name]) => name, ([name, { score, correct, incorrect }]) => [
+    { text: name, colour: colour.get(name) ?? 7 }, n(score.toFixed(2)), n(correct), n(incorrect),
+  ]);
+  byId("reputation-chart").hidden = all.length === 0;
+}
+
+export function reigns({ reigns }, now) {
+  const latest = [...reigns].reverse();
+  fill("reigns", latest, (reign) => `${reign.leader} ${reign.epoch} ${reign.from_us}`, (reign) => [
+    reign.leader, n(reign.epoch), clock(reign.from_us),
+    reign.until_us ? span((reign.until_us - reign.from_us) / 1e6) : { text: `${span((now - reign.from_us) / 1e6)}, leads`, class: "" },
+    n(reign.gap_ms === null ? "–" : milliseconds(reign.gap_ms)),
+  ]);
+}
+
+export function nodes({ nodes, node, leadership }) {
+  const states = { following: "follows", aggregating: "leads", offline: "offline" };
+  rows(byId("nodes"), nodes, (entry) => entry.name, (entry) => {
+    const leads = entry.name === leadership.leader;
+    const state = !entry.alive ? "gone" : leads ? "leads" : entry.name === leadership.standby ? "stands by" : entry.state === "aggregating" ? "follows" : states[entry.state] ?? "there";
+    const unfit = entry.alive && entry.fit === false ? ", not fit to lead" : "";
+    return [
+      entry.name + (entry.name === node.name ? " (this)" : ""), entry.role,
+      { text: state + unfit, class: entry.alive ? (unfit ? "warn" : "") : "bad" }, { text: entry.version ?? "–", class: "dim" },
+    ];
+  });
+  text(byId("nodes-count"), `${nodes.filter((entry) => entry.alive).length} of ${nodes.length} there`);
+}
+
+/// What counts as left out, beside payloads that were rejected, in words.
+const DROPS = {
+  publish_refused: "not sent: link down or full", publish_too_large: "not sent: too large", inbox_full: "dropped: node too far behind",
+  name_conflict: "another node has this name", disconnected: "link lost", connect_failed: "link not established", broker_refused: "refused by a broker",
+  vote_ignored: "vote for nothing", reputations_not_saved: "reputations not saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped",
+  detection_unplaced: "detection not placed", browser_refused: "browser refused", browser_throttled: "browser slowed down", dashboard_not_bound: "page's address not free",
+};
+
+const earlier = new Map();
+
+export function drops({ counters, now_us }) {
+  const rejected = Object.entries(counters.rejects).map(([reason, count]) => [`rejected: ${reason.replaceAll("_", " ")}`, count]);
+  const events = Object.entries(DROPS).map(([event, words]) => [words, counters.events[event] ?? 0]);
+  const all = [...rejected, ...events].filter(([, count]) => count > 0);
+  fill("drops", all, ([reason]) => reason, ([reason, count]) => {
+    const lately = recent(reason, count, now_us);
+    return [reason, n(count), { text: lately ? `+${lately}` : "–", class: lately ? "n warn" : "n dim" }];
+  });
+}
+
+/// How much a counter rose in the last ten seconds or so.
+function recent(reason, count, now) {
+  const kept = (earlier.get(reason) ?? [[now, count]]).filter(([, value]) => value <= count);
+  if (kept.length === 0 || now - kept.at(-1)[0] > 1e6) kept.push([now, count]);
+  while (kept.length > 1 && now - kept[1][0] > 10e6) kept.shift();
+  earlier.set(reason, kept);
+  return count - kept[0][1];
+}

@@ -1,0 +1,152 @@
+//! The listener, on a thread of its own: whatever browsers do, the cell's threads do not notice.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{Semaphore, oneshot, watch};
+use tokio_io_timeout::TimeoutStream;
+
+use super::DashboardConfig;
+use super::access::Access;
+use super::observer::Observer;
+use super::routes::Site;
+use crate::counters::Event;
+
+/// A running server; dropping it stops it.
+#[derive(Debug)]
+pub(super) struct Server {
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// First and longest wait before an address that was not free is tried again.
+const RETRY_MIN: Duration = Duration::from_millis(500);
+const RETRY_MAX: Duration = Duration::from_secs(10);
+
+/// How long a browser may take for the head of a request, also between two on one connection.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// How long a browser may read nothing of what it asked for.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Most bytes that wait for one browser, beside what its socket holds.
+const MAX_BUFFER_BYTES: usize = 64 * 1024;
+
+impl Server {
+    /// Starts the thread; `bound` gets the address as soon as it is listened on.
+    ///
+    /// # Errors
+    /// When the operating system gives no thread.
+    pub(super) fn start(
+        config: DashboardConfig,
+        address: SocketAddr,
+        observer: Arc<Observer>,
+        bound: watch::Sender<Option<SocketAddr>>,
+    ) -> io::Result<Self> {
+        let (stop, stopped) = oneshot::channel();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let thread = std::thread::Builder::new().name("dashboard".into()).spawn(move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    () = Arc::clone(&observer).run(config.max_rate_hz) => {}
+                    () = serve(&config, address, &observer, &bound) => {}
+                    // The sender is dropped too when its owner is.
+                    _ = stopped => {}
+                }
+            });
+            runtime.shutdown_background();
+        })?;
+        Ok(Self { stop: Some(stop), thread: Some(thread) })
+    }
+
+    /// Whether the thread has ended by itself.
+    pub(super) fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        drop(self.stop.take());
+        if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
+            tracing::warn!("the dashboard's thread panicked");
+        }
+    }
+}
+
+async fn serve(
+    config: &DashboardConfig,
+    address: SocketAddr,
+    observer: &Arc<Observer>,
+    bound: &watch::Sender<Option<SocketAddr>>,
+) {
+    let listener = listen(bound.borrow().unwrap_or(address), observer).await;
+    let Ok(address) = listener.local_addr() else { return };
+    let node = &observer.sources().node.name;
+    let access = Access::new(config.token.as_ref(), address, node);
+    tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
+    bound.send_replace(Some(address));
+    let router = Site::new(Arc::clone(observer), access, config.max_connections).router();
+    let places = Arc::new(Semaphore::new(config.max_connections));
+    loop {
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                // Out of file descriptors, most likely: some may be free soon.
+                tracing::debug!(%error, "no connection accepted");
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                continue;
+            }
+        };
+        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+            observer.sources().counters.count(Event::BrowserRefused);
+            continue;
+        };
+        let router = router.clone();
+        tokio::spawn(async move {
+            if let Err(error) = answer(stream, router).await {
+                tracing::debug!(%error, "connection of a browser ended");
+            }
+            drop(place);
+        });
+    }
+}
+
+async fn answer(stream: TcpStream, router: axum::Router) -> hyper::Result<()> {
+    if let Err(error) = stream.set_nodelay(true) {
+        tracing::debug!(%error, "small packets may wait");
+    }
+    let mut stream = TimeoutStream::new(stream);
+    stream.set_write_timeout(Some(WRITE_TIMEOUT));
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEAD_TIMEOUT)
+        .max_buf_size(MAX_BUFFER_BYTES)
+        .serve_connection(TokioIo::new(Box::pin(stream)), TowerToHyperService::new(router))
+        .await
+}
+
+/// Listens as soon as the address is free.
+async fn listen(address: SocketAddr, observer: &Observer) -> TcpListener {
+    let mut wait = RETRY_MIN;
+    loop {
+        match TcpListener::bind(address).await {
+            Ok(listener) => return listener,
+            Err(error) => {
+                if wait == RETRY_MIN {
+                    tracing::warn!(%address, %error, "dashboard cannot listen, key `dashboard.listen`; trying again");
+                }
+                observer.sources().counters.count(Event::DashboardNotBound);
+            }
+        }
+        tokio::time::sleep(wait).await;
+        wait = (2 * wait).min(RETRY_MAX);
+    }
+}

@@ -1,0 +1,34 @@
+//! Which topics a node takes.
+
+/// Which topics a node takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Maps, verdicts, reputations and statuses.
+    Follower,
+    /// Also reports and evidence: the node aggregates or may have to.
+    Candidate,
+}
+
+/// Where vehicles report.
+pub(super) const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
+
+impl Part {
+    /// All that the node may subscribe to. Reports come last: wherever they are left out, a level keeps its place, by
+    /// which a broker names it.
+    pub(super) fn levels(self) -> &'static [&'static str] {
+        match self {
+            Self::Follower => {
+                &["global_detections", "global_verdicts", "reputations", "nodes/+", "detections/+", "vote_detections/+"]
+            }
+            Self::Candidate => &[
+                "global_detections",
+                "global_verdicts",
+                "reputations",
+                "nodes/+",
+                "ledger/+",
+                "detections/+",
+                "vote_detections/+",
+            ],
+        }
+    }
+}
