@@ -8,10 +8,10 @@ SETS ?= examples/crowd_labels
 VERDICTS ?= 200
 PASSES ?= 50
 
-.PHONY: help setup demo testbed eval-labels liars test sim trials lint doc audit bench core-only replay-check edge-only clean
+.PHONY: help setup demo testbed eval-labels liars test test-dashboard monitoring sim trials lint doc audit bench core-only replay-check edge-only clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: ## install the system packages that are missing
 	@missing=$$(for p in $(PACKAGES); do dpkg-query -W -f='$${Status}' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -41,6 +41,13 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 test: PACKAGES += mosquitto
 test: setup ## all tests
 	cargo test --locked --workspace
+
+test-dashboard: PACKAGES += chromium chromium-driver prometheus
+test-dashboard: setup monitoring ## the page in a real browser, with pictures in target/dashboard; installs Chromium
+	cargo test --locked -p ecod-actors --test dashboard -- --ignored --nocapture
+
+monitoring: ## check the rules for Prometheus, where promtool is there
+	packaging/check-monitoring
 
 sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of SEED=n
 	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election_sim -- --nocapture

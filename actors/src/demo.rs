@@ -53,6 +53,8 @@ pub struct Demo<'a> {
     pub duration: Duration,
     /// Where configurations and logs go.
     pub directory: &'a Path,
+    /// Where the first vehicle serves its page.
+    pub dashboard: SocketAddr,
 }
 
 /// What came of one scene, and what there is to draw.
@@ -253,6 +255,8 @@ impl Demo<'_> {
         };
         let mut config = setup::cav(self.testbed, self.scene, cav, source);
         config.role = Role::Auto;
+        // The first vehicle's: the edge is killed half-way.
+        config.dashboard.listen = (index == 1).then_some(self.dashboard);
         let log = self.map_log(cav);
         if log.exists() {
             fs::remove_file(&log).with_context(|| format!("cannot remove {}", log.display()))?;
@@ -264,6 +268,15 @@ impl Demo<'_> {
     fn map_log(&self, cav: &Cav) -> PathBuf {
         self.directory.join(format!("{}.maps.jsonl", cav.name))
     }
+}
+
+/// A TCP address on which nothing listens now.
+///
+/// # Errors
+/// When loopback has no free port.
+pub fn free_address() -> anyhow::Result<SocketAddr> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port on loopback")?;
+    Ok(listener.local_addr()?)
 }
 
 /// Addresses on which nothing listens now, no two the same.

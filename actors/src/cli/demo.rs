@@ -13,7 +13,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::testbed::{Results, check_writable, read, select};
 use super::{Failure, print, write_json};
-use crate::demo::{Demo, DemoResult, News, Reign};
+use crate::demo::{Demo, DemoResult, News, Reign, free_address};
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
 
@@ -44,6 +44,8 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     fs::create_dir_all(&arguments.out).with_context(|| format!("cannot make {}", arguments.out.display()))?;
     check_writable(&results_file)?;
     print(&format!("a cell on this machine: 1 edge, killed half-way, {}\n\n", vehicles(&scenes)))?;
+    let dashboard = free_address()?;
+    print(&format!("watch it at http://{dashboard}/\n\n"))?;
     let mut results = Vec::with_capacity(scenes.len());
     let count = scenes.len();
     for (index, scene) in scenes.into_iter().enumerate() {
@@ -55,6 +57,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             scene,
             duration: Duration::from_secs(arguments.seconds),
             directory: &directory,
+            dashboard,
         };
         print(&format!("[{}/{count}] {}: starting {} processes\n", index + 1, scene.name, scene.cavs.len() + 1))?;
         let outcome = runtime.block_on(until_signalled(demo.run(|progress| {

@@ -57,6 +57,10 @@ pub struct RunArguments {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     map_log: Option<PathBuf>,
+    /// Serve a web page with the cell, metrics and health; other addresses than loopback need `dashboard.token`
+    #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1, default_missing_value = "127.0.0.1:8080")]
+    #[serde(skip)]
+    dashboard: Option<SocketAddr>,
     /// Print the configuration that results from file, environment and flags, and exit
     #[arg(long)]
     #[serde(skip)]
@@ -80,6 +84,8 @@ struct Overrides<'a> {
     mqtt: Option<MqttOverrides<'a>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     membership: Option<MembershipOverrides<'a>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    dashboard: Option<DashboardOverrides>,
 }
 
 #[derive(Serialize)]
@@ -92,11 +98,18 @@ struct MembershipOverrides<'a> {
     seeds: &'a [String],
 }
 
+#[derive(Serialize)]
+struct DashboardOverrides {
+    listen: SocketAddr,
+}
+
 pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     let mqtt = arguments.broker.as_ref().map(|broker| MqttOverrides { broker });
     let seeds = (!arguments.seeds.is_empty()).then_some(&*arguments.seeds);
     let membership = seeds.map(|seeds| MembershipOverrides { seeds });
-    let config = NodeConfig::load(arguments.config.as_deref(), &Overrides { top: arguments, mqtt, membership });
+    let dashboard = arguments.dashboard.map(|listen| DashboardOverrides { listen });
+    let overrides = Overrides { top: arguments, mqtt, membership, dashboard };
+    let config = NodeConfig::load(arguments.config.as_deref(), &overrides);
     let config = config.map_err(Failure::usage)?;
     if arguments.print_config {
         return Ok(print(&config.to_toml().context("the configuration cannot be written as TOML")?)?);

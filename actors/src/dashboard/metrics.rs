@@ -155,7 +155,7 @@ fn reputations(registry: &mut Registry, observer: &Observer) {
     gauge(registry, "reputation_vehicles", "Vehicles that have a reputation.", count(vehicles.len()));
     let scores = Family::<Labels, Float>::default();
     let help = "Weight of a vehicle's votes; the first vehicles by name only";
-    registry.register_with_unit("reputation_score", help, Unit::Ratios, scores.clone());
+    registry.register("reputation_score_ratio", help, scores.clone());
     for (vehicle, reputation) in vehicles.iter().take(MAX_VEHICLES) {
         scores.get_or_create(&vec![("vehicle", vehicle.to_string())]).set(reputation.score);
     }

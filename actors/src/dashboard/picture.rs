@@ -92,13 +92,13 @@ pub(super) struct LeadershipFacts {
 }
 
 /// A node of the cell.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct NodeEntry {
     /// Its name.
     pub name: NodeName,
     /// Its role.
     pub role: Role,
-    /// Whether it answers; always of this node.
+    /// Whether it answers, or a broker has not said otherwise.
     pub alive: bool,
     /// What it said it does.
     pub state: Option<NodeState>,
@@ -168,7 +168,7 @@ pub(super) fn nodes(sources: &Sources) -> Vec<NodeEntry> {
     nodes.extend(statuses.into_values().filter(|status| status.node != own.name).map(|status| NodeEntry {
         name: status.node.clone(),
         role: status.role,
-        alive: false,
+        alive: status.state != NodeState::Offline,
         state: Some(status.state),
         fit: status.fit,
         version: Some(status.version.clone()),

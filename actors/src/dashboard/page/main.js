@@ -48,8 +48,9 @@ function arrange(picture, landmarks, now) {
     const state = place.label !== null ? "full" : empty ? "" : "unknown";
     return { ...place, facing_rad: known.get(place.id)?.facing_rad, state, words: empty ? "seen empty" : "not seen" };
   });
+  const views = new Map(picture.nodes.map((node) => [node.name, node.fov_rad]));
   const vehicles = picture.vehicles.map(({ kind, received_at_us, report }) => ({
-    key: `${report.node} ${kind}`, node: report.node, kind, received_at_us, seq: report.seq, pose: report.pose, objects: report.objects,
+    key: `${report.node} ${kind}`, node: report.node, kind, received_at_us, seq: report.seq, pose: report.pose, fov_rad: views.get(report.node), objects: report.objects,
     inView: report.seen?.length, seen: (report.seen ?? []).map((id) => known.get(id)).filter(Boolean), colour: colour.get(report.node),
   }));
   return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };

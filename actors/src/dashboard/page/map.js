@@ -207,10 +207,10 @@ function ellipse([xx, xy, yy]) {
 
 /// The field of view, as far as the vehicle sees anything; without a known width, what it saw.
 function wedge(vehicle, at) {
-  const { pose, objects, seen } = vehicle;
+  const { pose, fov_rad, objects, seen } = vehicle;
   const rays = [...objects, ...seen].map((p) => [Math.hypot(p.x_m - pose.x_m, p.y_m - pose.y_m), turn(Math.atan2(p.y_m - pose.y_m, p.x_m - pose.x_m) - pose.heading_rad)]);
   const reach = Math.max(rays.reduce((far, [range]) => Math.max(far, range), 0) * 1.1, 60 / at.scale);
-  const half = pose.fov_rad ? pose.fov_rad / 2 : rays.reduce((wide, [, bearing]) => Math.max(wide, Math.abs(bearing)), 0) + 0.05;
+  const half = fov_rad ? fov_rad / 2 : rays.reduce((wide, [, bearing]) => Math.max(wide, Math.abs(bearing)), 0) + 0.05;
   const point = (bearing) => at({ x_m: pose.x_m + reach * Math.cos(pose.heading_rad + bearing), y_m: pose.y_m + reach * Math.sin(pose.heading_rad + bearing) }).map((c) => c.toFixed(1)).join(" ");
   const r = (reach * at.scale).toFixed(1);
   const [x, y] = at(pose).map((c) => c.toFixed(1));

@@ -1,0 +1,104 @@
+//! The page as people see it.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use ecod::wire::Role;
+
+use crate::cell::Vehicles;
+use crate::processes::{Place, free_places, start};
+use crate::webdriver::Browser;
+
+const SHOWN: &str = "document.querySelectorAll('#map .place.full').length >= 6 \
+    && document.querySelectorAll('#map .body').length >= 4 && document.querySelectorAll('#verdicts tr').length >= 4 \
+    && document.querySelectorAll('#reputations tr').length >= 4";
+
+/// The map of a cell of processes fills, a vehicle takes over when the edge's process is killed, and the page says so,
+/// also to those who do not see it. Leaves pictures of the page in `target/dashboard`.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
+    let pictures = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap().join("dashboard");
+    std::fs::create_dir_all(&pictures).unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    let places: [Place; 3] = free_places();
+    let [at_edge, at_euclid, at_gauss] = places;
+    let mut edge = start("edge", Role::Edge, at_edge, &places, directory.path());
+    let _euclid = start("euclid", Role::Auto, at_euclid, &places, directory.path());
+    let _gauss = start("gauss", Role::Auto, at_gauss, &places, directory.path());
+    let _vehicles = Vehicles::start(&places.map(|place| place.broker), 4, 12);
+
+    let browser = Browser::start().await;
+    browser.look(1440, 900, "light").await;
+    let opened = Instant::now();
+    browser.open(&format!("http://{}/", at_euclid.page)).await;
+    browser.until("document.querySelector('#state').classList.contains('live')").await;
+    println!("page live {:?} after it was asked for, WebDriver included", opened.elapsed());
+    browser.until("document.querySelector('#leader').textContent === 'edge'").await;
+    browser.until(SHOWN).await;
+    let first = "performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd";
+    println!("page loaded in {} ms by the browser's own clock", browser.evaluate(first).await);
+    tokio::time::sleep(Duration::from_secs(6)).await;
+    for (name, width, height, scheme) in [
+        ("light", 1440, 900, "light"),
+        ("dark", 1440, 900, "dark"),
+        ("phone", 390, 844, "light"),
+        ("tablet", 900, 1100, "dark"),
+    ] {
+        browser.look(width, height, scheme).await;
+        browser.screenshot(&pictures.join(format!("{name}.png"))).await;
+        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
+        assert_eq!(browser.evaluate(wider).await, false, "{name}: the page scrolls sideways");
+    }
+    browser.look(1440, 900, "light").await;
+
+    edge.0.kill().unwrap();
+    let killed = Instant::now();
+    browser.until("!['edge', 'nobody', '–'].includes(document.querySelector('#leader').textContent)").await;
+    println!("another leader on the page {:?} after the edge was killed", killed.elapsed());
+    browser.until("/leads now, in place of edge/.test(document.querySelector('#announcer').textContent)").await;
+    browser
+        .until("[...document.querySelectorAll('#reigns tr')].some((row) => row.textContent.startsWith('edge'))")
+        .await;
+    browser.until("document.querySelector('#state').classList.contains('live')").await;
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    browser.screenshot(&pictures.join("failover.png")).await;
+
+    keyboard_and_table(&browser).await;
+    assert_eq!(browser.complaints().await, Vec::<String>::new());
+
+    drop(_euclid);
+    browser.until("document.querySelector('#state').classList.contains('stale')").await;
+    browser.until("!document.querySelector('#notice').hidden && document.body.classList.contains('stale-data')").await;
+    browser.screenshot(&pictures.join("stale.png")).await;
+    let _euclid = start("euclid", Role::Auto, at_euclid, &places, directory.path());
+    browser.until("document.querySelector('#state').classList.contains('live')").await;
+    browser.quit().await;
+    println!("pictures of the page: {}", pictures.display());
+}
+
+/// The map moves by keys and has a table in its place; everything that is pressed or scrolled can be reached and has a name.
+async fn keyboard_and_table(browser: &Browser) {
+    let place = "document.querySelector('#map .place').getAttribute('x')";
+    browser.evaluate("document.querySelector('#map').focus()").await;
+    let before = browser.evaluate(place).await;
+    browser.press("ArrowRight").await;
+    browser.until(&format!("{place} !== '{}'", before.as_str().unwrap())).await;
+    browser.press("0").await;
+    browser.until(&format!("{place} === '{}'", before.as_str().unwrap())).await;
+    browser.evaluate("document.querySelector('#as-table').click()").await;
+    browser
+        .until("document.querySelectorAll('#places tr').length >= 12 && document.querySelector('#map-frame').hidden")
+        .await;
+    browser.evaluate("document.querySelector('#as-table').click()").await;
+    let nameless = "[...document.querySelectorAll('button, svg, [role], section')].filter((e) => !e.closest('[hidden]') \
+        && !(e.textContent.trim() || e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')) \
+        && !e.getAttribute('aria-hidden')).map((e) => e.outerHTML.slice(0, 80))";
+    let nameless = browser.evaluate(nameless).await;
+    // The state before the first picture and a notice while all is well say nothing.
+    assert_eq!(
+        nameless.as_array().unwrap().iter().filter(|e| !e.to_string().contains("role=\\\"alert")).count(),
+        0,
+        "{nameless}"
+    );
+}

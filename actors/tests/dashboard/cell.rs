@@ -1,0 +1,181 @@
+//! Nodes with a page, and vehicles that only exist as their reports.
+
+use std::f64::consts::{PI, TAU};
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use ecod::landmark::LandmarkConfig;
+use ecod::names::NodeName;
+use ecod::wire::{Encoding, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, WirePose, encode};
+use ecod_actors::clock;
+use ecod_actors::config::NodeConfig;
+use ecod_actors::node::{self, NodeHandle};
+use rumqttc::{AsyncClient, MqttOptions, QoS};
+use tokio::task::JoinSet;
+use uuid::Uuid;
+
+pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Configuration of a node with a page on a free port, which meets no cell of another test.
+pub(crate) fn config(name: &str, role: Role, landmarks: usize) -> NodeConfig {
+    let landmark = |index: usize| {
+        let (x_m, y_m) = place(index);
+        LandmarkConfig {
+            id: format!("slot-{index}").into(),
+            x_m,
+            y_m,
+            facing_deg: Some(if y_m > 0.0 { -90.0 } else { 90.0 }),
+            vacancy: None,
+            synonyms: Default::default(),
+        }
+    };
+    let loopback = || SocketAddr::from(([127, 0, 0, 1], 0));
+    let mut config = NodeConfig {
+        name: Some(NodeName::new(name).unwrap()),
+        cell: NodeName::from_static("lot"),
+        role,
+        listen: Some(loopback()),
+        landmarks: (0..landmarks).map(landmark).collect(),
+        ..NodeConfig::default()
+    };
+    config.dashboard.listen = Some(loopback());
+    config.membership.bind = Some(loopback());
+    config.membership.multicast.enabled = false;
+    config.reputations.publish_period_s = 0.2;
+    config
+}
+
+/// Two rows of parking spots, three metres apart.
+fn place(index: usize) -> (f64, f64) {
+    ((index / 2) as f64 * 3.0, if index.is_multiple_of(2) { 4.0 } else { -4.0 })
+}
+
+/// Starts a node in this process and waits for its page.
+pub(crate) async fn start(config: NodeConfig) -> (NodeHandle, SocketAddr) {
+    config.validate().unwrap();
+    let node = node::start(config).await.unwrap();
+    let mut address = node.dashboard_address();
+    let address = tokio::time::timeout(PATIENCE, address.wait_for(Option::is_some)).await.expect("no page").unwrap();
+    (node, address.unwrap())
+}
+
+/// A node that finds the cell of another.
+pub(crate) async fn join(mut config: NodeConfig, other: &NodeHandle) -> (NodeHandle, SocketAddr) {
+    config.membership.seeds = vec![other.gossip_address().unwrap().to_string()];
+    start(config).await
+}
+
+/// Waits until it holds.
+pub(crate) async fn until<F: Future<Output = bool>>(what: &str, holds: impl Fn() -> F) {
+    let deadline = tokio::time::Instant::now() + PATIENCE;
+    while !holds().await {
+        assert!(tokio::time::Instant::now() < deadline, "never: {what}");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+/// Vehicles that report ten times a second to some brokers, as vehicles do to leader and standby; ends when dropped.
+pub(crate) struct Vehicles {
+    _tasks: JoinSet<()>,
+}
+
+impl Vehicles {
+    pub(crate) fn start(brokers: &[SocketAddr], count: usize, landmarks: usize) -> Self {
+        let mut tasks = JoinSet::new();
+        for vehicle in 0..count {
+            for broker in brokers {
+                tasks.spawn(report_to(*broker, vehicle, landmarks));
+            }
+        }
+        Self { _tasks: tasks }
+    }
+}
+
+async fn report_to(broker: SocketAddr, vehicle: usize, landmarks: usize) {
+    let options = MqttOptions::new(format!("vehicle-{vehicle}"), broker.ip().to_string(), broker.port());
+    let (client, mut events) = AsyncClient::new(options, 16);
+    let mut ticks = tokio::time::interval(Duration::from_millis(100));
+    let mut seq = 0;
+    loop {
+        tokio::select! {
+            polled = events.poll() => if polled.is_err() {
+                tokio::time::sleep(Duration::from_millis(200)).await;
+            },
+            _ = ticks.tick() => {
+                if seq % 20 == 0 {
+                    let status = status(vehicle);
+                    let topic = format!("ecod/v1/lot/nodes/{}", status.node);
+                    let _ = client.try_publish(topic, QoS::AtMostOnce, false, encode(&status, Encoding::Json));
+                }
+                seq += 1;
+                for (kind, report) in reports(vehicle, seq, landmarks) {
+                    let topic = format!("ecod/v1/lot/{kind}/{}", report.node);
+                    // A broker that is not there gets nothing.
+                    let _ = client.try_publish(topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json));
+                }
+            }
+        }
+    }
+}
+
+const NAMES: [&str; 6] = ["ada", "boole", "curie", "dirac", "escher", "fermat"];
+
+fn status(vehicle: usize) -> NodeStatus {
+    NodeStatus {
+        schema: SCHEMA_VERSION,
+        node: NodeName::from_static(NAMES[vehicle % NAMES.len()]),
+        id: Uuid::nil(),
+        role: Role::Cav,
+        state: NodeState::Following,
+        epoch: 0,
+        aggregator: None,
+        fit: None,
+        fov_rad: Some(1.1),
+        version: "0.1.0".into(),
+    }
+}
+
+/// What a vehicle says of the lot: parked cars at most spots, a pedestrian who walks about, and votes on what stands at
+/// the first spots, about which the last vehicle errs.
+fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, ObjectReport); 2] {
+    let second = clock::now().micros() as f64 / 1e6;
+    let length = (landmarks / 2) as f64 * 3.0;
+    let x_m = (vehicle as f64 * 5.0 + second * 0.6).rem_euclid(length + 6.0) - 3.0;
+    let (y_m, heading_rad) = if vehicle.is_multiple_of(2) { (-0.9, 0.12) } else { (0.9, PI + 0.12) };
+    let x_m = if vehicle.is_multiple_of(2) { x_m } else { length - x_m };
+    let pose = WirePose { x_m, y_m, heading_rad };
+    let in_view = |x: f64, y: f64| {
+        let bearing = (y - y_m).atan2(x - x_m) - heading_rad;
+        let bearing = (bearing + PI).rem_euclid(TAU) - PI;
+        bearing.abs() < 0.55 && (x - x_m).hypot(y - y_m) < 12.0
+    };
+    let object = |label: &str, x: f64, y: f64, landmark: Option<usize>| PerceivedObject {
+        label: label.into(),
+        confidence: 0.86,
+        x_m: x + 0.1 * (second + vehicle as f64).sin(),
+        y_m: y + 0.1 * (second * 1.3 + vehicle as f64).cos(),
+        covariance_m2: Some([0.09, 0.02, 0.04]),
+        landmark: landmark.map(|index| format!("slot-{index}").into()),
+    };
+    let visible: Vec<usize> = (0..landmarks).filter(|index| in_view(place(*index).0, place(*index).1)).collect();
+    let parked = visible.iter().filter(|index| *index % 5 != 2);
+    let mut objects: Vec<_> =
+        parked.map(|index| object("car", place(*index).0, place(*index).1, Some(*index))).collect();
+    let walker = (length / 2.0 + 5.0 * (second * 0.2).cos(), 1.6 * (second * 0.2).sin());
+    if in_view(walker.0, walker.1) {
+        objects.push(object("person", walker.0, walker.1, None));
+    }
+    let node = NodeName::from_static(NAMES[vehicle % NAMES.len()]);
+    let captured_at_us = clock::now();
+    let seen = visible.iter().map(|index| format!("slot-{index}").into()).collect();
+    let map =
+        ObjectReport { schema: SCHEMA_VERSION, node, seq, captured_at_us, pose: Some(pose), objects, seen: Some(seen) };
+    let label = |index: usize| match (vehicle, index) {
+        (3, _) => "truck",
+        (_, 1) if seq.is_multiple_of(3) => "van",
+        _ => "car",
+    };
+    let votes = (0..landmarks.min(5)).map(|index| object(label(index), place(index).0, place(index).1, Some(index)));
+    let votes = ObjectReport { objects: votes.collect(), seen: None, ..map.clone() };
+    [("detections", map), ("vote_detections", votes)]
+}

@@ -1,0 +1,55 @@
+//! Whether machines are told the truth about the node.
+
+use std::net::TcpListener;
+
+use ecod::wire::Role;
+use ecod_actors::counters::Event;
+
+use crate::cell::{config, join, start, until};
+use crate::http::get;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_vehicle_is_ready_when_it_follows_a_leader_that_publishes() {
+    let (cav, page) = start(config("euclid", Role::Cav, 2)).await;
+    assert_eq!((get(page, "/healthz").await.status, get(page, "/healthz").await.body.as_str()), (200, "ok\n"));
+    let alone = get(page, "/readyz").await;
+    assert_eq!((alone.status, alone.json()["reason"].as_str()), (503, Some("no leader known")));
+
+    let (edge, edge_page) = join(config("edge", Role::Edge, 2), &cav).await;
+    until("the edge is ready", || async { get(edge_page, "/readyz").await.json()["reason"] == "leading" }).await;
+    until("the vehicle is ready", || async { get(page, "/readyz").await.status == 200 }).await;
+    assert_eq!(get(page, "/readyz").await.json()["reason"], "following edge");
+
+    edge.stop().await;
+    until("the vehicle is not ready", || async { get(page, "/readyz").await.status == 503 }).await;
+    assert_eq!(get(page, "/healthz").await.status, 200, "it lives all the same");
+    cav.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_busy_port_is_counted_and_taken_as_soon_as_it_is_free() {
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap();
+    let mut config = config("euclid", Role::Auto, 1);
+    config.dashboard.listen = Some(address);
+    let node = ecod_actors::node::start(config).await.unwrap();
+    until("it is counted", || async { node.counters().events(Event::DashboardNotBound) > 0 }).await;
+    until("the node leads all the same", || async { node.leadership().borrow().is_leading() }).await;
+    assert_eq!(*node.dashboard_address().borrow(), None);
+    drop(taken);
+    until("the page is served", || async { node.dashboard_address().borrow().is_some() }).await;
+    assert_eq!(get(address, "/healthz").await.status, 200);
+    node.stop().await;
+    assert!(TcpListener::bind(address).is_ok(), "a stopped node leaves its port");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_page_that_was_killed_comes_back_where_it_was() {
+    let (node, page) = start(config("euclid", Role::Auto, 1)).await;
+    node.seats().dashboard.holder().unwrap().kill();
+    until("it answers again", || async {
+        tokio::net::TcpStream::connect(page).await.is_ok() && get(page, "/healthz").await.status == 200
+    })
+    .await;
+    node.stop().await;
+}

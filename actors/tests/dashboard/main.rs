@@ -1,0 +1,12 @@
+//! A node's page, metrics and health, asked for over real sockets.
+
+mod access;
+mod browser;
+mod cell;
+mod health;
+mod http;
+mod load;
+mod metrics;
+mod pictures;
+mod processes;
+mod webdriver;

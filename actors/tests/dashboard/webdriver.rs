@@ -1,0 +1,108 @@
+//! A headless Chromium, driven by the WebDriver protocol and, for colours and sizes, by Chromium's own commands.
+
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use serde_json::{Value, json};
+use tokio::net::TcpStream;
+
+use crate::cell::{PATIENCE, until};
+use crate::http::request;
+use crate::processes::{Process, free_places};
+
+/// A browser with one window.
+pub(crate) struct Browser {
+    driver: SocketAddr,
+    session: String,
+    _process: Process,
+}
+
+impl Browser {
+    /// Starts Debian's `chromedriver`, and `chromium` through it.
+    pub(crate) async fn start() -> Self {
+        let [place] = free_places::<1>();
+        let driver = place.page;
+        let port = format!("--port={}", driver.port());
+        let mut command = Command::new("chromedriver");
+        command.arg(port).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let process = Process(command.spawn().expect("install chromium and chromium-driver: make test-dashboard does"));
+        until("chromedriver answers", || async { TcpStream::connect(driver).await.is_ok() }).await;
+        let arguments =
+            ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars"];
+        let options = json!({ "goog:chromeOptions": { "args": arguments }, "goog:loggingPrefs": { "browser": "ALL" } });
+        let mut browser = Self { driver, session: String::new(), _process: process };
+        let started = browser.post("/session", json!({ "capabilities": { "alwaysMatch": options } })).await;
+        browser.session = format!("/session/{}", started["sessionId"].as_str().expect("no session"));
+        browser
+    }
+
+    pub(crate) async fn open(&self, url: &str) {
+        self.command("url", json!({ "url": url })).await;
+    }
+
+    /// What a script's expression is.
+    pub(crate) async fn evaluate(&self, expression: &str) -> Value {
+        self.command("execute/sync", json!({ "script": format!("return ({expression})"), "args": [] })).await
+    }
+
+    /// Waits until a script's expression is true.
+    pub(crate) async fn until(&self, expression: &str) {
+        until(expression, || async { self.evaluate(expression).await == true }).await;
+    }
+
+    /// Sets the size of the window in CSS pixels and the colours that the user prefers.
+    pub(crate) async fn look(&self, width: u32, height: u32, scheme: &str) {
+        let mobile = width < 600;
+        let size = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile });
+        self.chromium("Emulation.setDeviceMetricsOverride", size).await;
+        let features = json!([{ "name": "prefers-color-scheme", "value": scheme }]);
+        self.chromium("Emulation.setEmulatedMedia", json!({ "features": features })).await;
+        tokio::time::sleep(Duration::from_millis(600)).await;
+    }
+
+    /// Saves the whole page as a PNG file.
+    pub(crate) async fn screenshot(&self, file: &Path) {
+        let taken = self.chromium("Page.captureScreenshot", json!({ "captureBeyondViewport": true })).await;
+        let png = BASE64_STANDARD.decode(taken["data"].as_str().expect("no picture")).unwrap();
+        std::fs::write(file, png).unwrap();
+    }
+
+    /// Presses a key on what has the focus.
+    pub(crate) async fn press(&self, key: &str) {
+        for kind in ["keyDown", "keyUp"] {
+            self.chromium("Input.dispatchKeyEvent", json!({ "type": kind, "key": key, "code": key })).await;
+        }
+    }
+
+    /// What the browser complained of: errors of scripts, of policies, of missing files.
+    pub(crate) async fn complaints(&self) -> Vec<String> {
+        let log = self.command("se/log", json!({ "type": "browser" })).await;
+        let entries = log.as_array().cloned().unwrap_or_default();
+        entries.iter().map(|entry| entry["message"].to_string()).collect()
+    }
+
+    pub(crate) async fn quit(self) {
+        request(self.driver, "DELETE", &self.session, &[("Host", "localhost")], "").await;
+    }
+
+    async fn chromium(&self, command: &str, parameters: Value) -> Value {
+        self.command("goog/cdp/execute", json!({ "cmd": command, "params": parameters })).await
+    }
+
+    async fn command(&self, command: &str, body: Value) -> Value {
+        self.post(&format!("{}/{command}", self.session), body).await
+    }
+
+    async fn post(&self, path: &str, body: Value) -> Value {
+        let headers = [("Host", "localhost"), ("Content-Type", "application/json")];
+        let body = body.to_string();
+        let answered = tokio::time::timeout(PATIENCE, request(self.driver, "POST", path, &headers, &body));
+        let answer = answered.await.expect("the browser does not answer");
+        assert_eq!(answer.status, 200, "{path}: {}", answer.body);
+        answer.json()["value"].clone()
+    }
+}
