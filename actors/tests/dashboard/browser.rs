@@ -79,13 +79,13 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
 
 /// The map moves by keys and has a table in its place; everything that is pressed or scrolled can be reached and has a name.
 async fn keyboard_and_table(browser: &Browser) {
-    let place = "document.querySelector('#map .place').getAttribute('x')";
+    let place = "Number(document.querySelector('#map .place').getAttribute('x'))";
     browser.evaluate("document.querySelector('#map').focus()").await;
-    let before = browser.evaluate(place).await;
+    let before = browser.evaluate(place).await.as_f64().unwrap();
     browser.press("ArrowRight").await;
-    browser.until(&format!("{place} !== '{}'", before.as_str().unwrap())).await;
+    browser.until(&format!("Math.abs({place} - {before}) > 30")).await;
     browser.press("0").await;
-    browser.until(&format!("{place} === '{}'", before.as_str().unwrap())).await;
+    browser.until(&format!("Math.abs({place} - {before}) < 20")).await;
     browser.evaluate("document.querySelector('#as-table').click()").await;
     browser
         .until("document.querySelectorAll('#places tr').length >= 12 && document.querySelector('#map-frame').hidden")

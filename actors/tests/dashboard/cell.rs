@@ -6,7 +6,9 @@ use std::time::Duration;
 
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
-use ecod::wire::{Encoding, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, WirePose, encode};
+use ecod::wire::{
+    Encoding, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, WirePose, encode,
+};
 use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
@@ -140,14 +142,15 @@ fn status(vehicle: usize) -> NodeStatus {
 fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, ObjectReport); 2] {
     let second = clock::now().micros() as f64 / 1e6;
     let length = (landmarks / 2) as f64 * 3.0;
-    let x_m = (vehicle as f64 * 5.0 + second * 0.6).rem_euclid(length + 6.0) - 3.0;
-    let (y_m, heading_rad) = if vehicle.is_multiple_of(2) { (-0.9, 0.12) } else { (0.9, PI + 0.12) };
-    let x_m = if vehicle.is_multiple_of(2) { x_m } else { length - x_m };
+    let way_m = 3.0 * (second * 0.15 + vehicle as f64).sin();
+    let from_west = vehicle.is_multiple_of(2);
+    let (x_m, y_m) = if from_west { (way_m - 3.0, -0.9) } else { (length - way_m, 0.9) };
+    let heading_rad = if from_west { 0.1 } else { PI + 0.1 };
     let pose = WirePose { x_m, y_m, heading_rad };
     let in_view = |x: f64, y: f64| {
         let bearing = (y - y_m).atan2(x - x_m) - heading_rad;
         let bearing = (bearing + PI).rem_euclid(TAU) - PI;
-        bearing.abs() < 0.55 && (x - x_m).hypot(y - y_m) < 12.0
+        bearing.abs() < 0.55 && (x - x_m).hypot(y - y_m) < 16.0
     };
     let object = |label: &str, x: f64, y: f64, landmark: Option<usize>| PerceivedObject {
         label: label.into(),
@@ -175,7 +178,8 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
         (_, 1) if seq.is_multiple_of(3) => "van",
         _ => "car",
     };
-    let votes = (0..landmarks.min(5)).map(|index| object(label(index), place(index).0, place(index).1, Some(index)));
+    let voted = visible.iter().filter(|index| **index < 6);
+    let votes = voted.map(|index| object(label(*index), place(*index).0, place(*index).1, Some(*index)));
     let votes = ObjectReport { objects: votes.collect(), seen: None, ..map.clone() };
     [("detections", map), ("vote_detections", votes)]
 }

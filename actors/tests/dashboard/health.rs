@@ -6,7 +6,7 @@ use ecod::wire::Role;
 use ecod_actors::counters::Event;
 
 use crate::cell::{config, join, start, until};
-use crate::http::get;
+use crate::http::{get, try_request};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_vehicle_is_ready_when_it_follows_a_leader_that_publishes() {
@@ -48,7 +48,8 @@ async fn a_page_that_was_killed_comes_back_where_it_was() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;
     node.seats().dashboard.holder().unwrap().kill();
     until("it answers again", || async {
-        tokio::net::TcpStream::connect(page).await.is_ok() && get(page, "/healthz").await.status == 200
+        let answer = try_request(page, "GET", "/healthz", &[("Host", "localhost")], "").await;
+        answer.is_ok_and(|answer| answer.status == 200)
     })
     .await;
     node.stop().await;

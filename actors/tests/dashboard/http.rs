@@ -1,5 +1,6 @@
 //! Just enough of a browser to misbehave.
 
+use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -44,22 +45,43 @@ pub(crate) async fn request(
     headers: &[(&str, &str)],
     body: &str,
 ) -> Answer {
-    let mut stream = TcpStream::connect(address).await.unwrap();
+    let asked = timeout(PATIENCE, try_request(address, method, path, headers, body));
+    asked.await.expect("no answer").unwrap()
+}
+
+/// The same where the server may be about to go.
+pub(crate) async fn try_request(
+    address: SocketAddr,
+    method: &str,
+    path: &str,
+    headers: &[(&str, &str)],
+    body: &str,
+) -> io::Result<Answer> {
+    let mut stream = BufReader::new(TcpStream::connect(address).await?);
     let headers: String = headers.iter().map(|(name, value)| format!("{name}: {value}\r\n")).collect();
     let length = body.len();
     let request =
         format!("{method} {path} HTTP/1.1\r\n{headers}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}");
-    stream.write_all(request.as_bytes()).await.unwrap();
-    let mut bytes = Vec::new();
-    timeout(PATIENCE, stream.read_to_end(&mut bytes)).await.expect("no answer").unwrap();
-    let text = String::from_utf8(bytes).unwrap();
-    let (headers, body) = text.split_once("\r\n\r\n").unwrap_or_else(|| panic!("no HTTP: {text:?}"));
-    let status = headers.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap();
-    let answer = Answer { status, headers: headers.to_owned(), body: body.to_owned() };
-    if answer.header("transfer-encoding") == Some("chunked") {
-        return Answer { body: joined(&answer.body), ..answer };
+    stream.write_all(request.as_bytes()).await?;
+    let mut head = String::new();
+    while !head.ends_with("\r\n\r\n") {
+        if stream.read_line(&mut head).await? == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
     }
-    answer
+    let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap();
+    let mut answer = Answer { status, headers: head, body: String::new() };
+    if let Some(length) = answer.header("content-length").and_then(|length| length.parse().ok()) {
+        let mut bytes = vec![0; length];
+        stream.read_exact(&mut bytes).await?;
+        answer.body = String::from_utf8(bytes).unwrap();
+    } else {
+        stream.read_to_string(&mut answer.body).await?;
+    }
+    if answer.header("transfer-encoding") == Some("chunked") {
+        answer.body = joined(&answer.body);
+    }
+    Ok(answer)
 }
 
 /// Chunks put together.

@@ -71,6 +71,9 @@ export function span(seconds) {
   return `${Math.round(seconds / 86400)} d`;
 }
 
+/// How long ago something was; what is fresh does not flicker.
+export const ago = (seconds) => (seconds < 1 ? "now" : `${span(seconds)} ago`);
+
 export const milliseconds = (ms) => (ms < 10 ? ms.toFixed(1) : ms < 10000 ? Math.round(ms) : (ms / 1000).toFixed(0) + "k") + " ms";
 
 export const clock = (micros) => new Date(micros / 1000).toLocaleTimeString([], { hour12: false });

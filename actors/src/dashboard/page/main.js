@@ -49,11 +49,21 @@ function arrange(picture, landmarks, now) {
     return { ...place, facing_rad: known.get(place.id)?.facing_rad, state, words: empty ? "seen empty" : "not seen" };
   });
   const views = new Map(picture.nodes.map((node) => [node.name, node.fov_rad]));
-  const vehicles = picture.vehicles.map(({ kind, received_at_us, report }) => ({
-    key: `${report.node} ${kind}`, node: report.node, kind, received_at_us, seq: report.seq, pose: report.pose, fov_rad: views.get(report.node), objects: report.objects,
-    inView: report.seen?.length, seen: (report.seen ?? []).map((id) => known.get(id)).filter(Boolean), colour: colour.get(report.node),
-  }));
+  const byNode = Map.groupBy(picture.vehicles, (sighting) => sighting.report.node);
+  const vehicles = [...byNode].map(([node, sightings]) => vehicle(node, sightings, known, views.get(node), colour.get(node)));
   return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };
+}
+
+/// A vehicle may report for the map, for votes, or for both.
+function vehicle(node, sightings, known, fov_rad, colour) {
+  const [detections, votes] = ["detections", "vote_detections"].map((kind) => sightings.find((sighting) => sighting.kind === kind));
+  const { report } = detections ?? votes;
+  return {
+    node, fov_rad, colour, pose: report.pose, objects: report.objects, votes: votes?.report.objects.length,
+    detected: detections?.report.objects.length, inView: report.seen?.length,
+    seen: (report.seen ?? []).map((id) => known.get(id)).filter(Boolean),
+    received_at_us: Math.max(...sightings.map((sighting) => sighting.received_at_us)),
+  };
 }
 
 function drawText(picture, scene) {

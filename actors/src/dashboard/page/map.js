@@ -127,15 +127,15 @@ export class BirdsEye {
   #vehicles(vehicles, now, at, labels) {
     const posed = vehicles.filter((vehicle) => vehicle.pose);
     const old = (vehicle) => ((now - vehicle.received_at_us) / 1e6 > OLD_S ? "old" : "");
-    keyed(this.#layers.views, posed, (v) => v.key, () => svg("path"), (path, v) => {
+    keyed(this.#layers.views, posed, (v) => v.node, () => svg("path"), (path, v) => {
       set(path, { class: `view c${v.colour} ${old(v)}`, d: wedge(v, at) });
     });
-    const dots = vehicles.flatMap((v) => v.objects.map((object, index) => ({ ...object, key: `${v.key} ${index}`, of: v })));
+    const dots = vehicles.flatMap((v) => v.objects.map((object, index) => ({ ...object, key: `${v.node} ${index}`, of: v })));
     keyed(this.#layers.dots, dots.slice(0, MAX_DRAWN), (dot) => dot.key, () => svg("circle", { r: 3.5 }), (circle, dot) => {
       const [cx, cy] = at(dot);
       set(circle, { cx, cy, class: `dot c${dot.of.colour} ${old(dot.of)}` });
     });
-    keyed(this.#layers.vehicles, posed, (v) => v.key, () => {
+    keyed(this.#layers.vehicles, posed, (v) => v.node, () => {
       const g = svg("g");
       g.append(svg("path", { class: "body", d: "M12 0L-8 7.5L-4 0L-8 -7.5Z" }), svg("title"));
       return g;

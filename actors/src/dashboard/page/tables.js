@@ -1,9 +1,11 @@
 // Everything on the page that is text.
 
-import { byId, clock, milliseconds, n, rows, span, text } from "./dom.js";
+import { ago, byId, clock, milliseconds, n, rows, span, text } from "./dom.js";
 
 const percent = (value) => `${Math.round(value * 100)} %`;
 const list = (names) => (names.length > 3 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(", ") || "–");
+
+const inOrder = new Intl.Collator(undefined, { numeric: true }).compare;
 
 function fill(name, items, key, cells) {
   rows(byId(name), items, key, cells);
@@ -23,7 +25,7 @@ export function tiles({ leadership, map, verdicts }, now, perSecond) {
   text(byId("standby-more"), position === "standing_by" ? "this node leads next" : standby ? "leads if the leader fails" : "nobody named");
   const newest = map ?? verdicts;
   text(byId("round"), newest ? String(newest.message.round) : "–");
-  text(byId("round-more"), newest ? `${span((now - newest.received_at_us) / 1e6)} ago${perSecond === null ? "" : `, ${perSecond.toFixed(1)} a second`}` : "none yet");
+  text(byId("round-more"), newest ? `${ago((now - newest.received_at_us) / 1e6)}${perSecond === null ? "" : `, ${perSecond.toFixed(1)} a second`}` : "none yet");
   text(byId("failovers"), failovers === 1 ? "1 change of leader" : `${failovers} changes of leader`);
 }
 
@@ -47,7 +49,7 @@ export function places(scene) {
 }
 
 export function verdicts(received, now) {
-  const all = received?.message.verdicts ?? [];
+  const all = [...(received?.message.verdicts ?? [])].sort((a, b) => inOrder(a.landmark, b.landmark));
   fill("verdicts", all, (verdict) => verdict.landmark, (verdict) => {
     const votes = Object.entries(verdict.votes).sort((a, b) => b[1] - a[1]);
     const close = verdict.label !== null && votes.length > 1 && verdict.margin < 0.25 * verdict.score;
@@ -57,19 +59,18 @@ export function verdicts(received, now) {
       { text: verdict.margin.toFixed(2) + (close ? " close" : ""), class: close ? "n warn" : "n" },
     ];
   });
-  text(byId("verdicts-age"), received ? `${span((now - received.received_at_us) / 1e6)} ago` : "");
+  text(byId("verdicts-age"), received ? ago((now - received.received_at_us) / 1e6) : "");
 }
 
 export function vehicles(entries, now) {
-  fill("vehicles", entries, (vehicle) => vehicle.key, (vehicle) => {
+  fill("vehicles", entries, (vehicle) => vehicle.node, (vehicle) => {
     const age = (now - vehicle.received_at_us) / 1e6;
-    const kind = vehicle.kind === "vote_detections" ? " votes" : "";
     return [
-      { text: vehicle.node + kind, colour: vehicle.colour }, n(vehicle.objects.length), n(vehicle.inView ?? "–"), n(vehicle.seq),
-      { text: span(age), class: age > 2 ? "n bad" : "n" },
+      { text: vehicle.node, colour: vehicle.colour }, n(vehicle.detected ?? "–"), n(vehicle.inView ?? "–"), n(vehicle.votes ?? "–"),
+      { text: ago(age), class: age > 2 ? "n bad" : "n" },
     ];
   });
-  text(byId("vehicles-count"), entries.length ? `${new Set(entries.map((entry) => entry.node)).size}` : "");
+  text(byId("vehicles-count"), entries.length ? `${entries.length} reporting` : "");
 }
 
 export function reputations(received, colour) {
