@@ -103,20 +103,10 @@ pub(super) fn kind_label(kind: ReportKind) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    use ecod::wire::SCHEMA_VERSION;
-
     use super::*;
 
     fn report(node: &str, seq: u64) -> Incoming {
-        let report = ObjectReport {
-            schema: SCHEMA_VERSION,
-            node: NodeName::new(node).unwrap(),
-            seq,
-            captured_at_us: Timestamp(seq),
-            pose: None,
-            objects: Vec::new(),
-            seen: None,
-        };
+        let report = ObjectReport::new(NodeName::new(node).unwrap(), seq, Timestamp(seq));
         Incoming::Report { kind: ReportKind::Detections, report: Arc::new(report) }
     }
 

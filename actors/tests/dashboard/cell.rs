@@ -6,15 +6,12 @@ use std::time::Duration;
 
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
-use ecod::wire::{
-    Encoding, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, WirePose, encode,
-};
+use ecod::wire::{Encoding, FieldOfView, ObjectReport, PerceivedObject, Role, WirePose, encode};
 use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::task::JoinSet;
-use uuid::Uuid;
 
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
@@ -104,11 +101,6 @@ async fn report_to(broker: SocketAddr, vehicle: usize, landmarks: usize) {
                 tokio::time::sleep(Duration::from_millis(200)).await;
             },
             _ = ticks.tick() => {
-                if seq % 20 == 0 {
-                    let status = status(vehicle);
-                    let topic = format!("ecod/v1/lot/nodes/{}", status.node);
-                    let _ = client.try_publish(topic, QoS::AtMostOnce, false, encode(&status, Encoding::Json));
-                }
                 seq += 1;
                 for (kind, report) in reports(vehicle, seq, landmarks) {
                     let topic = format!("ecod/v1/lot/{kind}/{}", report.node);
@@ -121,21 +113,6 @@ async fn report_to(broker: SocketAddr, vehicle: usize, landmarks: usize) {
 }
 
 const NAMES: [&str; 6] = ["ada", "boole", "curie", "dirac", "escher", "fermat"];
-
-fn status(vehicle: usize) -> NodeStatus {
-    NodeStatus {
-        schema: SCHEMA_VERSION,
-        node: NodeName::from_static(NAMES[vehicle % NAMES.len()]),
-        id: Uuid::nil(),
-        role: Role::Cav,
-        state: NodeState::Following,
-        epoch: 0,
-        aggregator: None,
-        fit: None,
-        fov_rad: Some(1.1),
-        version: "0.1.0".into(),
-    }
-}
 
 /// What a vehicle says of the lot: parked cars at most spots, a pedestrian who walks about, and votes on what stands at
 /// the first spots, about which the last vehicle errs.
@@ -153,12 +130,14 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
         bearing.abs() < 0.55 && (x - x_m).hypot(y - y_m) < 16.0
     };
     let object = |label: &str, x: f64, y: f64, landmark: Option<usize>| PerceivedObject {
-        label: label.into(),
-        confidence: 0.86,
-        x_m: x + 0.1 * (second + vehicle as f64).sin(),
-        y_m: y + 0.1 * (second * 1.3 + vehicle as f64).cos(),
         covariance_m2: Some([0.09, 0.02, 0.04]),
         landmark: landmark.map(|index| format!("slot-{index}").into()),
+        ..PerceivedObject::new(
+            label,
+            0.86,
+            x + 0.1 * (second + vehicle as f64).sin(),
+            y + 0.1 * (second * 1.3 + vehicle as f64).cos(),
+        )
     };
     let visible: Vec<usize> = (0..landmarks).filter(|index| in_view(place(*index).0, place(*index).1)).collect();
     let parked = visible.iter().filter(|index| *index % 5 != 2);
@@ -168,11 +147,19 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
     if in_view(walker.0, walker.1) {
         objects.push(object("person", walker.0, walker.1, None));
     }
-    let node = NodeName::from_static(NAMES[vehicle % NAMES.len()]);
+    let name = NAMES[vehicle % NAMES.len()];
+    let node = if vehicle < NAMES.len() { name.to_owned() } else { format!("{name}-{vehicle}") };
+    let node = NodeName::new(node).unwrap();
     let captured_at_us = clock::now();
     let seen = visible.iter().map(|index| format!("slot-{index}").into()).collect();
-    let map =
-        ObjectReport { schema: SCHEMA_VERSION, node, seq, captured_at_us, pose: Some(pose), objects, seen: Some(seen) };
+    let view = Some(FieldOfView { range_m: 16.0, angle_rad: 1.1 });
+    let map = ObjectReport {
+        pose: Some(pose),
+        objects,
+        seen: Some(seen),
+        view,
+        ..ObjectReport::new(node, seq, captured_at_us)
+    };
     let label = |index: usize| match (vehicle, index) {
         (3, _) => "truck",
         (_, 1) if seq.is_multiple_of(3) => "van",
@@ -180,6 +167,6 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
     };
     let voted = visible.iter().filter(|index| **index < 6);
     let votes = voted.map(|index| object(label(*index), place(*index).0, place(*index).1, Some(*index)));
-    let votes = ObjectReport { objects: votes.collect(), seen: None, ..map.clone() };
+    let votes = ObjectReport { objects: votes.collect(), seen: None, view: None, ..map.clone() };
     [("detections", map), ("vote_detections", votes)]
 }

@@ -3,6 +3,7 @@
 mod access;
 mod browser;
 mod cell;
+mod cost;
 mod health;
 mod http;
 mod load;

@@ -48,18 +48,17 @@ function arrange(picture, landmarks, now) {
     const state = place.label !== null ? "full" : empty ? "" : "unknown";
     return { ...place, facing_rad: known.get(place.id)?.facing_rad, state, words: empty ? "seen empty" : "not seen" };
   });
-  const views = new Map(picture.nodes.map((node) => [node.name, node.fov_rad]));
   const byNode = Map.groupBy(picture.vehicles, (sighting) => sighting.report.node);
-  const vehicles = [...byNode].map(([node, sightings]) => vehicle(node, sightings, known, views.get(node), colour.get(node)));
+  const vehicles = [...byNode].map(([node, sightings]) => vehicle(node, sightings, known, colour.get(node)));
   return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };
 }
 
 /// A vehicle may report for the map, for votes, or for both.
-function vehicle(node, sightings, known, fov_rad, colour) {
+function vehicle(node, sightings, known, colour) {
   const [detections, votes] = ["detections", "vote_detections"].map((kind) => sightings.find((sighting) => sighting.kind === kind));
   const { report } = detections ?? votes;
   return {
-    node, fov_rad, colour, pose: report.pose, objects: report.objects, votes: votes?.report.objects.length,
+    node, colour, view: report.view, pose: report.pose, objects: report.objects, votes: votes?.report.objects.length,
     detected: detections?.report.objects.length, inView: report.seen?.length,
     seen: (report.seen ?? []).map((id) => known.get(id)).filter(Boolean),
     received_at_us: Math.max(...sightings.map((sighting) => sighting.received_at_us)),

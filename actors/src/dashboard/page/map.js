@@ -110,17 +110,20 @@ export class BirdsEye {
   #objects(objects, at, labels) {
     keyed(this.#layers.objects, objects, (object) => object.id, () => {
       const g = svg("g");
-      g.append(svg("ellipse", { class: "ellipse" }), svg("circle", { class: "centre", r: 2.5 }), svg("title"));
+      g.append(svg("line", { class: "motion" }), svg("ellipse", { class: "ellipse" }), svg("circle", { class: "centre", r: 2.5 }), svg("title"));
       return g;
     }, (g, object) => {
       const [x, y] = at(object);
       const { a, b, turn } = ellipse(object.covariance_m2);
-      const [around, centre, title] = g.children;
+      const [motion, around, centre, title] = g.children;
+      const [east, north] = object.velocity_mps ?? [0, 0];
+      const [x2, y2] = at({ x_m: object.x_m + east, y_m: object.y_m + north });
+      set(motion, { x1: x, y1: y, x2, y2 });
       const degrees = ((-turn * 180) / Math.PI).toFixed(1);
       set(around, { rx: Math.max(a * at.scale, 5), ry: Math.max(b * at.scale, 5), transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
       set(centre, { cx: x, cy: y });
       text(title, `${object.label}, ${Math.round(object.confidence * 100)} %, ± ${a.toFixed(2)} m, seen by ${object.contributors.join(", ")}`);
-      labels.put(`object ${object.id}`, object.label, x, y, 9, "");
+      labels.put(`object ${object.id}`, object.vehicle ?? object.label, x, y, 9, "");
     });
   }
 
@@ -205,12 +208,12 @@ function ellipse([xx, xy, yy]) {
   return { a: SIGMAS_95 * Math.sqrt(mean + spread), b: SIGMAS_95 * Math.sqrt(Math.max(mean - spread, 0)), turn: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
-/// The field of view, as far as the vehicle sees anything; without a known width, what it saw.
+/// The field of view, as far as the vehicle sees anything; without word of it, what it saw.
 function wedge(vehicle, at) {
-  const { pose, fov_rad, objects, seen } = vehicle;
+  const { pose, view, objects, seen } = vehicle;
   const rays = [...objects, ...seen].map((p) => [Math.hypot(p.x_m - pose.x_m, p.y_m - pose.y_m), turn(Math.atan2(p.y_m - pose.y_m, p.x_m - pose.x_m) - pose.heading_rad)]);
-  const reach = Math.max(rays.reduce((far, [range]) => Math.max(far, range), 0) * 1.1, 60 / at.scale);
-  const half = fov_rad ? fov_rad / 2 : rays.reduce((wide, [, bearing]) => Math.max(wide, Math.abs(bearing)), 0) + 0.05;
+  const reach = view?.range_m ?? Math.max(rays.reduce((far, [range]) => Math.max(far, range), 0) * 1.1, 60 / at.scale);
+  const half = view ? Math.min(view.angle_rad / 2, 3.14) : rays.reduce((wide, [, bearing]) => Math.max(wide, Math.abs(bearing)), 0) + 0.05;
   const point = (bearing) => at({ x_m: pose.x_m + reach * Math.cos(pose.heading_rad + bearing), y_m: pose.y_m + reach * Math.sin(pose.heading_rad + bearing) }).map((c) => c.toFixed(1)).join(" ");
   const r = (reach * at.scale).toFixed(1);
   const [x, y] = at(pose).map((c) => c.toFixed(1));
