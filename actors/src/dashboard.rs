@@ -86,7 +86,8 @@ impl Actor for Dashboard {
     ) -> Result<Self::State, ActorProcessingErr> {
         let DashboardArguments { config, listen, sources, bound } = arguments;
         config.validate()?;
-        let server = Server::start(config, listen, Arc::new(Observer::new(sources)), bound)?;
+        let observer = Arc::new(Observer::new(sources, config.max_rate_hz));
+        let server = Server::start(config, listen, observer, bound)?;
         myself.send_interval(CHECK_PERIOD, || DashboardMessage::CheckServer);
         Ok(DashboardState { server })
     }

@@ -53,6 +53,9 @@ pub(super) struct History {
     pub failovers: u64,
     #[serde(skip)]
     last_round: Option<(Epoch, Timestamp)>,
+    /// The gap before the last epoch's first round, which may be known before its reign is.
+    #[serde(skip)]
+    last_gap: Option<(Epoch, u64)>,
     #[serde(skip)]
     latencies_ms: Vec<f64>,
     #[serde(skip)]
@@ -93,8 +96,9 @@ impl History {
         let Some(epoch) = present else { return };
         let changed = self.reigns.back().is_some_and(|last| last.leader != epoch.leader);
         self.failovers += u64::from(changed);
+        let gap_ms = self.last_gap.as_ref().filter(|(of, _)| of == epoch).map(|(_, gap)| *gap);
         let (leader, epoch) = (epoch.leader.clone(), epoch.term);
-        push(&mut self.reigns, Reign { leader, epoch, from_us: now, until_us: None, gap_ms: None }, MAX_REIGNS);
+        push(&mut self.reigns, Reign { leader, epoch, from_us: now, until_us: None, gap_ms }, MAX_REIGNS);
     }
 
     /// Notes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
@@ -106,12 +110,13 @@ impl History {
         }
         let before = self.last_round.replace((epoch.clone(), received_at));
         let Some((last, last_at)) = before.filter(|(last, _)| last != epoch) else { return };
-        let gap = u64::try_from(received_at.since(last_at).as_millis()).ok();
+        let gap_ms = u64::try_from(received_at.since(last_at).as_millis()).unwrap_or(u64::MAX);
         let of_this = |reign: &&mut Reign| reign.leader == epoch.leader && reign.epoch == epoch.term;
         if let Some(reign) = self.reigns.iter_mut().rev().find(of_this) {
-            reign.gap_ms = reign.gap_ms.or(gap);
+            reign.gap_ms.get_or_insert(gap_ms);
         }
-        tracing::debug!(%last, %epoch, gap_ms = gap, "rounds of another leader");
+        self.last_gap = Some((epoch.clone(), gap_ms));
+        tracing::debug!(%last, %epoch, gap_ms, "rounds of another leader");
     }
 
     /// Closes a span.
@@ -162,12 +167,15 @@ mod tests {
         history.note_leadership(&led_by("euclid", 4), seconds(11));
         history.note_round(&epoch("euclid", 4), None, seconds(12));
         history.note_round(&epoch("euclid", 4), None, seconds(14));
+        history.note_round(&epoch("gauss", 5), None, seconds(15));
+        history.note_leadership(&led_by("gauss", 5), seconds(16));
         let reign = |leader, epoch, from, until: Option<u64>, gap_ms| {
             let leader = NodeName::from_static(leader);
             Reign { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
         };
-        assert_eq!(history.reigns, [reign("edge", 3, 1, Some(10), None), reign("euclid", 4, 11, None, Some(3000))]);
-        assert_eq!(history.failovers, 1);
+        let (first, second) = (reign("edge", 3, 1, Some(10), None), reign("euclid", 4, 11, Some(16), Some(3000)));
+        assert_eq!(history.reigns, [first, second, reign("gauss", 5, 16, None, Some(1000))]);
+        assert_eq!(history.failovers, 2);
     }
 
     #[test]
@@ -184,9 +192,8 @@ mod tests {
         let mut history = History::default();
         for n in 0..1000 {
             history.note_leadership(&led_by(if n % 2 == 0 { "edge" } else { "euclid" }, n), seconds(n));
-            (0..1000).for_each(|_| {
-                history.note_round(&Epoch::new(n, NodeName::from_static("edge")), Some(seconds(n)), seconds(n))
-            });
+            let epoch = Epoch::new(n, NodeName::from_static("edge"));
+            (0..1000).for_each(|_| history.note_round(&epoch, Some(seconds(n)), seconds(n)));
             assert!(history.latencies_ms.len() <= MAX_LATENCIES);
             history.sample(None, seconds(n));
         }

@@ -1,13 +1,13 @@
 //! Looks on as the node goes, keeps the history, and makes pictures for whoever looks.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::epoch::Epoch;
 use ecod::time::Timestamp;
 use tokio::sync::watch;
-use tokio::time::{Instant, MissedTickBehavior, interval};
+use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
 
 use super::history::{History, SAMPLE_PERIOD};
 use super::latency::Latencies;
@@ -25,6 +25,16 @@ pub(super) struct Observer {
     latencies: Latencies,
     pictures: watch::Sender<Bytes>,
     seen: Mutex<Seen>,
+    least_pause: Duration,
+    made: Mutex<Option<Made>>,
+}
+
+/// The latest picture as a server-sent event.
+#[derive(Debug, Clone)]
+struct Made {
+    event: Bytes,
+    /// When it is old enough for the next.
+    next: Instant,
 }
 
 #[derive(Debug, Default)]
@@ -42,13 +52,23 @@ const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Pauses are at least so many times as long as making the picture took, so that large cells cost no more.
 const PAUSE_FACTOR: u32 = 20;
 
+/// Around the JSON of a picture in its event.
+const EVENT_HEAD: &[u8] = b"event: picture\ndata: ";
+const EVENT_END: &[u8] = b"\n\n";
+
 /// A vehicle whose last report is older is no longer shown.
 const FORGET_AFTER: Duration = Duration::from_secs(30);
 
 impl Observer {
-    pub(super) fn new(sources: Sources) -> Self {
-        let seen = Mutex::default();
-        Self { sources, latencies: Latencies::default(), pictures: watch::Sender::new(Bytes::new()), seen }
+    pub(super) fn new(sources: Sources, max_rate_hz: f64) -> Self {
+        Self {
+            sources,
+            latencies: Latencies::default(),
+            pictures: watch::Sender::new(Bytes::new()),
+            seen: Mutex::default(),
+            least_pause: Duration::from_secs_f64(1.0 / max_rate_hz),
+            made: Mutex::default(),
+        }
     }
 
     /// What the node tells.
@@ -119,63 +139,78 @@ impl Observer {
         }
     }
 
-    /// The picture as a server-sent event.
+    /// The latest picture as a server-sent event, made anew when the last one is old enough.
     pub(super) fn event(&self) -> Bytes {
-        let mut event = b"event: picture\ndata: ".to_vec();
-        if let Err(error) = serde_json::to_writer(&mut event, &self.picture()) {
-            tracing::warn!(%error, "no picture for browsers");
-            return Bytes::from_static(b": no picture\n\n");
+        self.made().event
+    }
+
+    /// The latest picture as JSON.
+    pub(super) fn json(&self) -> Bytes {
+        let event = self.event();
+        event.slice(EVENT_HEAD.len()..event.len() - EVENT_END.len())
+    }
+
+    fn made(&self) -> Made {
+        let mut kept = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        let begun = Instant::now();
+        if let Some(made) = kept.as_ref().filter(|made| begun < made.next) {
+            return made.clone();
         }
-        event.extend_from_slice(b"\n\n");
-        event.into()
+        let mut event = EVENT_HEAD.to_vec();
+        if let Err(error) = serde_json::to_writer(&mut event, &self.picture()) {
+            tracing::warn!(%error, "picture for browsers cut short");
+        }
+        event.extend_from_slice(EVENT_END);
+        let next = Instant::now() + self.least_pause.max(begun.elapsed() * PAUSE_FACTOR);
+        kept.insert(Made { event: event.into(), next }).clone()
     }
 
     /// Looks on; ends never.
-    pub(super) async fn run(self: Arc<Self>, max_rate_hz: f64) {
+    pub(super) async fn run(&self) {
+        tokio::join!(self.look_on(), self.ask_on());
+    }
+
+    async fn look_on(&self) {
         let mut leadership = self.sources.leadership.clone();
         let mut maps = self.sources.newest.map.subscribe();
         let mut verdicts = self.sources.newest.verdicts.subscribe();
-        let [mut probes, mut samples] = [PROBE_PERIOD, SAMPLE_PERIOD].map(|period| {
-            let mut ticks = interval(period);
-            ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-            ticks
-        });
-        let least_pause = Duration::from_secs_f64(1.0 / max_rate_hz);
+        let mut samples = ticks(SAMPLE_PERIOD);
         let (mut next_picture, mut changed, mut pictured) = (Instant::now(), true, Instant::now());
         self.note_leadership();
         loop {
             let due = if changed { next_picture } else { (pictured + HEARTBEAT).max(next_picture) };
             tokio::select! {
                 Ok(()) = leadership.changed() => {
-                    leadership.mark_unchanged();
                     self.note_leadership();
                     self.watch_reports();
                     changed = true;
                 }
                 Ok(()) = maps.changed() => {
-                    maps.mark_unchanged();
                     self.note_map();
                     changed = true;
                 }
                 Ok(()) = verdicts.changed() => {
-                    verdicts.mark_unchanged();
                     self.note_verdicts();
                     changed = true;
                 }
-                _ = probes.tick() => {
-                    let probe = self.sources.probe().await;
-                    self.seen().probe = probe;
-                    self.watch_reports();
-                }
                 _ = samples.tick() => self.sample(),
                 () = tokio::time::sleep_until(due), if self.viewers() > 0 => {
-                    let begun = Instant::now();
-                    self.pictures.send_replace(self.event());
-                    pictured = Instant::now();
-                    next_picture = pictured + least_pause.max((pictured - begun) * PAUSE_FACTOR);
-                    changed = false;
+                    let made = self.made();
+                    self.pictures.send_replace(made.event);
+                    (next_picture, pictured, changed) = (made.next, Instant::now(), false);
                 }
             }
+        }
+    }
+
+    /// Asks the parts how they are; one that does not answer holds up nothing else.
+    async fn ask_on(&self) {
+        let mut probes = ticks(PROBE_PERIOD);
+        loop {
+            probes.tick().await;
+            let probe = self.sources.probe().await;
+            self.seen().probe = probe;
+            self.watch_reports();
         }
     }
 
@@ -218,6 +253,12 @@ impl Observer {
     fn seen(&self) -> MutexGuard<'_, Seen> {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+fn ticks(period: Duration) -> Interval {
+    let mut ticks = interval(period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
 }
 
 fn link_label(state: LinkState) -> &'static str {

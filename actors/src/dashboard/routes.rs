@@ -122,7 +122,7 @@ async fn show_metrics(State(site): State<Site>) -> Response {
 }
 
 async fn show_picture(State(site): State<Site>) -> Response {
-    Json(site.observer.picture()).into_response()
+    ([(header::CONTENT_TYPE, "application/json")], site.observer.json()).into_response()
 }
 
 /// All of the history, or with `?since=` only later samples.

@@ -55,7 +55,7 @@ impl Server {
         let thread = std::thread::Builder::new().name("dashboard".into()).spawn(move || {
             runtime.block_on(async {
                 tokio::select! {
-                    () = Arc::clone(&observer).run(config.max_rate_hz) => {}
+                    () = observer.run() => {}
                     () = serve(&config, address, &observer, &bound) => {}
                     // The sender is dropped too when its owner is.
                     _ = stopped => {}

@@ -78,7 +78,7 @@ function spread(lines, y, height) {
 /// The next number that reads well.
 function nice(value) {
   const power = 10 ** Math.floor(Math.log10(value));
-  return [1, 2, 4, 5, 10].find((step) => step * power >= value * 1.02) * power || value;
+  return [1, 2, 4, 5, 10, 20].find((step) => step * power >= value * 1.02) * power;
 }
 
 const trim = (value) => (value >= 10 ? value.toFixed(0) : value.toFixed(value < 1 ? 2 : 1)).replace(/\.?0+$/, (end) => (end.includes(".") ? "" : end));

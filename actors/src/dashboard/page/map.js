@@ -10,7 +10,7 @@ const OLD_S = 2;
 const MARGIN_PX = 56;
 
 /// Colours by name, in the order of the alphabet.
-export const colours = (names) => new Map([...names].sort().map((name, index) => [name, index % 8]));
+export const colours = (names) => new Map([...new Set(names)].sort().map((name, index) => [name, index % 8]));
 
 export class BirdsEye {
   #picture = byId("map");
