@@ -15,6 +15,8 @@ pub(super) struct Cast {
     pub(super) label: LabelIndex,
     pub(super) confidence: f64,
     pub(super) visibility: f64,
+    /// What the vehicle stated lately.
+    pub(super) recent: Recent,
     pub(super) weight: f64,
     /// Part of it that is the vehicle's own.
     pub(super) own: f64,
@@ -29,6 +31,24 @@ pub(super) struct Cast {
     pub(super) judged: bool,
     /// Whether it has been compared with the other vehicles' since it began to count.
     pub(super) compared: bool,
+}
+
+/// What one vehicle stated lately on one landmark: the weight of its votes for each label, fading. One frame in which an
+/// object was taken for another does not change the vehicle's vote.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Recent([(LabelIndex, f64); 3]);
+
+impl Recent {
+    /// Adds a statement of `weight` when all before have faded to `kept`; returns the label stated most.
+    pub(super) fn state(&mut self, label: LabelIndex, weight: f64, kept: f64) -> LabelIndex {
+        self.0.iter_mut().for_each(|(_, sum)| *sum *= kept);
+        let known = self.0.iter().position(|(known, sum)| *known == label && *sum > 0.0);
+        let least = (0..self.0.len()).min_by(|&a, &b| self.0[a].1.total_cmp(&self.0[b].1)).unwrap_or_default();
+        let place = &mut self.0[known.unwrap_or(least)];
+        *place = (label, weight + known.map_or(0.0, |_| place.1));
+        let stated = *place;
+        self.0.iter().copied().filter(|(_, sum)| *sum > stated.1).max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
+    }
 }
 
 impl Cast {

@@ -215,8 +215,11 @@ impl Model {
         candidates.iter().zip(logs).map(|(&label, p)| (label, p / total)).collect()
     }
 
+    /// Whether too few of a vehicle's votes are settled to trust it. Votes that still count do not prove it: many at
+    /// once would.
     pub(super) fn is_newcomer(&self, vehicle: usize) -> bool {
-        self.witnesses[vehicle].evidence() < self.config.probation_votes
+        let witness = &self.witnesses[vehicle];
+        witness.settled.total() + witness.inherited.total() < self.config.probation_votes
     }
 
     /// Factor that holds the summed weight of newcomers to `newcomer_share` of the proven vehicles'; 1 without proven.
@@ -253,10 +256,10 @@ impl Model {
         witness.settled.fade(fade);
         witness.inherited.fade(fade);
         self.settled.fade(fleet_fade);
-        for &(truth, p) in others {
+        for (truth, p) in sharpened(others) {
             witness.settled.add(truth, word.label, p * word.weight.min(1.0));
         }
-        for &(truth, p) in all {
+        for (truth, p) in sharpened(all) {
             self.settled.add(truth, word.label, p * word.weight.min(1.0));
         }
     }
@@ -284,6 +287,14 @@ impl Model {
         let fleet = self.fleet_accuracy().min(self.config.assumed_accuracy);
         (witness.correct() + prior * fleet) / (witness.evidence() + prior)
     }
+}
+
+/// Probabilities in proportion to their squares. Evidence that is kept for good leans to what was probably true: what
+/// little is left for labels that are never true would add up to rows that say how such labels are stated, all of them
+/// from votes on others.
+fn sharpened(posterior: &[(LabelIndex, f64)]) -> impl Iterator<Item = (LabelIndex, f64)> + '_ {
+    let squares: f64 = posterior.iter().map(|(_, p)| p * p).sum();
+    posterior.iter().map(move |&(label, p)| (label, p * p / squares.max(f64::MIN_POSITIVE)))
 }
 
 fn log_odds(p: f64) -> f64 {

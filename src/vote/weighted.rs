@@ -5,7 +5,7 @@ mod refine;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use super::ballot::{Ballot, Cast, probability};
+use super::ballot::{Ballot, Cast, Recent, probability};
 use super::calibration::{Calibration, Weights};
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
@@ -16,6 +16,12 @@ use crate::names::{Label, LandmarkId, NodeName};
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
+
+/// Time, in parts of the freshness, in which what a vehicle stated on a landmark fades to 1/e for its present vote.
+const RECENT_PART: f64 = 0.5;
+
+/// A statement counts this much at least among the vehicle's own.
+const LEAST_WEIGHT: f64 = 0.01;
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the votes that are fresh.
 #[derive(Debug, Clone)]
@@ -141,11 +147,20 @@ impl WeightedTally {
         let (vehicle, label) = (self.vehicle(node), self.label(label));
         let freshness = Duration::from_secs_f64(self.config.freshness_s);
         let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
+        let mut recent = earlier.map_or_else(Recent::default, |earlier| earlier.recent);
+        let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
+        let kept = (-age_s / (self.config.freshness_s * RECENT_PART)).exp();
+        let stated_most = recent.state(label, (confidence * visibility).max(LEAST_WEIGHT), kept);
+        let (label, confidence, visibility) = match earlier {
+            Some(earlier) if stated_most != label => (earlier.label, earlier.confidence, earlier.visibility),
+            _ => (label, confidence, visibility),
+        };
         let first = Cast {
             vehicle,
             label,
             confidence,
             visibility,
+            recent,
             weight: 1.0,
             own: 1.0,
             at,
@@ -163,7 +178,7 @@ impl WeightedTally {
             Some(Cast { since, compared, .. }) => {
                 self.uncount(landmark);
                 let said_before = earlier.filter(|earlier| earlier.label == label);
-                let rest = said_before.map_or(first, |earlier| Cast { confidence, visibility, at, ..earlier });
+                let rest = said_before.map_or(first, |earlier| Cast { confidence, visibility, recent, at, ..earlier });
                 Cast { since, compared, agreement: None, ..rest }
             }
             None => {
