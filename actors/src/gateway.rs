@@ -62,7 +62,7 @@ pub enum GatewayMessage {
         /// The new subscriber.
         subscriber: Subscriber,
     },
-    /// Send this vehicle's report; a candidate also takes it in-process.
+    /// Send this vehicle's report; the node also takes it in-process.
     PublishReport {
         /// What it is for.
         kind: ReportKind,
@@ -111,6 +111,8 @@ pub enum GatewayMessage {
 pub enum Part {
     /// Maps, verdicts, reputations and statuses.
     Follower,
+    /// Also reports: the node records them.
+    Observer,
     /// Also reports and evidence: the node aggregates or may have to.
     Candidate,
 }
@@ -186,9 +188,7 @@ impl Actor for Gateway {
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
                 state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
-                if state.part == Part::Candidate {
-                    inbox.deliver_local(Incoming::Report { kind, report });
-                }
+                inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {
                 state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
@@ -280,7 +280,8 @@ impl GatewayState {
     }
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
-        let reports = self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
+        let reports = self.part == Part::Observer
+            || self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
         self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
@@ -385,6 +386,14 @@ impl Part {
     fn levels(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
+            Self::Observer => &[
+                "global_detections",
+                "global_verdicts",
+                "reputations",
+                "nodes/+",
+                "detections/+",
+                "vote_detections/+",
+            ],
             Self::Candidate => &[
                 "global_detections",
                 "global_verdicts",

@@ -41,6 +41,7 @@ pub mod node;
 pub mod perception;
 #[cfg(feature = "camera")]
 pub mod projector;
+pub mod recorder;
 pub mod reputation_keeper;
 pub mod seat;
 pub mod state_file;

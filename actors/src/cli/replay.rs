@@ -1,5 +1,7 @@
 //! `ecod-node replay`: a recording run again in virtual time.
 
+mod log;
+
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -14,12 +16,14 @@ use crate::lines::{self, LineRead, read_line};
 /// Flags of `replay`.
 #[derive(Debug, Args)]
 pub(super) struct ReplayArguments {
-    /// Configuration of the cell, or of a node in it (TOML); without it, defaults and the locations that reports name
+    /// Configuration of the cell, or of a node in it (TOML); without it, that of the log, or for reports alone defaults and
+    /// the locations that they name
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Recorded reports, one JSON object a line in the order of arrival; `-` for standard input
-    #[arg(long, value_name = "FILE")]
-    input: PathBuf,
+    /// A log (MCAP), a directory of one node's logs, or reports, one JSON object a line in the order of arrival; `-` for
+    /// standard input; may be given several times for logs
+    #[arg(long, value_name = "FILE", required = true)]
+    input: Vec<PathBuf>,
     /// Where maps and verdicts are written, one JSON object a line; `-` for standard output
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
@@ -30,29 +34,20 @@ pub(super) struct ReplayArguments {
 
 pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
     let ReplayArguments { config, input, output, passes } = arguments;
+    let configured = config.is_some();
     let mut config = cell(config.as_deref())?;
     config.passes = *passes;
-    let limit = config.limits.payload_bytes;
-    let mut source = lines::open(input).map_err(Failure::usage)?;
-    let mut sink = lines::create(output, input).map_err(Failure::usage)?;
-    let mut replay = Replay::new(config);
-    let mut line = Vec::new();
-    loop {
-        match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", input.display()))? {
-            LineRead::End => break,
-            LineRead::TooLarge => replay.oversized_line(),
-            LineRead::Whole => {
-                if !write(&mut sink, &replay.line(&line)).with_context(|| cannot_write(output))? {
-                    return Ok(());
-                }
-            }
-        }
+    if let [input] = &**input
+        && !is_log(input)?
+    {
+        return replay_lines(config, input, output);
     }
-    let (rest, summary) = replay.finish();
-    if write(&mut sink, &rest).with_context(|| cannot_write(output))? {
-        flush(&mut sink).with_context(|| cannot_write(output))?;
-    }
-    report(&summary);
+    let files = log_files(input)?;
+    let mut sink = files.iter().try_fold(None, |_, file| lines::create(output, file).map(Some));
+    let sink = sink.as_mut().map_err(|error| Failure::usage(anyhow!("{error:#}")))?.as_mut();
+    let sink = sink.ok_or_else(|| Failure::usage(anyhow!("there is no log to replay")))?;
+    LogReplay::new(configured.then_some(&config), *passes).run(&files, sink, output)?;
+    flush(sink).with_context(|| cannot_write(output))?;
     Ok(())
 }
 
