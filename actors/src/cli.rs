@@ -8,7 +8,9 @@ mod demo;
 mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
+mod record;
 mod replay;
+mod report;
 mod run;
 mod schema;
 #[cfg(feature = "camera")]
@@ -44,8 +46,12 @@ enum Command {
     /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
+    /// Join a cell as an observer and record what all of it says (MCAP)
+    Record(record::RecordArguments),
     /// Run recorded reports again, in virtual time: the same input gives the same output
     Replay(replay::ReplayArguments),
+    /// Write one page about a log: leadership, latency, gaps, reputations, coverage, drops
+    Report(report::ReportArguments),
     /// Judge the output of a replay by what is true
     Eval(eval::EvalArguments),
     /// Calibrate a camera from photographs of a chessboard
@@ -68,7 +74,8 @@ const USAGE: u8 = 2;
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    let level = if cli.command.is_some() { "warn" } else { "info,rmqtt=warn,rmqtt_net=warn" };
+    let is_node = matches!(cli.command, None | Some(Command::Record(_)));
+    let level = if !is_node { "warn" } else { "info,rmqtt=warn,rmqtt_net=warn" };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
@@ -83,7 +90,9 @@ pub fn main() -> ExitCode {
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
+        Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
+        Some(Command::Report(arguments)) => report::run(&arguments),
         Some(Command::Eval(arguments)) => eval::run(&arguments),
         Some(Command::Schema) => schema::run(),
     };

@@ -42,6 +42,7 @@ pub mod perception;
 #[cfg(feature = "camera")]
 pub mod projector;
 pub mod recorder;
+pub mod report;
 pub mod reputation_keeper;
 pub mod seat;
 pub mod state_file;

@@ -5,13 +5,15 @@ mod log;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::replay::{FusedLine, Rejections, Replay, ReplayConfig, Summary};
 
 use super::Failure;
 use crate::config::NodeConfig;
 use crate::lines::{self, LineRead, read_line};
+use crate::recorder::{self, LogReader};
+use log::LogReplay;
 
 /// Flags of `replay`.
 #[derive(Debug, Args)]
@@ -34,20 +36,80 @@ pub(super) struct ReplayArguments {
 
 pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
     let ReplayArguments { config, input, output, passes } = arguments;
-    let configured = config.is_some();
-    let mut config = cell(config.as_deref())?;
-    config.passes = *passes;
-    if let [input] = &**input
-        && !is_log(input)?
-    {
-        return replay_lines(config, input, output);
+    let given = config.as_deref().map(|path| cell(Some(path))).transpose()?;
+    let kind = input_kind(input)?;
+    let mut sink = lines::create(output, input).map_err(Failure::usage)?;
+    match kind {
+        InputKind::Lines(input) => {
+            let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
+            replay_lines(Replay::new(config.clone()), &config, input, &mut sink, output)?;
+        }
+        InputKind::Log(files) => LogReplay::new(given.as_ref(), *passes).run(&files, &mut sink, output)?,
     }
-    let files = log_files(input)?;
-    let mut sink = files.iter().try_fold(None, |_, file| lines::create(output, file).map(Some));
-    let sink = sink.as_mut().map_err(|error| Failure::usage(anyhow!("{error:#}")))?.as_mut();
-    let sink = sink.ok_or_else(|| Failure::usage(anyhow!("there is no log to replay")))?;
-    LogReplay::new(configured.then_some(&config), *passes).run(&files, sink, output)?;
-    flush(sink).with_context(|| cannot_write(output))?;
+    Ok(flush(&mut sink).with_context(|| cannot_write(output))?)
+}
+
+/// What is to be replayed.
+enum InputKind<'a> {
+    /// A file of lines, or standard input.
+    Lines(&'a Path),
+    /// The files of a log.
+    Log(Vec<PathBuf>),
+}
+
+/// Looks into the inputs; a directory stands for the log files in it.
+fn input_kind(inputs: &[PathBuf]) -> Result<InputKind<'_>, Failure> {
+    if let [input] = inputs
+        && (input == Path::new("-") || (!input.is_dir() && !LogReader::recognises(input).map_err(Failure::usage)?))
+    {
+        return Ok(InputKind::Lines(input));
+    }
+    Ok(InputKind::Log(log_files(inputs)?))
+}
+
+/// The files of logs that are given by themselves or by their directories.
+pub(super) fn log_files(inputs: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
+    let mut files = Vec::new();
+    for input in inputs {
+        if input.is_dir() {
+            let found = recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
+            files.extend(found.map_err(Failure::usage)?);
+        } else if LogReader::recognises(input).map_err(Failure::usage)? {
+            files.push(input.clone());
+        } else {
+            return Err(Failure::usage(anyhow!("{} is not a log", input.display())));
+        }
+    }
+    if files.is_empty() {
+        return Err(Failure::usage(anyhow!("there is no log in the directory {}", inputs[0].display())));
+    }
+    Ok(files)
+}
+
+fn replay_lines(
+    mut replay: Replay,
+    config: &ReplayConfig,
+    input: &Path,
+    sink: &mut dyn Write,
+    output: &Path,
+) -> Result<(), Failure> {
+    let mut source = lines::open(input).map_err(Failure::usage)?;
+    let mut line = Vec::new();
+    let limit = config.limits.payload_bytes;
+    loop {
+        match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", input.display()))? {
+            LineRead::End => break,
+            LineRead::TooLarge => replay.oversized_line(),
+            LineRead::Whole => {
+                if !write_all(sink, &replay.line(&line), output)? {
+                    return Ok(());
+                }
+            }
+        }
+    }
+    let (rest, summary) = replay.finish();
+    write_all(sink, &rest, output)?;
+    report(&summary);
     Ok(())
 }
 
@@ -70,6 +132,10 @@ fn cannot_write(path: &Path) -> String {
 }
 
 /// False when nobody reads any more.
+fn write_all(sink: &mut dyn Write, output: &[FusedLine], path: &Path) -> anyhow::Result<bool> {
+    write(sink, output).with_context(|| cannot_write(path))
+}
+
 fn write(sink: &mut dyn Write, output: &[FusedLine]) -> io::Result<bool> {
     for line in output {
         let written = serde_json::to_writer(&mut *sink, line).map_err(io::Error::from);
