@@ -5,6 +5,7 @@ mod calibrate;
 mod columns;
 #[cfg(feature = "camera")]
 mod demo;
+mod doctor;
 mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
@@ -46,6 +47,8 @@ enum Command {
     /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
+    /// Look whether a node can run here: camera, broker, ports, key, clock, disk; say what to fix
+    Doctor(doctor::DoctorArguments),
     /// Join a cell as an observer and record what all of it says (MCAP)
     Record(record::RecordArguments),
     /// Run recorded reports again, in virtual time: the same input gives the same output
@@ -90,6 +93,7 @@ pub fn main() -> ExitCode {
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
+        Some(Command::Doctor(arguments)) => doctor::run(&arguments),
         Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
         Some(Command::Report(arguments)) => report::run(&arguments),

@@ -20,6 +20,7 @@ mod config;
 mod connection;
 mod inbox;
 mod link;
+mod probe;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -39,6 +40,7 @@ pub use config::{HiddenSecret, MqttConfig, MqttVersion, Secret};
 pub use ecod::wire::ReportKind;
 pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
+pub use probe::probe;
 
 use crate::counters::{Counters, Event};
 use connection::{Handling, LastWill};
@@ -280,8 +282,8 @@ impl GatewayState {
     }
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
-        let reports = self.part == Part::Observer
-            || self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
+        let reports =
+            self.part == Part::Observer || self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker));
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
         self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
@@ -386,14 +388,9 @@ impl Part {
     fn levels(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
-            Self::Observer => &[
-                "global_detections",
-                "global_verdicts",
-                "reputations",
-                "nodes/+",
-                "detections/+",
-                "vote_detections/+",
-            ],
+            Self::Observer => {
+                &["global_detections", "global_verdicts", "reputations", "nodes/+", "detections/+", "vote_detections/+"]
+            }
             Self::Candidate => &[
                 "global_detections",
                 "global_verdicts",

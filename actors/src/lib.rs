@@ -20,6 +20,7 @@ pub mod demo;
 pub mod detect;
 #[cfg(feature = "camera")]
 pub mod detector;
+pub mod doctor;
 pub mod follower;
 #[cfg(feature = "camera")]
 pub mod frame;

@@ -17,7 +17,9 @@ use ecod::replay::FusedLine;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, ReportKind, Reputations, Verdicts};
 
-use crate::recorder::{CounterReading, Identity, LeadershipChange, LogError, LogEvent, LogMessage, LogReader, SchemaName};
+use crate::recorder::{
+    CounterReading, Identity, LeadershipChange, LogError, LogEvent, LogMessage, LogReader, SchemaName,
+};
 use series::Samples;
 
 /// What is gathered of a log.
@@ -150,8 +152,7 @@ impl Report {
     }
 
     fn report(&mut self, topic: &str, at: Timestamp, report: &ObjectReport) {
-        let kind =
-            if topic.starts_with("vote_") { ReportKind::VoteDetections } else { ReportKind::Detections };
+        let kind = if topic.starts_with("vote_") { ReportKind::VoteDetections } else { ReportKind::Detections };
         if let Some(evaluation) = &mut self.evaluation {
             evaluation.report(kind, report);
         }

@@ -154,8 +154,7 @@ impl Rerun {
 
     fn lines(&mut self, fused: Option<Fused>) -> Vec<FusedLine> {
         let Some(Fused { map, verdicts, .. }) = fused else { return Vec::new() };
-        let lines: Vec<_> =
-            map.map(FusedLine::Map).into_iter().chain(verdicts.map(FusedLine::Verdicts)).collect();
+        let lines: Vec<_> = map.map(FusedLine::Map).into_iter().chain(verdicts.map(FusedLine::Verdicts)).collect();
         self.summary.written += lines.len() as u64;
         lines
     }

@@ -107,10 +107,7 @@ fn text<'a>(map: &'a BTreeMap<String, String>, key: &'static str) -> Result<&'a 
     map.get(key).map(String::as_str).ok_or_else(|| unusable(key, &"it is missing"))
 }
 
-fn json<T: serde::de::DeserializeOwned>(
-    map: &BTreeMap<String, String>,
-    key: &'static str,
-) -> Result<T, IdentityError> {
+fn json<T: serde::de::DeserializeOwned>(map: &BTreeMap<String, String>, key: &'static str) -> Result<T, IdentityError> {
     serde_json::from_str(text(map, key)?).map_err(|error| unusable(key, &error))
 }
 

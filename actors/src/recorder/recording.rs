@@ -24,7 +24,10 @@ pub(super) struct Entry {
 #[derive(Debug, Clone)]
 pub(super) enum Item {
     /// A report as the aggregator took it, or as an observer saw it.
-    Report { kind: ReportKind, report: Arc<ObjectReport> },
+    Report {
+        kind: ReportKind,
+        report: Arc<ObjectReport>,
+    },
     /// What the aggregator was told beside reports.
     Journal(JournalEvent),
     /// The aggregator made this round; not written.
@@ -35,7 +38,10 @@ pub(super) enum Item {
     Share(Arc<LedgerShare>),
     Status(Arc<NodeStatus>),
     Leadership(Leadership),
-    Link { broker: BrokerAddress, state: LinkState },
+    Link {
+        broker: BrokerAddress,
+        state: LinkState,
+    },
     Counters(CounterSnapshot),
     /// A picture of the camera as JPEG.
     Picture(Vec<u8>),

@@ -192,7 +192,8 @@ fn reputations(report: &Report) -> String {
         Some(vec![node.to_string(), format!("{:.3}", samples.newest()?)])
     };
     let rows: Vec<_> = report.reputations.iter().filter_map(newest).collect();
-    let text = shown(&over_time(report, "reputations", "weight of votes", curves)) + &table(&["vehicle", "last"], &rows);
+    let text =
+        shown(&over_time(report, "reputations", "weight of votes", curves)) + &table(&["vehicle", "last"], &rows);
     section("Reputations", "How far each vehicle's votes are trusted.", &text)
 }
 
@@ -205,7 +206,8 @@ fn coverage(report: &Report) -> String {
         .iter()
         .map(|(node, vehicle)| {
             let lasted = vehicle.last_at.since(vehicle.first_at.unwrap_or(vehicle.last_at)).as_secs_f64();
-            let rate = if lasted > 0.0 { format!("{:.1}", (vehicle.reports as f64 - 1.0) / lasted) } else { "-".into() };
+            let rate =
+                if lasted > 0.0 { format!("{:.1}", (vehicle.reports as f64 - 1.0) / lasted) } else { "-".into() };
             let objects = vehicle.objects as f64 / vehicle.reports.max(1) as f64;
             let counts = [vehicle.reports.to_string(), rate, format!("{objects:.1}"), vehicle.contributed.to_string()];
             [node.to_string()].into_iter().chain(counts).collect()

@@ -65,9 +65,10 @@ impl Plot<'_> {
             let shown = curve.points.iter().filter(|point| point.0 <= x_max);
             let points: Vec<_> = shown.map(|point| format!("{:.1},{:.1}", x(point.0), y(point.1))).collect();
             let title = Title::new(curve.name.as_str());
-            picture = picture.add(Group::new().add(title).add(
-                Polyline::new().set("class", format!("curve {}", class(index))).set("points", points.join(" ")),
-            ));
+            picture =
+                picture.add(Group::new().add(title).add(
+                    Polyline::new().set("class", format!("curve {}", class(index))).set("points", points.join(" ")),
+                ));
         }
         picture.to_string()
     }
@@ -84,7 +85,13 @@ pub(super) fn bars(title: &str, shares: &[(String, f64)]) -> String {
         picture = picture
             .add(text("tick", "end", left - 8.0, y + BAR / 2.0 + 4.0, name))
             .add(bar.set("width", format!("{:.1}", width * (share / 100.0).clamp(0.0, 1.0))).set("height", BAR - 6.0))
-            .add(text("tick", "start", left + width * share / 100.0 + 6.0, y + BAR / 2.0 + 4.0, &format!("{share:.1} %")));
+            .add(text(
+                "tick",
+                "start",
+                left + width * share / 100.0 + 6.0,
+                y + BAR / 2.0 + 4.0,
+                &format!("{share:.1} %"),
+            ));
     }
     picture.to_string()
 }

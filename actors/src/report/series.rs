@@ -23,7 +23,8 @@ impl Samples {
             let number = (x / seconds.max(1e-9) * parts as f64) as usize;
             match &mut part {
                 Some((current, held)) if *current == number => held.push((x, *value)),
-                _ => points.extend(part.replace((number, vec![(x, *value)])).into_iter().flat_map(|(_, held)| ends(held))),
+                _ => points
+                    .extend(part.replace((number, vec![(x, *value)])).into_iter().flat_map(|(_, held)| ends(held))),
             }
         }
         points.extend(part.into_iter().flat_map(|(_, held)| ends(held)));
@@ -44,7 +45,9 @@ impl Samples {
 /// The least and the largest, in the order of time.
 fn ends(held: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
     let by_value = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
-    let (Some(least), Some(largest)) = (held.iter().min_by(by_value), held.iter().max_by(by_value)) else { return held };
+    let (Some(least), Some(largest)) = (held.iter().min_by(by_value), held.iter().max_by(by_value)) else {
+        return held;
+    };
     let mut ends = vec![*least, *largest];
     ends.sort_by(|a, b| a.0.total_cmp(&b.0));
     ends.dedup();
@@ -65,7 +68,8 @@ pub(super) fn distribution(values: &[f64], parts: usize) -> Vec<(f64, f64)> {
     sorted.sort_by(f64::total_cmp);
     let count = sorted.len();
     let step = count.div_ceil(parts).max(1);
-    let mut points: Vec<_> = (0..count).step_by(step).map(|n| (sorted[n], 100.0 * (n + 1) as f64 / count as f64)).collect();
+    let mut points: Vec<_> =
+        (0..count).step_by(step).map(|n| (sorted[n], 100.0 * (n + 1) as f64 / count as f64)).collect();
     points.extend(sorted.last().map(|last| (*last, 100.0)));
     points
 }

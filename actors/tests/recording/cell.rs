@@ -31,7 +31,13 @@ pub(crate) fn free_address() -> SocketAddr {
 }
 
 /// A node that records below `directory`: loopback only, found by a seed.
-pub(crate) fn config(node: &str, role: Role, bind: Option<SocketAddr>, seed: SocketAddr, directory: &Path) -> NodeConfig {
+pub(crate) fn config(
+    node: &str,
+    role: Role,
+    bind: Option<SocketAddr>,
+    seed: SocketAddr,
+    directory: &Path,
+) -> NodeConfig {
     let mut config = NodeConfig {
         name: Some(name(node)),
         role,
@@ -110,7 +116,8 @@ impl Cell {
         let end = tokio::time::Instant::now() + time;
         while tokio::time::Instant::now() < end {
             self.seq += 1;
-            for (number, (node, (handle, _))) in self.nodes.iter().enumerate().filter(|(_, (node, _))| *node != "edge") {
+            for (number, (node, (handle, _))) in self.nodes.iter().enumerate().filter(|(_, (node, _))| *node != "edge")
+            {
                 let report = Arc::new(report(node, self.seq, number));
                 for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
                     let message = GatewayMessage::PublishReport { kind, report: Arc::clone(&report) };
@@ -170,6 +177,7 @@ fn report(node: &str, seq: u64, vehicle: usize) -> ObjectReport {
         y_m: 1.0 - off / 3.0,
         covariance_m2: Some([0.01 + off / 7.0, 0.0, 0.02]),
         landmark: Some(landmark.into()),
+        ..PerceivedObject::new("", 0.0, 0.0, 0.0)
     };
     ObjectReport {
         schema: SCHEMA_VERSION,

@@ -91,7 +91,12 @@ async fn an_observer_records_what_all_say() {
     let observer = Command::new(env!("CARGO_BIN_EXE_ecod-node")).args(arguments).spawn().unwrap();
     let mut observer = disk::Process(observer);
     cell.until("the observer takes part", |cell| {
-        cell.node("edge").members().borrow().iter().any(|member| member.name.as_str().starts_with("recorder-")).then_some(())
+        cell.node("edge")
+            .members()
+            .borrow()
+            .iter()
+            .any(|member| member.name.as_str().starts_with("recorder-"))
+            .then_some(())
     })
     .await;
     cell.drive(Duration::from_secs(4)).await;
@@ -120,7 +125,10 @@ async fn an_observer_records_what_all_say() {
         FusedLine::Map(map) => map.landmarks[0].label.clone(),
         FusedLine::Verdicts(verdicts) => verdicts.verdicts[0].label.clone(),
     };
-    assert!(lines.len() > 20 && lines.iter().filter(|line| labels(line).as_deref() == Some("car")).count() > 20, "{said}");
+    assert!(
+        lines.len() > 20 && lines.iter().filter(|line| labels(line).as_deref() == Some("car")).count() > 20,
+        "{said}"
+    );
     assert!(lines.iter().all(|line| key(line).0.starts_with("recorder-")));
     assert_eq!(log.identity.unwrap().cell, name("cell"));
 }

@@ -163,10 +163,15 @@ fn say(rerun: &Rerun) {
         eprintln!("rejected {reason} {reports}");
     }
     if summary.continued {
-        eprintln!("the log begins in the middle of a run: its first rounds rest on less evidence than the live ones did");
+        eprintln!(
+            "the log begins in the middle of a run: its first rounds rest on less evidence than the live ones did"
+        );
     }
     if summary.missing > 0 {
-        eprintln!("{} entries are missing in the log: rounds after them may differ from the live ones", summary.missing);
+        eprintln!(
+            "{} entries are missing in the log: rounds after them may differ from the live ones",
+            summary.missing
+        );
     }
 }
 
