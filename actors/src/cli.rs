@@ -16,6 +16,7 @@ mod run;
 mod schema;
 #[cfg(feature = "camera")]
 mod testbed;
+mod top;
 
 use std::fs;
 use std::io::{ErrorKind, IsTerminal, Write};
@@ -49,6 +50,8 @@ enum Command {
     Testbed(testbed::TestbedArguments),
     /// Look whether a node can run here: camera, broker, ports, key, clock, disk; say what to fix
     Doctor(doctor::DoctorArguments),
+    /// Join a cell as an observer and show it in this terminal
+    Top(top::TopArguments),
     /// Join a cell as an observer and record what all of it says (MCAP)
     Record(record::RecordArguments),
     /// Run recorded reports again, in virtual time: the same input gives the same output
@@ -77,8 +80,11 @@ const USAGE: u8 = 2;
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    let is_node = matches!(cli.command, None | Some(Command::Record(_)));
-    let level = if !is_node { "warn" } else { "info,rmqtt=warn,rmqtt_net=warn" };
+    let level = match &cli.command {
+        None | Some(Command::Record(_)) => "info,rmqtt=warn,rmqtt_net=warn",
+        Some(Command::Top(_)) => "off",
+        Some(_) => "warn",
+    };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
@@ -94,6 +100,7 @@ pub fn main() -> ExitCode {
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
         Some(Command::Doctor(arguments)) => doctor::run(&arguments),
+        Some(Command::Top(arguments)) => top::run(&arguments),
         Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
         Some(Command::Report(arguments)) => report::run(&arguments),

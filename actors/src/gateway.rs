@@ -113,7 +113,7 @@ pub enum GatewayMessage {
 pub enum Part {
     /// Maps, verdicts, reputations and statuses.
     Follower,
-    /// Also reports: the node records them.
+    /// Also reports and evidence: the node records them.
     Observer,
     /// Also reports and evidence: the node aggregates or may have to.
     Candidate,
@@ -388,10 +388,7 @@ impl Part {
     fn levels(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &["global_detections", "global_verdicts", "reputations", "nodes/+"],
-            Self::Observer => {
-                &["global_detections", "global_verdicts", "reputations", "nodes/+", "detections/+", "vote_detections/+"]
-            }
-            Self::Candidate => &[
+            Self::Observer | Self::Candidate => &[
                 "global_detections",
                 "global_verdicts",
                 "reputations",

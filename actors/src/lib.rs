@@ -49,3 +49,4 @@ pub mod seat;
 pub mod state_file;
 #[cfg(feature = "camera")]
 pub mod testbed;
+pub mod top;

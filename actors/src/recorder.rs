@@ -16,6 +16,8 @@ mod disk;
 mod foxglove;
 mod identity;
 mod log_file;
+#[cfg(feature = "camera")]
+mod pictures;
 mod reader;
 mod recording;
 mod writer;
@@ -32,6 +34,8 @@ pub use channels::{CounterReading, LeadershipChange, SchemaName};
 pub use config::RecordConfig;
 pub use disk::{EXTENSION, files, free_bytes};
 pub use identity::{Identity, IdentityError};
+#[cfg(feature = "camera")]
+pub use pictures::Pictures;
 pub use reader::{LogError, LogEvent, LogMessage, LogReader};
 pub use recording::Recording;
 

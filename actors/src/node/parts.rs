@@ -29,6 +29,7 @@ use crate::{
     camera,
     detector::Detector,
     projector::{Projector, ProjectorArguments},
+    recorder::Pictures,
 };
 
 /// What the parts are made from; kept to make them again.
@@ -175,7 +176,9 @@ impl Assembly {
             }
             #[cfg(feature = "camera")]
             Part::Detector => {
-                let arguments = camera::detector(&self.config, self.seats.projector.clone(), self.counters());
+                let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
+                let projector = self.seats.projector.clone();
+                let arguments = camera::detector(&self.config, projector, pictures, self.counters());
                 let arguments = arguments.map_err(in_full)?;
                 seat(&self.seats.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }

@@ -9,7 +9,7 @@ use std::time::Duration;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::replay::FusedLine;
-use ecod::wire::{ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, WirePose};
+use ecod::wire::{ObjectReport, PerceivedObject, Role, WirePose};
 use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::gateway::{GatewayMessage, ReportKind};
@@ -180,13 +180,9 @@ fn report(node: &str, seq: u64, vehicle: usize) -> ObjectReport {
         ..PerceivedObject::new("", 0.0, 0.0, 0.0)
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: name(node),
-        seq,
-        captured_at_us: clock::now(),
         pose: Some(WirePose { x_m: 0.1 * vehicle as f64, y_m: off, heading_rad: 0.3 }),
         objects: vec![object("slot-0", 2.0), object("slot-1", 4.0)],
-        seen: None,
+        ..ObjectReport::new(name(node), seq, clock::now())
     }
 }
 

@@ -105,3 +105,69 @@ fn what_is_no_log_is_refused_by_name() {
     let (code, _, said) = replay(&[empty.path()]);
     assert!(code == 2 && said.contains("no log in"), "{said}");
 }
+
+/// The Python reader that everybody has agrees on what is in a log.
+#[test]
+fn the_python_reader_reads_a_log() {
+    let python = std::env::var("ECOD_PYTHON").unwrap_or("python3".into());
+    if !Command::new(&python).args(["-c", "import mcap"]).output().is_ok_and(|output| output.status.success()) {
+        eprintln!(
+            "SKIPPED: {python} has no package mcap; `make recording-check` installs it in a directory of its own"
+        );
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let log = file(&folder, "log.mcap", &log(1));
+    let script = "import json, sys; from mcap.reader import make_reader\n\
+        for schema, channel, message in make_reader(open(sys.argv[1], 'rb')).iter_messages():\n \
+        print(schema.name, channel.topic, message.log_time, json.loads(message.data)['seq'])";
+    let run = Command::new(python).args(["-c", script]).arg(log).output().unwrap();
+    let said = String::from_utf8_lossy(&run.stdout).into_owned() + &String::from_utf8_lossy(&run.stderr);
+    let lines: Vec<_> = said.lines().collect();
+    assert_eq!(lines.len(), 3, "{said}");
+    assert_eq!(lines[0], "ecod.ObjectReport detections/a 1732154401000000000 1");
+}
+
+#[test]
+fn a_report_is_one_page_with_everything_in_it() {
+    let folder = TempDir::new().unwrap();
+    let (log, page) = (file(&folder, "log.mcap", &log(1)), folder.path().join("report.html"));
+    let truth = file(&folder, "truth.json", br#"{"landmarks": {"slot-0": "car"}}"#);
+    let report = |log: &Path| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+        command.arg("report").arg(log).arg("--truth").arg(&truth).arg("-o").arg(&page).output().unwrap()
+    };
+    let run = report(&log);
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(html.contains("Log of gauss") && html.contains("prefers-color-scheme: dark"));
+    assert!(!html.contains("http://") && !html.contains("https://") && !html.contains("<script"), "self-contained");
+    assert!(String::from_utf8_lossy(&run.stderr).contains("ecod.Tea"));
+    let run = report(&file(&folder, "not.mcap", b"{}"));
+    assert_eq!(run.status.code(), Some(2));
+}
+
+#[test]
+fn the_doctor_says_what_is_broken_by_its_exit_code_and_as_json() {
+    let folder = TempDir::new().unwrap();
+    let config = |name: &str, more: &str| {
+        let text = format!(
+            "role = \"edge\"\nlisten = \"127.0.0.1:0\"\n{more}\n[membership]\nbind = \"127.0.0.1:0\"\nmulticast.enabled = false\n"
+        );
+        file(&folder, name, text.as_bytes())
+    };
+    let doctor = |config: &Path, json: bool| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+        command.arg("doctor").arg("--config").arg(config).args(json.then_some("--json")).output().unwrap()
+    };
+    let sound = doctor(&config("sound.toml", ""), false);
+    let text = String::from_utf8_lossy(&sound.stdout).into_owned();
+    assert!(sound.status.success() && text.contains("ok    broker port"), "{text}");
+    let broken = doctor(&config("broken.toml", "state_dir = \"/proc/no/such\""), true);
+    assert_eq!(broken.status.code(), Some(1));
+    let findings: serde_json::Value = serde_json::from_slice(&broken.stdout).unwrap();
+    let state = findings.as_array().unwrap().iter().find(|finding| finding["check"] == "state directory").unwrap();
+    assert_eq!(state["verdict"], "broken");
+    assert!(state["fix"].as_str().unwrap().contains("state_dir"));
+    assert_eq!(doctor(&config("typo.toml", "stat_dir = \"x\""), false).status.code(), Some(2));
+}

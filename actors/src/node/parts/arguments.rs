@@ -88,6 +88,10 @@ impl Assembly {
                 Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
                 Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
+                Incoming::Ledger(share) if !fuses => {
+                    recording.share(share, at);
+                    true
+                }
                 Incoming::Ledger(share) => {
                     recording.share(share, at);
                     election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
