@@ -69,7 +69,7 @@ replay-check: setup ## prove that replays are byte-equal from run to run and fro
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
 	python3 -m venv $(BUILD)/recording-venv
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap
-	ECOD_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --nocapture python
+	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --nocapture python
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features

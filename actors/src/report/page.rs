@@ -108,7 +108,7 @@ fn accuracy(report: &Report) -> String {
             alone.iter().filter_map(|(node, alone)| Some((node.to_string(), alone.accuracy_pct?))).collect();
         if !shares.is_empty() {
             let title = format!("{name}: accuracy of every vehicle alone");
-            text += &format!("<h3>{title}</h3>\n{}", bars(&title, &shares));
+            text += &format!("<h3>{title}</h3>\n{}", drawing(&bars(&title, &shares)));
         }
     }
     section("Accuracy", "Judged by the truth that was given; an item is a location while its truth stays.", &text)
@@ -182,6 +182,9 @@ fn gaps(report: &Report) -> String {
 }
 
 fn reputations(report: &Report) -> String {
+    if report.reputations.is_empty() {
+        return section("Reputations", "None were published: the cell does not run VOTE, or nobody voted.", "");
+    }
     let start = report.first.unwrap_or_default();
     let curve = |(node, samples): (&ecod::names::NodeName, &super::Samples)| Curve {
         name: node.to_string(),
@@ -214,7 +217,7 @@ fn coverage(report: &Report) -> String {
         })
         .collect();
     let head = ["vehicle", "reports", "a second", "objects each", "entries contributed to"];
-    let text = if report.entries == 0 { String::new() } else { bars("coverage per vehicle", &shares) };
+    let text = if report.entries == 0 { String::new() } else { drawing(&bars("coverage per vehicle", &shares)) };
     let about = "Share of the labelled entries of all maps that rest on a vehicle's detections; reports of all kinds, as \
                  often as they came.";
     section("Coverage", about, &(text + &table(&head, &rows)))
@@ -254,7 +257,11 @@ fn shown(plot: &Plot<'_>) -> String {
         format!("<li><i class=\"{}\"></i>{}</li>\n", class(index), escape(&curve.name))
     };
     let keys: String = plot.curves.iter().enumerate().map(key).collect();
-    format!("<figure>\n{}\n<ul class=\"legend\">\n{keys}</ul>\n</figure>\n", plot.draw())
+    format!("<figure>\n{}<ul class=\"legend\">\n{keys}</ul>\n</figure>\n", drawing(&plot.draw()))
+}
+
+fn drawing(picture: &str) -> String {
+    format!("<div class=\"drawing\">{picture}</div>\n")
 }
 
 const QUANTILES: [&str; 6] = ["ms", "number", "p50", "p95", "p99", "max"];

@@ -31,7 +31,7 @@ const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 250.0;
 const LEFT: f64 = 56.0;
 const RIGHT: f64 = 12.0;
-const TOP: f64 = 12.0;
+const TOP: f64 = 26.0;
 const BOTTOM: f64 = 40.0;
 const BAR: f64 = 24.0;
 const TICKS: f64 = 6.0;
@@ -56,7 +56,7 @@ impl Plot<'_> {
         picture = picture
             .add(line("axis", (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)))
             .add(text("label", "middle", (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 6.0, self.x_label))
-            .add(text("label", "start", LEFT + 4.0, TOP + 8.0, self.y_label));
+            .add(text("label", "start", 4.0, TOP - 12.0, self.y_label));
         for (at, what) in &self.marks {
             let mark = line("mark", (x(*at), TOP), (x(*at), HEIGHT - BOTTOM));
             picture = picture.add(Group::new().add(mark).add(Title::new(what.as_str())));
