@@ -29,7 +29,8 @@ async fn frame(camera: &CameraConfig) -> Finding {
     // A camera that blocks for good keeps its thread; the program ends all the same.
     let (sender, answer) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
-        let size = source.open().and_then(|mut source| source.next_frame()).map(|frame| ImageSize::of(&frame.image));
+        let size =
+            source.open(PATIENCE).and_then(|mut source| source.next_frame()).map(|frame| ImageSize::of(&frame.image));
         // Nobody waits any more after the patience.
         let _ = sender.send(size);
     });
