@@ -87,9 +87,9 @@ impl Report {
     /// [`LogError::Unreadable`].
     pub fn file(&mut self, path: &Path) -> Result<(), LogError> {
         let mut log = LogReader::open(path)?;
-        while let Some(event) = log.next() {
+        for event in log.by_ref() {
             match event {
-                Ok(LogEvent::Identity(identity)) => self.meet(*identity),
+                Ok(LogEvent::Identity(identity)) => self.meet(&identity),
                 Ok(LogEvent::Message(message)) => self.message(&message),
                 Err(error @ LogError::Unreadable { .. }) => return Err(error),
                 Err(error) => self.problems.push(error.to_string()),
@@ -116,7 +116,7 @@ impl Report {
         page::write(self)
     }
 
-    fn meet(&mut self, identity: Identity) {
+    fn meet(&mut self, identity: &Identity) {
         if let Some(known) = self.identity.replace(identity.clone()) {
             if known.node != identity.node {
                 self.problems.push(format!("logs of {} and {} are mixed", known.node, identity.node));

@@ -45,7 +45,7 @@ pub(super) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) 
 /// What the operating system said.
 pub fn free_bytes(dir: &Path) -> io::Result<u64> {
     let facts = statvfs(dir)?;
-    Ok(u64::from(facts.blocks_available()).saturating_mul(facts.fragment_size()))
+    Ok(facts.blocks_available().saturating_mul(facts.fragment_size()))
 }
 
 /// The files of a log, the oldest first.

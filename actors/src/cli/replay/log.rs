@@ -44,7 +44,7 @@ impl<'a> LogReplay<'a> {
     pub(super) fn run(mut self, files: &[PathBuf], sink: &mut dyn Write, output: &Path) -> Result<(), Failure> {
         for file in files {
             let mut log = LogReader::open(file).map_err(Failure::usage)?;
-            while let Some(event) = log.next() {
+            for event in log.by_ref() {
                 let lines = match event {
                     Ok(LogEvent::Identity(identity)) => self.meet(*identity, file)?,
                     Ok(LogEvent::Message(message)) => self.message(&message),
