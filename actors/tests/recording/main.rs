@@ -32,7 +32,7 @@ fn key(line: &FusedLine) -> (String, u64, u64, bool) {
     }
 }
 
-fn by_key(lines: Vec<FusedLine>) -> BTreeMap<(String, u64, u64, bool), String> {
+fn by_key(lines: &[FusedLine]) -> BTreeMap<(String, u64, u64, bool), String> {
     lines.iter().map(|line| (key(line), serde_json::to_string(line).unwrap())).collect()
 }
 
@@ -57,9 +57,9 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
     for node in ["edge", "euclid", "gauss"] {
         let dir = directory.path().join(node);
         let recorded = Log::read(&dir);
-        let own = recorded.fused().into_iter().filter(|line| key(line).0 == node).collect();
+        let own: Vec<_> = recorded.fused().into_iter().filter(|line| key(line).0 == node).collect();
         let (again, said) = replay(&dir);
-        let (own, again) = (by_key(own), by_key(again));
+        let (own, again) = (by_key(&own), by_key(&again));
         for (key, line) in &own {
             assert_eq!(again.get(key), Some(line), "{node}: {key:?}\n{said}");
         }
