@@ -8,7 +8,7 @@ SETS ?= examples/crowd_labels
 VERDICTS ?= 200
 PASSES ?= 50
 
-.PHONY: help setup demo testbed eval-labels liars test test-dashboard monitoring sim trials lint doc audit bench core-only replay-check edge-only clean
+.PHONY: help setup demo testbed eval-labels liars test test-dashboard monitoring sim trials lint doc audit bench core-only replay-check edge-only recording-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -72,6 +72,11 @@ core-only: ## prove that the core needs no runtime: it depends on a list of crat
 
 replay-check: setup ## prove that replays are byte-equal from run to run and from debug to release
 	packaging/check-replay
+
+recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
+	python3 -m venv $(BUILD)/recording-venv
+	$(BUILD)/recording-venv/bin/pip install --quiet mcap
+	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --nocapture python
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features

@@ -11,11 +11,13 @@
 //! A standby runs the machine without leading: it takes reports and closes rounds, but nothing comes out. From
 //! [`Aggregator::lead`] on its rounds count, with all the evidence it has gathered.
 
+mod command;
 mod config;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
 
 use crate::epoch::Epoch;

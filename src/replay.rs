@@ -10,6 +10,7 @@
 //! most ten seconds' rounds; then time goes on at the next line. Memory is bounded by the cell and not by the recording.
 
 mod clock;
+mod journal;
 mod line;
 #[cfg(test)]
 mod tests;
@@ -17,6 +18,7 @@ mod tests;
 use std::collections::{BTreeMap, HashSet, VecDeque};
 use std::time::Duration;
 
+pub use journal::{JournalEntry, JournalEvent, Rerun, RerunSummary};
 pub use line::FusedLine;
 
 use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
@@ -153,11 +155,15 @@ impl Replay {
             return Vec::new();
         }
         self.summary.lines += 1;
-        match Line::read(text, &self.config.limits) {
-            Ok(line) => self.ahead.push_back((self.number, line)),
-            Err(reason) => self.reject(self.number, reason),
-        }
-        if self.ahead.len() > LOOKAHEAD { self.next() } else { Vec::new() }
+        self.take(Line::read(text, &self.config.limits))
+    }
+
+    /// Takes the next report of a recording that is not made of lines; each counts as one.
+    pub fn report(&mut self, kind: ReportKind, report: ObjectReport, received_at: Timestamp) -> Vec<FusedLine> {
+        self.number += 1;
+        self.summary.lines += 1;
+        let checked = report.validate(&self.config.limits);
+        self.take(checked.map(|()| Line { kind, at: received_at, report }))
     }
 
     /// Counts a line that was too large to be read at all.
@@ -184,6 +190,14 @@ impl Replay {
         }
         self.summary.ignored_votes = self.cell.as_ref().map_or(0, Aggregator::ignored_votes);
         (output, self.summary)
+    }
+
+    fn take(&mut self, line: Result<Line, RejectReason>) -> Vec<FusedLine> {
+        match line {
+            Ok(line) => self.ahead.push_back((self.number, line)),
+            Err(reason) => self.reject(self.number, reason),
+        }
+        if self.ahead.len() > LOOKAHEAD { self.next() } else { Vec::new() }
     }
 
     fn reject(&mut self, number: u64, reason: RejectReason) {

@@ -73,7 +73,8 @@ struct Vehicle {
 }
 
 /// When the first round of a leadership is due.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
 pub enum FirstRound {
     /// A period from now: the round before has just been closed, by this node or one that handed over.
     OnTime,

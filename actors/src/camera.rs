@@ -23,6 +23,7 @@ use crate::image_size::ImageSize;
 use crate::lens::Lens;
 use crate::perception::{Perception, Vantage};
 use crate::projector::ProjectorMessage;
+use crate::recorder::Pictures;
 use crate::seat::Seat;
 
 /// A vehicle's camera and what is made of its frames.
@@ -164,6 +165,7 @@ pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
 pub fn detector(
     config: &NodeConfig,
     projector: Seat<ProjectorMessage>,
+    pictures: Option<Pictures>,
     counters: Arc<Counters>,
 ) -> anyhow::Result<DetectorArguments> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
@@ -176,6 +178,7 @@ pub fn detector(
         detect: camera.detector.build().context("key `camera.detector`")?,
         optics: ImageSize::from(&lens.intrinsics),
         projector,
+        pictures,
         counters,
     })
 }

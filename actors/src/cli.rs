@@ -5,14 +5,18 @@ mod calibrate;
 mod columns;
 #[cfg(feature = "camera")]
 mod demo;
+mod doctor;
 mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
+mod record;
 mod replay;
+mod report;
 mod run;
 mod schema;
 #[cfg(feature = "camera")]
 mod testbed;
+mod top;
 
 use std::fs;
 use std::io::{ErrorKind, IsTerminal, Write};
@@ -44,8 +48,16 @@ enum Command {
     /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
+    /// Look whether a node can run here: camera, broker, ports, key, clock, disk; say what to fix
+    Doctor(doctor::DoctorArguments),
+    /// Join a cell as an observer and show it in this terminal
+    Top(top::TopArguments),
+    /// Join a cell as an observer and record what all of it says (MCAP)
+    Record(record::RecordArguments),
     /// Run recorded reports again, in virtual time: the same input gives the same output
     Replay(replay::ReplayArguments),
+    /// Write one page about a log: leadership, latency, gaps, reputations, coverage, drops
+    Report(report::ReportArguments),
     /// Judge the output of a replay by what is true
     Eval(eval::EvalArguments),
     /// Calibrate a camera from photographs of a chessboard
@@ -68,7 +80,11 @@ const USAGE: u8 = 2;
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    let level = if cli.command.is_some() { "warn" } else { "info,rmqtt=warn,rmqtt_net=warn" };
+    let level = match &cli.command {
+        None | Some(Command::Record(_)) => "info,rmqtt=warn,rmqtt_net=warn",
+        Some(Command::Top(_)) => "off",
+        Some(_) => "warn",
+    };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
@@ -83,7 +99,11 @@ pub fn main() -> ExitCode {
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
+        Some(Command::Doctor(arguments)) => doctor::run(&arguments),
+        Some(Command::Top(arguments)) => top::run(&arguments),
+        Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
+        Some(Command::Report(arguments)) => report::run(&arguments),
         Some(Command::Eval(arguments)) => eval::run(&arguments),
         Some(Command::Schema) => schema::run(),
     };

@@ -23,6 +23,7 @@ use crate::dashboard::DashboardConfig;
 use crate::gateway::MqttConfig;
 use crate::leader_election::DataPlane;
 use crate::membership::MembershipConfig;
+use crate::recorder::RecordConfig;
 use crate::reputation_keeper::ReputationKeeperConfig;
 
 /// Everything that a node can be told.
@@ -64,6 +65,9 @@ pub struct NodeConfig {
     /// The camera and what is made of its frames. Default none.
     #[cfg(feature = "camera")]
     pub camera: Option<CameraConfig>,
+    /// The log of what the node takes. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub record: Option<RecordConfig>,
     /// The cell's known locations, the same on every node. Default none.
     pub landmarks: Vec<LandmarkConfig>,
 }
@@ -99,6 +103,7 @@ impl Default for NodeConfig {
             dashboard: DashboardConfig::default(),
             #[cfg(feature = "camera")]
             camera: None,
+            record: None,
             landmarks: Vec::new(),
         }
     }
@@ -188,6 +193,9 @@ impl NodeConfig {
         #[cfg(feature = "camera")]
         if let Some(camera) = &self.camera {
             camera.validate().map_err(|error| error.within("camera"))?;
+        }
+        if let Some(record) = &self.record {
+            record.validate().map_err(|error| error.within("record"))?;
         }
         LandmarkConfig::validate_all(&self.landmarks)
     }

@@ -46,6 +46,12 @@ pub enum Event {
     ReputationsSaved,
     /// Reputations could not be written to disk.
     ReputationsNotSaved,
+    /// An entry was written to the log.
+    Recorded,
+    /// An entry is not in the log: the writer was too far behind, or the disk took nothing.
+    RecordDropped,
+    /// The log could not be written; once per attempt.
+    RecordFailed,
     /// The fuser looked whether a round is due, published or not.
     RoundDue,
     /// A camera frame was looked at.
@@ -66,7 +72,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 27] = [
+    pub const ALL: [Self; 30] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -86,6 +92,9 @@ impl Event {
         Self::LedgerMerged,
         Self::ReputationsSaved,
         Self::ReputationsNotSaved,
+        Self::Recorded,
+        Self::RecordDropped,
+        Self::RecordFailed,
         Self::RoundDue,
         Self::FrameDetected,
         Self::FrameFailed,
@@ -118,6 +127,9 @@ impl Event {
             Self::LedgerMerged => "ledger_merged",
             Self::ReputationsSaved => "reputations_saved",
             Self::ReputationsNotSaved => "reputations_not_saved",
+            Self::Recorded => "recorded",
+            Self::RecordDropped => "record_dropped",
+            Self::RecordFailed => "record_failed",
             Self::RoundDue => "round_due",
             Self::FrameDetected => "frame_detected",
             Self::FrameFailed => "frame_failed",

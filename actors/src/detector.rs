@@ -21,6 +21,7 @@ use crate::frame::Frame;
 use crate::frame_source::capture::{Capture, CaptureConfig, Opener};
 use crate::image_size::{ImageSize, SizeMismatch};
 use crate::projector::ProjectorMessage;
+use crate::recorder::Pictures;
 use crate::seat::Seat;
 
 /// What the detector is asked to do.
@@ -47,6 +48,8 @@ pub struct DetectorArguments {
     pub optics: ImageSize,
     /// Gets the detections.
     pub projector: Seat<ProjectorMessage>,
+    /// Gets the frames that were looked at, to record some.
+    pub pictures: Option<Pictures>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -65,6 +68,7 @@ pub struct DetectorState {
     /// Whether the last frame could not be looked at: the first in a row is told of.
     failing: bool,
     projector: Seat<ProjectorMessage>,
+    pictures: Option<Pictures>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
 }
@@ -79,10 +83,11 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, optics, projector, counters } = arguments;
+        let DetectorArguments { open, capture, detect, optics, projector, pictures, counters } = arguments;
         let capture = Capture::start(open, capture)?;
         let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters)));
-        Ok(DetectorState { detect: Some(detect), optics, mismatch: None, failing: false, projector, counters, pump })
+        let detect = Some(detect);
+        Ok(DetectorState { detect, optics, mismatch: None, failing: false, projector, pictures, counters, pump })
     }
 
     async fn handle(
@@ -94,12 +99,16 @@ impl Actor for Detector {
         let DetectorMessage::Look { frame, turn } = message;
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
-        let (detect, outcome) = spawn_blocking(move || {
+        let mut pictures = state.pictures.take();
+        let (detect, pictures, outcome) = spawn_blocking(move || {
             let outcome = detect.detect(&frame);
-            (detect, outcome)
+            if let Some(pictures) = &mut pictures {
+                pictures.offer(&frame);
+            }
+            (detect, pictures, outcome)
         })
         .await?;
-        state.detect = Some(detect);
+        (state.detect, state.pictures) = (Some(detect), pictures);
         match outcome {
             Ok(mut detections) => {
                 state.failing = false;

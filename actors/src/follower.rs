@@ -23,6 +23,7 @@ use tokio::sync::watch;
 use crate::counters::{Counters, Event};
 use crate::gateway::{Delivery, Incoming};
 use crate::leader_election::{LeaderElectionMessage, Leadership};
+use crate::recorder::Recording;
 use crate::seat::Seat;
 use gate::{Gate, MEMORY, Refusal};
 
@@ -90,6 +91,8 @@ pub struct FollowerArguments {
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line.
     pub log: Option<PathBuf>,
+    /// Where everything accepted is recorded.
+    pub recording: Recording,
     /// The lowest term taken at first: the highest that an earlier run of the node knew.
     pub least_term: u64,
     /// Who leads.
@@ -111,6 +114,7 @@ pub struct FollowerState {
     verdicts: Gate,
     reputations: Gate,
     log: Option<BufWriter<File>>,
+    recording: Recording,
     leadership: watch::Receiver<Leadership>,
     election: Seat<LeaderElectionMessage>,
     counters: Arc<Counters>,
@@ -156,9 +160,9 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, least_term, leadership, election, counters, .. } = arguments;
+        let FollowerArguments { newest, recording, least_term, leadership, election, counters, .. } = arguments;
         let [maps, verdicts, reputations] = [(); 3].map(|()| Gate::new(least_term));
-        Self { newest, maps, verdicts, reputations, log, leadership, election, counters }
+        Self { newest, maps, verdicts, reputations, log, recording, leadership, election, counters }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
@@ -168,6 +172,7 @@ impl FollowerState {
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         self.write(&received);
+        self.recording.map(map, received_at);
         self.newest.map.send_replace(Some(received));
         Ok(())
     }
@@ -176,6 +181,7 @@ impl FollowerState {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
         self.verdicts.admit(&epoch, verdicts.round, received_at, self.may_lead(&epoch))?;
         self.counters.count(Event::VerdictsAccepted);
+        self.recording.verdicts(verdicts, received_at);
         if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
             self.election.send(LeaderElectionMessage::NoteRound { epoch, round: verdicts.round });
         }
@@ -188,6 +194,7 @@ impl FollowerState {
         let epoch = Epoch::new(reputations.epoch, aggregator);
         self.reputations.admit(&epoch, reputations.round, received_at, self.may_lead(&epoch))?;
         self.counters.count(Event::ReputationsAccepted);
+        self.recording.reputations(reputations, received_at);
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
         Ok(())
     }
@@ -227,6 +234,7 @@ mod tests {
         let arguments = FollowerArguments {
             newest: Newest::default(),
             log: None,
+            recording: Recording::default(),
             least_term: 0,
             leadership: watch::channel(leadership).1,
             election: Seat::default(),

@@ -9,9 +9,10 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ecod::aggregator::{Aggregator, Fused};
+use ecod::aggregator::{Aggregator, Command, Fused};
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
+use ecod::replay::JournalEvent;
 use ecod::reputation::ReputationLedger;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
@@ -22,6 +23,7 @@ use tokio::task::AbortHandle;
 use crate::clock;
 use crate::counters::{Counters, Event};
 use crate::gateway::{Delivery, GatewayMessage, Incoming};
+use crate::recorder::Recording;
 use crate::reputation_keeper::ReputationKeeperMessage;
 use crate::seat::Seat;
 
@@ -64,6 +66,8 @@ pub enum FuserMessage {
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
+    /// Where the aggregator's inputs are recorded.
+    pub recording: Recording,
     /// Where maps and verdicts are published.
     pub gateway: Seat<GatewayMessage>,
     /// Is told what rounds say about vehicles.
@@ -79,6 +83,7 @@ pub struct Fuser;
 /// The aggregator and its alarm.
 pub struct FuserState {
     aggregator: Aggregator,
+    recording: Recording,
     gateway: Seat<GatewayMessage>,
     keeper: Seat<ReputationKeeperMessage>,
     counters: Arc<Counters>,
@@ -96,8 +101,9 @@ impl Actor for Fuser {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let FuserArguments { aggregator, gateway, keeper, counters } = arguments;
-        let mut state = FuserState { aggregator, gateway, keeper, counters, alarm: Timestamp(u64::MAX), timer: None };
+        let FuserArguments { aggregator, recording, gateway, keeper, counters } = arguments;
+        let alarm = Timestamp(u64::MAX);
+        let mut state = FuserState { aggregator, recording, gateway, keeper, counters, alarm, timer: None };
         state.set_alarm(&myself);
         Ok(state)
     }
@@ -117,15 +123,15 @@ impl Actor for Fuser {
             }
             FuserMessage::Lead { epoch, first_round, first } => state.lead(epoch, first_round, first),
             FuserMessage::HoldRound => {
-                state.aggregator.hold();
+                state.command(Command::Hold);
                 state.alarm = Timestamp(u64::MAX);
             }
             FuserMessage::StopPublishing => {
-                state.aggregator.stand_by();
+                state.command(Command::StandBy);
                 state.keeper.send(ReputationKeeperMessage::StandBy);
             }
-            FuserMessage::Adopt { ledger } => state.aggregator.adopt(&ledger),
-            FuserMessage::Resume { reputations } => state.aggregator.resume(&reputations),
+            FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
+            FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
         }
         state.set_alarm(&myself);
         Ok(())
@@ -136,6 +142,7 @@ impl FuserState {
     fn take(&mut self, delivery: &Delivery) {
         let Incoming::Report { kind, report } = &delivery.message else { return };
         let ignored_before = self.aggregator.ignored_votes();
+        self.recording.report(*kind, report, delivery.received_at);
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         self.counters.add(Event::VoteIgnored, self.aggregator.ignored_votes() - ignored_before);
         match taken {
@@ -150,17 +157,27 @@ impl FuserState {
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
         self.keeper
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
-        self.aggregator.lead(epoch, first_round, first, clock::now());
+        self.command(Command::Lead { epoch, first_round, first });
         self.tick();
     }
 
     fn tick(&mut self) {
-        let fused = self.aggregator.tick(clock::now());
-        self.publish(fused);
+        self.command(Command::Tick);
+    }
+
+    /// Tells the aggregator; a tick that is not due says nothing and is not recorded.
+    fn command(&mut self, command: Command) {
+        let now = clock::now();
+        if command != Command::Tick || now >= self.aggregator.deadline() {
+            let fused = self.aggregator.command(&command, now);
+            self.recording.journal(now, JournalEvent::Command(command));
+            self.publish(fused);
+        }
     }
 
     fn publish(&self, fused: Option<Fused>) {
         let Some(Fused { epoch, round, map, verdicts, evidence, reputations }) = fused else { return };
+        self.recording.round(round);
         if let Some(map) = map {
             self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });
         }

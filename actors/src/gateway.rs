@@ -21,6 +21,7 @@ mod connection;
 mod inbox;
 mod link;
 mod part;
+mod probe;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -41,6 +42,7 @@ pub use ecod::wire::ReportKind;
 pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
 pub use part::Part;
+pub use probe::probe;
 
 use crate::counters::{Counters, Event};
 use connection::{Handling, LastWill, last_will};
@@ -71,7 +73,7 @@ pub enum GatewayMessage {
         /// The new subscriber.
         subscriber: Subscriber,
     },
-    /// Send this vehicle's report; a candidate also takes it in-process.
+    /// Send this vehicle's report; the node also takes it in-process.
     PublishReport {
         /// What it is for.
         kind: ReportKind,
@@ -189,9 +191,7 @@ impl Actor for Gateway {
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
                 state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
-                if state.part == Part::Candidate || state.watches_reports {
-                    inbox.deliver_local(Incoming::Report { kind, report });
-                }
+                inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {
                 state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
@@ -284,7 +284,7 @@ impl GatewayState {
     }
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
-        let reports = self.watches_reports || self.takes_reports_of(broker);
+        let reports = self.watches_reports || self.part == Part::Observer || self.takes_reports_of(broker);
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
         self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }

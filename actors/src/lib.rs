@@ -21,6 +21,7 @@ pub mod demo;
 pub mod detect;
 #[cfg(feature = "camera")]
 pub mod detector;
+pub mod doctor;
 pub mod follower;
 #[cfg(feature = "camera")]
 pub mod frame;
@@ -42,8 +43,11 @@ pub mod node;
 pub mod perception;
 #[cfg(feature = "camera")]
 pub mod projector;
+pub mod recorder;
+pub mod report;
 pub mod reputation_keeper;
 pub mod seat;
 pub mod state_file;
 #[cfg(feature = "camera")]
 pub mod testbed;
+pub mod top;

@@ -2,7 +2,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
@@ -51,17 +51,16 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     Ok(Box::new(BufReader::with_capacity(1 << 18, file)))
 }
 
-/// Creates a file, or empties it; it must not be the one at `input`, which is still to be read.
+/// Creates a file, or empties it; it must not be one of `inputs`, which are still to be read.
 ///
 /// # Errors
 /// Naming the file.
-pub fn create(path: &Path, input: &Path) -> anyhow::Result<Box<dyn Write>> {
+pub fn create(path: &Path, inputs: &[PathBuf]) -> anyhow::Result<Box<dyn Write>> {
     if path == Path::new("-") {
         return Ok(Box::new(BufWriter::new(io::stdout().lock())));
     }
-    if let (Ok(ours), Ok(theirs)) = (fs::canonicalize(path), fs::canonicalize(input))
-        && ours == theirs
-    {
+    let ours = fs::canonicalize(path).ok();
+    if ours.is_some() && inputs.iter().any(|input| fs::canonicalize(input).ok() == ours) {
         bail!("{} is to be both read and written", path.display());
     }
     let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! Node
+//! ├─ Recorder          writes the log                     if configured
 //! ├─ Broker            embedded MQTT broker               may lead, and the nodes' own brokers are used
 //! ├─ Membership        who is there, datagrams            always
 //! ├─ Gateway           the only owner of MQTT clients     always

@@ -1,25 +1,31 @@
 //! `ecod-node replay`: a recording run again in virtual time.
 
+mod log;
+
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::replay::{FusedLine, Rejections, Replay, ReplayConfig, Summary};
 
 use super::Failure;
 use crate::config::NodeConfig;
 use crate::lines::{self, LineRead, read_line};
+use crate::recorder::{self, LogReader};
+use log::LogReplay;
 
 /// Flags of `replay`.
 #[derive(Debug, Args)]
 pub(super) struct ReplayArguments {
-    /// Configuration of the cell, or of a node in it (TOML); without it, defaults and the locations that reports name
+    /// Configuration of the cell, or of a node in it (TOML); without it, that of the log, or for reports alone defaults and
+    /// the locations that they name
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Recorded reports, one JSON object a line in the order of arrival; `-` for standard input
-    #[arg(long, value_name = "FILE")]
-    input: PathBuf,
+    /// A log (MCAP), a directory of one node's logs, or reports, one JSON object a line in the order of arrival; `-` for
+    /// standard input; may be given several times for logs
+    #[arg(long, value_name = "FILE", required = true)]
+    input: Vec<PathBuf>,
     /// Where maps and verdicts are written, one JSON object a line; `-` for standard output
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
@@ -30,28 +36,79 @@ pub(super) struct ReplayArguments {
 
 pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
     let ReplayArguments { config, input, output, passes } = arguments;
-    let mut config = cell(config.as_deref())?;
-    config.passes = *passes;
-    let limit = config.limits.payload_bytes;
-    let mut source = lines::open(input).map_err(Failure::usage)?;
+    let given = config.as_deref().map(|path| cell(Some(path))).transpose()?;
+    let kind = input_kind(input)?;
     let mut sink = lines::create(output, input).map_err(Failure::usage)?;
-    let mut replay = Replay::new(config);
+    match kind {
+        InputKind::Lines(input) => {
+            let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
+            replay_lines(Replay::new(config.clone()), &config, input, &mut sink, output)?;
+        }
+        InputKind::Log(files) => LogReplay::new(given.as_ref(), *passes).run(&files, &mut sink, output)?,
+    }
+    Ok(flush(&mut sink).with_context(|| cannot_write(output))?)
+}
+
+/// What is to be replayed.
+enum InputKind<'a> {
+    /// A file of lines, or standard input.
+    Lines(&'a Path),
+    /// The files of a log.
+    Log(Vec<PathBuf>),
+}
+
+/// Looks into the inputs; a directory stands for the log files in it.
+fn input_kind(inputs: &[PathBuf]) -> Result<InputKind<'_>, Failure> {
+    if let [input] = inputs
+        && (input == Path::new("-") || (!input.is_dir() && !LogReader::recognises(input).map_err(Failure::usage)?))
+    {
+        return Ok(InputKind::Lines(input));
+    }
+    Ok(InputKind::Log(log_files(inputs)?))
+}
+
+/// The files of logs that are given by themselves or by their directories.
+pub(super) fn log_files(inputs: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
+    let mut files = Vec::new();
+    for input in inputs {
+        if input.is_dir() {
+            let found = recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
+            files.extend(found.map_err(Failure::usage)?);
+        } else if LogReader::recognises(input).map_err(Failure::usage)? {
+            files.push(input.clone());
+        } else {
+            return Err(Failure::usage(anyhow!("{} is not a log", input.display())));
+        }
+    }
+    if files.is_empty() {
+        return Err(Failure::usage(anyhow!("there is no log in the directory {}", inputs[0].display())));
+    }
+    Ok(files)
+}
+
+fn replay_lines(
+    mut replay: Replay,
+    config: &ReplayConfig,
+    input: &Path,
+    sink: &mut dyn Write,
+    output: &Path,
+) -> Result<(), Failure> {
+    let mut source = lines::open(input).map_err(Failure::usage)?;
     let mut line = Vec::new();
+    let limit = config.limits.payload_bytes;
     loop {
         match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", input.display()))? {
             LineRead::End => break,
             LineRead::TooLarge => replay.oversized_line(),
             LineRead::Whole => {
-                if !write(&mut sink, &replay.line(&line)).with_context(|| cannot_write(output))? {
+                if !write_all(sink, &replay.line(&line), output)? {
                     return Ok(());
                 }
             }
         }
     }
     let (rest, summary) = replay.finish();
-    if write(&mut sink, &rest).with_context(|| cannot_write(output))? {
-        flush(&mut sink).with_context(|| cannot_write(output))?;
-    }
+    write_all(sink, &rest, output)?;
     report(&summary);
     Ok(())
 }
@@ -75,6 +132,10 @@ fn cannot_write(path: &Path) -> String {
 }
 
 /// False when nobody reads any more.
+fn write_all(sink: &mut dyn Write, output: &[FusedLine], path: &Path) -> anyhow::Result<bool> {
+    write(sink, output).with_context(|| cannot_write(path))
+}
+
 fn write(sink: &mut dyn Write, output: &[FusedLine]) -> io::Result<bool> {
     for line in output {
         let written = serde_json::to_writer(&mut *sink, line).map_err(io::Error::from);

@@ -19,7 +19,7 @@ use crate::gateway::BrokerAddress;
 use crate::node;
 
 /// Flags of a node; each overrides the key of its name in the configuration file.
-#[derive(Debug, Args, Serialize)]
+#[derive(Debug, Default, Args, Serialize)]
 pub struct RunArguments {
     /// Who leads: `edge` whenever it is there, `auto` if no better candidate is, `cav` never
     #[arg(long, value_parser = ["auto", "cav", "edge"])]
@@ -61,6 +61,10 @@ pub struct RunArguments {
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1, default_missing_value = "127.0.0.1:8080")]
     #[serde(skip)]
     dashboard: Option<SocketAddr>,
+    /// Record in this directory (MCAP); the table [record] of the configuration file has more
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    record: Option<PathBuf>,
     /// Print the configuration that results from file, environment and flags, and exit
     #[arg(long)]
     #[serde(skip)]
@@ -104,21 +108,32 @@ struct DashboardOverrides {
 }
 
 pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
-    let mqtt = arguments.broker.as_ref().map(|broker| MqttOverrides { broker });
-    let seeds = (!arguments.seeds.is_empty()).then_some(&*arguments.seeds);
-    let membership = seeds.map(|seeds| MembershipOverrides { seeds });
-    let dashboard = arguments.dashboard.map(|listen| DashboardOverrides { listen });
-    let overrides = Overrides { top: arguments, mqtt, membership, dashboard };
-    let config = NodeConfig::load(arguments.config.as_deref(), &overrides);
-    let config = config.map_err(Failure::usage)?;
+    let config = arguments.load()?;
     if arguments.print_config {
         return Ok(print(&config.to_toml().context("the configuration cannot be written as TOML")?)?);
     }
+    run_node(config, arguments.stop_at_eof)
+}
+
+/// Runs a node until it is told to stop or gives up.
+pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Failure> {
     let runtime = tokio::runtime::Runtime::new().context("no threads for the node")?;
-    let served = runtime.block_on(serve(config, arguments.stop_at_eof));
+    let served = runtime.block_on(serve(config, stop_at_eof));
     // A detector may be busy for good; whoever restarts the node must not wait for it.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     Ok(served?)
+}
+
+impl RunArguments {
+    /// The configuration that results from file, environment and flags.
+    fn load(&self) -> Result<NodeConfig, Failure> {
+        let mqtt = self.broker.as_ref().map(|broker| MqttOverrides { broker });
+        let seeds = (!self.seeds.is_empty()).then_some(&*self.seeds);
+        let membership = seeds.map(|seeds| MembershipOverrides { seeds });
+        let dashboard = self.dashboard.map(|listen| DashboardOverrides { listen });
+        let overrides = Overrides { top: self, mqtt, membership, dashboard };
+        NodeConfig::load(self.config.as_deref(), &overrides).map_err(Failure::usage)
+    }
 }
 
 /// How long the threads of a stopped node may take to end.
@@ -128,7 +143,7 @@ const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     #[cfg(feature = "camera")]
-    if config.role == Role::Cav && config.camera.is_none() {
+    if config.role == Role::Cav && config.camera.is_none() && config.record.is_none() {
         tracing::warn!("no [camera] is configured: this vehicle reports nothing, it only follows");
     }
     let mut node = node::start(config).await?;
@@ -141,6 +156,54 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     tracing::info!("stopping");
     node.stop().await;
     Ok(())
+}
+
+/// How somebody joins a cell to watch it.
+#[derive(Debug, Args)]
+pub(super) struct ObserverArguments {
+    /// Configuration of a node of the cell (TOML): how the cell is found, its key, its locations
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Name of this observer, unique in the cell
+    #[arg(long)]
+    name: Option<NodeName>,
+    /// Name of the cell
+    #[arg(long)]
+    cell: Option<NodeName>,
+    /// An external broker for all data; without one the nodes' own are used
+    #[arg(long, value_name = "HOST:PORT")]
+    broker: Option<BrokerAddress>,
+    /// A node to ask for the cell; may be given several times
+    #[arg(long = "seed", value_name = "HOST:PORT")]
+    seeds: Vec<String>,
+}
+
+impl ObserverArguments {
+    /// The configuration of a node that only listens: it leads nothing, has no camera, keeps nothing, and leaves the
+    /// addresses in the file to the node that they are for. Without a name it has that of the process.
+    pub(super) fn load(&self, purpose: &str) -> Result<NodeConfig, Failure> {
+        let name = format!("{purpose}-{}", std::process::id());
+        let name = self.name.clone().or_else(|| NodeName::new(&name).ok());
+        let run = RunArguments {
+            role: Some("cav".into()),
+            config: self.config.clone(),
+            name,
+            cell: self.cell.clone(),
+            broker: self.broker.clone(),
+            seeds: self.seeds.clone(),
+            ..RunArguments::default()
+        };
+        let mut config = run.load()?;
+        if let Some(bind) = &mut config.membership.bind {
+            bind.set_port(0);
+        }
+        #[cfg(feature = "camera")]
+        {
+            config.camera = None;
+        }
+        (config.membership.advertise, config.state_dir, config.map_log) = (None, None, None);
+        Ok(config)
+    }
 }
 
 /// Waits for the end of standard input. The thread that reads it is left behind: it cannot be woken.

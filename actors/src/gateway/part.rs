@@ -5,6 +5,8 @@
 pub enum Part {
     /// Maps, verdicts, reputations and statuses.
     Follower,
+    /// Also reports and evidence: the node records them.
+    Observer,
     /// Also reports and evidence: the node aggregates or may have to.
     Candidate,
 }
@@ -20,7 +22,7 @@ impl Part {
             Self::Follower => {
                 &["global_detections", "global_verdicts", "reputations", "nodes/+", "detections/+", "vote_detections/+"]
             }
-            Self::Candidate => &[
+            Self::Observer | Self::Candidate => &[
                 "global_detections",
                 "global_verdicts",
                 "reputations",

@@ -38,6 +38,14 @@ pub enum KeyError {
     },
 }
 
+/// Whether the key that the configuration names can be used.
+///
+/// # Errors
+/// [`KeyError`] when the key file cannot be used.
+pub fn check_key(config: &MembershipConfig, cell: &NodeName) -> Result<(), KeyError> {
+    CellKey::load(config, cell).map(drop)
+}
+
 impl CellKey {
     /// Reads the key that the configuration names. Without one, the cell's name is the key, which keeps cells apart and
     /// nobody out.

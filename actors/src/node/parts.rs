@@ -24,6 +24,7 @@ use crate::fuser::Fuser;
 use crate::gateway::Gateway;
 use crate::leader_election::{LeaderElection, LeaderElectionMessage, Leadership};
 use crate::membership::{FrameCounters, Member, Membership, MembershipMessage};
+use crate::recorder::{Recorder, Recording};
 use crate::reputation_keeper::{ReputationKeeper, SharedBook};
 use crate::seat::Seat;
 #[cfg(feature = "camera")]
@@ -31,6 +32,7 @@ use crate::{
     camera,
     detector::Detector,
     projector::{Projector, ProjectorArguments},
+    recorder::Pictures,
 };
 
 /// What the parts are made from; kept to make them again.
@@ -43,6 +45,7 @@ pub(super) struct Assembly {
     counters: Arc<Counters>,
     newest: Newest,
     book: SharedBook,
+    recording: Recording,
     broker_address: watch::Sender<Option<SocketAddr>>,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
@@ -63,13 +66,15 @@ const REBIND_WAIT: Duration = Duration::from_millis(50);
 impl Assembly {
     pub(super) fn new(config: NodeConfig, failed: watch::Sender<Option<String>>) -> Self {
         let by_evidence = config.fusion.vote.mode != VoteMode::Paper;
+        let counters = Arc::<Counters>::default();
         Self {
             name: config.name.clone().unwrap_or(NodeName::from_static("node")),
             config,
             run: Uuid::now_v7(),
             started_at: clock::now(),
             seats: Seats::default(),
-            counters: Arc::default(),
+            recording: Recording::new(Arc::clone(&counters)),
+            counters,
             newest: Newest::default(),
             book: SharedBook::new(by_evidence),
             broker_address: watch::Sender::new(None),
@@ -127,6 +132,7 @@ impl Assembly {
     pub(super) fn parts(&self) -> Vec<Part> {
         let leads = self.config.may_lead();
         let mut parts = Vec::new();
+        parts.extend(self.config.record.is_some().then_some(Part::Recorder));
         parts.extend((leads && self.config.data_plane().embedded).then_some(Part::Broker));
         parts.extend([Part::Membership, Part::Gateway, Part::Follower]);
         if leads {
@@ -145,6 +151,7 @@ impl Assembly {
     /// Starts one part below the supervisor and seats it.
     pub(super) async fn start(&mut self, part: Part, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
         match part {
+            Part::Recorder => self.start_recorder(supervisor).await,
             Part::Broker => self.start_broker(supervisor).await,
             Part::Membership => self.start_membership(supervisor).await,
             Part::Gateway => {
@@ -187,7 +194,9 @@ impl Assembly {
             }
             #[cfg(feature = "camera")]
             Part::Detector => {
-                let arguments = camera::detector(&self.config, self.seats.projector.clone(), self.counters());
+                let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
+                let projector = self.seats.projector.clone();
+                let arguments = camera::detector(&self.config, projector, pictures, self.counters());
                 let arguments = arguments.map_err(in_full)?;
                 seat(&self.seats.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }
@@ -209,6 +218,12 @@ impl Assembly {
         stop(&self.seats.gateway).await;
         stop(&self.seats.membership).await;
         stop(&self.seats.broker).await;
+        stop(&self.seats.recorder).await;
+    }
+
+    async fn start_recorder(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let Some(arguments) = self.recorder_arguments() else { return Err("no [record] is configured".into()) };
+        seat(&self.seats.recorder, Actor::spawn_linked(None, Recorder, arguments, supervisor).await)
     }
 
     /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to

@@ -7,6 +7,7 @@ use crate::fuser::FuserMessage;
 use crate::gateway::GatewayMessage;
 use crate::leader_election::LeaderElectionMessage;
 use crate::membership::MembershipMessage;
+use crate::recorder::RecorderMessage;
 use crate::reputation_keeper::ReputationKeeperMessage;
 use crate::seat::Seat;
 #[cfg(feature = "camera")]
@@ -15,6 +16,8 @@ use crate::{detector::DetectorMessage, projector::ProjectorMessage};
 /// A part of a node, in the order of starting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Part {
+    /// The writer of the log.
+    Recorder,
     /// The embedded broker.
     Broker,
     /// The gossip with the other nodes.
@@ -42,6 +45,8 @@ pub enum Part {
 /// Where the parts of a node are reached.
 #[derive(Debug, Clone, Default)]
 pub struct Seats {
+    /// The recorder's.
+    pub recorder: Seat<RecorderMessage>,
     /// The embedded broker's.
     pub broker: Seat<BrokerMessage>,
     /// The membership's.

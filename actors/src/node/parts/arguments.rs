@@ -8,6 +8,7 @@ use ecod::aggregator::Aggregator;
 use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
 use ecod::landmark::Landmark;
+use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
 use super::Assembly;
@@ -19,6 +20,7 @@ use crate::gateway::{self, GatewayArguments, Incoming, Subscriber};
 use crate::leader_election::{LeaderElectionArguments, LeaderElectionMessage, Parts, Position, saved_term};
 use crate::membership::{EventSink, MembershipArguments};
 use crate::node::Seats;
+use crate::recorder::{Identity, RecorderArguments};
 use crate::reputation_keeper::{ReputationKeeperArguments, ReputationKeeperMessage};
 use crate::state_file::StateFile;
 
@@ -44,7 +46,7 @@ impl Assembly {
     pub(super) fn gateway_arguments(&self) -> GatewayArguments {
         GatewayArguments {
             cell: self.config.cell.clone(),
-            part: if self.config.may_lead() { gateway::Part::Candidate } else { gateway::Part::Follower },
+            part: self.gateway_part(),
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
             counters: self.counters(),
@@ -53,13 +55,40 @@ impl Assembly {
         }
     }
 
-    /// Takes what comes in to the part that deals with it.
+    fn gateway_part(&self) -> gateway::Part {
+        if self.config.may_lead() {
+            gateway::Part::Candidate
+        } else if self.config.record.as_ref().is_some_and(|record| record.reports) {
+            gateway::Part::Observer
+        } else {
+            gateway::Part::Follower
+        }
+    }
+
+    pub(super) fn recorder_arguments(&self) -> Option<RecorderArguments> {
+        Some(RecorderArguments {
+            config: self.config.record.clone()?,
+            identity: Identity::of(&self.config, &self.name, self.run),
+            recording: self.recording.clone(),
+            leadership: self.leadership(),
+            counters: self.counters(),
+        })
+    }
+
+    /// Takes what comes in to the part that deals with it. Reports are recorded by the fuser where there is one: in the
+    /// order in which they are fused.
     fn subscriber(&self) -> Subscriber {
         let Seats { fuser, follower, keeper, election, .. } = self.seats.clone();
         let (name, feed, leadership) = (self.name.clone(), Arc::clone(&self.feed), self.leadership());
+        let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
         Arc::new(move |delivery| {
-            feed.note(&delivery.message, delivery.received_at);
+            let at = delivery.received_at;
+            feed.note(&delivery.message, at);
             match &delivery.message {
+                Incoming::Report { kind, report } if !fuses => {
+                    recording.report(*kind, report, at);
+                    true
+                }
                 // Evidence is for those that lead now or next; others that get it only look at it.
                 Incoming::Report { report, .. }
                     if feed.watches() && report.node != name && leadership.borrow().position == Position::Following =>
@@ -70,14 +99,21 @@ impl Assembly {
                 Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
                 Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
+                Incoming::Ledger(share) if !fuses => {
+                    recording.share(share, at);
+                    true
+                }
                 Incoming::Ledger(share) => {
+                    recording.share(share, at);
                     election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
                     keeper.send(ReputationKeeperMessage::Merge { delivery })
                 }
                 Incoming::Link { broker, state } => {
+                    recording.link(broker, *state, at);
                     election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
                 }
                 Incoming::Status(status) => {
+                    recording.status(status, at);
                     election.send(LeaderElectionMessage::TakeStatus { status: Arc::clone(status) })
                 }
             };
@@ -88,6 +124,7 @@ impl Assembly {
         FollowerArguments {
             newest: self.newest.clone(),
             log: self.config.map_log.clone(),
+            recording: self.recording.clone(),
             least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
             leadership: self.leadership(),
             election: self.seats.election.clone(),
@@ -113,10 +150,13 @@ impl Assembly {
     /// A fuser starts with the evidence that the keeper has.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
-        let mut aggregator = Aggregator::standby(fusion, landmarks, clock::now());
-        aggregator.adopt(&self.book.open().ledger);
+        let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
+        let mut aggregator = Aggregator::standby(fusion, landmarks, now);
+        aggregator.adopt(&ledger);
+        self.recording.journal(now, JournalEvent::Start { ledger });
         FuserArguments {
             aggregator,
+            recording: self.recording.clone(),
             gateway: self.seats.gateway.clone(),
             keeper: self.seats.keeper.clone(),
             counters: self.counters(),

@@ -1,0 +1,34 @@
+//! `ecod-node record`: joins a cell to record what all of it says.
+
+use std::path::PathBuf;
+
+use anyhow::anyhow;
+use clap::Args;
+
+use super::Failure;
+use super::run::{ObserverArguments, run_node};
+use crate::recorder::RecordConfig;
+
+/// Flags of `record`.
+#[derive(Debug, Args)]
+pub(super) struct RecordArguments {
+    #[command(flatten)]
+    observer: ObserverArguments,
+    /// Directory of the log; default that of [record] in the configuration
+    #[arg(long, value_name = "DIR")]
+    dir: Option<PathBuf>,
+}
+
+/// Records until SIGINT or SIGTERM.
+pub(super) fn run(arguments: &RecordArguments) -> Result<(), Failure> {
+    let mut config = arguments.observer.load("recorder")?;
+    let configured = config.record.take();
+    let record = match (&arguments.dir, configured) {
+        (Some(dir), Some(record)) => RecordConfig { dir: dir.clone(), ..record },
+        (Some(dir), None) => RecordConfig::new(dir),
+        (None, Some(record)) => record,
+        (None, None) => return Err(Failure::usage(anyhow!("where is recorded? give --dir, or [record] in --config"))),
+    };
+    config.record = Some(RecordConfig { reports: true, ..record });
+    run_node(config, false)
+}

@@ -1,0 +1,190 @@
+//! Logs run again: by the journal of the node's aggregator where it has one, else by the reports that an observer took.
+
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::anyhow;
+use ecod::landmark::Landmark;
+use ecod::replay::{FusedLine, JournalEntry, Replay, ReplayConfig, Rerun};
+use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
+
+use super::{Failure, report, write_all};
+use crate::recorder::{Identity, LogError, LogEvent, LogMessage, LogReader, SchemaName};
+
+/// What was live was within the limits of its node; here they only bound memory.
+const LIMITS: Limits = Limits { payload_bytes: 1 << 28, map_bytes: 1 << 28, objects: usize::MAX };
+
+/// The machine that runs the reports again.
+enum Machine {
+    /// Nothing has been read that says which.
+    Undecided,
+    /// The aggregator's journal.
+    Journal(Box<Rerun>),
+    /// Reports by their time of receipt.
+    Reports(Box<Replay>),
+}
+
+/// Runs the files of a log again, in their order.
+pub(super) struct LogReplay<'a> {
+    /// Replaces the configuration in the log.
+    cell: Option<&'a ReplayConfig>,
+    passes: Option<u32>,
+    identity: Option<Identity>,
+    machine: Machine,
+    unreadable: BTreeMap<RejectReason, u64>,
+}
+
+impl<'a> LogReplay<'a> {
+    pub(super) fn new(cell: Option<&'a ReplayConfig>, passes: Option<u32>) -> Self {
+        Self { cell, passes, identity: None, machine: Machine::Undecided, unreadable: BTreeMap::new() }
+    }
+
+    /// Reads the files and writes what comes of them; what cannot be used is told of and left out.
+    pub(super) fn run(mut self, files: &[PathBuf], sink: &mut dyn Write, output: &Path) -> Result<(), Failure> {
+        for file in files {
+            let mut log = LogReader::open(file).map_err(Failure::usage)?;
+            for event in log.by_ref() {
+                let lines = match event {
+                    Ok(LogEvent::Identity(identity)) => self.meet(*identity, file)?,
+                    Ok(LogEvent::Message(message)) => self.message(&message),
+                    Err(error @ LogError::Unreadable { .. }) => return Err(anyhow!(error).into()),
+                    Err(error) => {
+                        eprintln!("ecod-node: {:#}", anyhow!(error));
+                        continue;
+                    }
+                };
+                if !write_all(sink, &lines, output)? {
+                    return Ok(());
+                }
+            }
+            for (schema, messages) in log.unknown() {
+                eprintln!("{}: {messages} messages of {schema:?} are not known and left out", file.display());
+            }
+        }
+        self.finish(sink, output)
+    }
+
+    fn meet(&mut self, identity: Identity, file: &Path) -> Result<Vec<FusedLine>, Failure> {
+        match &self.identity {
+            Some(known) if known.node != identity.node => {
+                let (one, other) = (&known.node, &identity.node);
+                let what = format!("{} is of node {other}, files before it of {one}", file.display());
+                return Err(Failure::usage(anyhow!("{what}: give the files of one node at a time")));
+            }
+            Some(_) => return Ok(Vec::new()),
+            None => {}
+        }
+        if identity.version != env!("CARGO_PKG_VERSION") {
+            eprintln!("written by version {}: rounds may differ from what that version made of it", identity.version);
+        }
+        self.identity = Some(identity);
+        Ok(Vec::new())
+    }
+
+    fn message(&mut self, message: &LogMessage) -> Vec<FusedLine> {
+        match message.schema {
+            SchemaName::JournalEntry if self.passes.is_none() => {
+                let Ok(entry) = serde_json::from_slice::<JournalEntry>(&message.json) else {
+                    return self.reject(RejectReason::Malformed);
+                };
+                self.rerun().map(|rerun| rerun.entry(&entry)).unwrap_or_default()
+            }
+            SchemaName::ObjectReport => match read_report(message) {
+                Ok((kind, report)) => match self.machine() {
+                    Machine::Journal(rerun) => rerun.report(kind, &report, message.at),
+                    Machine::Reports(replay) => replay.report(kind, report, message.at),
+                    Machine::Undecided => Vec::new(),
+                },
+                Err(reason) => self.reject(reason),
+            },
+            _ => Vec::new(),
+        }
+    }
+
+    fn reject(&mut self, reason: RejectReason) -> Vec<FusedLine> {
+        *self.unreadable.entry(reason).or_default() += 1;
+        Vec::new()
+    }
+
+    /// A journal precedes the reports that it is about.
+    fn rerun(&mut self) -> Option<&mut Rerun> {
+        if matches!(self.machine, Machine::Undecided) {
+            let (fusion, landmarks) = match (self.cell, &self.identity) {
+                (Some(cell), _) => (cell.fusion.clone(), cell.landmarks.clone()),
+                (None, Some(identity)) => (identity.fusion.clone(), landmarks(identity)),
+                (None, None) => (ReplayConfig::default().fusion, Vec::new()),
+            };
+            self.machine = Machine::Journal(Box::new(Rerun::new(fusion, landmarks)));
+        }
+        if let Machine::Journal(rerun) = &mut self.machine { Some(rerun) } else { None }
+    }
+
+    fn machine(&mut self) -> &mut Machine {
+        if matches!(self.machine, Machine::Undecided) {
+            let mut config = match (self.cell, &self.identity) {
+                (Some(cell), _) => cell.clone(),
+                (None, Some(identity)) => ReplayConfig {
+                    aggregator: identity.node.clone(),
+                    fusion: identity.fusion.clone(),
+                    landmarks: landmarks(identity),
+                    ..ReplayConfig::default()
+                },
+                (None, None) => ReplayConfig::default(),
+            };
+            (config.passes, config.limits) = (self.passes, LIMITS);
+            self.machine = Machine::Reports(Box::new(Replay::new(config)));
+        }
+        &mut self.machine
+    }
+
+    fn finish(self, sink: &mut dyn Write, output: &Path) -> Result<(), Failure> {
+        for (reason, messages) in &self.unreadable {
+            eprintln!("rejected {reason} {messages}");
+        }
+        match self.machine {
+            Machine::Undecided => eprintln!("there is no report and no journal in the log"),
+            Machine::Reports(replay) => {
+                let (lines, summary) = replay.finish();
+                write_all(sink, &lines, output)?;
+                report(&summary);
+            }
+            Machine::Journal(rerun) => say(&rerun),
+        }
+        Ok(())
+    }
+}
+
+fn say(rerun: &Rerun) {
+    let summary = rerun.summary();
+    let used = summary.reports - summary.rejected.values().sum::<u64>();
+    eprintln!("{} reports, {used} used, {} written", summary.reports, summary.written);
+    for (reason, reports) in &summary.rejected {
+        eprintln!("rejected {reason} {reports}");
+    }
+    if summary.continued {
+        eprintln!(
+            "the log begins in the middle of a run: its first rounds rest on less evidence than the live ones did"
+        );
+    }
+    if summary.missing > 0 {
+        eprintln!(
+            "{} entries are missing in the log: rounds after them may differ from the live ones",
+            summary.missing
+        );
+    }
+}
+
+fn read_report(message: &LogMessage) -> Result<(ReportKind, ObjectReport), RejectReason> {
+    let level = message.topic.split('/').next().unwrap_or_default();
+    let kind = match level {
+        "detections" => ReportKind::Detections,
+        "vote_detections" => ReportKind::VoteDetections,
+        _ => return Err(RejectReason::UnknownTopic),
+    };
+    Ok((kind, decode(&message.json, &LIMITS)?))
+}
+
+fn landmarks(identity: &Identity) -> Vec<Landmark> {
+    identity.landmarks.iter().map(Landmark::from).collect()
+}

@@ -1,0 +1,45 @@
+//! `ecod-node report`: a log as one page.
+
+use std::fs;
+use std::path::PathBuf;
+
+use anyhow::{Context, anyhow};
+use clap::Args;
+use ecod::eval::Truth;
+
+use super::Failure;
+use super::replay::log_files;
+use crate::report::Report;
+
+/// Flags of `report`.
+#[derive(Debug, Args)]
+pub(super) struct ReportArguments {
+    /// Logs of one node (MCAP) in order, or the directory that they are in
+    #[arg(value_name = "LOG", required = true)]
+    logs: Vec<PathBuf>,
+    /// What really stands at each location (JSON, or CSV with the columns item,truth)
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// The page that is written (HTML)
+    #[arg(short, long, value_name = "FILE", default_value = "report.html")]
+    output: PathBuf,
+}
+
+pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
+    let ReportArguments { logs, truth, output } = arguments;
+    let truth = truth.as_ref().map(|path| {
+        let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        Truth::parse(&text).with_context(|| format!("truth {}", path.display()))
+    });
+    let mut report = Report::new(truth.transpose().map_err(Failure::usage)?);
+    for file in log_files(logs)? {
+        report.file(&file).map_err(|error| anyhow!(error))?;
+    }
+    for problem in report.problems() {
+        eprintln!("ecod-node: {problem}");
+    }
+    if report.is_empty() {
+        return Err(anyhow!("there is nothing in the log").into());
+    }
+    Ok(fs::write(output, report.page()).with_context(|| format!("cannot write {}", output.display()))?)
+}

@@ -1,0 +1,61 @@
+//! `ecod-node top`: a cell in a terminal.
+
+use std::io::IsTerminal;
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use clap::Args;
+use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind, KeyModifiers};
+
+use super::Failure;
+use super::run::ObserverArguments;
+use crate::clock;
+use crate::node::{self, NodeHandle};
+use crate::top::{View, draw};
+
+/// Flags of `top`.
+#[derive(Debug, Args)]
+pub(super) struct TopArguments {
+    #[command(flatten)]
+    observer: ObserverArguments,
+}
+
+/// How often the terminal is drawn.
+const PERIOD: Duration = Duration::from_millis(250);
+
+/// Joins the cell and draws it until somebody has seen enough.
+pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
+    if !std::io::stdout().is_terminal() {
+        return Err(Failure::usage(anyhow!("standard output is no terminal")));
+    }
+    let mut config = arguments.observer.load("top")?;
+    config.record = None;
+    let cell = config.cell.clone();
+    let runtime = tokio::runtime::Runtime::new().context("no threads for the node")?;
+    let node = runtime.block_on(node::start(config)).map_err(|error| anyhow!(error))?;
+    let shown = ratatui::run(|terminal| show(terminal, &node, &cell));
+    runtime.block_on(node.stop());
+    Ok(shown.context("the terminal cannot be drawn")?)
+}
+
+fn show(
+    terminal: &mut ratatui::DefaultTerminal,
+    node: &NodeHandle,
+    cell: &ecod::names::NodeName,
+) -> std::io::Result<()> {
+    let mut view = None;
+    loop {
+        let now = View::of(node, cell, view.take(), clock::now());
+        terminal.draw(|frame| draw(frame, &now))?;
+        view = Some(now);
+        if event::poll(PERIOD)?
+            && let Event::Key(key) = event::read()?
+            && key.kind == KeyEventKind::Press
+        {
+            let interrupted = key.modifiers.contains(KeyModifiers::CONTROL) && key.code == KeyCode::Char('c');
+            if interrupted || matches!(key.code, KeyCode::Char('q') | KeyCode::Esc) {
+                return Ok(());
+            }
+        }
+    }
+}

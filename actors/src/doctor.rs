@@ -1,0 +1,152 @@
+//! What a node needs of its machine, looked at one by one before the node runs.
+//!
+//! Nothing is changed: ports are opened and closed again, files are made beside others and removed, a broker is connected
+//! to and left. While the node itself runs, its own ports are in use, which is said.
+
+#[cfg(feature = "camera")]
+mod camera;
+mod clock;
+mod network;
+mod storage;
+
+use serde::Serialize;
+
+use crate::config::NodeConfig;
+
+/// What was found out about one thing.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// What was looked at.
+    pub check: &'static str,
+    /// How it is.
+    pub verdict: Verdict,
+    /// What was seen.
+    pub seen: String,
+    /// What to do about it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fix: Option<String>,
+}
+
+/// How something is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// As it should be.
+    Fine,
+    /// The node runs, but not as well as it could.
+    Doubtful,
+    /// The node does not run, or not what it is for.
+    Broken,
+}
+
+impl Finding {
+    fn fine(check: &'static str, seen: impl Into<String>) -> Self {
+        Self { check, verdict: Verdict::Fine, seen: seen.into(), fix: None }
+    }
+
+    fn doubtful(check: &'static str, seen: impl Into<String>, fix: impl Into<String>) -> Self {
+        Self { check, verdict: Verdict::Doubtful, seen: seen.into(), fix: Some(fix.into()) }
+    }
+
+    fn broken(check: &'static str, seen: impl Into<String>, fix: impl Into<String>) -> Self {
+        Self { check, verdict: Verdict::Broken, seen: seen.into(), fix: Some(fix.into()) }
+    }
+}
+
+/// Looks at everything that the configuration asks for; `config` is taken as valid.
+pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    #[cfg(feature = "camera")]
+    findings.extend(camera::examine(config).await);
+    findings.extend(network::broker(config).await);
+    findings.extend(network::gossip(config));
+    findings.extend(network::multicast(config));
+    findings.push(storage::key(config));
+    findings.push(clock::synchronised());
+    findings.extend(storage::directories(config));
+    findings
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::{TcpListener, UdpSocket};
+
+    use ecod::names::NodeName;
+    use ecod::wire::Role;
+
+    use super::*;
+    use crate::recorder::RecordConfig;
+
+    fn config() -> NodeConfig {
+        let mut config =
+            NodeConfig { name: Some(NodeName::from_static("edge")), role: Role::Edge, ..NodeConfig::default() };
+        config.listen = Some("127.0.0.1:0".parse().unwrap());
+        config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+        config.membership.multicast.enabled = false;
+        config
+    }
+
+    async fn finding(config: &NodeConfig, check: &str) -> Finding {
+        let findings = examine(config).await;
+        findings
+            .iter()
+            .find(|finding| finding.check == check)
+            .unwrap_or_else(|| panic!("{check}: {findings:?}"))
+            .clone()
+    }
+
+    #[tokio::test]
+    async fn a_node_that_can_run_has_nothing_broken() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut config = config();
+        config.state_dir = Some(directory.path().into());
+        config.record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path().join("a/b")) });
+        let findings = examine(&config).await;
+        assert!(findings.iter().all(|finding| finding.verdict < Verdict::Broken), "{findings:?}");
+        assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0, "nothing is left behind");
+    }
+
+    #[tokio::test]
+    async fn ports_in_use_are_named() {
+        let (tcp, udp) = (TcpListener::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+        let mut config = config();
+        config.listen = tcp.local_addr().ok();
+        config.membership.bind = udp.local_addr().ok();
+        for (check, port, key) in [
+            ("broker port", tcp.local_addr().unwrap().port(), "`listen`"),
+            ("gossip port", udp.local_addr().unwrap().port(), "`membership.bind`"),
+        ] {
+            let finding = finding(&config, check).await;
+            assert_eq!(finding.verdict, Verdict::Broken);
+            assert!(finding.seen.contains(&port.to_string()) && finding.fix.unwrap().contains(key));
+        }
+    }
+
+    #[tokio::test]
+    async fn an_external_broker_must_be_there() {
+        let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let mut config = config();
+        config.mqtt.broker = Some(address.into());
+        let finding = finding(&config, "broker").await;
+        assert_eq!(finding.verdict, Verdict::Broken);
+        assert!(finding.seen.contains(&address.to_string()), "{finding:?}");
+    }
+
+    #[tokio::test]
+    async fn keys_and_directories_that_cannot_be_used_are_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let (short, file) = (directory.path().join("key"), directory.path().join("file"));
+        std::fs::write(&short, "short").unwrap();
+        std::fs::write(&file, "").unwrap();
+        let mut config = config();
+        assert_eq!(finding(&config, "cell key").await.verdict, Verdict::Doubtful);
+        config.membership.key_file = Some(short);
+        assert_eq!(finding(&config, "cell key").await.verdict, Verdict::Broken);
+        config.state_dir = Some(file.join("below"));
+        let found = finding(&config, "state directory").await;
+        assert!(found.verdict == Verdict::Broken && found.seen.contains("below"), "{found:?}");
+        config.record = Some(RecordConfig { min_free_mb: 1_000_000_000, ..RecordConfig::new(directory.path()) });
+        let found = finding(&config, "log directory").await;
+        assert!(found.verdict == Verdict::Broken && found.fix.unwrap().contains("min_free_mb"));
+    }
+}

@@ -1,0 +1,102 @@
+//! Broker, ports and multicast.
+
+use std::io;
+use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
+use std::time::Duration;
+
+use super::Finding;
+use crate::config::NodeConfig;
+use crate::gateway;
+use crate::membership::DEFAULT_PORT;
+
+/// How long a datagram to oneself may take.
+const PATIENCE: Duration = Duration::from_millis(500);
+
+/// The external broker as it answers, and the port of the embedded one.
+pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    let plane = config.data_plane();
+    if let Some(address) = &plane.external {
+        findings.push(match gateway::probe(address, &config.cell, &config.mqtt).await {
+            Ok(()) => Finding::fine("broker", format!("{address} accepts this node")),
+            Err(error) => Finding::broken(
+                "broker",
+                format!("{address}: {error}"),
+                "start it, or set `mqtt.broker`, `mqtt.user`, `mqtt.password` and `mqtt.version` as it wants them",
+            ),
+        });
+    }
+    if config.may_lead() && plane.embedded {
+        let address = config.broker_listen();
+        findings.push(match TcpListener::bind(address) {
+            Ok(_) => Finding::fine("broker port", format!("{address} is free")),
+            Err(error) => Finding::broken(
+                "broker port",
+                format!("{address}: {}", words(&error)),
+                "stop what uses it, perhaps this node itself, or set `listen` to another",
+            ),
+        });
+    }
+    findings
+}
+
+/// The port on which the node gossips.
+pub(super) fn gossip(config: &NodeConfig) -> Option<Finding> {
+    let check = "gossip port";
+    let membership = &config.membership;
+    let ip = if membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
+    let address = membership.bind.unwrap_or(SocketAddr::from((ip, DEFAULT_PORT)));
+    Some(match UdpSocket::bind(address) {
+        Ok(_) => Finding::fine(check, format!("{address} is free")),
+        Err(error) if membership.bind.is_none() => Finding::doubtful(
+            check,
+            format!("{address}: {}, a free one will be taken", words(&error)),
+            "set `membership.bind` if others have this node as a seed",
+        ),
+        Err(error) => Finding::broken(
+            check,
+            format!("{address}: {}", words(&error)),
+            "stop what uses it, perhaps this node itself, or set `membership.bind` to another",
+        ),
+    })
+}
+
+/// Whether a datagram to the group comes back.
+pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
+    let multicast = &config.membership.multicast;
+    if !multicast.enabled {
+        return None;
+    }
+    let ip = config.membership.bind.map(|bind| bind.ip());
+    let ip = ip.unwrap_or(IpAddr::from(if config.membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] }));
+    let IpAddr::V4(ip) = ip else { return None };
+    let interface = multicast.interface.unwrap_or(ip);
+    let returned = || -> io::Result<()> {
+        let (receiver, sender) = (UdpSocket::bind((multicast.group, 0))?, UdpSocket::bind((ip, 0))?);
+        receiver.join_multicast_v4(&multicast.group, &interface)?;
+        receiver.set_read_timeout(Some(PATIENCE))?;
+        if !interface.is_unspecified() {
+            socket2::SockRef::from(&sender).set_multicast_if_v4(&interface)?;
+        }
+        sender.send_to(b"ecod", (multicast.group, receiver.local_addr()?.port()))?;
+        receiver.recv(&mut [0; 4]).map(drop)
+    };
+    let check = "multicast";
+    Some(match returned() {
+        Ok(()) => Finding::fine(check, format!("{} comes back by {interface}", multicast.group)),
+        Err(error) => Finding::doubtful(
+            check,
+            format!("{} by {interface}: {}", multicast.group, words(&error)),
+            "set `membership.multicast.interface`, or list nodes in `membership.seeds`",
+        ),
+    })
+}
+
+fn words(error: &io::Error) -> String {
+    match error.kind() {
+        io::ErrorKind::AddrInUse => "in use".into(),
+        io::ErrorKind::AddrNotAvailable => "not an address of this machine".into(),
+        io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => "nothing came back".into(),
+        _ => error.to_string(),
+    }
+}

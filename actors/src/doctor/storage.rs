@@ -1,0 +1,93 @@
+//! The cell's key and the directories that are written.
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use super::Finding;
+use crate::config::NodeConfig;
+use crate::membership::{KeyError, check_key};
+use crate::recorder::free_bytes;
+
+/// Free space in bytes below which a directory of state is doubtful.
+const LITTLE: u64 = 100_000_000;
+
+/// Whether there is a key, and whether others can read it.
+pub(super) fn key(config: &NodeConfig) -> Finding {
+    let check = "cell key";
+    let membership = &config.membership;
+    if !membership.has_key() {
+        let fix = "set `membership.key_file`, the same on all nodes, for a cell of more than one machine";
+        return Finding::doubtful(check, "none: the cell is on this machine only, and anyone here can take part", fix);
+    }
+    match check_key(membership, &config.cell) {
+        Ok(()) => {}
+        Err(error @ KeyError::TooShort { .. }) => {
+            return Finding::broken(check, error.to_string(), "`openssl rand -hex 32` makes one");
+        }
+        Err(error) => {
+            return Finding::broken(check, error.to_string(), "set `membership.key_file` to a file it can read");
+        }
+    }
+    let Some(path) = &membership.key_file else { return Finding::fine(check, "set") };
+    match fs::metadata(path) {
+        Ok(facts) if facts.permissions().mode() & 0o077 != 0 => {
+            let seen = format!("{} can be read by others", path.display());
+            Finding::doubtful(check, seen, format!("chmod 600 {}", path.display()))
+        }
+        _ => Finding::fine(check, path.display().to_string()),
+    }
+}
+
+/// Whether the directories can be written and have room.
+pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    match &config.state_dir {
+        Some(dir) => findings.push(directory("state directory", dir, LITTLE, "state_dir")),
+        None if config.may_lead() => findings.push(Finding::doubtful(
+            "state directory",
+            "none: reputations end with the node",
+            "set `state_dir`",
+        )),
+        None => {}
+    }
+    if let Some(record) = &config.record {
+        findings.push(directory("log directory", &record.dir, record.min_free_mb * 1_000_000, "record.dir"));
+    }
+    if let Some(log) = &config.map_log {
+        let dir = log.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        findings.push(directory("map log", dir, LITTLE, "map_log"));
+    }
+    findings
+}
+
+fn directory(check: &'static str, dir: &Path, needed: u64, key: &str) -> Finding {
+    let existing = dir.ancestors().find(|ancestor| ancestor.is_dir() || ancestor.as_os_str().is_empty());
+    let existing = existing.filter(|ancestor| !ancestor.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // What is between is no directory: it cannot be made.
+    let blocked = dir.ancestors().find(|ancestor| ancestor.exists() && !ancestor.is_dir());
+    let written = match blocked {
+        Some(path) => Err(io::Error::new(io::ErrorKind::NotADirectory, format!("{} is a file", path.display()))),
+        None => write_beside(existing),
+    };
+    let shown = dir.display();
+    match written.and_then(|()| free_bytes(existing)) {
+        Err(error) => {
+            let fix = format!("make it writable for the user of the node, or set `{key}` to another");
+            Finding::broken(check, format!("{shown}: {error}"), fix)
+        }
+        Ok(free) if free < needed => {
+            let seen = format!("{shown} has {} MB left of {} that are needed", free / 1_000_000, needed / 1_000_000);
+            let fix = if key == "record.dir" { "make room, or lower `record.min_free_mb`" } else { "make room" };
+            Finding::broken(check, seen, fix)
+        }
+        Ok(free) => Finding::fine(check, format!("{shown}, {} MB free", free / 1_000_000)),
+    }
+}
+
+fn write_beside(dir: &Path) -> io::Result<()> {
+    let file: PathBuf = dir.join(format!(".ecod-doctor-{}", std::process::id()));
+    fs::write(&file, b"ecod")?;
+    fs::remove_file(&file)
+}

@@ -1,0 +1,231 @@
+//! A log read in the order in which it was written, in bounded memory.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use ecod::time::Timestamp;
+use mcap::McapError;
+use mcap::records::{Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+
+use super::channels::SchemaName;
+use super::identity::{Identity, IdentityError};
+
+/// How a file of this kind begins.
+const MAGIC: &[u8] = b"\x89MCAP0\r\n";
+
+/// Longest record that is read: a chunk, or a map of the largest cells.
+const MAX_RECORD_BYTES: usize = 1 << 28;
+
+/// What a log holds.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LogEvent {
+    /// Who wrote it, at its beginning.
+    Identity(Box<Identity>),
+    /// A message.
+    Message(LogMessage),
+}
+
+/// One message of a log.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LogMessage {
+    /// What it is.
+    pub schema: SchemaName,
+    /// The topic without the cell's root.
+    pub topic: String,
+    /// When the recording node took it, by its clock.
+    pub at: Timestamp,
+    /// The message in JSON.
+    pub json: Vec<u8>,
+}
+
+/// What of a log cannot be used. All of it but [`LogError::Unreadable`] leaves the rest usable.
+#[derive(Debug, thiserror::Error)]
+pub enum LogError {
+    /// The file is not there or cannot be read.
+    #[error("cannot read {path}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// The file ends in the middle, as it does when its writer was killed.
+    #[error("{path} was not finished: what was written last is not in it")]
+    Truncated {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file is damaged from some place on.
+    #[error("{path} is damaged, nothing after the damage is used")]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: McapError,
+    },
+    /// A later version of the program wrote it.
+    #[error("{path} has version {found} of the log, this program knows {known}: what it does not know is left out", known = Identity::VERSION)]
+    Newer {
+        /// The file.
+        path: PathBuf,
+        /// Its version.
+        found: u64,
+    },
+    /// Its metadata cannot be used.
+    #[error("{path}")]
+    Identity {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: IdentityError,
+    },
+}
+
+/// Reads one file of a log.
+pub struct LogReader {
+    path: PathBuf,
+    source: BufReader<File>,
+    reader: LinearReader,
+    schemas: HashMap<u16, String>,
+    channels: HashMap<u16, Channel>,
+    /// Whether the data section was read to its end.
+    complete: bool,
+    ended: bool,
+    /// Messages of schemas that are not known here.
+    unknown: BTreeMap<String, u64>,
+}
+
+struct Channel {
+    schema: Option<SchemaName>,
+    schema_name: String,
+    topic: String,
+}
+
+impl LogReader {
+    /// Whether the file begins as a log does.
+    ///
+    /// # Errors
+    /// [`LogError::Unreadable`].
+    pub fn recognises(path: &Path) -> Result<bool, LogError> {
+        let mut beginning = Vec::new();
+        let read = File::open(path).and_then(|file| file.take(MAGIC.len() as u64).read_to_end(&mut beginning));
+        read.map_err(|source| LogError::Unreadable { path: path.into(), source })?;
+        Ok(beginning == MAGIC)
+    }
+
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// [`LogError::Unreadable`].
+    pub fn open(path: &Path) -> Result<Self, LogError> {
+        let file = File::open(path).map_err(|source| LogError::Unreadable { path: path.into(), source })?;
+        let options = LinearReaderOptions::default()
+            .with_skip_end_magic(true)
+            .with_prevalidate_chunk_crcs(true)
+            .with_record_length_limit(MAX_RECORD_BYTES);
+        Ok(Self {
+            path: path.into(),
+            source: BufReader::with_capacity(1 << 18, file),
+            reader: LinearReader::new_with_options(options),
+            schemas: HashMap::new(),
+            channels: HashMap::new(),
+            complete: false,
+            ended: false,
+            unknown: BTreeMap::new(),
+        })
+    }
+
+    /// Messages that were passed over because their schema is not known here, by its name.
+    pub fn unknown(&self) -> &BTreeMap<String, u64> {
+        &self.unknown
+    }
+
+    /// The next event; errors are part of the sequence, and but for damage it goes on after them.
+    fn step(&mut self) -> Option<Result<LogEvent, LogError>> {
+        loop {
+            let event = match self.reader.next_event() {
+                None => return self.end(None),
+                Some(Err(error)) => return self.end(Some(error)),
+                Some(Ok(event)) => event,
+            };
+            match event {
+                LinearReadEvent::ReadRequest(wanted) => match self.source.read(self.reader.insert(wanted)) {
+                    Ok(read) => self.reader.notify_read(read),
+                    Err(source) => {
+                        self.ended = true;
+                        return Some(Err(LogError::Unreadable { path: self.path.clone(), source }));
+                    }
+                },
+                LinearReadEvent::Record { opcode: op::DATA_END, .. } => self.complete = true,
+                LinearReadEvent::Record { opcode, data } => match mcap::parse_record(opcode, data) {
+                    Err(error) => return self.end(Some(error)),
+                    Ok(record) => {
+                        let record = record.into_owned();
+                        if let Some(event) = self.take(record) {
+                            return Some(event);
+                        }
+                    }
+                },
+            }
+        }
+    }
+
+    fn take(&mut self, record: Record<'static>) -> Option<Result<LogEvent, LogError>> {
+        match record {
+            Record::Metadata(metadata) if metadata.name == Identity::RECORD => Some(self.identity(&metadata.metadata)),
+            Record::Schema { header, .. } => {
+                self.schemas.insert(header.id, header.name);
+                None
+            }
+            Record::Channel(channel) => {
+                let schema_name = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+                let schema = SchemaName::from_name(&schema_name).filter(|_| channel.message_encoding == "json");
+                self.channels.insert(channel.id, Channel { schema, schema_name, topic: channel.topic });
+                None
+            }
+            Record::Message { header, data } => {
+                let channel = self.channels.get(&header.channel_id)?;
+                let Some(schema) = channel.schema else {
+                    *self.unknown.entry(channel.schema_name.clone()).or_default() += 1;
+                    return None;
+                };
+                let (topic, at) = (channel.topic.clone(), Timestamp(header.log_time / 1000));
+                Some(Ok(LogEvent::Message(LogMessage { schema, topic, at, json: data.into_owned() })))
+            }
+            _ => None,
+        }
+    }
+
+    fn identity(&self, map: &BTreeMap<String, String>) -> Result<LogEvent, LogError> {
+        let path = self.path.clone();
+        match Identity::version_in(map) {
+            Some(found) if found > Identity::VERSION => Err(LogError::Newer { path, found }),
+            _ => match Identity::from_map(map) {
+                Ok(identity) => Ok(LogEvent::Identity(Box::new(identity))),
+                Err(source) => Err(LogError::Identity { path, source }),
+            },
+        }
+    }
+
+    fn end(&mut self, error: Option<McapError>) -> Option<Result<LogEvent, LogError>> {
+        if std::mem::replace(&mut self.ended, true) || self.complete {
+            return None;
+        }
+        let path = self.path.clone();
+        Some(Err(match error {
+            None | Some(McapError::UnexpectedEof | McapError::UnexpectedEoc) => LogError::Truncated { path },
+            Some(source) => LogError::Damaged { path, source },
+        }))
+    }
+}
+
+impl Iterator for LogReader {
+    type Item = Result<LogEvent, LogError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.ended { None } else { self.step() }
+    }
+}

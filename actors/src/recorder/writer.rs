@@ -1,0 +1,146 @@
+//! The thread that writes the log: it alone waits for the disk.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
+
+use ecod::aggregator::Command;
+use ecod::replay::JournalEvent;
+use mcap::{McapError, McapResult};
+
+use super::config::RecordConfig;
+use super::disk;
+use super::identity::Identity;
+use super::log_file::LogFile;
+use super::recording::{Entry, Item, Recording, Standing};
+use crate::counters::Event;
+
+/// How often the log is made safe from the end of the process.
+const FLUSH_PERIOD: Duration = Duration::from_secs(1);
+
+/// How long a disk that took nothing is left alone.
+const RETRY_AFTER: Duration = Duration::from_secs(5);
+
+/// Takes entries from the queue to the disk.
+pub(super) struct LogWriter {
+    config: RecordConfig,
+    identity: Identity,
+    recording: Recording,
+    file: Option<LogFile>,
+    flush_due: Instant,
+    retry_at: Option<Instant>,
+    /// A failure is told of once.
+    failing: bool,
+}
+
+impl LogWriter {
+    pub(super) fn new(config: RecordConfig, identity: Identity, recording: Recording) -> Self {
+        let flush_due = Instant::now() + FLUSH_PERIOD;
+        Self { config, identity, recording, file: None, flush_due, retry_at: None, failing: false }
+    }
+
+    /// Writes until nobody can send any more.
+    pub(super) fn run(mut self, queue: &Receiver<Entry>) {
+        loop {
+            match queue.recv_timeout(self.flush_due.saturating_duration_since(Instant::now())) {
+                Ok(entry) => self.take(&entry),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            if Instant::now() >= self.flush_due {
+                self.flush();
+                self.flush_due = Instant::now() + FLUSH_PERIOD;
+            }
+        }
+        let Some(file) = self.file.take() else { return };
+        if let Err(error) = file.finish() {
+            self.failed(&error);
+        }
+    }
+
+    fn take(&mut self, entry: &Entry) {
+        self.open(entry);
+        self.follow(&entry.item);
+        let is_of_journal = entry.item.is_of_journal();
+        let Some(file) = &mut self.file else { return self.recording.lost(is_of_journal) };
+        let written = match self.recording.take_missing() {
+            0 => Ok(()),
+            entries => file.journal(entry.at, &JournalEvent::Missing { entries }),
+        };
+        match written.and_then(|()| file.write(entry)) {
+            Ok(()) => self.recording.counters().count(Event::Recorded),
+            Err(error) => {
+                self.recording.lost(is_of_journal);
+                self.failed(&error);
+            }
+        }
+    }
+
+    /// Begins the next file if there is none, unless the last attempt has just failed.
+    fn open(&mut self, entry: &Entry) {
+        if self.file.is_some() || self.retry_at.is_some_and(|at| Instant::now() < at) {
+            return;
+        }
+        match self.begin(entry) {
+            Ok(file) => {
+                tracing::info!(file = %file.path().display(), "recording");
+                self.file = Some(file);
+                (self.retry_at, self.failing) = (None, false);
+            }
+            Err(error) => self.failed(&error),
+        }
+    }
+
+    fn begin(&self, entry: &Entry) -> McapResult<LogFile> {
+        let RecordConfig { dir, drawable, .. } = &self.config;
+        let (path, file) = disk::create(dir, &self.identity.node, entry.at, self.config.min_free_bytes())?;
+        let mut file = LogFile::begin(path, file, &self.identity, *drawable)?;
+        let Standing { runs, leads, next_round } = self.recording.standing().clone();
+        if runs && !matches!(entry.item, Item::Journal(JournalEvent::Start { .. })) {
+            file.journal(entry.at, &JournalEvent::Continue { leads, next_round })?;
+        }
+        Ok(file)
+    }
+
+    /// Keeps up with the aggregator, for files that begin in the middle of its run.
+    fn follow(&self, item: &Item) {
+        let mut standing = self.recording.standing();
+        match item {
+            Item::Journal(JournalEvent::Start { .. }) => *standing = Standing { runs: true, ..Standing::default() },
+            Item::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
+                (standing.leads, standing.next_round) = (Some(epoch.clone()), *first_round);
+            }
+            Item::Journal(JournalEvent::Command(Command::StandBy)) => standing.leads = None,
+            Item::Round(round) => standing.next_round = round.saturating_add(1),
+            _ => {}
+        }
+    }
+
+    fn flush(&mut self) {
+        let Some(file) = &mut self.file else { return };
+        let is_full = match file.flush() {
+            Ok(bytes) => bytes >= self.config.max_file_bytes() || file.opened().elapsed() >= self.config.max_file_age(),
+            Err(error) => return self.failed(&error),
+        };
+        if is_full && let Some(Err(error)) = self.file.take().map(LogFile::finish) {
+            self.failed(&error);
+        }
+        if is_full && let Err(error) = disk::prune(&self.config.dir, &self.identity.node, self.config.max_old_bytes()) {
+            self.failed(&error.into());
+        }
+    }
+
+    /// Counts a failure, and leaves file and disk alone for a while.
+    fn failed(&mut self, error: &McapError) {
+        self.recording.counters().count(Event::RecordFailed);
+        if let Some(file) = self.file.take() {
+            // What was not flushed is lost with it.
+            self.recording.lost(true);
+            file.abandon();
+        }
+        self.retry_at = Some(Instant::now() + RETRY_AFTER);
+        if !std::mem::replace(&mut self.failing, true) {
+            let directory = self.config.dir.display();
+            tracing::warn!(%directory, %error, "not recording, the node goes on; tried again every {RETRY_AFTER:?}");
+        }
+    }
+}

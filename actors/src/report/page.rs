@@ -1,0 +1,315 @@
+//! The page itself.
+
+use std::fmt::{Display, Write};
+
+use chrono::DateTime;
+use ecod::eval::Scores;
+use ecod::time::Timestamp;
+
+use super::plot::{Curve, Plot, bars, class};
+use super::series::{distribution, quantile};
+use super::{Report, Rounds};
+use crate::counters::Event;
+use crate::recorder::CounterReading;
+
+/// How finely time is shown.
+const PARTS: usize = 700;
+
+/// Most curves of a plot; a table has all.
+const MOST_CURVES: usize = 12;
+
+/// Counted events that mean that something was lost.
+const LOSSES: [Event; 8] = [
+    Event::PublishRefused,
+    Event::PublishTooLarge,
+    Event::InboxFull,
+    Event::RecordDropped,
+    Event::FrameFailed,
+    Event::FrameSkipped,
+    Event::DetectionUnplaced,
+    Event::ReputationsNotSaved,
+];
+
+/// Counts of what was lost or refused; copies that came a second way are neither.
+pub(super) fn losses(reading: &CounterReading) -> impl Iterator<Item = (&str, u64)> {
+    let is_loss = |name: &str| LOSSES.iter().any(|event| event.as_str() == name);
+    let events = reading.events.iter().filter(move |(name, _)| is_loss(name));
+    let rejects = reading.rejects.iter().filter(|(name, _)| *name != "out_of_order");
+    events.chain(rejects).map(|(name, times)| (name.as_str(), *times))
+}
+
+/// Writes the page.
+pub(super) fn write(report: &Report) -> String {
+    let sections = [
+        accuracy(report),
+        leadership(report),
+        latency(report),
+        gaps(report),
+        reputations(report),
+        coverage(report),
+        drops(report),
+    ];
+    let node = report.identity.as_ref().map_or("a node", |identity| identity.node.as_str());
+    let title = escape(&format!("Log of {node}"));
+    let head = format!("<h1>{title}</h1>\n{}{}", summary(report), problems(report));
+    format!(
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <meta name=\"color-scheme\" content=\"light dark\">\n<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n\
+         <body>\n<main>\n{head}{}</main>\n</body>\n</html>\n",
+        sections.concat()
+    )
+}
+
+fn summary(report: &Report) -> String {
+    let first = report.first.unwrap_or_default();
+    let mut rows = vec![
+        ("recorded".to_owned(), format!("{} to {} UTC, {}", clock(first), clock(report.last), span(report))),
+        ("messages".into(), report.messages.to_string()),
+        ("maps, verdicts".into(), format!("{}, {}", report.maps.count, report.verdicts.count)),
+    ];
+    if let Some(identity) = &report.identity {
+        rows.insert(0, ("cell".into(), identity.cell.to_string()));
+        rows.push(("written by".into(), format!("ecod-node {}, run {}", identity.version, identity.run)));
+    }
+    let row = |(name, value): (String, String)| format!("<dt>{}</dt><dd>{}</dd>\n", escape(&name), escape(&value));
+    format!("<dl>\n{}</dl>\n", rows.into_iter().map(row).collect::<String>())
+}
+
+fn problems(report: &Report) -> String {
+    if report.problems.is_empty() {
+        return String::new();
+    }
+    let items: String = report.problems.iter().map(|problem| format!("<li>{}</li>\n", escape(problem))).collect();
+    format!("<section class=\"warning\">\n<h2>Not used</h2>\n<ul>\n{items}</ul>\n</section>\n")
+}
+
+fn accuracy(report: &Report) -> String {
+    let Some(result) = report.evaluation.as_ref().map(ecod::eval::Evaluation::result) else { return String::new() };
+    let percent = |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{share:.1}"));
+    let row = |name: &str, scores: &Scores| {
+        let shares = [
+            scores.accuracy_pct,
+            scores.coverage_pct,
+            scores.labelled_accuracy_pct,
+            scores.rounds.accuracy_pct,
+            scores.majority_accuracy_pct,
+        ];
+        let cells = [name.to_owned(), scores.lines.to_string(), scores.items.to_string()];
+        cells.into_iter().chain(shares.map(percent)).collect::<Vec<_>>()
+    };
+    let judged = [("PACE", &result.pace), ("VOTE", &result.vote)];
+    let rows: Vec<_> = judged.iter().filter_map(|(name, scores)| Some(row(name, scores.as_ref()?))).collect();
+    let head = ["", "rounds", "items", "accuracy %", "coverage %", "labelled %", "all rounds %", "majority %"];
+    let mut text = table(&head, &rows);
+    for (name, scores) in judged.iter().filter_map(|(name, scores)| Some((name, scores.as_ref()?))) {
+        let alone: Vec<_> = scores.vehicles.iter().collect();
+        let shares: Vec<_> =
+            alone.iter().filter_map(|(node, alone)| Some((node.to_string(), alone.accuracy_pct?))).collect();
+        if !shares.is_empty() {
+            let title = format!("{name}: accuracy of every vehicle alone");
+            text += &format!("<h3>{title}</h3>\n{}", drawing(&bars(&title, &shares)));
+        }
+    }
+    section("Accuracy", "Judged by the truth that was given; an item is a location while its truth stays.", &text)
+}
+
+fn leadership(report: &Report) -> String {
+    let rows: Vec<_> = report
+        .reigns
+        .iter()
+        .map(|reign| {
+            let lasted = reign.last_at.since(reign.first_at).as_secs_f64();
+            let cells = [reign.epoch.leader.to_string(), reign.epoch.term.to_string(), clock(reign.first_at)];
+            cells.into_iter().chain([format!("{lasted:.1}"), reign.rounds.to_string()]).collect()
+        })
+        .collect();
+    let changes: Vec<_> = report
+        .changes
+        .iter()
+        .map(|change| {
+            let leader = change.epoch.as_ref().map_or("-".to_owned(), ToString::to_string);
+            let standby = change.standby.as_ref().map_or("-".to_owned(), ToString::to_string);
+            vec![clock(change.at_us), change.position.replace('_', " "), leader, standby]
+        })
+        .collect();
+    let mut text = table(&["leader", "term", "first round, UTC", "lasted s", "rounds taken"], &rows);
+    if !changes.is_empty() {
+        let all = table(&["UTC", "this node is", "leader@term", "standby"], &changes);
+        text += &format!("<details><summary>What this node knew of it</summary>\n{all}</details>\n");
+    }
+    section("Leadership", "Whose rounds this node took.", &text)
+}
+
+fn latency(report: &Report) -> String {
+    let Rounds { fusing, travelling, .. } = &report.maps;
+    let kinds = [
+        ("maps: oldest capture to end of round", fusing),
+        ("maps: end of round to this node", travelling),
+        ("verdicts: end of round to this node", &report.verdicts.travelling),
+    ];
+    let kinds: Vec<_> = kinds.into_iter().filter(|(_, values)| !values.is_empty()).collect();
+    let rows: Vec<_> = kinds.iter().map(|(name, values)| quantiles(name, values)).collect();
+    let curves = |&(name, values): &(&str, &Vec<f64>)| {
+        let points = distribution(values, PARTS).into_iter().map(|(value, share)| (value * 1000.0, share));
+        Curve { name: name.to_owned(), points: points.collect() }
+    };
+    let most = kinds.iter().filter_map(|(_, values)| quantile(values, 0.995)).fold(0.0, f64::max);
+    let plot = Plot {
+        title: "latency distribution",
+        x_label: "ms",
+        y_label: "% of rounds within",
+        curves: kinds.iter().map(curves).collect(),
+        marks: Vec::new(),
+        x_max: Some((most * 1000.0).max(1.0)),
+    };
+    let text = shown(&plot) + &table(&QUANTILES, &rows);
+    section("Latency", "By the clocks of aggregator and recording node, as far apart as these are.", &text)
+}
+
+fn gaps(report: &Report) -> String {
+    let start = report.first.unwrap_or_default();
+    let kinds = [("maps", &report.maps.gaps), ("verdicts", &report.verdicts.gaps)];
+    let kinds: Vec<_> = kinds.into_iter().filter(|(_, gaps)| gaps.newest().is_some()).collect();
+    let rows: Vec<_> = kinds.iter().map(|(name, gaps)| quantiles(name, &gaps.values())).collect();
+    let curve = |&(name, gaps): &(&str, &super::Samples)| {
+        let points = gaps.points(start, seconds(report), PARTS).into_iter().map(|(x, gap)| (x, gap * 1000.0));
+        Curve { name: name.to_owned(), points: points.collect() }
+    };
+    let plot = over_time(report, "time between rounds", "ms since the round before", kinds.iter().map(curve).collect());
+    let text = shown(&plot) + &table(&QUANTILES, &rows);
+    section("Gaps", "Time between rounds as this node took them; upright lines are changes of leader.", &text)
+}
+
+fn reputations(report: &Report) -> String {
+    if report.reputations.is_empty() {
+        return section("Reputations", "None were published: the cell does not run VOTE, or nobody voted.", "");
+    }
+    let start = report.first.unwrap_or_default();
+    let curve = |(node, samples): (&ecod::names::NodeName, &super::Samples)| Curve {
+        name: node.to_string(),
+        points: samples.points(start, seconds(report), PARTS),
+    };
+    let curves: Vec<_> = report.reputations.iter().take(MOST_CURVES).map(curve).collect();
+    let newest = |(node, samples): (&ecod::names::NodeName, &super::Samples)| {
+        Some(vec![node.to_string(), format!("{:.3}", samples.newest()?)])
+    };
+    let rows: Vec<_> = report.reputations.iter().filter_map(newest).collect();
+    let text =
+        shown(&over_time(report, "reputations", "weight of votes", curves)) + &table(&["vehicle", "last"], &rows);
+    section("Reputations", "How far each vehicle's votes are trusted.", &text)
+}
+
+fn coverage(report: &Report) -> String {
+    let share = |contributed: u64| 100.0 * contributed as f64 / report.entries.max(1) as f64;
+    let shares: Vec<_> =
+        report.vehicles.iter().map(|(node, vehicle)| (node.to_string(), share(vehicle.contributed))).collect();
+    let rows: Vec<_> = report
+        .vehicles
+        .iter()
+        .map(|(node, vehicle)| {
+            let lasted = vehicle.last_at.since(vehicle.first_at.unwrap_or(vehicle.last_at)).as_secs_f64();
+            let rate =
+                if lasted > 0.0 { format!("{:.1}", (vehicle.reports as f64 - 1.0) / lasted) } else { "-".into() };
+            let objects = vehicle.objects as f64 / vehicle.reports.max(1) as f64;
+            let counts = [vehicle.reports.to_string(), rate, format!("{objects:.1}"), vehicle.contributed.to_string()];
+            [node.to_string()].into_iter().chain(counts).collect()
+        })
+        .collect();
+    let head = ["vehicle", "reports", "a second", "objects each", "entries contributed to"];
+    let text = if report.entries == 0 { String::new() } else { drawing(&bars("coverage per vehicle", &shares)) };
+    let about = "Share of the labelled entries of all maps that rest on a vehicle's detections; reports of all kinds, as \
+                 often as they came.";
+    section("Coverage", about, &(text + &table(&head, &rows)))
+}
+
+fn drops(report: &Report) -> String {
+    let Some((first, last)) = &report.counters else { return String::new() };
+    let before = |name: &str| losses(first).find(|(other, _)| *other == name).map_or(0, |(_, times)| times);
+    let rows: Vec<_> = losses(last)
+        .filter_map(|(name, times)| {
+            let lost = times.saturating_sub(before(name));
+            (lost > 0).then(|| vec![name.replace('_', " "), lost.to_string()])
+        })
+        .collect();
+    if rows.is_empty() {
+        return section("Drops", "Nothing was lost or refused while this was recorded.", "");
+    }
+    let points = report.losses.points(report.first.unwrap_or_default(), seconds(report), PARTS);
+    let curve = Curve { name: "lost or refused since the node began".into(), points };
+    let text = shown(&over_time(report, "drops", "lost or refused", vec![curve])) + &table(&["reason", "times"], &rows);
+    section("Drops", "What this node lost or refused, by reason.", &text)
+}
+
+fn over_time<'a>(report: &Report, title: &'a str, y_label: &'a str, curves: Vec<Curve>) -> Plot<'a> {
+    let start = report.first.unwrap_or_default();
+    let marks = report.reigns.iter().skip(1);
+    let marks = marks.map(|reign| (reign.first_at.since(start).as_secs_f64(), reign.epoch.to_string())).collect();
+    Plot { title, x_label: "s", y_label, curves, marks, x_max: Some(seconds(report)) }
+}
+
+/// The plot with its legend; nothing without points.
+fn shown(plot: &Plot<'_>) -> String {
+    if plot.curves.iter().all(|curve| curve.points.is_empty()) {
+        return String::new();
+    }
+    let key = |(index, curve): (usize, &Curve)| {
+        format!("<li><i class=\"{}\"></i>{}</li>\n", class(index), escape(&curve.name))
+    };
+    let keys: String = plot.curves.iter().enumerate().map(key).collect();
+    format!("<figure>\n{}<ul class=\"legend\">\n{keys}</ul>\n</figure>\n", drawing(&plot.draw()))
+}
+
+fn drawing(picture: &str) -> String {
+    format!("<div class=\"drawing\">{picture}</div>\n")
+}
+
+const QUANTILES: [&str; 6] = ["ms", "number", "p50", "p95", "p99", "max"];
+
+fn quantiles(name: &str, values: &[f64]) -> Vec<String> {
+    let shares = [0.5, 0.95, 0.99, 1.0];
+    let ms = |share| quantile(values, share).map_or("-".to_owned(), |value| format!("{:.1}", value * 1000.0));
+    [name.to_owned(), values.len().to_string()].into_iter().chain(shares.map(ms)).collect()
+}
+
+fn section(title: &str, about: &str, content: &str) -> String {
+    format!("<section>\n<h2>{title}</h2>\n<p>{about}</p>\n{content}</section>\n")
+}
+
+fn table(head: &[&str], rows: &[Vec<String>]) -> String {
+    let mut text = String::new();
+    let cell = |text: &mut String, tag: &str, content: &str| {
+        // Writing to a string does not fail.
+        let _ = write!(text, "<{tag}>{}</{tag}>", escape(content));
+    };
+    text.push_str("<div class=\"scroll\"><table>\n<thead><tr>");
+    head.iter().for_each(|content| cell(&mut text, "th", content));
+    text.push_str("</tr></thead>\n<tbody>\n");
+    for row in rows {
+        text.push_str("<tr>");
+        row.iter().for_each(|content| cell(&mut text, "td", content));
+        text.push_str("</tr>\n");
+    }
+    text.push_str("</tbody>\n</table></div>\n");
+    text
+}
+
+fn seconds(report: &Report) -> f64 {
+    report.last.since(report.first.unwrap_or(report.last)).as_secs_f64().max(1e-3)
+}
+
+fn span(report: &Report) -> String {
+    format!("{:.1} s", seconds(report))
+}
+
+fn clock(at: Timestamp) -> String {
+    let time = i64::try_from(at.micros()).ok().and_then(DateTime::from_timestamp_micros).unwrap_or_default();
+    time.format("%Y-%m-%d %H:%M:%S%.3f").to_string()
+}
+
+/// Text of others in HTML.
+fn escape(text: &(impl Display + ?Sized)) -> String {
+    text.to_string().replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+const STYLE: &str = include_str!("page.css");

@@ -1,0 +1,165 @@
+//! Plots as SVG that take their colours from the page.
+
+use svg::Document;
+use svg::node::element::{Group, Line, Polyline, Rectangle, Text, Title};
+
+/// A line of a plot.
+#[derive(Debug)]
+pub(super) struct Curve {
+    pub(super) name: String,
+    pub(super) points: Vec<(f64, f64)>,
+}
+
+/// Lines over a common axis.
+#[derive(Debug)]
+pub(super) struct Plot<'a> {
+    /// What it shows, for those who do not see it.
+    pub(super) title: &'a str,
+    pub(super) x_label: &'a str,
+    pub(super) y_label: &'a str,
+    pub(super) curves: Vec<Curve>,
+    /// Vertical lines and what happened there.
+    pub(super) marks: Vec<(f64, String)>,
+    /// Largest x that is shown, if not that of the points.
+    pub(super) x_max: Option<f64>,
+}
+
+/// How many colours the page has; further curves take the same ones dashed.
+pub(super) const COLOURS: usize = 6;
+
+const WIDTH: f64 = 720.0;
+const HEIGHT: f64 = 250.0;
+const LEFT: f64 = 56.0;
+const RIGHT: f64 = 12.0;
+const TOP: f64 = 26.0;
+const BOTTOM: f64 = 40.0;
+const BAR: f64 = 24.0;
+const TICKS: f64 = 6.0;
+
+impl Plot<'_> {
+    pub(super) fn draw(&self) -> String {
+        let points = || self.curves.iter().flat_map(|curve| &curve.points);
+        let x_max = self.x_max.unwrap_or_else(|| points().map(|point| point.0).fold(0.0, f64::max)).max(1e-9);
+        let y_max = points().filter(|point| point.0 <= x_max).map(|point| point.1).fold(0.0, f64::max).max(1e-9);
+        let (x_step, y_step) = (step(x_max), step(y_max * 1.05));
+        let y_max = (y_max / y_step).ceil() * y_step;
+        let x = |value: f64| LEFT + (WIDTH - LEFT - RIGHT) * value / x_max;
+        let y = |value: f64| HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * value / y_max;
+        let mut picture = picture(self.title, HEIGHT);
+        for value in ticks(y_step, y_max) {
+            picture = picture.add(line("grid", (LEFT, y(value)), (WIDTH - RIGHT, y(value))));
+            picture = picture.add(text("tick", "end", LEFT - 6.0, y(value) + 4.0, &number(value)));
+        }
+        for value in ticks(x_step, x_max) {
+            picture = picture.add(text("tick", "middle", x(value), HEIGHT - BOTTOM + 16.0, &number(value)));
+        }
+        picture = picture
+            .add(line("axis", (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)))
+            .add(text("label", "middle", (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 6.0, self.x_label))
+            .add(text("label", "start", 4.0, TOP - 12.0, self.y_label));
+        for (at, what) in &self.marks {
+            let mark = line("mark", (x(*at), TOP), (x(*at), HEIGHT - BOTTOM));
+            picture = picture.add(Group::new().add(mark).add(Title::new(what.as_str())));
+        }
+        for (index, curve) in self.curves.iter().enumerate() {
+            let shown = curve.points.iter().filter(|point| point.0 <= x_max);
+            let points: Vec<_> = shown.map(|point| format!("{:.1},{:.1}", x(point.0), y(point.1))).collect();
+            let title = Title::new(curve.name.as_str());
+            picture =
+                picture.add(Group::new().add(title).add(
+                    Polyline::new().set("class", format!("curve {}", class(index))).set("points", points.join(" ")),
+                ));
+        }
+        picture.to_string()
+    }
+}
+
+/// Shares in percent as bars.
+pub(super) fn bars(title: &str, shares: &[(String, f64)]) -> String {
+    let height = BAR * shares.len() as f64 + 8.0;
+    let (left, width) = (160.0, WIDTH - 160.0 - 60.0);
+    let mut picture = picture(title, height);
+    for (index, (name, share)) in shares.iter().enumerate() {
+        let y = 4.0 + BAR * index as f64;
+        let bar = Rectangle::new().set("class", "bar").set("x", left).set("y", y + 3.0).set("rx", 2);
+        picture = picture
+            .add(text("tick", "end", left - 8.0, y + BAR / 2.0 + 4.0, name))
+            .add(bar.set("width", format!("{:.1}", width * (share / 100.0).clamp(0.0, 1.0))).set("height", BAR - 6.0))
+            .add(text(
+                "tick",
+                "start",
+                left + width * share / 100.0 + 6.0,
+                y + BAR / 2.0 + 4.0,
+                &format!("{share:.1} %"),
+            ));
+    }
+    picture.to_string()
+}
+
+/// The class of a curve, for its colour.
+pub(super) fn class(index: usize) -> String {
+    let dashed = if index / COLOURS % 2 == 1 { " dashed" } else { "" };
+    format!("c{}{dashed}", index % COLOURS)
+}
+
+fn picture(title: &str, height: f64) -> Document {
+    let document = Document::new().set("viewBox", (0.0, 0.0, WIDTH, height)).set("role", "img");
+    document.set("aria-label", title).set("preserveAspectRatio", "xMinYMin meet")
+}
+
+fn line(class: &str, from: (f64, f64), to: (f64, f64)) -> Line {
+    let round = |value: f64| format!("{value:.1}");
+    let line = Line::new().set("class", class).set("x1", round(from.0)).set("y1", round(from.1));
+    line.set("x2", round(to.0)).set("y2", round(to.1))
+}
+
+fn text(class: &str, anchor: &str, x: f64, y: f64, content: &str) -> Text {
+    let text = Text::new(content).set("class", class).set("text-anchor", anchor);
+    text.set("x", format!("{x:.1}")).set("y", format!("{y:.1}"))
+}
+
+/// 1, 2 or 5 times a power of ten, so that an axis has a handful of ticks.
+fn step(max: f64) -> f64 {
+    let rough = max / TICKS;
+    let power = 10f64.powf(rough.log10().floor());
+    [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|step| *step >= rough).unwrap_or(10.0 * power)
+}
+
+fn ticks(step: f64, max: f64) -> impl Iterator<Item = f64> {
+    (0..=(max / step + 1e-6) as u32).map(move |n| f64::from(n) * step)
+}
+
+/// As many digits as a tick needs.
+pub(super) fn number(value: f64) -> String {
+    let rounded = format!("{value:.4}");
+    let short = rounded.trim_end_matches('0').trim_end_matches('.');
+    if short.is_empty() { "0".into() } else { short.into() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn axes_have_a_handful_of_round_ticks() {
+        for (max, expected) in [(1.0, 0.2), (0.07, 0.02), (3600.0, 1000.0), (59.0, 10.0)] {
+            assert!((step(max) - expected).abs() < 1e-12, "{max}: {}", step(max));
+            assert!((3..=8).contains(&ticks(step(max), max).count()), "{max}");
+        }
+        assert_eq!([0.0, 0.2, 1000.0].map(number), ["0", "0.2", "1000"]);
+    }
+
+    #[test]
+    fn a_plot_is_well_formed_whatever_it_is_given() {
+        let curve = |points: Vec<(f64, f64)>| Curve { name: "<a & b>".into(), points };
+        for points in [vec![], vec![(0.0, 0.0)], vec![(0.0, 1.0), (5.0, 2.0)]] {
+            let marks = vec![(1.0, "new \"leader\" <x>".into())];
+            let curves = vec![curve(points)];
+            let plot = Plot { title: "t & u", x_label: "s", y_label: "ms", curves, marks, x_max: None };
+            let drawn = plot.draw();
+            let document = roxmltree::Document::parse(&drawn).unwrap_or_else(|error| panic!("{error}: {drawn}"));
+            assert!(!drawn.contains("NaN") && document.descendants().any(|node| node.has_tag_name("polyline")));
+        }
+        assert!(roxmltree::Document::parse(&bars("b", &[("a<b".into(), 120.0)])).is_ok());
+    }
+}

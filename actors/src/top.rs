@@ -1,0 +1,289 @@
+//! A cell in a terminal: who leads, what is where, who is trusted, what was lost. Drawn from what an observer knows.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{Reputations, Role, Verdicts};
+use ratatui::Frame;
+use ratatui::layout::{Constraint, Layout};
+use ratatui::style::{Style, Stylize};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Block, Paragraph, Row, Table};
+
+use crate::counters::CounterSnapshot;
+use crate::follower::{Received, ReceivedMap};
+use crate::leader_election::Leadership;
+use crate::membership::Member;
+use crate::node::NodeHandle;
+
+/// Age beyond which a map is no longer to be relied on.
+const STALE: Duration = Duration::from_secs(1);
+
+/// Leaderships that are remembered.
+const HISTORY: usize = 5;
+
+/// What is known of a cell at one moment.
+#[derive(Debug)]
+pub struct View {
+    /// The cell's name.
+    pub cell: NodeName,
+    /// The present time.
+    pub now: Timestamp,
+    /// Who leads.
+    pub leadership: Leadership,
+    /// Leaderships whose maps came, and since when; the newest last.
+    pub history: VecDeque<(Epoch, Timestamp)>,
+    /// The other nodes.
+    pub members: Vec<Member>,
+    /// The newest map.
+    pub map: Option<ReceivedMap>,
+    /// The newest verdicts.
+    pub verdicts: Option<Received<Verdicts>>,
+    /// The newest reputations.
+    pub reputations: Option<Received<Reputations>>,
+    /// The observer's counters.
+    pub counters: CounterSnapshot,
+}
+
+impl View {
+    /// What `node` knows; `before` hands on the history.
+    pub fn of(node: &NodeHandle, cell: &NodeName, before: Option<Self>, now: Timestamp) -> Self {
+        let mut view = Self {
+            cell: cell.clone(),
+            now,
+            leadership: node.leadership().borrow().clone(),
+            history: before.map(|before| before.history).unwrap_or_default(),
+            members: node.members().borrow().clone(),
+            map: node.newest_map().borrow().clone(),
+            verdicts: node.newest_verdicts().borrow().clone(),
+            reputations: node.newest_reputations().borrow().clone(),
+            counters: node.counters().snapshot(),
+        };
+        view.remember();
+        view
+    }
+
+    /// Takes note of who made the newest map.
+    fn remember(&mut self) {
+        let Some(received) = &self.map else { return };
+        let epoch = Epoch::new(received.map.epoch, received.map.aggregator.clone());
+        if self.history.back().is_none_or(|(newest, _)| *newest != epoch) {
+            self.history.push_back((epoch, received.received_at));
+        }
+        while self.history.len() > HISTORY {
+            self.history.pop_front();
+        }
+    }
+
+    fn age(&self) -> Option<Duration> {
+        self.map.as_ref().map(|received| self.now.since(received.received_at))
+    }
+}
+
+/// Draws the cell.
+pub fn draw(frame: &mut Frame<'_>, view: &View) {
+    let [head, places, below, foot] =
+        Layout::vertical([Constraint::Length(4), Constraint::Min(5), Constraint::Length(9), Constraint::Length(1)])
+            .areas(frame.area());
+    let [nodes, losses] = Layout::horizontal([Constraint::Percentage(60), Constraint::Percentage(40)]).areas(below);
+    frame.render_widget(summary(view), head);
+    frame.render_widget(landmarks(view), places);
+    frame.render_widget(vehicles(view), nodes);
+    frame.render_widget(counted(view), losses);
+    frame.render_widget(Line::from(" q quits").dim(), foot);
+}
+
+fn summary(view: &View) -> Paragraph<'_> {
+    let leader = match (view.leadership.leader(), &view.leadership.epoch) {
+        (Some(leader), Some(epoch)) => {
+            let since = view.history.back().filter(|(newest, _)| newest == epoch);
+            let since = since.map_or_else(String::new, |(_, at)| format!(" for {}", span(view.now.since(*at))));
+            let standby = view.leadership.standby.as_ref().map_or_else(String::new, |name| format!(", next {name}"));
+            Span::from(format!("{leader} leads in term {}{since}{standby}", epoch.term)).bold()
+        }
+        _ => Span::from("nobody leads").bold().red(),
+    };
+    let freshness = match view.age() {
+        Some(age) if age <= STALE => Span::from(format!("map {} ms old", age.as_millis())).green(),
+        Some(age) => Span::from(format!("STALE: no map for {}", span(age))).bold().red(),
+        None => Span::from("no map yet").yellow(),
+    };
+    let before: Vec<_> = view.history.iter().rev().skip(1).map(|(epoch, _)| epoch.to_string()).collect();
+    let before = if before.is_empty() { String::new() } else { format!("  before: {}", before.join(", ")) };
+    let lines = vec![Line::from(vec![leader, "  ".into(), freshness]), Line::from(before).dim()];
+    Paragraph::new(lines).block(Block::bordered().title(format!(" cell {} ", view.cell)))
+}
+
+fn landmarks(view: &View) -> Table<'_> {
+    let verdicts = view.verdicts.as_ref().map(|received| &received.message.verdicts);
+    let verdict = |id: &str| verdicts?.iter().find(|verdict| verdict.landmark == *id);
+    let mut rows = Vec::new();
+    for entry in view.map.iter().flat_map(|received| &received.map.landmarks) {
+        let voted = verdict(&entry.id).map_or([String::new(), String::new()], |verdict| {
+            [verdict.label.as_deref().unwrap_or("-").to_owned(), format!("{:.2}", verdict.margin)]
+        });
+        let [label, margin] = voted;
+        rows.push(Row::new([
+            entry.id.to_string(),
+            entry.label.as_deref().unwrap_or("-").to_owned(),
+            format!("{:.2}", entry.confidence),
+            label,
+            margin,
+            listed(&entry.contributors),
+        ]));
+    }
+    let mapped = |id: &str| view.map.iter().flat_map(|received| &received.map.landmarks).any(|entry| entry.id == *id);
+    for verdict in verdicts.into_iter().flatten().filter(|verdict| !mapped(&verdict.landmark)) {
+        rows.push(Row::new([
+            verdict.landmark.to_string(),
+            String::new(),
+            String::new(),
+            verdict.label.as_deref().unwrap_or("-").to_owned(),
+            format!("{:.2}", verdict.margin),
+            listed(&verdict.contributors),
+        ]));
+    }
+    let widths = [16, 16, 6, 16, 7].map(Constraint::Length).into_iter().chain([Constraint::Fill(1)]);
+    let head = Row::new(["location", "map", "conf.", "verdict", "margin", "by"]).style(Style::new().bold());
+    Table::new(rows, widths).header(head).block(Block::bordered().title(" what is where "))
+}
+
+fn vehicles(view: &View) -> Table<'_> {
+    let reputations = view.reputations.as_ref().map(|received| &received.message.reputations);
+    let rows = view.members.iter().map(|member| {
+        let role = match member.role {
+            Role::Auto => "auto",
+            Role::Cav => "cav",
+            Role::Edge => "edge",
+        };
+        let part = match &view.leadership {
+            it if it.leader() == Some(&member.name) => "leads",
+            it if it.standby.as_ref() == Some(&member.name) => "next",
+            _ => "",
+        };
+        let reputation = reputations.and_then(|reputations| reputations.get(&member.name));
+        let reputation =
+            reputation.map_or_else(String::new, |it| format!("{:.2} {}+ {}-", it.score, it.correct, it.incorrect));
+        Row::new([member.name.to_string(), role.to_owned(), part.to_owned(), reputation])
+    });
+    let widths = [Constraint::Fill(1), Constraint::Length(5), Constraint::Length(6), Constraint::Length(20)];
+    let head = Row::new(["node", "role", "", "reputation"]).style(Style::new().bold());
+    Table::new(rows, widths).header(head).block(Block::bordered().title(format!(" {} nodes ", view.members.len())))
+}
+
+fn counted(view: &View) -> Table<'_> {
+    const SHOWN: [&str; 5] = ["inbox_full", "publish_refused", "disconnected", "connect_failed", "record_dropped"];
+    let events = view.counters.events.iter().filter(|(name, _)| SHOWN.contains(name));
+    let counts = events.chain(&view.counters.rejects).filter(|(_, times)| **times > 0);
+    let rows: Vec<_> = counts.map(|(name, times)| Row::new([name.replace('_', " "), times.to_string()])).collect();
+    let title = if rows.is_empty() { " nothing lost here " } else { " lost here " };
+    Table::new(rows, [Constraint::Fill(1), Constraint::Length(10)]).block(Block::bordered().title(title))
+}
+
+fn listed(nodes: &[NodeName]) -> String {
+    nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(" ")
+}
+
+fn span(time: Duration) -> String {
+    match time.as_secs() {
+        seconds @ 0..120 => format!("{seconds} s"),
+        seconds @ 120..7200 => format!("{} min", seconds / 60),
+        seconds => format!("{} h", seconds / 3600),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ecod::wire::{GlobalMap, LandmarkState, SCHEMA_VERSION};
+    use ratatui::Terminal;
+    use ratatui::backend::TestBackend;
+
+    use super::*;
+    use crate::counters::Counters;
+    use crate::leader_election::Position;
+
+    fn name(text: &str) -> NodeName {
+        NodeName::new(text).unwrap()
+    }
+
+    fn view(now: Timestamp) -> View {
+        let entry = LandmarkState {
+            id: "slot-0".into(),
+            label: Some("car".into()),
+            confidence: 0.93,
+            x_m: 0.0,
+            y_m: 0.0,
+            contributors: vec![name("gauss")],
+            observers: Vec::new(),
+        };
+        let map: GlobalMap = serde_json::from_value(serde_json::json!({
+            "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0,
+            "landmarks": [entry], "objects": []
+        }))
+        .unwrap();
+        let epoch = Epoch::new(4, name("euclid"));
+        let mut view = View {
+            cell: name("lot-1"),
+            now,
+            leadership: Leadership { position: Position::Following, epoch: Some(epoch), standby: Some(name("gauss")) },
+            history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
+            members: vec![Member {
+                name: name("gauss"),
+                run: 0,
+                gossip: "127.0.0.1:1".parse().unwrap(),
+                broker: None,
+                role: Role::Auto,
+            }],
+            map: Some(ReceivedMap { received_at: Timestamp(7_000_000), map: Arc::new(map) }),
+            verdicts: None,
+            reputations: None,
+            counters: Counters::default().snapshot(),
+        };
+        view.remember();
+        view
+    }
+
+    fn shown(view: &View, width: u16, height: u16) -> String {
+        let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
+        terminal.draw(|frame| draw(frame, view)).unwrap();
+        terminal.backend().to_string()
+    }
+
+    #[test]
+    fn the_leader_the_places_and_the_nodes_are_seen() {
+        let text = shown(&view(Timestamp(7_200_000)), 100, 30);
+        for part in [
+            "cell lot-1",
+            "euclid leads in term 4",
+            "next gauss",
+            "map 200 ms old",
+            "slot-0",
+            "car",
+            "0.93",
+            "before: edge@3",
+        ] {
+            assert!(text.contains(part), "{part}: {text}");
+        }
+        assert!(text.contains("nothing lost here") && !text.contains("STALE"), "{text}");
+    }
+
+    #[test]
+    fn an_old_map_is_not_passed_off_as_fresh() {
+        assert!(shown(&view(Timestamp(12_000_000)), 100, 30).contains("STALE: no map for 5 s"));
+        let alone = View { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
+        let text = shown(&alone, 100, 30);
+        assert!(text.contains("nobody leads") && text.contains("no map yet"), "{text}");
+    }
+
+    #[test]
+    fn a_small_terminal_is_no_trouble() {
+        for (width, height) in [(1, 1), (20, 5), (40, 12)] {
+            shown(&view(Timestamp(0)), width, height);
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! Logs that are cut short, damaged, or of another version, and other readers.
+
+use std::collections::BTreeMap;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use ecod::replay::ReplayConfig;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{WriteOptions, Writer};
+use tempfile::TempDir;
+
+/// A log of two reports, with this version and one more channel.
+fn log(version: u64) -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    let mut writer: Writer<_> = WriteOptions::new().compression(None).create(&mut bytes).unwrap();
+    let fusion = serde_json::to_string(&ReplayConfig::default().fusion).unwrap();
+    let metadata = [
+        ("log", version.to_string()),
+        ("node", "gauss".into()),
+        ("cell", "cell".into()),
+        ("run", uuid::Uuid::nil().to_string()),
+        ("version", env!("CARGO_PKG_VERSION").into()),
+        ("fusion", fusion),
+        ("landmarks", "[]".into()),
+    ];
+    let metadata: BTreeMap<_, _> = metadata.map(|(key, value)| (key.to_owned(), value)).into();
+    writer.write_metadata(&Metadata { name: "ecod.log".into(), metadata }).unwrap();
+    let mut channel = |schema: &str, topic: &str| {
+        let schema = writer.add_schema(schema, "jsonschema", b"{}").unwrap();
+        writer.add_channel(schema, topic, "json", &BTreeMap::new()).unwrap()
+    };
+    let (reports, tea) = (channel("ecod.ObjectReport", "detections/a"), channel("ecod.Tea", "tea"));
+    for (second, channel_id) in [(1, reports), (2, tea), (3, reports)] {
+        let micros: u64 = 1_732_154_400_000_000 + second * 1_000_000;
+        let report = format!(
+            r#"{{"schema":1,"node":"a","seq":{second},"captured_at_us":{micros},"pose":null,
+            "objects":[{{"label":"car","confidence":0.9,"x_m":1.0,"y_m":2.0,"landmark":"slot-0"}}]}}"#
+        );
+        let time = micros * 1000;
+        let header = MessageHeader { channel_id, sequence: second as u32, log_time: time, publish_time: time };
+        writer.write_to_known_channel(&header, report.as_bytes()).unwrap();
+        writer.flush().unwrap();
+    }
+    writer.finish().unwrap();
+    drop(writer);
+    bytes.into_inner()
+}
+
+fn file(folder: &TempDir, name: &str, bytes: &[u8]) -> PathBuf {
+    let path = folder.path().join(name);
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+/// The code with which a replay ends, the number of lines it writes, and what it says.
+fn replay(inputs: &[&Path]) -> (i32, usize, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+    command.args(["replay", "--output", "-"]);
+    for input in inputs {
+        command.arg("--input").arg(input);
+    }
+    let run = command.output().unwrap();
+    let lines = run.stdout.iter().filter(|byte| **byte == b'\n').count();
+    (run.status.code().unwrap(), lines, String::from_utf8(run.stderr).unwrap())
+}
+
+#[test]
+fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
+    let folder = TempDir::new().unwrap();
+    let whole = log(1);
+    let (code, lines, said) = replay(&[&file(&folder, "whole.mcap", &whole)]);
+    assert!(code == 0 && lines > 10 && said.contains("2 lines, 2 used"), "{code} {lines} {said}");
+    assert!(said.contains("1 messages of \"ecod.Tea\" are not known"), "{said}");
+
+    let (code, _, said) = replay(&[&file(&folder, "newer.mcap", &log(7))]);
+    assert!(code == 0 && said.contains("newer.mcap has version 7 of the log, this program knows 1"), "{said}");
+    assert!(said.contains("2 lines, 2 used"), "{said}");
+
+    let second = whole.windows(8).rposition(|bytes| bytes == b"captured").unwrap();
+    let (code, lines, said) = replay(&[&file(&folder, "cut.mcap", &whole[..second])]);
+    assert!(code == 0 && lines > 0 && said.contains("cut.mcap was not finished"), "{code} {lines} {said}");
+    assert!(said.contains("1 lines, 1 used"), "{said}");
+
+    let mut damaged = whole.clone();
+    damaged[second..second + 20].fill(0xff);
+    let (code, _, said) = replay(&[&file(&folder, "damaged.mcap", &damaged)]);
+    assert!(code == 0 && said.contains("damaged.mcap is damaged"), "{said}");
+
+    for length in 0..whole.len() {
+        let reader = ecod_actors::recorder::LogReader::open(&file(&folder, "any.mcap", &whole[..length])).unwrap();
+        assert!(reader.take(1000).count() < 1000, "cut at {length}, reading ends");
+    }
+}
+
+#[test]
+fn what_is_no_log_is_refused_by_name() {
+    let folder = TempDir::new().unwrap();
+    let (one, lines) = (file(&folder, "one.mcap", &log(1)), file(&folder, "lines.jsonl", b"{}\n"));
+    let (code, _, said) = replay(&[&one, &lines]);
+    assert!(code == 2 && said.contains("lines.jsonl is not a log"), "{said}");
+    let (code, _, said) = replay(&[Path::new("/no/such.mcap")]);
+    assert!(code == 2 && said.contains("/no/such.mcap"), "{said}");
+    let empty = TempDir::new().unwrap();
+    let (code, _, said) = replay(&[empty.path()]);
+    assert!(code == 2 && said.contains("no log in"), "{said}");
+}
+
+/// The Python reader that everybody has agrees on what is in a log.
+#[test]
+fn the_python_reader_reads_a_log() {
+    let python = std::env::var("MCAP_PYTHON").unwrap_or("python3".into());
+    if !Command::new(&python).args(["-c", "import mcap"]).output().is_ok_and(|output| output.status.success()) {
+        eprintln!(
+            "SKIPPED: {python} has no package mcap; `make recording-check` installs it in a directory of its own"
+        );
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let log = file(&folder, "log.mcap", &log(1));
+    let script = "import json, sys; from mcap.reader import make_reader\n\
+        for schema, channel, message in make_reader(open(sys.argv[1], 'rb')).iter_messages():\n \
+        print(schema.name, channel.topic, message.log_time, json.loads(message.data)['seq'])";
+    let run = Command::new(python).args(["-c", script]).arg(log).output().unwrap();
+    let said = String::from_utf8_lossy(&run.stdout).into_owned() + &String::from_utf8_lossy(&run.stderr);
+    let lines: Vec<_> = said.lines().collect();
+    assert_eq!(lines.len(), 3, "{said}");
+    assert_eq!(lines[0], "ecod.ObjectReport detections/a 1732154401000000000 1");
+}
+
+#[test]
+fn a_report_is_one_page_with_everything_in_it() {
+    let folder = TempDir::new().unwrap();
+    let (log, page) = (file(&folder, "log.mcap", &log(1)), folder.path().join("report.html"));
+    let truth = file(&folder, "truth.json", br#"{"landmarks": {"slot-0": "car"}}"#);
+    let report = |log: &Path| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+        command.arg("report").arg(log).arg("--truth").arg(&truth).arg("-o").arg(&page).output().unwrap()
+    };
+    let run = report(&log);
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(html.contains("Log of gauss") && html.contains("prefers-color-scheme: dark"));
+    assert!(["<script", "src=", "href=", "url("].iter().all(|part| !html.contains(part)), "self-contained");
+    assert!(String::from_utf8_lossy(&run.stderr).contains("ecod.Tea"));
+    let run = report(&file(&folder, "not.mcap", b"{}"));
+    assert_eq!(run.status.code(), Some(2));
+}
+
+#[test]
+fn the_doctor_says_what_is_broken_by_its_exit_code_and_as_json() {
+    let folder = TempDir::new().unwrap();
+    let config = |name: &str, more: &str| {
+        let text = format!(
+            "role = \"edge\"\nlisten = \"127.0.0.1:0\"\n{more}\n[membership]\nbind = \"127.0.0.1:0\"\nmulticast.enabled = false\n"
+        );
+        file(&folder, name, text.as_bytes())
+    };
+    let doctor = |config: &Path, json: bool| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+        command.arg("doctor").arg("--config").arg(config).args(json.then_some("--json")).output().unwrap()
+    };
+    let sound = doctor(&config("sound.toml", ""), false);
+    let text = String::from_utf8_lossy(&sound.stdout).into_owned();
+    assert!(sound.status.success() && text.contains("ok    broker port"), "{text}");
+    let broken = doctor(&config("broken.toml", "state_dir = \"/proc/no/such\""), true);
+    assert_eq!(broken.status.code(), Some(1));
+    let findings: serde_json::Value = serde_json::from_slice(&broken.stdout).unwrap();
+    let state = findings.as_array().unwrap().iter().find(|finding| finding["check"] == "state directory").unwrap();
+    assert_eq!(state["verdict"], "broken");
+    assert!(state["fix"].as_str().unwrap().contains("state_dir"));
+    assert_eq!(doctor(&config("typo.toml", "stat_dir = \"x\""), false).status.code(), Some(2));
+}

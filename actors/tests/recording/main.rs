@@ -1,0 +1,134 @@
+//! Logs of live cells: what is in them, what outlives the process, and that they run again as it was.
+
+mod cell;
+mod disk;
+mod files;
+
+use std::collections::BTreeMap;
+use std::process::Command;
+use std::time::Duration;
+
+use ecod::replay::FusedLine;
+use ecod::wire::Role;
+use ecod_actors::recorder::SchemaName;
+
+use cell::{Cell, Log, name};
+
+/// The lines that a replay of a node's log writes, and what it says.
+fn replay(log: &std::path::Path) -> (Vec<FusedLine>, String) {
+    let arguments = ["replay", "--input", log.to_str().unwrap(), "--output", "-"];
+    let run = Command::new(env!("CARGO_BIN_EXE_ecod-node")).args(arguments).output().unwrap();
+    let said = String::from_utf8(run.stderr).unwrap();
+    assert!(run.status.success(), "{said}");
+    let lines = run.stdout.split(|byte| *byte == b'\n').filter(|line| !line.is_empty());
+    (lines.map(|line| serde_json::from_slice(line).unwrap()).collect(), said)
+}
+
+/// Whose line it is, of which term and round, and whether it is a map.
+fn key(line: &FusedLine) -> (String, u64, u64, bool) {
+    match line {
+        FusedLine::Map(map) => (map.aggregator.to_string(), map.epoch, map.round, true),
+        FusedLine::Verdicts(verdicts) => (verdicts.aggregator.to_string(), verdicts.epoch, verdicts.round, false),
+    }
+}
+
+fn by_key(lines: &[FusedLine]) -> BTreeMap<(String, u64, u64, bool), String> {
+    lines.iter().map(|line| (key(line), serde_json::to_string(line).unwrap())).collect()
+}
+
+/// Every map and verdict of every leader comes out of its log again, to the last bit, across a failover and back.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_every_leader_made_is_made_again_from_its_log() {
+    let mut cell = Cell::default();
+    for (node, role) in [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Auto)] {
+        cell.start(node, role).await;
+    }
+    cell.served_by("edge").await;
+    cell.drive(Duration::from_secs(3)).await;
+    cell.kill("edge");
+    let substitute = cell.served_by_another_than("edge").await;
+    cell.drive(Duration::from_secs(2)).await;
+    cell.start("edge", Role::Edge).await;
+    cell.served_by("edge").await;
+    cell.drive(Duration::from_secs(2)).await;
+    let directory = cell.stop().await;
+
+    let mut leaders = Vec::new();
+    for node in ["edge", "euclid", "gauss"] {
+        let dir = directory.path().join(node);
+        let recorded = Log::read(&dir);
+        let own: Vec<_> = recorded.fused().into_iter().filter(|line| key(line).0 == node).collect();
+        let (again, said) = replay(&dir);
+        let (own, again) = (by_key(&own), by_key(&again));
+        for (key, line) in &own {
+            assert_eq!(again.get(key), Some(line), "{node}: {key:?}\n{said}");
+        }
+        // A killed node has made rounds that it had no time to write down, and the other way round.
+        let more = again.keys().filter(|key| !own.contains_key(*key)).count();
+        assert!(more <= 20, "{node}: {more} rounds of {} were not recorded", again.len());
+        assert!(!said.contains("missing") && !said.contains("middle"), "{said}");
+        if !own.is_empty() {
+            assert!(own.values().any(|line| line.contains("\"euclid\"")), "{node} fused reports");
+            leaders.push(node);
+        }
+        eprintln!("{node}: {} recorded, {} made again", own.len(), again.len());
+    }
+    assert!(leaders.contains(&"edge") && leaders.contains(&&*substitute), "{leaders:?}");
+}
+
+/// An observer's log has what all of the cell said, and the reports in it can be fused.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_observer_records_what_all_say() {
+    let mut cell = Cell::default();
+    cell.start("edge", Role::Edge).await;
+    cell.start("euclid", Role::Auto).await;
+    cell.served_by("edge").await;
+    let dir = cell.directory().join("observer");
+    let seed = cell.node("edge").gossip_address().unwrap().to_string();
+    let config = cell.directory().join("edge.toml");
+    std::fs::write(&config, toml::to_string(&cell.config("edge", Role::Edge)).unwrap()).unwrap();
+    let arguments = ["record", "--config", config.to_str().unwrap(), "--dir", dir.to_str().unwrap(), "--seed", &seed];
+    let observer = Command::new(env!("CARGO_BIN_EXE_ecod-node")).args(arguments).spawn().unwrap();
+    let mut observer = disk::Process(observer);
+    cell.until("the observer takes part", |cell| {
+        cell.node("edge")
+            .members()
+            .borrow()
+            .iter()
+            .any(|member| member.name.as_str().starts_with("recorder-"))
+            .then_some(())
+    })
+    .await;
+    cell.drive(Duration::from_secs(4)).await;
+    observer.terminate();
+    let _directory = cell.stop().await;
+
+    let log = Log::read(&dir);
+    for schema in [
+        SchemaName::ObjectReport,
+        SchemaName::GlobalMap,
+        SchemaName::Verdicts,
+        SchemaName::Reputations,
+        SchemaName::NodeStatus,
+        SchemaName::Leadership,
+        SchemaName::Counters,
+        SchemaName::SceneUpdate,
+        SchemaName::FrameTransform,
+        SchemaName::Log,
+    ] {
+        assert!(log.count(schema) > 0, "{schema:?}");
+    }
+    assert_eq!(log.count(SchemaName::JournalEntry), 0);
+    assert!(log.problems.is_empty(), "{:?}", log.problems);
+    let (lines, said) = replay(&dir);
+    let labels = |line: &FusedLine| match line {
+        FusedLine::Map(map) => map.landmarks[0].label.clone(),
+        FusedLine::Verdicts(verdicts) => verdicts.verdicts[0].label.clone(),
+    };
+    assert!(
+        lines.len() > 20 && lines.iter().filter(|line| labels(line).as_deref() == Some("car")).count() > 20,
+        "{said}"
+    );
+    assert!(lines.iter().all(|line| key(line).0.starts_with("recorder-")));
+    assert_eq!(log.identity.unwrap().cell, name("cell"));
+}

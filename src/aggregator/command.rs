@@ -1,0 +1,63 @@
+//! What an aggregator is told beside reports, as values: whoever keeps them, the reports, and the times of both can run
+//! it again.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::{Aggregator, Fused};
+use crate::epoch::Epoch;
+use crate::names::NodeName;
+use crate::reputation::ReputationLedger;
+use crate::round::FirstRound;
+use crate::time::Timestamp;
+use crate::wire::Reputation;
+
+/// Something an aggregator is told; see the method of the same name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Command {
+    /// [`Aggregator::tick`].
+    Tick,
+    /// [`Aggregator::lead`].
+    Lead {
+        /// The leadership.
+        epoch: Epoch,
+        /// Number of the next round.
+        first_round: u64,
+        /// When it is due.
+        first: FirstRound,
+    },
+    /// [`Aggregator::hold`].
+    Hold,
+    /// [`Aggregator::stand_by`].
+    StandBy,
+    /// [`Aggregator::adopt`].
+    Adopt {
+        /// All evidence that is known.
+        #[schemars(with = "serde_json::Value")]
+        ledger: Arc<ReputationLedger>,
+    },
+    /// [`Aggregator::resume`].
+    Resume {
+        /// The reputations.
+        reputations: BTreeMap<NodeName, Reputation>,
+    },
+}
+
+impl Aggregator {
+    /// Does what it is told at `now`; returns what came of the round if that closes it.
+    pub fn command(&mut self, command: &Command, now: Timestamp) -> Option<Fused> {
+        match command {
+            Command::Tick => return self.tick(now),
+            Command::Lead { epoch, first_round, first } => self.lead(epoch.clone(), *first_round, *first, now),
+            Command::Hold => self.hold(),
+            Command::StandBy => self.stand_by(),
+            Command::Adopt { ledger } => self.adopt(ledger),
+            Command::Resume { reputations } => self.resume(reputations),
+        }
+        None
+    }
+}
