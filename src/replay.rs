@@ -234,10 +234,11 @@ impl Replay {
         let silent_from = before + SILENCE.max(3 * period);
         while let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline) {
             let patience = if self.pending { Duration::ZERO } else { period / 2 };
-            if deadline + patience >= now || deadline > silent_from {
+            let due = deadline.max(before);
+            if due + patience >= now || deadline > silent_from {
                 break;
             }
-            self.tick(deadline.max(before), output);
+            self.tick(due, output);
         }
     }
 

@@ -9,6 +9,7 @@ use super::Tracker;
 use super::align::Pair;
 use super::assignment::{Pairing, assign};
 use super::calibration::log_odds;
+use super::config::TracksConfig;
 use super::evidence::Rates;
 use super::motion::Measurement;
 use super::source::Source;
@@ -197,8 +198,7 @@ impl Tracker {
             source.view.learn(&seen.reported, was_hit, true);
         }
         track.motion.update(at, &seen.measurement, density);
-        describe(track, source, seen, at);
-        track.motion.limit_speed(config.max_speed_mps);
+        describe(track, source, seen, at, config);
         if let Some(log_odds) = last {
             source.calibration.learn(log_odds, true);
         }
@@ -266,7 +266,7 @@ impl Tracker {
     fn found(&mut self, taking: &Taking<'_>, seen: &Seen<'_>) {
         let (number, at) = (taking.number, taking.at);
         let mut track = Track::new(founding_id(taking.report, seen.index), at, &seen.measurement, &self.config);
-        describe(&mut track, taking.source, seen, at);
+        describe(&mut track, taking.source, seen, at, &self.config);
         let nats = taking.source.calibration.nats(seen.object.confidence);
         let witness = track.witness(number, at);
         witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
@@ -276,11 +276,12 @@ impl Tracker {
 }
 
 /// Takes over what a detection says beside its place.
-fn describe(track: &mut Track, source: &Source, seen: &Seen<'_>, at: Timestamp) {
+fn describe(track: &mut Track, source: &Source, seen: &Seen<'_>, at: Timestamp, config: &TracksConfig) {
     if let Some([x, y]) = seen.object.velocity_mps {
         let velocity = source.alignment.turned(&Vector2::new(x, y));
         track.motion.update_velocity(velocity, VELOCITY_SIGMA_MPS);
     }
+    track.motion.limit_speed(config.max_speed_mps);
     let heading_rad = seen.object.heading_rad.map(|heading_rad| source.alignment.correct_heading(heading_rad));
     track.describe(seen.object, heading_rad);
     track.refresh(at);

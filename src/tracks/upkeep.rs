@@ -129,6 +129,7 @@ impl Tracker {
                     if let Some([x, y]) = object.velocity_mps {
                         track.motion.update_velocity(Vector2::new(x, y), 1.0);
                     }
+                    track.motion.limit_speed(self.config.max_speed_mps);
                     track.inherit(object, now);
                     self.add(track);
                 }
