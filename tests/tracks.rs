@@ -5,6 +5,7 @@ use ecod::epoch::Epoch;
 use ecod::landmark::Landmark;
 use ecod::names::NodeName;
 use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
+use ecod::round::FirstRound;
 use ecod::time::Timestamp;
 use ecod::tracks::{TracksConfig, TracksMode};
 use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, ReportKind, encode};
@@ -99,7 +100,7 @@ fn beside_known_locations_only_the_rest_is_tracked_and_only_if_asked_for() {
 fn a_standby_leads_on_with_the_same_identities() {
     let open = || Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(START));
     let (mut leader, mut standby) = (open(), open());
-    leader.lead(Epoch::new(1, NodeName::from_static("edge")), 1, true, Timestamp(START));
+    leader.lead(Epoch::new(1, NodeName::from_static("edge")), 1, FirstRound::OnTime, Timestamp(START));
     let mut map = None;
     for frame in 1..30 {
         let now = Timestamp(START + frame * 100_000);
@@ -109,7 +110,7 @@ fn a_standby_leads_on_with_the_same_identities() {
         }
     }
     let now = Timestamp(START + 3_000_000);
-    standby.lead(Epoch::new(2, NodeName::from_static("gauss")), 30, false, now);
+    standby.lead(Epoch::new(2, NodeName::from_static("gauss")), 30, FirstRound::Overdue, now);
     let next = standby.tick(now).unwrap().map.unwrap();
     let ids = |map: &GlobalMap| map.objects.iter().map(|object| object.id).collect::<Vec<_>>();
     assert_eq!(ids(&next), ids(&map.unwrap()));
