@@ -13,6 +13,8 @@
 
 mod command;
 mod config;
+#[cfg(test)]
+mod tests;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -27,6 +29,7 @@ use crate::pace::Pace;
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
+use crate::tracks::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::window::ReportWindow;
 use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
@@ -42,7 +45,7 @@ pub struct Fused {
     pub map: Option<GlobalMap>,
     /// What VOTE made of it, if the cell runs VOTE; in `paper` mode only when a packet of frames is complete.
     pub verdicts: Option<Verdicts>,
-    /// Votes of which it has been settled whether they were right.
+    /// Votes, and words about tracked objects, of which it has been settled whether they were right.
     pub evidence: Vec<Evidence>,
     /// In VOTE's `paper` mode, with the verdicts, how far each vehicle is trusted: no function of the evidence there.
     pub reputations: Option<BTreeMap<NodeName, Reputation>>,
@@ -56,6 +59,9 @@ pub struct Aggregator {
     windows: [ReportWindow; ReportKind::COUNT],
     rounds: RoundTrigger,
     pace: Option<Pace>,
+    tracks: Option<Tracker>,
+    /// Whether tracking ends with the first known location.
+    tracks_open_cell: bool,
     vote: Option<Vote>,
     by_packets: bool,
     /// Whether anyone has voted: a cell that runs both algorithms spares its network verdicts about nothing until then.
@@ -65,9 +71,16 @@ pub struct Aggregator {
 impl Aggregator {
     /// An aggregator without evidence that does not lead; `config` is taken as valid.
     pub fn standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let FusionConfig { algorithms, window, round, pace, vote, reputation: _ } = config;
+        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation: _ } = config;
         let by_packets = vote.mode == VoteMode::Paper;
         let vote = algorithms.vote().then(|| Vote::new(vote, landmarks.clone()));
+        let tracks_open_cell = tracks.mode == TracksMode::Auto;
+        let is_tracking = match tracks.mode {
+            TracksMode::Auto => landmarks.is_empty(),
+            TracksMode::On => true,
+            TracksMode::Off => false,
+        };
+        let tracks = (algorithms.pace() && is_tracking).then(|| Tracker::new(tracks));
         let gate_m = pace.gate_m;
         let pace = algorithms.pace().then(|| Pace::new(pace, Arc::new(LandmarkIndex::new(landmarks, gate_m))));
         Self {
@@ -76,6 +89,8 @@ impl Aggregator {
             windows: [ReportWindow::new(window.clone()), ReportWindow::new(window)],
             rounds: RoundTrigger::new(round, now),
             pace,
+            tracks,
+            tracks_open_cell,
             vote,
             by_packets,
             voted: false,
@@ -126,7 +141,11 @@ impl Aggregator {
         match kind {
             ReportKind::Detections => {
                 let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
-                pace.observe(report, window.admit(report, now)?);
+                let captured_at = window.admit(report, now)?;
+                pace.observe(report, captured_at);
+                if let Some(tracks) = &mut self.tracks {
+                    tracks.observe_only(report, captured_at, |object| !pace.is_at_landmark(object));
+                }
             }
             ReportKind::VoteDetections => {
                 let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
@@ -148,8 +167,12 @@ impl Aggregator {
         self.rounds.deadline()
     }
 
-    /// Adds known locations for PACE; evidence stays. VOTE takes locations from reports by itself where none are known.
+    /// Adds known locations for PACE; evidence stays, but tracks of `auto` end. VOTE takes locations from reports by
+    /// itself where none are known.
     pub fn add_landmarks(&mut self, landmarks: Vec<Landmark>) {
+        if self.tracks_open_cell && !landmarks.is_empty() {
+            self.tracks = None;
+        }
         if let Some(pace) = &mut self.pace {
             pace.add_landmarks(landmarks);
         }
@@ -182,6 +205,21 @@ impl Aggregator {
         if let Some(vote) = &mut self.vote {
             vote.adopt(ledger);
         }
+        if let Some(tracks) = &mut self.tracks {
+            tracks.adopt(ledger);
+        }
+    }
+
+    /// Goes on with the identities of the objects in another aggregator's map, received at `now`.
+    pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
+        if let Some(tracks) = &mut self.tracks {
+            tracks.adopt_map(map, now);
+        }
+    }
+
+    /// What tracking could not use so far.
+    pub fn tracks_losses(&self) -> TracksLosses {
+        self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
     }
 
     /// Goes on, in VOTE's `paper` mode, from reputations that were published.
@@ -198,6 +236,7 @@ impl Aggregator {
 
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
+        let tracks = self.tracks.as_mut().map(|tracks| tracks.close(now)).unwrap_or_default();
         let by_packets = self.by_packets;
         let wanted = self.voted || pace.is_none();
         let is_due = |vote: &&mut Vote| if by_packets { vote.is_packet_complete() } else { wanted };
@@ -208,17 +247,19 @@ impl Aggregator {
         }
         let round = self.next_round;
         self.next_round = round.saturating_add(1);
-        let (verdicts, evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
+        let TracksRound { objects, pose_corrections, oldest_capture, evidence: seen } = tracks;
+        let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
+        evidence.extend(seen);
         let map = pace.map(|pace| GlobalMap {
             schema: SCHEMA_VERSION,
             aggregator: epoch.leader.clone(),
             epoch: epoch.term,
             round,
             fused_at_us: now,
-            oldest_capture_us: pace.oldest_capture,
+            oldest_capture_us: [pace.oldest_capture, oldest_capture].into_iter().flatten().min(),
             landmarks: pace.landmarks,
-            objects: Vec::new(),
-            pose_corrections: BTreeMap::new(),
+            objects,
+            pose_corrections,
         });
         let verdicts = verdicts.map(|verdicts: Vec<Verdict>| Verdicts {
             schema: SCHEMA_VERSION,
@@ -230,171 +271,5 @@ impl Aggregator {
         });
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
         Some(Fused { epoch, round, map, verdicts, evidence, reputations })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::round::{RoundClose, RoundConfig};
-    use crate::vote::VoteConfig;
-    use crate::wire::PerceivedObject;
-    use ReportKind::{Detections, VoteDetections};
-    use nalgebra::Point2;
-
-    const START: u64 = 1_732_154_400_000_000;
-
-    fn at(ms: u64) -> Timestamp {
-        Timestamp(START + ms * 1000)
-    }
-
-    fn landmarks() -> Vec<Landmark> {
-        let ball = Point2::new(1.0, 0.0);
-        vec![Landmark { id: "ball".into(), position: ball, facing_rad: None, vacancy: None, synonyms: vec![] }]
-    }
-
-    fn report(node: &str, label: &str, captured_ms: u64) -> ObjectReport {
-        ObjectReport {
-            objects: vec![PerceivedObject {
-                landmark: Some("ball".into()),
-                ..PerceivedObject::new(label, 0.9, 1.0, 0.0)
-            }],
-            ..ObjectReport::new(NodeName::new(node).unwrap(), captured_ms, at(captured_ms))
-        }
-    }
-
-    fn leader(config: FusionConfig) -> Aggregator {
-        Aggregator::new(NodeName::from_static("edge"), 7, config, landmarks(), at(0))
-    }
-
-    fn shown(fused: &Fused) -> (Option<&str>, Option<&str>) {
-        let map = fused.map.as_ref().and_then(|map| map.landmarks[0].label.as_deref());
-        (map, fused.verdicts.as_ref().and_then(|verdicts| verdicts.verdicts[0].label.as_deref()))
-    }
-
-    #[test]
-    fn a_round_is_closed_for_map_and_verdicts_together() {
-        let round = RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() };
-        let mut cell = leader(FusionConfig { round, ..FusionConfig::default() });
-        for round in 1..=3 {
-            let now = at(round * 100);
-            for kind in [Detections, VoteDetections] {
-                cell.report(
-                    kind,
-                    &report("euclid", "cup", round * 100 - 10),
-                    now - std::time::Duration::from_millis(5),
-                )
-                .unwrap();
-            }
-            let fused = cell.tick(now).unwrap();
-            let (map, verdicts) = (fused.map.clone().unwrap(), fused.verdicts.clone().unwrap());
-            assert_eq!((map.epoch, map.round, map.fused_at_us), (7, round, now));
-            assert_eq!((verdicts.epoch, verdicts.round, verdicts.fused_at_us), (7, round, now));
-            assert_eq!((verdicts.aggregator.as_str(), shown(&fused).1), ("edge", Some("cup")));
-            assert_eq!(verdicts.verdicts[0].contributors, [NodeName::from_static("euclid")]);
-        }
-    }
-
-    #[test]
-    fn one_frame_may_go_out_as_both_kinds_but_each_only_once() {
-        let mut cell = leader(FusionConfig::default());
-        let frame = report("euclid", "cup", 10);
-        assert_eq!(cell.report(Detections, &frame, at(12)), Ok(None));
-        assert_eq!(cell.report(VoteDetections, &frame, at(12)), Ok(None));
-        for kind in [Detections, VoteDetections] {
-            assert_eq!(cell.report(kind, &frame, at(13)), Err(RejectReason::OutOfOrder));
-        }
-        let old = report("gauss", "cup", 10);
-        assert_eq!(cell.report(VoteDetections, &old, at(9000)), Err(RejectReason::Stale));
-    }
-
-    #[test]
-    fn a_cell_refuses_reports_for_what_it_does_not_run() {
-        for (algorithms, kind, other) in
-            [(Algorithms::Pace, Detections, VoteDetections), (Algorithms::Vote, VoteDetections, Detections)]
-        {
-            let mut cell = leader(FusionConfig { algorithms, ..FusionConfig::default() });
-            assert_eq!(cell.report(kind, &report("euclid", "cup", 10), at(11)), Ok(None));
-            assert_eq!(cell.report(other, &report("euclid", "cup", 10), at(11)), Err(RejectReason::NotFused));
-            let fused = cell.tick(at(100)).unwrap();
-            assert_eq!(fused.map.is_some(), algorithms.pace());
-            assert_eq!(fused.verdicts.is_some(), algorithms.vote());
-        }
-    }
-
-    #[test]
-    fn where_both_run_verdicts_come_from_the_first_vote_on() {
-        let mut cell = leader(FusionConfig::default());
-        cell.report(Detections, &report("euclid", "cup", 10), at(12)).unwrap();
-        let silent = cell.tick(at(100)).unwrap();
-        assert!(silent.map.is_some() && silent.verdicts.is_none());
-        cell.report(VoteDetections, &report("euclid", "cup", 110), at(112)).unwrap();
-        assert!(cell.tick(at(200)).unwrap().verdicts.is_some());
-        assert!(cell.tick(at(20_000)).unwrap().verdicts.is_some(), "silence is a verdict once there were votes");
-    }
-
-    #[test]
-    fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
-        let mut cell = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
-        for step in 1..=20 {
-            for kind in [Detections, VoteDetections] {
-                assert_eq!(cell.report(kind, &report("euclid", "cup", step * 50), at(step * 50)), Ok(None));
-            }
-            assert_eq!(cell.tick(at(step * 50 + 20)), None);
-        }
-        let epoch = Epoch::new(3, NodeName::from_static("gauss"));
-        cell.lead(epoch.clone(), 88, FirstRound::Overdue, at(1030));
-        let first = cell.tick(at(1030)).expect("due at once");
-        assert_eq!((first.epoch.clone(), first.round, shown(&first)), (epoch.clone(), 88, (Some("cup"), Some("cup"))));
-        cell.lead(epoch, 89, FirstRound::OnTime, at(1040));
-        assert_eq!(cell.tick(at(1139)), None);
-        assert_eq!(cell.tick(at(1140)).map(|fused| fused.round), Some(89));
-        cell.lead(Epoch::new(4, NodeName::from_static("gauss")), 90, FirstRound::AfterConnects, at(1140));
-        assert_eq!(cell.report(ReportKind::Detections, &report("euclid", "cup", 1150), at(1150)), Ok(None));
-        assert_eq!(cell.tick(at(1164)), None, "the others are still connecting");
-        assert_eq!(cell.tick(at(1165)).map(|fused| fused.round), Some(90));
-        cell.stand_by();
-        assert_eq!(cell.tick(at(1300)), None);
-    }
-
-    #[test]
-    fn paper_verdicts_come_by_packets_and_rounds_without_result_are_not_counted() {
-        let vote = VoteConfig { mode: VoteMode::Paper, ..VoteConfig::default() };
-        let config = FusionConfig { algorithms: Algorithms::Vote, vote, ..FusionConfig::default() };
-        let mut cell = leader(config);
-        let rounds: Vec<_> = (1..=10)
-            .filter_map(|frame| {
-                let now = at(frame * 100);
-                cell.report(VoteDetections, &report("euclid", "cup", frame * 100), now)
-                    .unwrap()
-                    .or_else(|| cell.tick(now))
-            })
-            .map(|fused| (fused.round, fused.verdicts.unwrap().verdicts[0].votes["cup"]))
-            .collect();
-        assert_eq!(rounds.iter().map(|(round, _)| *round).collect::<Vec<_>>(), [1, 2]);
-        assert!(rounds[1].1 > rounds[0].1, "the paper's scores are sums");
-    }
-
-    #[test]
-    fn settled_votes_become_evidence_that_another_aggregator_adopts() {
-        let config =
-            FusionConfig { round: RoundConfig { period_s: 0.5, ..RoundConfig::default() }, ..Default::default() };
-        let mut cell = leader(config.clone());
-        let mut ledger = ReputationLedger::default();
-        for step in 1..=60u64 {
-            for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
-                let fused = cell.report(VoteDetections, &report(node, label, step * 500), at(step * 500)).unwrap();
-                for (fused, evidence) in fused.iter().flat_map(|f| f.evidence.iter().map(move |e| (f, e))) {
-                    ledger.record(fused.epoch.term, &fused.epoch.leader, evidence);
-                }
-            }
-        }
-        assert!(ledger.totals()[&NodeName::from_static("liar")].1 > 5);
-        let mut other = leader(config);
-        other.adopt(&ledger);
-        let reputations = other.reputations();
-        assert!(
-            reputations[&NodeName::from_static("euclid")].score > reputations[&NodeName::from_static("liar")].score
-        );
     }
 }

@@ -13,7 +13,7 @@ use crate::names::NodeName;
 use crate::reputation::ReputationLedger;
 use crate::round::FirstRound;
 use crate::time::Timestamp;
-use crate::wire::Reputation;
+use crate::wire::{GlobalMap, Reputation};
 
 /// Something an aggregator is told; see the method of the same name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -40,6 +40,13 @@ pub enum Command {
         #[schemars(with = "serde_json::Value")]
         ledger: Arc<ReputationLedger>,
     },
+    /// [`Aggregator::adopt_map`].
+    AdoptMap {
+        /// The map.
+        map: Arc<GlobalMap>,
+        /// When it was received.
+        received_at: Timestamp,
+    },
     /// [`Aggregator::resume`].
     Resume {
         /// The reputations.
@@ -56,6 +63,7 @@ impl Aggregator {
             Command::Hold => self.hold(),
             Command::StandBy => self.stand_by(),
             Command::Adopt { ledger } => self.adopt(ledger),
+            Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::Resume { reputations } => self.resume(reputations),
         }
         None

@@ -1,0 +1,150 @@
+use super::*;
+use crate::round::{RoundClose, RoundConfig};
+use crate::vote::VoteConfig;
+use crate::wire::PerceivedObject;
+use ReportKind::{Detections, VoteDetections};
+use nalgebra::Point2;
+
+const START: u64 = 1_732_154_400_000_000;
+
+fn at(ms: u64) -> Timestamp {
+    Timestamp(START + ms * 1000)
+}
+
+fn landmarks() -> Vec<Landmark> {
+    let ball = Point2::new(1.0, 0.0);
+    vec![Landmark { id: "ball".into(), position: ball, facing_rad: None, vacancy: None, synonyms: vec![] }]
+}
+
+fn report(node: &str, label: &str, captured_ms: u64) -> ObjectReport {
+    ObjectReport {
+        objects: vec![PerceivedObject { landmark: Some("ball".into()), ..PerceivedObject::new(label, 0.9, 1.0, 0.0) }],
+        ..ObjectReport::new(NodeName::new(node).unwrap(), captured_ms, at(captured_ms))
+    }
+}
+
+fn leader(config: FusionConfig) -> Aggregator {
+    Aggregator::new(NodeName::from_static("edge"), 7, config, landmarks(), at(0))
+}
+
+fn shown(fused: &Fused) -> (Option<&str>, Option<&str>) {
+    let map = fused.map.as_ref().and_then(|map| map.landmarks[0].label.as_deref());
+    (map, fused.verdicts.as_ref().and_then(|verdicts| verdicts.verdicts[0].label.as_deref()))
+}
+
+#[test]
+fn a_round_is_closed_for_map_and_verdicts_together() {
+    let round = RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() };
+    let mut cell = leader(FusionConfig { round, ..FusionConfig::default() });
+    for round in 1..=3 {
+        let now = at(round * 100);
+        for kind in [Detections, VoteDetections] {
+            cell.report(kind, &report("euclid", "cup", round * 100 - 10), now - std::time::Duration::from_millis(5))
+                .unwrap();
+        }
+        let fused = cell.tick(now).unwrap();
+        let (map, verdicts) = (fused.map.clone().unwrap(), fused.verdicts.clone().unwrap());
+        assert_eq!((map.epoch, map.round, map.fused_at_us), (7, round, now));
+        assert_eq!((verdicts.epoch, verdicts.round, verdicts.fused_at_us), (7, round, now));
+        assert_eq!((verdicts.aggregator.as_str(), shown(&fused).1), ("edge", Some("cup")));
+        assert_eq!(verdicts.verdicts[0].contributors, [NodeName::from_static("euclid")]);
+    }
+}
+
+#[test]
+fn one_frame_may_go_out_as_both_kinds_but_each_only_once() {
+    let mut cell = leader(FusionConfig::default());
+    let frame = report("euclid", "cup", 10);
+    assert_eq!(cell.report(Detections, &frame, at(12)), Ok(None));
+    assert_eq!(cell.report(VoteDetections, &frame, at(12)), Ok(None));
+    for kind in [Detections, VoteDetections] {
+        assert_eq!(cell.report(kind, &frame, at(13)), Err(RejectReason::OutOfOrder));
+    }
+    let old = report("gauss", "cup", 10);
+    assert_eq!(cell.report(VoteDetections, &old, at(9000)), Err(RejectReason::Stale));
+}
+
+#[test]
+fn a_cell_refuses_reports_for_what_it_does_not_run() {
+    for (algorithms, kind, other) in
+        [(Algorithms::Pace, Detections, VoteDetections), (Algorithms::Vote, VoteDetections, Detections)]
+    {
+        let mut cell = leader(FusionConfig { algorithms, ..FusionConfig::default() });
+        assert_eq!(cell.report(kind, &report("euclid", "cup", 10), at(11)), Ok(None));
+        assert_eq!(cell.report(other, &report("euclid", "cup", 10), at(11)), Err(RejectReason::NotFused));
+        let fused = cell.tick(at(100)).unwrap();
+        assert_eq!(fused.map.is_some(), algorithms.pace());
+        assert_eq!(fused.verdicts.is_some(), algorithms.vote());
+    }
+}
+
+#[test]
+fn where_both_run_verdicts_come_from_the_first_vote_on() {
+    let mut cell = leader(FusionConfig::default());
+    cell.report(Detections, &report("euclid", "cup", 10), at(12)).unwrap();
+    let silent = cell.tick(at(100)).unwrap();
+    assert!(silent.map.is_some() && silent.verdicts.is_none());
+    cell.report(VoteDetections, &report("euclid", "cup", 110), at(112)).unwrap();
+    assert!(cell.tick(at(200)).unwrap().verdicts.is_some());
+    assert!(cell.tick(at(20_000)).unwrap().verdicts.is_some(), "silence is a verdict once there were votes");
+}
+
+#[test]
+fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
+    let mut cell = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
+    for step in 1..=20 {
+        for kind in [Detections, VoteDetections] {
+            assert_eq!(cell.report(kind, &report("euclid", "cup", step * 50), at(step * 50)), Ok(None));
+        }
+        assert_eq!(cell.tick(at(step * 50 + 20)), None);
+    }
+    let epoch = Epoch::new(3, NodeName::from_static("gauss"));
+    cell.lead(epoch.clone(), 88, FirstRound::Overdue, at(1030));
+    let first = cell.tick(at(1030)).expect("due at once");
+    assert_eq!((first.epoch.clone(), first.round, shown(&first)), (epoch.clone(), 88, (Some("cup"), Some("cup"))));
+    cell.lead(epoch, 89, FirstRound::OnTime, at(1040));
+    assert_eq!(cell.tick(at(1139)), None);
+    assert_eq!(cell.tick(at(1140)).map(|fused| fused.round), Some(89));
+    cell.lead(Epoch::new(4, NodeName::from_static("gauss")), 90, FirstRound::AfterConnects, at(1140));
+    assert_eq!(cell.report(ReportKind::Detections, &report("euclid", "cup", 1150), at(1150)), Ok(None));
+    assert_eq!(cell.tick(at(1164)), None, "the others are still connecting");
+    assert_eq!(cell.tick(at(1165)).map(|fused| fused.round), Some(90));
+    cell.stand_by();
+    assert_eq!(cell.tick(at(1300)), None);
+}
+
+#[test]
+fn paper_verdicts_come_by_packets_and_rounds_without_result_are_not_counted() {
+    let vote = VoteConfig { mode: VoteMode::Paper, ..VoteConfig::default() };
+    let config = FusionConfig { algorithms: Algorithms::Vote, vote, ..FusionConfig::default() };
+    let mut cell = leader(config);
+    let rounds: Vec<_> = (1..=10)
+        .filter_map(|frame| {
+            let now = at(frame * 100);
+            cell.report(VoteDetections, &report("euclid", "cup", frame * 100), now).unwrap().or_else(|| cell.tick(now))
+        })
+        .map(|fused| (fused.round, fused.verdicts.unwrap().verdicts[0].votes["cup"]))
+        .collect();
+    assert_eq!(rounds.iter().map(|(round, _)| *round).collect::<Vec<_>>(), [1, 2]);
+    assert!(rounds[1].1 > rounds[0].1, "the paper's scores are sums");
+}
+
+#[test]
+fn settled_votes_become_evidence_that_another_aggregator_adopts() {
+    let config = FusionConfig { round: RoundConfig { period_s: 0.5, ..RoundConfig::default() }, ..Default::default() };
+    let mut cell = leader(config.clone());
+    let mut ledger = ReputationLedger::default();
+    for step in 1..=60u64 {
+        for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
+            let fused = cell.report(VoteDetections, &report(node, label, step * 500), at(step * 500)).unwrap();
+            for (fused, evidence) in fused.iter().flat_map(|f| f.evidence.iter().map(move |e| (f, e))) {
+                ledger.record(fused.epoch.term, &fused.epoch.leader, evidence);
+            }
+        }
+    }
+    assert!(ledger.totals()[&NodeName::from_static("liar")].1 > 5);
+    let mut other = leader(config);
+    other.adopt(&ledger);
+    let reputations = other.reputations();
+    assert!(reputations[&NodeName::from_static("euclid")].score > reputations[&NodeName::from_static("liar")].score);
+}
