@@ -13,7 +13,7 @@ use ecod::names::NodeName;
 use ecod::pace::{Pace, PaceConfig, PaceMode};
 use ecod::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
 use ecod::time::Timestamp;
-use ecod::wire::{Encoding, Limits, ObjectReport, PerceivedObject, SCHEMA_VERSION, WirePose, decode_report, encode};
+use ecod::wire::{Encoding, Limits, ObjectReport, PerceivedObject, WirePose, decode_report, encode};
 use nalgebra::Point2;
 
 use figures::Figures;
@@ -165,22 +165,20 @@ fn report(vehicle: usize, objects: usize, landmarks: usize, side: usize) -> Obje
         let position = place(landmark, side);
         let jitter = ((vehicle * 31 + n * 17) % 100) as f64 / 100.0 - 0.5;
         PerceivedObject {
-            label: if (vehicle + n).is_multiple_of(10) { "truck".into() } else { "car".into() },
-            confidence: 0.5 + ((vehicle + n) % 50) as f64 / 100.0,
-            x_m: position.x + 0.2 * jitter,
-            y_m: position.y - 0.2 * jitter,
             covariance_m2: Some([0.01, 0.001, 0.02]),
-            landmark: None,
+            ..PerceivedObject::new(
+                if (vehicle + n).is_multiple_of(10) { "truck" } else { "car" },
+                0.5 + ((vehicle + n) % 50) as f64 / 100.0,
+                position.x + 0.2 * jitter,
+                position.y - 0.2 * jitter,
+            )
         }
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(format!("v{vehicle}")).expect("a valid name"),
-        seq: 1,
-        captured_at_us: NOON,
         pose: Some(WirePose { x_m: 0.6096, y_m: 0.4572, heading_rad: 2.8798 }),
         objects: (0..objects).map(object).collect(),
         seen: Some((0..objects).map(|n| format!("l{}", (first + n) % landmarks).into()).collect()),
+        ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).expect("a valid name"), 1, NOON)
     }
 }
 

@@ -8,7 +8,7 @@ use std::time::Instant;
 use ecod::names::NodeName;
 use ecod::replay::{Replay, ReplayConfig};
 use ecod::time::Timestamp;
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION, WirePose};
+use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 use serde_json::json;
 
 use figures::Figures;
@@ -67,22 +67,24 @@ fn recording(topic: &str) -> Vec<String> {
             let object = |n: u64| {
                 let place = (vehicle * 3 + n) % LANDMARKS;
                 PerceivedObject {
-                    label: if (frame + vehicle + n).is_multiple_of(10) { "truck".into() } else { "car".into() },
-                    confidence: 0.5 + ((vehicle + n) % 50) as f64 / 100.0,
-                    x_m: 3.0 * place as f64 + 0.01 * (vehicle % 7) as f64,
-                    y_m: 0.02 * (frame % 5) as f64,
                     covariance_m2: Some([0.01, 0.001, 0.02]),
                     landmark: Some(format!("slot-{place}").into()),
+                    ..PerceivedObject::new(
+                        if (frame + vehicle + n).is_multiple_of(10) { "truck" } else { "car" },
+                        0.5 + ((vehicle + n) % 50) as f64 / 100.0,
+                        3.0 * place as f64 + 0.01 * (vehicle % 7) as f64,
+                        0.02 * (frame % 5) as f64,
+                    )
                 }
             };
             let report = ObjectReport {
-                schema: SCHEMA_VERSION,
-                node: NodeName::new(format!("v{vehicle}")).expect("a valid name"),
-                seq: frame,
-                captured_at_us: Timestamp(1_732_154_400_000_000 + frame * 100_000 + vehicle * 1_000),
                 pose: (topic == "detections").then_some(WirePose { x_m: 0.6096, y_m: 0.4572, heading_rad: 2.8798 }),
                 objects: (0..OBJECTS).map(object).collect(),
-                seen: None,
+                ..ObjectReport::new(
+                    NodeName::new(format!("v{vehicle}")).expect("a valid name"),
+                    frame,
+                    Timestamp(1_732_154_400_000_000 + frame * 100_000 + vehicle * 1_000),
+                )
             };
             let mut line = serde_json::to_value(&report).expect("plain json");
             line["topic"] = topic.into();

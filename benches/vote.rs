@@ -8,7 +8,7 @@ use ecod::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION};
+use ecod::wire::{ObjectReport, PerceivedObject};
 
 use figures::Figures;
 
@@ -137,22 +137,22 @@ fn reports(votes: usize, round: u64, at: Timestamp) -> Vec<ObjectReport> {
             let object = |place: usize| {
                 let wrong = (place * 7 + witness * 13 + round as usize * 3).is_multiple_of(5);
                 PerceivedObject {
-                    label: LABELS[(place + usize::from(wrong) * (1 + witness % 4)) % LABELS.len()].into(),
-                    confidence: 0.5 + 0.5 * ((place * 31 + witness * 17) % 97) as f64 / 97.0,
-                    x_m: 0.0,
-                    y_m: 0.0,
-                    covariance_m2: None,
                     landmark: Some(format!("place-{place}").into()),
+                    ..PerceivedObject::new(
+                        LABELS[(place + usize::from(wrong) * (1 + witness % 4)) % LABELS.len()],
+                        0.5 + 0.5 * ((place * 31 + witness * 17) % 97) as f64 / 97.0,
+                        0.0,
+                        0.0,
+                    )
                 }
             };
             reports.push(ObjectReport {
-                schema: SCHEMA_VERSION,
-                node: node(vehicle),
-                seq: round * 1_000_000 + group as u64,
-                captured_at_us: at + Duration::from_micros(group as u64),
-                pose: None,
                 objects: (group * OBJECTS..landmarks.min((group + 1) * OBJECTS)).map(object).collect(),
-                seen: None,
+                ..ObjectReport::new(
+                    node(vehicle),
+                    round * 1_000_000 + group as u64,
+                    at + Duration::from_micros(group as u64),
+                )
             });
         }
     }

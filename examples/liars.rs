@@ -12,7 +12,7 @@ use std::time::Duration;
 use ecod::names::{Label, NodeName};
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig};
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION};
+use ecod::wire::{ObjectReport, PerceivedObject};
 use plotters::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -134,24 +134,12 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
                 said[place][label] += 1;
                 said_honestly[place][label] += usize::from(vehicle >= liars);
                 objects.push(PerceivedObject {
-                    label: LABELS[label].into(),
-                    confidence: 0.8,
-                    x_m: 0.0,
-                    y_m: 0.0,
-                    covariance_m2: None,
                     landmark: Some(format!("place-{place}").into()),
+                    ..PerceivedObject::new(LABELS[label], 0.8, 0.0, 0.0)
                 });
             }
             let node = NodeName::new(name)?;
-            let report = ObjectReport {
-                schema: SCHEMA_VERSION,
-                node,
-                seq: round,
-                captured_at_us: now,
-                pose: None,
-                objects,
-                seen: None,
-            };
+            let report = ObjectReport { objects, ..ObjectReport::new(node, round, now) };
             vote.observe(&report, now)?;
         }
         let verdicts: BTreeMap<_, Option<Label>> =

@@ -211,6 +211,7 @@ impl Aggregator {
             oldest_capture_us: pace.oldest_capture,
             landmarks: pace.landmarks,
             objects: Vec::new(),
+            pose_corrections: BTreeMap::new(),
         });
         let verdicts = verdicts.map(|verdicts: Vec<Verdict>| Verdicts {
             schema: SCHEMA_VERSION,
@@ -247,20 +248,11 @@ mod tests {
 
     fn report(node: &str, label: &str, captured_ms: u64) -> ObjectReport {
         ObjectReport {
-            schema: SCHEMA_VERSION,
-            node: NodeName::new(node).unwrap(),
-            seq: captured_ms,
-            captured_at_us: at(captured_ms),
-            pose: None,
             objects: vec![PerceivedObject {
-                label: label.into(),
-                confidence: 0.9,
-                x_m: 1.0,
-                y_m: 0.0,
-                covariance_m2: None,
                 landmark: Some("ball".into()),
+                ..PerceivedObject::new(label, 0.9, 1.0, 0.0)
             }],
-            seen: None,
+            ..ObjectReport::new(NodeName::new(node).unwrap(), captured_ms, at(captured_ms))
         }
     }
 

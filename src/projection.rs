@@ -104,12 +104,8 @@ impl Projection {
             return Err(ProjectionError::DegenerateBox(label.clone()));
         }
         Ok(PerceivedObject {
-            label: label.clone(),
-            confidence: detection.confidence,
-            x_m: position.0,
-            y_m: position.1,
             covariance_m2: Some([covariance.xx, covariance.xy, covariance.yy]),
-            landmark: None,
+            ..PerceivedObject::new(label.clone(), detection.confidence, position.0, position.1)
         })
     }
 

@@ -170,7 +170,7 @@ mod tests {
     }
 
     fn object(label: &str, x_m: f64, y_m: f64) -> PerceivedObject {
-        PerceivedObject { label: label.into(), confidence: 0.9, x_m, y_m, covariance_m2: None, landmark: None }
+        PerceivedObject::new(label, 0.9, x_m, y_m)
     }
 
     /// Seen from the origin, looking east with a field of view of 62.2°.

@@ -207,20 +207,11 @@ fn seconds(s: f64) -> i64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::SCHEMA_VERSION;
 
     const NOON: u64 = 1_732_154_400_000_000;
 
     fn report(node: &str, captured_us: u64) -> ObjectReport {
-        ObjectReport {
-            schema: SCHEMA_VERSION,
-            node: NodeName::new(node).unwrap(),
-            seq: 0,
-            captured_at_us: Timestamp(captured_us),
-            pose: None,
-            objects: vec![],
-            seen: None,
-        }
+        ObjectReport { objects: vec![], ..ObjectReport::new(NodeName::new(node).unwrap(), 0, Timestamp(captured_us)) }
     }
 
     fn window() -> ReportWindow {

@@ -17,6 +17,7 @@
 mod check;
 mod codec;
 mod ledger;
+mod object;
 mod reject;
 mod topic;
 
@@ -29,10 +30,11 @@ use uuid::Uuid;
 pub use check::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, Payload, check_fused_at};
 pub use codec::{Encoding, decode, decode_report, encode};
 pub use ledger::{MAX_SHARE_ENTRIES, decode_share};
+pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
 
-use crate::geometry::{Covariance, Pose};
+use crate::geometry::Pose;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::time::Timestamp;
 
@@ -58,6 +60,25 @@ pub struct ObjectReport {
     /// Landmarks that were in view, near enough and not hidden, whether or not something was detected there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seen: Option<Vec<LandmarkId>>,
+    /// What the sensor covers from the pose; without it, the aggregator learns from the detections where a miss counts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub view: Option<FieldOfView>,
+}
+
+impl ObjectReport {
+    /// An empty report.
+    pub fn new(node: NodeName, seq: u64, captured_at: Timestamp) -> Self {
+        Self {
+            schema: SCHEMA_VERSION,
+            node,
+            seq,
+            captured_at_us: captured_at,
+            pose: None,
+            objects: Vec::new(),
+            seen: None,
+            view: None,
+        }
+    }
 }
 
 /// A camera pose on the wire.
@@ -83,32 +104,6 @@ impl From<Pose> for WirePose {
     }
 }
 
-/// A detection with its place in the world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct PerceivedObject {
-    /// Class label or decoded text.
-    pub label: Label,
-    /// The detector's confidence, 0 to 1.
-    pub confidence: f64,
-    /// East in metres.
-    pub x_m: f64,
-    /// North in metres.
-    pub y_m: f64,
-    /// Position covariance `[xx, xy, yy]` in m².
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub covariance_m2: Option<[f64; 3]>,
-    /// The known location that the node takes this object for; required in VOTE.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub landmark: Option<LandmarkId>,
-}
-
-impl PerceivedObject {
-    /// The reported covariance, if any.
-    pub fn covariance(&self) -> Option<Covariance> {
-        self.covariance_m2.map(|[xx, xy, yy]| Covariance { xx, xy, yy })
-    }
-}
-
 /// The fused map of one round (PACE).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct GlobalMap {
@@ -129,6 +124,9 @@ pub struct GlobalMap {
     pub landmarks: Vec<LandmarkState>,
     /// Objects that matched no known location.
     pub objects: Vec<FusedObject>,
+    /// By vehicle, how its positions were corrected before they were fused.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
 }
 
 /// What is agreed to be at one known location.
@@ -150,25 +148,6 @@ pub struct LandmarkState {
     /// known to be empty, without observers it is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub observers: Vec<NodeName>,
-}
-
-/// An object of the open world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct FusedObject {
-    /// Stable identity of the object.
-    pub id: Uuid,
-    /// The agreed label.
-    pub label: Label,
-    /// Confidence in the label, 0 to 1.
-    pub confidence: f64,
-    /// East in metres.
-    pub x_m: f64,
-    /// North in metres.
-    pub y_m: f64,
-    /// Position covariance `[xx, xy, yy]` in m².
-    pub covariance_m2: [f64; 3],
-    /// The nodes whose detections went into the entry.
-    pub contributors: Vec<NodeName>,
 }
 
 /// The verdicts of one round (VOTE).

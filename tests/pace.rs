@@ -6,7 +6,7 @@ use ecod::landmark::{Landmark, LandmarkIndex, VacancySign};
 use ecod::names::{Label, NodeName};
 use ecod::pace::{Pace, PaceConfig, PaceMode};
 use ecod::time::Timestamp;
-use ecod::wire::{LandmarkState, ObjectReport, PerceivedObject, SCHEMA_VERSION};
+use ecod::wire::{LandmarkState, ObjectReport, PerceivedObject};
 use nalgebra::Point2;
 use proptest::prelude::*;
 
@@ -23,18 +23,14 @@ fn landmark(id: usize, x: f64, y: f64) -> Landmark {
 }
 
 fn object(label: &str, confidence: f64, x_m: f64, y_m: f64) -> PerceivedObject {
-    PerceivedObject { label: label.into(), confidence, x_m, y_m, covariance_m2: None, landmark: None }
+    PerceivedObject::new(label, confidence, x_m, y_m)
 }
 
 fn report(node: &str, objects: Vec<PerceivedObject>, seen: &[&str]) -> ObjectReport {
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(node).unwrap(),
-        seq: 0,
-        captured_at_us: START,
-        pose: None,
         objects,
         seen: Some(seen.iter().map(Label::new).collect()),
+        ..ObjectReport::new(NodeName::new(node).unwrap(), 0, START)
     }
 }
 

@@ -7,7 +7,7 @@ use ecod::names::NodeName;
 use ecod::reputation::{Evidence, ReputationLedger};
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
-use ecod::wire::{ObjectReport, PerceivedObject, RejectReason, SCHEMA_VERSION, WirePose};
+use ecod::wire::{ObjectReport, PerceivedObject, RejectReason, WirePose};
 use nalgebra::Point2;
 use proptest::prelude::*;
 
@@ -15,21 +15,12 @@ const START: Timestamp = Timestamp(1_700_000_000_000_000);
 
 fn report(node: &str, seq: u64, at: Timestamp, votes: &[(&str, &str, f64)]) -> ObjectReport {
     let object = |&(landmark, label, confidence): &(&str, &str, f64)| PerceivedObject {
-        label: label.into(),
-        confidence,
-        x_m: 0.0,
-        y_m: 0.0,
-        covariance_m2: None,
         landmark: Some(landmark.into()),
+        ..PerceivedObject::new(label, confidence, 0.0, 0.0)
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(node).expect("test names are valid"),
-        seq,
-        captured_at_us: at,
-        pose: None,
         objects: votes.iter().map(object).collect(),
-        seen: None,
+        ..ObjectReport::new(NodeName::new(node).expect("test names are valid"), seq, at)
     }
 }
 

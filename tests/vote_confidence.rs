@@ -5,7 +5,7 @@ use std::time::Duration;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig};
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION, Verdict};
+use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -38,21 +38,12 @@ fn accuracy(state: impl Fn(usize, f64, f64) -> f64) -> (f64, f64) {
                 let wrong = (truth + rng.random_range(1..LABELS)) % LABELS;
                 let label = if rng.random_bool(p) { truth } else { wrong };
                 let object = PerceivedObject {
-                    label: label.to_string().into(),
-                    confidence: state(vehicle, p, rng.random_range(0.0..1.0)),
-                    x_m: 0.0,
-                    y_m: 0.0,
-                    covariance_m2: None,
                     landmark: Some(item.to_string().into()),
+                    ..PerceivedObject::new(label.to_string(), state(vehicle, p, rng.random_range(0.0..1.0)), 0.0, 0.0)
                 };
                 let report = ObjectReport {
-                    schema: SCHEMA_VERSION,
-                    node: NodeName::new(format!("v{vehicle}")).unwrap(),
-                    seq: item as u64,
-                    captured_at_us: at,
-                    pose: None,
                     objects: vec![object],
-                    seen: None,
+                    ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), item as u64, at)
                 };
                 vote.observe(&report, at).unwrap();
             }

@@ -7,7 +7,7 @@ use ecod::landmark::Landmark;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION, WirePose};
+use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 use nalgebra::Point2;
 use proptest::prelude::*;
 
@@ -82,21 +82,13 @@ fn landmark(place: usize) -> Landmark {
 
 fn wire((vehicle, (x_m, y_m, heading_rad), detections): &Report, seq: u64) -> ObjectReport {
     let object = |&(place, label, confidence): &Detection| PerceivedObject {
-        label: LABELS[label].into(),
-        confidence,
-        x_m: PLACES[place].0,
-        y_m: PLACES[place].1,
-        covariance_m2: None,
         landmark: Some(format!("place-{place}").into()),
+        ..PerceivedObject::new(LABELS[label], confidence, PLACES[place].0, PLACES[place].1)
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(format!("v{vehicle}")).unwrap(),
-        seq,
-        captured_at_us: START + Duration::from_millis(seq),
         pose: Some(WirePose { x_m: *x_m, y_m: *y_m, heading_rad: *heading_rad }),
         objects: detections.iter().map(object).collect(),
-        seen: None,
+        ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), seq, START + Duration::from_millis(seq))
     }
 }
 

@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::Context;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
-use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, encode};
+use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, Role, encode};
 use ecod_actors::bench::rounds::{self, Traffic};
 use ecod_actors::bench::two_hop::{self, Load};
 use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
@@ -207,21 +207,13 @@ fn receive(
 /// Every vehicle sees an object at every landmark, displaced by a round's own distance.
 fn report(vehicle: usize, round: u32) -> anyhow::Result<ObjectReport> {
     let object = |index: usize| PerceivedObject {
-        label: "ABCD123".into(),
-        confidence: 0.93,
-        x_m: index as f64 * 3.0 + displacement_m(round),
-        y_m: 0.1,
         covariance_m2: Some([0.01, 0.0, 0.01]),
-        landmark: None,
+        ..PerceivedObject::new("ABCD123", 0.93, index as f64 * 3.0 + displacement_m(round), 0.1)
     };
     Ok(ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(format!("v{vehicle}"))?,
-        seq: round.into(),
-        captured_at_us: clock::now(),
-        pose: None,
         objects: (0..LANDMARKS).map(object).collect(),
         seen: Some((0..LANDMARKS).map(|index| format!("slot-{index}").into()).collect()),
+        ..ObjectReport::new(NodeName::new(format!("v{vehicle}"))?, round.into(), clock::now())
     })
 }
 

@@ -132,21 +132,12 @@ async fn join(
 
 fn report(seq: u64) -> ObjectReport {
     let object = |index: u32| PerceivedObject {
-        label: "ABCD123".into(),
-        confidence: 0.93,
-        x_m: f64::from(index) * 0.25,
-        y_m: 0.48,
         covariance_m2: Some([0.0004, 0.0, 0.0001]),
-        landmark: None,
+        ..PerceivedObject::new("ABCD123", 0.93, f64::from(index) * 0.25, 0.48)
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new("euclid").expect("a valid name"),
-        seq,
-        captured_at_us: clock::now(),
-        pose: None,
         objects: (0..10).map(object).collect(),
-        seen: None,
+        ..ObjectReport::new(NodeName::new("euclid").expect("a valid name"), seq, clock::now())
     }
 }
 
@@ -160,5 +151,6 @@ fn answer_to(report: &ObjectReport) -> GlobalMap {
         oldest_capture_us: Some(report.captured_at_us),
         landmarks: vec![],
         objects: vec![],
+        pose_corrections: Default::default(),
     }
 }

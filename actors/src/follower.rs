@@ -245,6 +245,7 @@ mod tests {
             oldest_capture_us: None,
             landmarks: Vec::new(),
             objects: Vec::new(),
+            pose_corrections: Default::default(),
         })
     }
 

@@ -11,7 +11,7 @@ use ecod::names::NodeName;
 use ecod::projection::{Projection, ProjectionConfig, Ranging};
 use ecod::time::Timestamp;
 use ecod::view::{ViewConfig, landmarks_in_view};
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION};
+use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
 
 use crate::corner_pose::locate_target;
@@ -64,13 +64,10 @@ impl Perception {
         let seen = landmarks_in_view(landmarks, &self.camera, &lens.intrinsics, &objects, sizes, &self.view);
         self.seq += 1;
         ObjectReport {
-            schema: SCHEMA_VERSION,
-            node: self.vantage.node.clone(),
-            seq: self.seq,
-            captured_at_us: captured_at,
             pose: Some(self.camera.into()),
             objects,
             seen: Some(seen),
+            ..ObjectReport::new(self.vantage.node.clone(), self.seq, captured_at)
         }
     }
 

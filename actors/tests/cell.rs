@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
-use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, Role};
 use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::gateway::{GatewayMessage, ReportKind};
@@ -51,20 +51,8 @@ async fn cav(name: &str, edge: &NodeHandle) -> NodeHandle {
 
 fn report(node: &str, label: &str, slot: i32) -> Arc<ObjectReport> {
     Arc::new(ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(node).unwrap(),
-        seq: 1,
-        captured_at_us: clock::now(),
-        pose: None,
-        objects: vec![PerceivedObject {
-            label: label.into(),
-            confidence: 0.9,
-            x_m: f64::from(slot) * 3.0 + 0.1,
-            y_m: 0.0,
-            covariance_m2: None,
-            landmark: None,
-        }],
-        seen: None,
+        objects: vec![PerceivedObject::new(label, 0.9, f64::from(slot) * 3.0 + 0.1, 0.0)],
+        ..ObjectReport::new(NodeName::new(node).unwrap(), 1, clock::now())
     })
 }
 

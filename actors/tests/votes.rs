@@ -9,9 +9,7 @@ use ecod::aggregator::Algorithms;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::vote::VoteMode;
-use ecod::wire::{
-    ObjectReport, PerceivedObject, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION, Verdict, decode,
-};
+use ecod::wire::{ObjectReport, PerceivedObject, RejectReason, Reputation, Reputations, Role, Verdict, decode};
 use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::counters::Event;
@@ -81,20 +79,11 @@ async fn member(node: &str, role: Role, other: &NodeHandle, configure: impl FnOn
 fn report(node: &str, label: &str, landmark: &str) -> Arc<ObjectReport> {
     static SEQ: AtomicU64 = AtomicU64::new(0);
     Arc::new(ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: name(node),
-        seq: SEQ.fetch_add(1, Ordering::Relaxed),
-        captured_at_us: clock::now(),
-        pose: None,
         objects: vec![PerceivedObject {
-            label: label.into(),
-            confidence: 0.9,
-            x_m: 1.0,
-            y_m: 0.0,
-            covariance_m2: None,
             landmark: Some(landmark.into()),
+            ..PerceivedObject::new(label, 0.9, 1.0, 0.0)
         }],
-        seen: None,
+        ..ObjectReport::new(name(node), SEQ.fetch_add(1, Ordering::Relaxed), clock::now())
     })
 }
 

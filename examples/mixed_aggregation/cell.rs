@@ -9,7 +9,7 @@ use ecod::epoch::Epoch;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role, SCHEMA_VERSION};
+use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role};
 use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::follower::ReceivedMap;
@@ -144,21 +144,13 @@ async fn report(node: NodeName, seen: &[(usize, &str)], gateway: Seat<GatewayMes
     for seq in 0.. {
         ticks.tick().await;
         let object = |(place, label): &(usize, &str)| PerceivedObject {
-            label: (*label).into(),
-            confidence: 0.9,
-            x_m: PLACES[*place].1,
-            y_m: 0.0,
-            covariance_m2: None,
             landmark: Some(PLACES[*place].0.into()),
+            ..PerceivedObject::new(*label, 0.9, PLACES[*place].1, 0.0)
         };
         let report = Arc::new(ObjectReport {
-            schema: SCHEMA_VERSION,
-            node: node.clone(),
-            seq,
-            captured_at_us: clock::now(),
-            pose: None,
             objects: seen.iter().map(object).collect(),
             seen: Some(PLACES.iter().map(|(id, _)| (*id).into()).collect()),
+            ..ObjectReport::new(node.clone(), seq, clock::now())
         });
         for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
             gateway.send(GatewayMessage::PublishReport { kind, report: Arc::clone(&report) });

@@ -20,7 +20,7 @@ use ecod::election::Input;
 use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{ObjectReport, PerceivedObject, SCHEMA_VERSION};
+use ecod::wire::{ObjectReport, PerceivedObject};
 
 use vehicle::{Payload, Vehicle};
 
@@ -170,20 +170,11 @@ impl Cell {
 fn report(node: usize, now: Timestamp) -> ObjectReport {
     let (name, seen) = SEEN[node];
     let object = |(place, label): (usize, &str)| PerceivedObject {
-        label: label.into(),
-        confidence: 0.9,
-        x_m: PLACES[place].1,
-        y_m: 0.0,
-        covariance_m2: None,
         landmark: Some(PLACES[place].0.into()),
+        ..PerceivedObject::new(label, 0.9, PLACES[place].1, 0.0)
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::from_static(name),
-        seq: now.since(START).as_millis() as u64,
-        captured_at_us: now,
-        pose: None,
         objects: seen.map(object).into(),
-        seen: None,
+        ..ObjectReport::new(NodeName::from_static(name), now.since(START).as_millis() as u64, now)
     }
 }

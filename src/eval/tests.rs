@@ -22,21 +22,12 @@ fn verdicts(round: u64, entries: &[(&str, Option<&str>)]) -> FusedLine {
 
 fn report(node: &str, at: u64, votes: &[(&str, &str)]) -> ObjectReport {
     let object = |&(landmark, label): &(&str, &str)| PerceivedObject {
-        label: label.into(),
-        confidence: 1.0,
-        x_m: 0.0,
-        y_m: 0.0,
-        covariance_m2: None,
         landmark: Some(landmark.into()),
+        ..PerceivedObject::new(label, 1.0, 0.0, 0.0)
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(node).unwrap(),
-        seq: at,
-        captured_at_us: Timestamp(at),
-        pose: None,
         objects: votes.iter().map(object).collect(),
-        seen: None,
+        ..ObjectReport::new(NodeName::new(node).unwrap(), at, Timestamp(at))
     }
 }
 

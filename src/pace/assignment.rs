@@ -138,14 +138,7 @@ mod tests {
     type Distances = Vec<(u32, u32)>;
 
     fn objects(count: usize) -> Vec<PerceivedObject> {
-        let object = |label: usize| PerceivedObject {
-            label: label.to_string().into(),
-            confidence: 0.9,
-            x_m: 0.0,
-            y_m: 0.0,
-            covariance_m2: None,
-            landmark: None,
-        };
+        let object = |label: usize| PerceivedObject::new(label.to_string(), 0.9, 0.0, 0.0);
         (0..count).map(object).collect()
     }
 

@@ -1,26 +1,17 @@
 use super::*;
 use crate::testbed::Testbed;
-use crate::wire::{Encoding, PerceivedObject, SCHEMA_VERSION, WirePose, encode};
+use crate::wire::{Encoding, PerceivedObject, WirePose, encode};
 
 const START: u64 = 1_700_000_000_000_000;
 
 fn report(node: &str, at_ms: u64, votes: &[(&str, &str)]) -> ObjectReport {
     let object = |(n, &(landmark, label)): (usize, &(&str, &str))| PerceivedObject {
-        label: label.into(),
-        confidence: 0.9,
-        x_m: 5.0 * n as f64,
-        y_m: 0.0,
-        covariance_m2: None,
         landmark: Some(landmark.into()),
+        ..PerceivedObject::new(label, 0.9, 5.0 * n as f64, 0.0)
     };
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(node).unwrap(),
-        seq: at_ms,
-        captured_at_us: Timestamp(START + at_ms * 1000),
-        pose: None,
         objects: votes.iter().enumerate().map(object).collect(),
-        seen: None,
+        ..ObjectReport::new(NodeName::new(node).unwrap(), at_ms, Timestamp(START + at_ms * 1000))
     }
 }
 
@@ -224,22 +215,20 @@ fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
                 let label = spot.truth.clone().filter(|_| !is_wrong).unwrap_or("EMPTY".into());
                 let off = 0.002 * ((n + number) % 5) as f64;
                 PerceivedObject {
-                    label,
-                    confidence: 0.6 + 0.05 * number as f64,
-                    x_m: spot.occupied.x + off,
-                    y_m: spot.occupied.y - off,
                     covariance_m2: Some([1e-4, 0.0, 1e-4]),
                     landmark: Some(spot.id.clone()),
+                    ..PerceivedObject::new(
+                        label,
+                        0.6 + 0.05 * number as f64,
+                        spot.occupied.x + off,
+                        spot.occupied.y - off,
+                    )
                 }
             };
             let report = ObjectReport {
-                schema: SCHEMA_VERSION,
-                node: cav.name.clone(),
-                seq: step + 1,
-                captured_at_us: captured_at,
                 pose: Some(WirePose::from(cav.pose)),
                 objects: scene.spots.iter().enumerate().map(object).collect(),
-                seen: None,
+                ..ObjectReport::new(cav.name.clone(), step + 1, captured_at)
             };
             let received_at = captured_at + Duration::from_millis(5);
             reports.push((ReportKind::Detections, report.clone(), received_at));

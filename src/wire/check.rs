@@ -1,14 +1,16 @@
 //! What a payload may say: every value that came from outside is checked before anything is made of it.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_SHARE_ENTRIES, NodeStatus, ObjectReport, RejectReason,
-    Reputations, SCHEMA_VERSION, Verdict, Verdicts,
+    FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_SHARE_ENTRIES, NodeStatus, ObjectReport,
+    PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
 };
 use crate::geometry::Covariance;
-use crate::names::MAX_NAME_BYTES;
+use crate::names::{Label, MAX_NAME_BYTES};
 use crate::time::Timestamp;
 
 /// Bounds that a payload must keep to be decoded at all.
@@ -37,6 +39,18 @@ pub const MAX_FUSED_AHEAD_S: u64 = 3600;
 
 /// Largest coordinate in metres that is taken for a position on Earth.
 const WORLD_BOUND_M: f64 = 1e8;
+
+/// Fastest object in metres per second.
+const SPEED_BOUND_MPS: f64 = 1e4;
+
+/// Largest object, and farthest range of a sensor, in metres.
+const SIZE_BOUND_M: f64 = 1e5;
+
+/// Largest heading in radians: whoever counts turns need not stop at the first.
+const ANGLE_BOUND_RAD: f64 = 1e6;
+
+/// Most classes that one object can have scores for.
+const MAX_SCORES: usize = 256;
 
 /// Largest score of a label: far beyond the votes of all vehicles that a cell can have.
 const SCORE_BOUND: f64 = 1e9;
@@ -83,7 +97,8 @@ impl Payload for GlobalMap {
         let times = [Some(self.fused_at_us), self.oldest_capture_us];
         check_integers([self.epoch, self.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
         self.landmarks.iter().try_for_each(check_landmark)?;
-        self.objects.iter().try_for_each(check_object)
+        self.objects.iter().try_for_each(check_object)?;
+        self.pose_corrections.values().try_for_each(check_correction)
     }
 }
 
@@ -167,11 +182,14 @@ impl ObjectReport {
         {
             return Err(RejectReason::NotFinite);
         }
+        self.view.map_or(Ok(()), check_view)?;
         check_labels(seen.iter().map(|id| &**id))?;
         self.objects.iter().try_for_each(|object| {
             check_place(object.x_m, object.y_m)?;
             object.covariance().map_or(Ok(()), check_covariance)?;
             check_confidence(object.confidence)?;
+            check_motion(object.velocity_mps, object.heading_rad, object.size_m)?;
+            check_scores(&object.scores)?;
             check_labels([&*object.label].into_iter().chain(object.landmark.as_deref()))
         })
     }
@@ -193,11 +211,51 @@ fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
 }
 
 fn check_object(object: &FusedObject) -> Result<(), RejectReason> {
-    let [xx, xy, yy] = object.covariance_m2;
     check_place(object.x_m, object.y_m)?;
-    check_covariance(Covariance { xx, xy, yy })?;
+    check_covariance(object.covariance())?;
     check_confidence(object.confidence)?;
+    object.existence.map_or(Ok(()), check_confidence)?;
+    check_motion(object.velocity_mps, object.heading_rad, object.size_m)?;
+    check_scores(&object.scores)?;
+    object.age_s.map_or(Ok(()), |age_s| check_between(age_s, 0.0, MAX_INTEGER as f64))?;
+    check_integers(object.first_seen_us.map(Timestamp::micros))?;
     check_labels([&*object.label])
+}
+
+fn check_correction(correction: &PoseCorrection) -> Result<(), RejectReason> {
+    let [x_m, y_m] = correction.about_m;
+    check_place(x_m, y_m)?;
+    check_place(correction.dx_m, correction.dy_m)?;
+    check_between(correction.dheading_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)?;
+    check_between(correction.pairs, 0.0, MAX_INTEGER as f64)
+}
+
+fn check_view(view: FieldOfView) -> Result<(), RejectReason> {
+    check_between(view.range_m, 0.0, SIZE_BOUND_M)?;
+    check_between(view.angle_rad, 0.0, ANGLE_BOUND_RAD)
+}
+
+fn check_motion(
+    velocity_mps: Option<[f64; 2]>,
+    heading_rad: Option<f64>,
+    size_m: Option<[f64; 2]>,
+) -> Result<(), RejectReason> {
+    let mut speeds = velocity_mps.into_iter().flatten();
+    speeds.try_for_each(|speed| check_between(speed, -SPEED_BOUND_MPS, SPEED_BOUND_MPS))?;
+    heading_rad.map_or(Ok(()), |heading| check_between(heading, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD))?;
+    size_m.into_iter().flatten().try_for_each(|size| check_between(size, 0.0, SIZE_BOUND_M))
+}
+
+fn check_scores(scores: &BTreeMap<Label, f64>) -> Result<(), RejectReason> {
+    if scores.len() > MAX_SCORES {
+        return Err(RejectReason::TooManyObjects);
+    }
+    scores.values().copied().try_for_each(check_confidence)?;
+    check_labels(scores.keys().map(|label| &**label))
+}
+
+fn check_between(value: f64, low: f64, high: f64) -> Result<(), RejectReason> {
+    if (low..=high).contains(&value) { Ok(()) } else { Err(number_reason(value)) }
 }
 
 fn check_verdict(verdict: &Verdict) -> Result<(), RejectReason> {

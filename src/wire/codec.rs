@@ -85,7 +85,7 @@ mod tests {
 
     use super::*;
     use crate::time::Timestamp;
-    use crate::wire::{PerceivedObject, Reputations, WirePose};
+    use crate::wire::{FieldOfView, PerceivedObject, Reputations, WirePose};
 
     fn node() -> NodeName {
         NodeName::new("euclid").unwrap()
@@ -93,20 +93,14 @@ mod tests {
 
     fn report() -> ObjectReport {
         ObjectReport {
-            schema: SCHEMA_VERSION,
-            node: node(),
-            seq: 412,
-            captured_at_us: Timestamp(1_732_154_400_123_456),
             pose: Some(WirePose { x_m: 0.61, y_m: 0.46, heading_rad: 2.88 }),
             objects: vec![PerceivedObject {
-                label: "ABCD123".into(),
-                confidence: 0.93,
-                x_m: 0.25,
-                y_m: 0.48,
                 covariance_m2: Some([0.0004, 0.0, 0.0001]),
                 landmark: Some("slot-0".into()),
+                ..PerceivedObject::new("ABCD123", 0.93, 0.25, 0.48)
             }],
             seen: Some(vec!["slot-0".into(), "slot-1".into()]),
+            ..ObjectReport::new(node(), 412, Timestamp(1_732_154_400_123_456))
         }
     }
 
@@ -125,7 +119,7 @@ mod tests {
     #[test]
     fn each_flaw_of_a_report_has_its_reason() {
         type Flaw = (fn(&mut ObjectReport), RejectReason);
-        let flaws: [Flaw; 18] = [
+        let flaws: [Flaw; 24] = [
             (|r| r.schema = 2, RejectReason::UnknownSchema),
             (|r| r.schema = 0, RejectReason::UnknownSchema),
             (|r| r.node = NodeName::new("gauss").unwrap(), RejectReason::NodeMismatch),
@@ -144,6 +138,12 @@ mod tests {
             (|r| r.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
             (|r| r.objects[0].landmark = Some("a\nb".into()), RejectReason::InvalidLabel),
             (|r| r.seen = Some(vec!["".into()]), RejectReason::InvalidLabel),
+            (|r| r.objects[0].velocity_mps = Some([1e9, 0.0]), RejectReason::OutOfRange),
+            (|r| r.objects[0].heading_rad = Some(1e9), RejectReason::OutOfRange),
+            (|r| r.objects[0].size_m = Some([0.0, -1.0]), RejectReason::OutOfRange),
+            (|r| r.objects[0].scores = [("cup".into(), 2.0)].into(), RejectReason::ConfidenceOutOfRange),
+            (|r| r.view = Some(FieldOfView { range_m: -1.0, angle_rad: 1.0 }), RejectReason::OutOfRange),
+            (|r| r.view = Some(FieldOfView { range_m: 1.0, angle_rad: 1e9 }), RejectReason::OutOfRange),
         ];
         assert_eq!(reason(&report()), None);
         for (index, (spoil, expected)) in flaws.into_iter().enumerate() {
@@ -198,12 +198,11 @@ mod tests {
             (x_m, y_m) in (-1e8..1e8f64, -1e8..1e8f64),
             variances in option::of((1e-6..1e6f64, 1e-6..1e6f64)),
             landmark in option::of("[a-z0-9-]{1,64}"),
+            velocity_mps in option::of([-1e4..1e4f64, -1e4..1e4f64]),
+            (heading_rad, size_m) in (option::of(-10.0..10.0f64), option::of([0.0..1e5f64, 0.0..1e5f64])),
+            scores in collection::btree_map("[a-z]{1,8}".prop_map(Into::into), 0.0..=1.0f64, 0..4),
         ) -> PerceivedObject {
-            PerceivedObject {
-                label: label.into(), confidence, x_m, y_m,
-                covariance_m2: variances.map(|(xx, yy)| [xx, 0.0, yy]),
-                landmark: landmark.map(Into::into),
-            }
+            PerceivedObject { covariance_m2: variances.map(|(xx, yy)| [xx, 0.0, yy]), landmark: landmark.map(Into::into), velocity_mps, heading_rad, size_m, scores, ..PerceivedObject::new(label, confidence, x_m, y_m) }
         }
     }
 
@@ -214,12 +213,7 @@ mod tests {
             objects in collection::vec(object(), 0..20),
             seen in option::of(collection::vec("[a-z]{1,8}", 0..5)),
         ) -> ObjectReport {
-            ObjectReport {
-                schema: SCHEMA_VERSION, node: node(), seq, captured_at_us: Timestamp(captured_at),
-                pose: pose.map(|(x_m, y_m, heading_rad)| WirePose { x_m, y_m, heading_rad }),
-                objects,
-                seen: seen.map(|ids| ids.into_iter().map(Into::into).collect()),
-            }
+            ObjectReport { pose: pose.map(|(x_m, y_m, heading_rad)| WirePose { x_m, y_m, heading_rad }), objects, seen: seen.map(|ids| ids.into_iter().map(Into::into).collect()), ..ObjectReport::new(node(), seq, Timestamp(captured_at)) }
         }
     }
 

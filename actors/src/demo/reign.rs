@@ -78,6 +78,7 @@ mod tests {
             oldest_capture_us: None,
             landmarks: Vec::new(),
             objects: Vec::new(),
+            pose_corrections: Default::default(),
         };
         ReceivedMap { received_at: Timestamp(at_ms * 1000), map: Arc::new(map) }
     }

@@ -193,20 +193,8 @@ impl Stranger {
 
 pub(crate) fn report(node: &str, seq: u64) -> ObjectReport {
     ObjectReport {
-        schema: SCHEMA_VERSION,
-        node: name(node),
-        seq,
-        captured_at_us: Timestamp(1_732_154_400_123_456),
-        pose: None,
-        objects: vec![PerceivedObject {
-            label: "car".into(),
-            confidence: 0.9,
-            x_m: 1.0,
-            y_m: 2.0,
-            covariance_m2: None,
-            landmark: None,
-        }],
-        seen: None,
+        objects: vec![PerceivedObject::new("car", 0.9, 1.0, 2.0)],
+        ..ObjectReport::new(name(node), seq, Timestamp(1_732_154_400_123_456))
     }
 }
 
@@ -220,5 +208,6 @@ pub(crate) fn map(aggregator: &str, round: u64) -> Arc<GlobalMap> {
         oldest_capture_us: None,
         landmarks: vec![],
         objects: vec![],
+        pose_corrections: Default::default(),
     })
 }

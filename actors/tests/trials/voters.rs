@@ -104,16 +104,9 @@ fn keep(newest: &mut Option<Arc<Reputations>>, reputations: Arc<Reputations>) {
 }
 
 fn vote(node: NodeName, label: &str, seq: u64) -> ObjectReport {
-    let object = PerceivedObject {
-        label: label.into(),
-        confidence: 0.9,
-        x_m: 6.0,
-        y_m: 0.0,
-        covariance_m2: None,
-        landmark: Some(LANDMARK.into()),
-    };
-    let (schema, captured_at_us) = (SCHEMA_VERSION, clock::now());
-    ObjectReport { schema, node, seq, captured_at_us, pose: None, objects: vec![object], seen: None }
+    let object = PerceivedObject { landmark: Some(LANDMARK.into()), ..PerceivedObject::new(label, 0.9, 6.0, 0.0) };
+    let (_schema, captured_at_us) = (SCHEMA_VERSION, clock::now());
+    ObjectReport { objects: vec![object], ..ObjectReport::new(node, seq, captured_at_us) }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

@@ -28,14 +28,22 @@ fn map() -> GlobalMap {
             observers: vec![edge()],
         }],
         objects: vec![FusedObject {
-            id: Uuid::nil(),
-            label: "car".into(),
-            confidence: 0.8,
-            x_m: 1.0,
-            y_m: 2.0,
-            covariance_m2: [0.1, 0.0, 0.2],
             contributors: vec![edge()],
+            existence: Some(0.9),
+            scores: [("car".into(), 0.9), ("truck".into(), 0.1)].into(),
+            velocity_mps: Some([3.0, -4.0]),
+            heading_rad: Some(-0.9),
+            size_m: Some([4.5, 1.8]),
+            age_s: Some(0.1),
+            first_seen_us: Some(Timestamp(1_732_154_390_000_000)),
+            vehicle: Some(edge()),
+            ..FusedObject::new(Uuid::nil(), "car", 0.8, 1.0, 2.0, Covariance { xx: 0.1, xy: 0.0, yy: 0.2 })
         }],
+        pose_corrections: [(
+            edge(),
+            PoseCorrection { about_m: [1.0, 2.0], dx_m: 0.2, dy_m: -0.1, dheading_rad: 0.01, pairs: 12.5 },
+        )]
+        .into(),
     }
 }
 
@@ -93,6 +101,9 @@ fn each_flaw_has_its_reason<T: Payload>(sound: impl Fn() -> T, flaws: &[Flaw<T>]
 
 #[test]
 fn each_flaw_of_a_map_has_its_reason() {
+    fn edge_of(map: &mut GlobalMap) -> &mut PoseCorrection {
+        map.pose_corrections.get_mut(&edge()).unwrap()
+    }
     each_flaw_has_its_reason(
         map,
         &[
@@ -111,6 +122,17 @@ fn each_flaw_of_a_map_has_its_reason() {
             (|m| m.objects[0].covariance_m2[1] = f64::INFINITY, RejectReason::NotFinite),
             (|m| m.objects[0].confidence = -0.5, RejectReason::ConfidenceOutOfRange),
             (|m| m.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
+            (|m| m.objects[0].existence = Some(1.5), RejectReason::ConfidenceOutOfRange),
+            (|m| m.objects[0].scores = [("".into(), 0.5)].into(), RejectReason::InvalidLabel),
+            (|m| m.objects[0].velocity_mps = Some([f64::NAN, 0.0]), RejectReason::NotFinite),
+            (|m| m.objects[0].velocity_mps = Some([0.0, 1e9]), RejectReason::OutOfRange),
+            (|m| m.objects[0].heading_rad = Some(f64::INFINITY), RejectReason::NotFinite),
+            (|m| m.objects[0].size_m = Some([4.0, -1.0]), RejectReason::OutOfRange),
+            (|m| m.objects[0].age_s = Some(-1.0), RejectReason::OutOfRange),
+            (|m| m.objects[0].first_seen_us = Some(Timestamp(1 << 53)), RejectReason::OutOfRange),
+            (|m| edge_of(m).dheading_rad = f64::NAN, RejectReason::NotFinite),
+            (|m| edge_of(m).dx_m = f64::INFINITY, RejectReason::NotFinite),
+            (|m| edge_of(m).pairs = -1.0, RejectReason::OutOfRange),
         ],
     );
 }

@@ -179,6 +179,7 @@ mod tests {
             oldest_capture_us: None,
             landmarks: Vec::new(),
             objects: Vec::new(),
+            pose_corrections: Default::default(),
         };
         assembly.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
         assert_eq!(

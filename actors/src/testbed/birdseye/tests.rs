@@ -29,6 +29,7 @@ fn map(testbed: &Testbed, scene: &Scene, otherwise: &[(&str, Option<&str>)]) -> 
         oldest_capture_us: None,
         landmarks: scene.spots.iter().map(state).collect(),
         objects: Vec::new(),
+        pose_corrections: Default::default(),
     }
 }
 

@@ -1,0 +1,163 @@
+//! Objects as a vehicle reports them and as the aggregator agrees on them.
+
+use std::collections::BTreeMap;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use uuid::Uuid;
+
+use crate::geometry::Covariance;
+use crate::names::{Label, LandmarkId, NodeName};
+use crate::time::Timestamp;
+
+/// A detection with its place in the world.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct PerceivedObject {
+    /// Class label or decoded text.
+    pub label: Label,
+    /// The detector's confidence, 0 to 1.
+    pub confidence: f64,
+    /// East in metres.
+    pub x_m: f64,
+    /// North in metres.
+    pub y_m: f64,
+    /// Position covariance `[xx, xy, yy]` in m².
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub covariance_m2: Option<[f64; 3]>,
+    /// The known location that the node takes this object for; required in VOTE.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub landmark: Option<LandmarkId>,
+    /// Velocity over ground `[east, north]` in metres per second.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub velocity_mps: Option<[f64; 2]>,
+    /// Direction in which the object points, in radians counter-clockwise from east.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub heading_rad: Option<f64>,
+    /// Size `[length, width]` in metres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub size_m: Option<[f64; 2]>,
+    /// The detector's confidence in each class, 0 to 1, if it tells more than the best one.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub scores: BTreeMap<Label, f64>,
+}
+
+impl PerceivedObject {
+    /// An object of which no more is known than what and where it is.
+    pub fn new(label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64) -> Self {
+        Self {
+            label: label.into(),
+            confidence,
+            x_m,
+            y_m,
+            covariance_m2: None,
+            landmark: None,
+            velocity_mps: None,
+            heading_rad: None,
+            size_m: None,
+            scores: BTreeMap::new(),
+        }
+    }
+
+    /// The reported covariance, if any.
+    pub fn covariance(&self) -> Option<Covariance> {
+        self.covariance_m2.map(|[xx, xy, yy]| Covariance { xx, xy, yy })
+    }
+}
+
+/// What a camera or scanner covers, seen from the pose of its report and centred on its heading.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct FieldOfView {
+    /// Range in metres within which objects are found as a rule.
+    pub range_m: f64,
+    /// Opening angle in radians, both sides together; 2π for all around.
+    pub angle_rad: f64,
+}
+
+/// An object of the open world, where it is at the time of fusion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct FusedObject {
+    /// Stable identity of the object.
+    pub id: Uuid,
+    /// The agreed label.
+    pub label: Label,
+    /// How far the entry may be relied on, 0 to 1: existence probability times the label's.
+    pub confidence: f64,
+    /// East in metres.
+    pub x_m: f64,
+    /// North in metres.
+    pub y_m: f64,
+    /// Position covariance `[xx, xy, yy]` in m².
+    pub covariance_m2: [f64; 3],
+    /// The nodes whose detections went into the entry.
+    pub contributors: Vec<NodeName>,
+    /// Probability that the object exists and is still there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub existence: Option<f64>,
+    /// Probability of each class.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub scores: BTreeMap<Label, f64>,
+    /// Velocity over ground `[east, north]` in metres per second.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub velocity_mps: Option<[f64; 2]>,
+    /// Direction in which the object points, in radians counter-clockwise from east.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub heading_rad: Option<f64>,
+    /// Size `[length, width]` in metres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub size_m: Option<[f64; 2]>,
+    /// Time in seconds since it was last detected.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub age_s: Option<f64>,
+    /// When it was first detected, by the aggregator's clock.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub first_seen_us: Option<Timestamp>,
+    /// The node that this object is, by its own word.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub vehicle: Option<NodeName>,
+}
+
+impl FusedObject {
+    /// An object of which no more is known than what and where it is.
+    pub fn new(id: Uuid, label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64, covariance: Covariance) -> Self {
+        Self {
+            id,
+            label: label.into(),
+            confidence,
+            x_m,
+            y_m,
+            covariance_m2: [covariance.xx, covariance.xy, covariance.yy],
+            contributors: Vec::new(),
+            existence: None,
+            scores: BTreeMap::new(),
+            velocity_mps: None,
+            heading_rad: None,
+            size_m: None,
+            age_s: None,
+            first_seen_us: None,
+            vehicle: None,
+        }
+    }
+
+    /// The position covariance.
+    pub fn covariance(&self) -> Covariance {
+        let [xx, xy, yy] = self.covariance_m2;
+        Covariance { xx, xy, yy }
+    }
+}
+
+/// By how much a vehicle's positions are off, as estimated from what several vehicles see.
+///
+/// A reported position p belongs at R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`, `dy_m`).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct PoseCorrection {
+    /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of what the vehicle sees.
+    pub about_m: [f64; 2],
+    /// East in metres.
+    pub dx_m: f64,
+    /// North in metres.
+    pub dy_m: f64,
+    /// Rotation in radians, counter-clockwise.
+    pub dheading_rad: f64,
+    /// Pairs of detections that the estimate rests on, older ones counting less.
+    pub pairs: f64,
+}
