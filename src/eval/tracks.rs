@@ -213,29 +213,30 @@ impl TrackEvaluation {
 
     /// Takes the next map.
     pub fn map(&mut self, map: &GlobalMap) {
-        let at = map.fused_at_us;
-        let distance = |frame: Timestamp| frame.micros_from(at).abs();
+        let ids = &mut self.ids;
+        let said = map.objects.iter().map(|object| {
+            let fresh = ids.len() as u32;
+            SaidObject {
+                id: *ids.entry(object.id).or_insert(fresh),
+                label: object.label.clone(),
+                score: object.confidence,
+                position: Point2::new(object.x_m, object.y_m),
+            }
+        });
+        let said = said.collect();
+        self.said(map.fused_at_us, said);
+    }
+
+    /// Takes what was said, in any other way, to be there at a time.
+    pub fn said(&mut self, at: Timestamp, said: Vec<SaidObject>) {
         let frames = self.truth.frames();
         let first = frames.partition_point(|frame| at.micros_from(frame.at) > self.reach_us);
-        for (number, frame) in frames.iter().enumerate().skip(first) {
-            if distance(frame.at) > self.reach_us {
-                break;
+        let near = frames[first..].iter().take_while(|frame| frame.at.micros_from(at) <= self.reach_us);
+        for (frame, nearest) in near.zip(&mut self.maps[first..]) {
+            let distance = |time: Timestamp| frame.at.micros_from(time).abs();
+            if nearest.as_ref().is_none_or(|(other, _)| distance(*other) >= distance(at)) {
+                *nearest = Some((at, said.clone()));
             }
-            let nearest = &mut self.maps[number];
-            if nearest.as_ref().is_some_and(|(other, _)| frame.at.micros_from(*other).abs() < distance(frame.at)) {
-                continue;
-            }
-            let ids = &mut self.ids;
-            let said = map.objects.iter().map(|object| {
-                let fresh = ids.len() as u32;
-                SaidObject {
-                    id: *ids.entry(object.id).or_insert(fresh),
-                    label: object.label.clone(),
-                    score: object.confidence,
-                    position: Point2::new(object.x_m, object.y_m),
-                }
-            });
-            *nearest = Some((at, said.collect()));
         }
     }
 

@@ -1,5 +1,6 @@
 use super::matching::Pair;
 use super::*;
+use crate::geometry::Covariance;
 use crate::names::NodeName;
 use crate::wire::{FusedObject, SCHEMA_VERSION};
 
@@ -132,15 +133,8 @@ fn the_matching_has_the_greatest_sum_however_many_contest() {
 }
 
 fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
-    let object = |&(id, x_m): &(u128, f64)| FusedObject {
-        id: Uuid::from_u128(id),
-        label: "car".into(),
-        confidence: 0.9,
-        x_m,
-        y_m: 0.0,
-        covariance_m2: [1.0, 0.0, 1.0],
-        contributors: Vec::new(),
-    };
+    let covariance = Covariance::isotropic(1.0);
+    let object = |&(id, x_m): &(u128, f64)| FusedObject::new(Uuid::from_u128(id), "car", 0.9, x_m, 0.0, covariance);
     GlobalMap {
         schema: SCHEMA_VERSION,
         aggregator: NodeName::from_static("edge"),
@@ -150,6 +144,7 @@ fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
         oldest_capture_us: None,
         landmarks: Vec::new(),
         objects: objects.iter().map(object).collect(),
+        pose_corrections: BTreeMap::new(),
     }
 }
 
