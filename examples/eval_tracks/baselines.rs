@@ -25,14 +25,14 @@ const PATIENCE: Duration = Duration::from_millis(500);
 
 /// What was found, with its score.
 #[derive(Debug, Clone)]
-pub struct Found {
+pub(crate) struct Found {
     label: Label,
     score: f64,
     position: Point2<f64>,
 }
 
 /// All that one report says, the vehicle itself too if its pose is known.
-pub fn found(report: &ObjectReport) -> Vec<Found> {
+pub(crate) fn found(report: &ObjectReport) -> Vec<Found> {
     let objects = report.objects.iter().map(|object| Found {
         label: object.label.clone(),
         score: object.confidence,
@@ -48,11 +48,11 @@ pub fn found(report: &ObjectReport) -> Vec<Found> {
 
 /// The last reports of all vehicles.
 #[derive(Debug, Default)]
-pub struct Latest(BTreeMap<NodeName, (Timestamp, Vec<Found>)>);
+pub(crate) struct Latest(BTreeMap<NodeName, (Timestamp, Vec<Found>)>);
 
 impl Latest {
     /// Takes a report, unless a later one is there already.
-    pub fn report(&mut self, report: &ObjectReport) {
+    pub(crate) fn report(&mut self, report: &ObjectReport) {
         let last = self.0.entry(report.node.clone()).or_default();
         if report.captured_at_us > last.0 {
             *last = (report.captured_at_us, found(report));
@@ -60,14 +60,14 @@ impl Latest {
     }
 
     /// What all vehicles found.
-    pub fn union(&self, now: Timestamp) -> Vec<Found> {
+    pub(crate) fn union(&self, now: Timestamp) -> Vec<Found> {
         let fresh = self.0.values().filter(|(captured, _)| now.since(*captured) <= MAX_AGE);
         fresh.flat_map(|(_, found)| found.iter().cloned()).collect()
     }
 }
 
 /// Of those of one label near each other, the one with the highest score.
-pub fn suppressed(mut found: Vec<Found>) -> Vec<Found> {
+pub(crate) fn suppressed(mut found: Vec<Found>) -> Vec<Found> {
     found.sort_by(|a, b| b.score.total_cmp(&a.score));
     let mut kept: Vec<Found> = Vec::new();
     for candidate in found {
@@ -83,7 +83,7 @@ pub fn suppressed(mut found: Vec<Found>) -> Vec<Found> {
 
 /// Gives identities to what is found.
 #[derive(Debug, Default)]
-pub struct Tracker {
+pub(crate) struct Tracker {
     tracks: Vec<Track>,
     identities: u32,
 }
@@ -99,7 +99,7 @@ struct Track {
 
 impl Tracker {
     /// Takes what is there at a time.
-    pub fn track(&mut self, at: Timestamp, found: &[Found]) -> Vec<SaidObject> {
+    pub(crate) fn track(&mut self, at: Timestamp, found: &[Found]) -> Vec<SaidObject> {
         self.tracks.retain(|track| at.since(track.at) <= PATIENCE);
         let mut pairs = Vec::new();
         for (number, track) in self.tracks.iter().enumerate() {

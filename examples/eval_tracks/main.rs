@@ -31,14 +31,14 @@ const REPORT: Range<u64> = 1001..1005;
 const OBSERVERS: [usize; 6] = [2, 4, 8, 16, 32, 50];
 
 /// Ways to make a map of the same reports.
-pub const METHODS: [&str; 4] = ["best vehicle", "union", "late fusion", "ecod"];
+pub(crate) const METHODS: [&str; 4] = ["best vehicle", "union", "late fusion", "ecod"];
 
 /// Columns of the table.
-pub const FIGURES: [&str; 9] =
+pub(crate) const FIGURES: [&str; 9] =
     ["AP@0.5", "AP@1", "AP@2", "AP@4", "best F1", "MODA", "HOTA", "IDF1", "switches per object"];
 
 /// The figures of one method, in the order of [`FIGURES`].
-pub type Figures = [f64; FIGURES.len()];
+pub(crate) type Figures = [f64; FIGURES.len()];
 
 struct Options {
     seeds: Range<u64>,

@@ -14,7 +14,7 @@ const COLORS: [RGBColor; METHODS.len()] =
 const DRAWN: [usize; 6] = [0, 2, 4, 5, 6, 7];
 
 /// Draws a panel for each figure; `courses` has the figures of all methods by the number of vehicles.
-pub fn draw(path: &Path, courses: &[(usize, [Figures; METHODS.len()])]) -> anyhow::Result<()> {
+pub(crate) fn draw(path: &Path, courses: &[(usize, [Figures; METHODS.len()])]) -> anyhow::Result<()> {
     let (first, last) = (courses.first().context("nothing to draw")?.0, courses[courses.len() - 1].0);
     let area = SVGBackend::new(path, (960, 640)).into_drawing_area();
     area.fill(&WHITE)?;
