@@ -4,11 +4,13 @@
 //! [--observers 2,4,8] [--write-table FILE] [--svg FILE] [--recordings DIR]`
 //!
 //! Parameters are chosen on the seeds `tuning` and figures reported on the seeds `report`; `--count` takes the first
-//! of them. `--recordings` writes reports and truth of every scene for `ecod-node replay` and `ecod-node eval`.
+//! of them. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
+//! `ecod-node eval`.
 
 mod baselines;
 mod plot;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::{BufWriter, Write as _};
 use std::ops::Range;
@@ -16,13 +18,15 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
-use ecod::eval::tracks::{AP_DISTANCES_M, TrackEvaluation, TrackScores, TrackTruth};
+use ecod::eval::tracks::{AP_DISTANCES_M, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
+use ecod::geometry::Covariance;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
-use ecod::wire::{GlobalMap, ReportKind};
+use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind, SCHEMA_VERSION};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use uuid::Uuid;
 
 use baselines::{Latest, Tracker, found, suppressed};
 
@@ -100,8 +104,12 @@ impl Scene {
     }
 }
 
-/// All methods on one recording.
-fn run(recording: &TrafficRecording, observers: usize) -> anyhow::Result<[TrackScores; METHODS.len()]> {
+/// All methods on one recording; `write` gets every map of late fusion.
+fn run(
+    recording: &TrafficRecording,
+    observers: usize,
+    write: &mut dyn FnMut(Timestamp, &[SaidObject]),
+) -> anyhow::Result<[TrackScores; METHODS.len()]> {
     let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth)?)?;
     let judge = || TrackEvaluation::new(truth.clone());
     let (mut union, mut late, mut ours) = (judge(), judge(), judge());
@@ -112,7 +120,9 @@ fn run(recording: &TrafficRecording, observers: usize) -> anyhow::Result<[TrackS
         Event::Map(at) => {
             let all = latest.union(at);
             union.said(at, union_tracker.track(at, &all));
-            late.said(at, late_tracker.track(at, &suppressed(all)));
+            let suppressed = late_tracker.track(at, &suppressed(all));
+            write(at, &suppressed);
+            late.said(at, suppressed);
         }
     }) {
         ours.map(&map);
@@ -123,7 +133,7 @@ fn run(recording: &TrafficRecording, observers: usize) -> anyhow::Result<[TrackS
 }
 
 enum Event<'a> {
-    Report(&'a ecod::wire::ObjectReport),
+    Report(&'a ObjectReport),
     Map(Timestamp),
 }
 
@@ -174,15 +184,43 @@ fn figures(scores: &TrackScores, truth_ids: usize) -> Figures {
     [a, b, c, d, f1, moda, hota, idf1, at.id_switches as f64 / truth_ids.max(1) as f64]
 }
 
-fn write_recording(folder: &Path, name: &str, recording: &TrafficRecording) -> anyhow::Result<()> {
-    fs::create_dir_all(folder)?;
-    let mut reports = BufWriter::new(File::create(folder.join(format!("{name}.reports.jsonl")))?);
-    for arrived in &recording.reports {
-        serde_json::to_writer(&mut reports, arrived)?;
-        reports.write_all(b"\n")?;
+/// Where a recording is written to, line by line.
+struct Files {
+    maps: BufWriter<File>,
+}
+
+impl Files {
+    fn new(folder: &Path, name: &str, recording: &TrafficRecording) -> anyhow::Result<Self> {
+        fs::create_dir_all(folder)?;
+        let file = |kind: &str| folder.join(format!("{name}.{kind}"));
+        let mut reports = BufWriter::new(File::create(file("reports.jsonl"))?);
+        for arrived in &recording.reports {
+            writeln!(reports, "{}", serde_json::to_string(arrived)?)?;
+        }
+        reports.flush()?;
+        fs::write(file("truth.json"), serde_json::to_vec(&recording.truth)?)?;
+        Ok(Self { maps: BufWriter::new(File::create(file("late.jsonl"))?) })
     }
-    reports.flush()?;
-    Ok(fs::write(folder.join(format!("{name}.truth.json")), serde_json::to_vec(&recording.truth)?)?)
+
+    fn map(&mut self, at: Timestamp, said: &[SaidObject]) -> anyhow::Result<()> {
+        let objects = said.iter().map(|said| {
+            let id = Uuid::from_u128(u128::from(said.id));
+            let covariance = Covariance::isotropic(1.0);
+            FusedObject::new(id, said.label.clone(), said.score, said.position.x, said.position.y, covariance)
+        });
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("late-fusion"),
+            epoch: 1,
+            round: 1,
+            fused_at_us: at,
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: objects.collect(),
+            pose_corrections: BTreeMap::new(),
+        };
+        Ok(writeln!(self.maps, "{}", serde_json::to_string(&map)?)?)
+    }
 }
 
 fn header() -> String {
@@ -213,12 +251,20 @@ fn main() -> anyhow::Result<()> {
         for seed in &seeds {
             let mut rng = ChaCha8Rng::seed_from_u64(*seed);
             let recording = generate(&config, &mut || rng.random());
-            if let Some(folder) = &options.recordings {
-                write_recording(folder, &format!("{name}-{seed}"), &recording)?;
-            }
-            let ids: std::collections::BTreeSet<usize> =
+            let folder = options.recordings.as_ref();
+            let mut files =
+                folder.map(|folder| Files::new(folder, &format!("{name}-{seed}"), &recording)).transpose()?;
+            let mut written = Ok(());
+            let mut write = |at, said: &[SaidObject]| {
+                if let (Some(files), Ok(())) = (&mut files, &written) {
+                    written = files.map(at, said);
+                }
+            };
+            let ids: BTreeSet<usize> =
                 recording.truth.frames.iter().flat_map(|frame| frame.objects.iter().map(|object| object.id)).collect();
-            for (method, scores) in run(&recording, config.observers)?.iter().enumerate() {
+            let scores = run(&recording, config.observers, &mut write)?;
+            written?;
+            for (method, scores) in scores.iter().enumerate() {
                 for (sum, figure) in mean[method].iter_mut().zip(figures(scores, ids.len())) {
                     *sum += figure / seeds.len() as f64;
                 }

@@ -142,7 +142,14 @@ impl TrafficConfig {
             bicycles: 0,
             convoy: true,
             synchronous: true,
-            sensor: SensorConfig { range_m: 50.0, ..SensorConfig::default() },
+            memory_s: 0.3,
+            sensor: SensorConfig {
+                range_m: 50.0,
+                clutter: 0.5,
+                ghosts_per_s: 0.15,
+                lures: 0.4,
+                ..SensorConfig::default()
+            },
             said: SaidConfig { poses: false, covariances: false, views: false },
             ..Self::default()
         }
