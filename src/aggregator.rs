@@ -4,8 +4,9 @@
 //! [`Aggregator::deadline`]; either may close a round and return what it made. The live node and the replay of a log
 //! run this same machine.
 //!
-//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time. In
-//! VOTE's `paper` mode verdicts come with the rounds in which a packet of frames is complete, and only with them.
+//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time. Where
+//! both run, verdicts come from the first vote on. In VOTE's `paper` mode verdicts come with the rounds in which a packet
+//! of frames is complete, and only with them.
 //!
 //! A standby runs the machine without leading: it takes reports and closes rounds, but nothing comes out. From
 //! [`Aggregator::lead`] on its rounds count, with all the evidence it has gathered.
@@ -22,7 +23,7 @@ use crate::landmark::{Landmark, LandmarkIndex};
 use crate::names::NodeName;
 use crate::pace::Pace;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::round::RoundTrigger;
+use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
 use crate::vote::{Vote, VoteMode};
 use crate::window::ReportWindow;
@@ -55,6 +56,8 @@ pub struct Aggregator {
     pace: Option<Pace>,
     vote: Option<Vote>,
     by_packets: bool,
+    /// Whether anyone has voted: a cell that runs both algorithms spares its network verdicts about nothing until then.
+    voted: bool,
 }
 
 impl Aggregator {
@@ -73,22 +76,22 @@ impl Aggregator {
             pace,
             vote,
             by_packets,
+            voted: false,
         }
     }
 
     /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
     pub fn new(name: NodeName, epoch: u64, config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
         let mut aggregator = Self::standby(config, landmarks, now);
-        aggregator.lead(Epoch::new(epoch, name), 1, true, now);
+        aggregator.lead(Epoch::new(epoch, name), 1, FirstRound::OnTime, now);
         aggregator
     }
 
-    /// Leads from `now` on: the next round is number `first_round` of `epoch`, due a period later if the round before
-    /// it was closed `on_time`, else at once.
-    pub fn lead(&mut self, epoch: Epoch, first_round: u64, on_time: bool, now: Timestamp) {
+    /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says.
+    pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {
         self.leads = Some(epoch);
         self.next_round = first_round;
-        self.rounds.start(on_time, now);
+        self.rounds.start(first, now);
     }
 
     /// Lets the present round last its whole period: whoever takes the lead over has that long to say so.
@@ -127,6 +130,7 @@ impl Aggregator {
                 let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
                 window.admit(report, now)?;
                 vote.observe(report, now)?;
+                self.voted = true;
             }
         }
         Ok(if self.rounds.report(kind, &report.node, now) { self.close(now) } else { None })
@@ -193,7 +197,8 @@ impl Aggregator {
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
         let by_packets = self.by_packets;
-        let is_due = |vote: &&mut Vote| !by_packets || vote.is_packet_complete();
+        let wanted = self.voted || pace.is_none();
+        let is_due = |vote: &&mut Vote| if by_packets { vote.is_packet_complete() } else { wanted };
         let vote = self.vote.as_mut().filter(is_due).map(|vote| vote.close(now));
         let epoch = self.leads.clone()?;
         if pace.is_none() && vote.is_none() {
@@ -316,6 +321,17 @@ mod tests {
     }
 
     #[test]
+    fn where_both_run_verdicts_come_from_the_first_vote_on() {
+        let mut cell = leader(FusionConfig::default());
+        cell.report(Detections, &report("euclid", "cup", 10), at(12)).unwrap();
+        let silent = cell.tick(at(100)).unwrap();
+        assert!(silent.map.is_some() && silent.verdicts.is_none());
+        cell.report(VoteDetections, &report("euclid", "cup", 110), at(112)).unwrap();
+        assert!(cell.tick(at(200)).unwrap().verdicts.is_some());
+        assert!(cell.tick(at(20_000)).unwrap().verdicts.is_some(), "silence is a verdict once there were votes");
+    }
+
+    #[test]
     fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
         let mut cell = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
         for step in 1..=20 {
@@ -325,12 +341,16 @@ mod tests {
             assert_eq!(cell.tick(at(step * 50 + 20)), None);
         }
         let epoch = Epoch::new(3, NodeName::from_static("gauss"));
-        cell.lead(epoch.clone(), 88, false, at(1030));
+        cell.lead(epoch.clone(), 88, FirstRound::Overdue, at(1030));
         let first = cell.tick(at(1030)).expect("due at once");
         assert_eq!((first.epoch.clone(), first.round, shown(&first)), (epoch.clone(), 88, (Some("cup"), Some("cup"))));
-        cell.lead(epoch, 89, true, at(1040));
+        cell.lead(epoch, 89, FirstRound::OnTime, at(1040));
         assert_eq!(cell.tick(at(1139)), None);
         assert_eq!(cell.tick(at(1140)).map(|fused| fused.round), Some(89));
+        cell.lead(Epoch::new(4, NodeName::from_static("gauss")), 90, FirstRound::AfterConnects, at(1140));
+        assert_eq!(cell.report(ReportKind::Detections, &report("euclid", "cup", 1150), at(1150)), Ok(None));
+        assert_eq!(cell.tick(at(1164)), None, "the others are still connecting");
+        assert_eq!(cell.tick(at(1165)).map(|fused| fused.round), Some(90));
         cell.stand_by();
         assert_eq!(cell.tick(at(1300)), None);
     }

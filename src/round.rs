@@ -72,6 +72,21 @@ struct Vehicle {
     reported: bool,
 }
 
+/// When the first round of a leadership is due.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum FirstRound {
+    /// A period from now: the round before has just been closed, by this node or one that handed over.
+    OnTime,
+    /// At once: the others are connected to this node's broker and wait.
+    Overdue,
+    /// [`CONNECT_TIME`] from now: the others wait, but nobody told them before to connect here.
+    AfterConnects,
+}
+
+/// How long a vehicle takes to connect to a broker that it has just heard of, and some more. A map sent before costs it
+/// a whole period.
+pub const CONNECT_TIME: Duration = Duration::from_millis(25);
+
 /// Periods after which a silent vehicle is no longer waited for.
 const LIVE_PERIODS: u32 = 3;
 
@@ -114,10 +129,16 @@ impl RoundTrigger {
         true
     }
 
-    /// Starts a run of rounds: the first is due a period after `now` if the one before was closed in time, else at once.
-    pub fn start(&mut self, on_time: bool, now: Timestamp) {
-        self.last_close = if on_time { now } else { now - self.config.period() };
-        self.held = false;
+    /// Starts a run of rounds.
+    pub fn start(&mut self, first: FirstRound, now: Timestamp) {
+        let period = self.config.period();
+        let wait = match first {
+            FirstRound::OnTime => period,
+            FirstRound::Overdue => Duration::ZERO,
+            FirstRound::AfterConnects => CONNECT_TIME.min(period),
+        };
+        self.last_close = now + wait - period;
+        self.held = first == FirstRound::AfterConnects;
     }
 
     /// Lets the present round last its whole period, whoever has reported.
@@ -179,9 +200,9 @@ mod tests {
     #[test]
     fn a_run_of_rounds_starts_at_once_or_a_period_later() {
         let mut rounds = trigger(RoundClose::WhenComplete);
-        rounds.start(true, at(50));
+        rounds.start(FirstRound::OnTime, at(50));
         assert_eq!(rounds.deadline(), at(150));
-        rounds.start(false, at(50));
+        rounds.start(FirstRound::Overdue, at(50));
         assert!(rounds.tick(at(50)));
     }
 

@@ -267,6 +267,23 @@ pub struct NodeStatus {
     pub version: String,
 }
 
+impl NodeStatus {
+    /// What a node says that has just started and follows nobody yet.
+    pub fn starting(node: NodeName, id: Uuid, role: Role, version: &str) -> Self {
+        Self {
+            schema: SCHEMA_VERSION,
+            node,
+            id,
+            role,
+            state: NodeState::Following,
+            epoch: 0,
+            aggregator: None,
+            fit: None,
+            version: version.to_owned(),
+        }
+    }
+}
+
 /// What a node is meant to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]

@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::Context;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
 use ecod_actors::bench::two_hop::{self, Load};
 use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
 use ecod_actors::clock;
@@ -98,17 +98,7 @@ async fn join(
     broker: &BrokerAddress,
 ) -> anyhow::Result<(ActorRef<GatewayMessage>, mpsc::UnboundedReceiver<Delivery>)> {
     let (sender, mut deliveries) = mpsc::unbounded_channel();
-    let status = NodeStatus {
-        schema: SCHEMA_VERSION,
-        node: NodeName::new(name)?,
-        id: Uuid::new_v4(),
-        role: Role::Auto,
-        state: NodeState::Following,
-        epoch: 0,
-        aggregator: None,
-        fit: None,
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-    };
+    let status = NodeStatus::starting(NodeName::new(name)?, Uuid::new_v4(), Role::Auto, env!("CARGO_PKG_VERSION"));
     let arguments = GatewayArguments {
         cell: NodeName::new("bench")?,
         part,

@@ -13,6 +13,7 @@ use ecod::aggregator::{Aggregator, Fused};
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::reputation::ReputationLedger;
+use ecod::round::FirstRound;
 use ecod::time::Timestamp;
 use ecod::wire::Reputation;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
@@ -40,8 +41,8 @@ pub enum FuserMessage {
         epoch: Epoch,
         /// Number of the next round.
         first_round: u64,
-        /// Whether the round before has just been published: the next is then due a period later, otherwise at once.
-        on_time: bool,
+        /// When it is due.
+        first: FirstRound,
     },
     /// Let the present round last its whole period: another node is about to lead from the next one on.
     HoldRound,
@@ -114,7 +115,7 @@ impl Actor for Fuser {
                 state.alarm = Timestamp(u64::MAX);
                 state.tick();
             }
-            FuserMessage::Lead { epoch, first_round, on_time } => state.lead(epoch, first_round, on_time),
+            FuserMessage::Lead { epoch, first_round, first } => state.lead(epoch, first_round, first),
             FuserMessage::HoldRound => {
                 state.aggregator.hold();
                 state.alarm = Timestamp(u64::MAX);
@@ -146,10 +147,10 @@ impl FuserState {
         }
     }
 
-    fn lead(&mut self, epoch: Epoch, first_round: u64, on_time: bool) {
+    fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
         self.keeper
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
-        self.aggregator.lead(epoch, first_round, on_time, clock::now());
+        self.aggregator.lead(epoch, first_round, first, clock::now());
         self.tick();
     }
 

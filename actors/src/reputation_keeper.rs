@@ -236,7 +236,8 @@ impl ReputationKeeperState {
         let leader = share.epoch.map(|term| Epoch::new(term, share.node.clone()));
         if leader.is_some() && leader != self.heard {
             self.heard = leader;
-            let own: Vec<_> = self.entries().filter(|entry| entry.aggregator == self.arguments.name).collect();
+            let own: Vec<_> =
+                self.entries().into_iter().filter(|entry| entry.aggregator == self.arguments.name).collect();
             self.share(&own);
         }
     }
@@ -275,20 +276,21 @@ impl ReputationKeeperState {
         self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
     }
 
-    fn entries(&self) -> std::vec::IntoIter<LedgerEntry> {
-        self.arguments.book.open().ledger.entries().collect::<Vec<_>>().into_iter()
+    fn entries(&self) -> Vec<LedgerEntry> {
+        self.arguments.book.open().ledger.entries().collect()
     }
 
     fn share_all(&self) {
-        self.share(&self.entries().collect::<Vec<_>>());
+        self.share(&self.entries());
     }
 
     /// Shares all evidence, and that there is none: whoever takes over waits for it.
     fn send_snapshot(&self) {
-        if self.entries().next().is_none() {
+        let entries = self.entries();
+        if entries.is_empty() {
             self.publish_share(&[]);
         }
-        self.share_all();
+        self.share(&entries);
     }
 
     fn share(&self, entries: &[LedgerEntry]) {

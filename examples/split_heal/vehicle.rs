@@ -135,9 +135,9 @@ impl Vehicle {
                     }
                     self.outbox.push((Some(to), Payload::Election(message.encode(Encoding::Cbor))));
                 }
-                Effect::Lead { epoch, first_round, on_time } => {
+                Effect::Lead { epoch, first_round, first } => {
                     self.news.push(format!("{epoch} leads from #{first_round}"));
-                    self.aggregator.lead(epoch, first_round, on_time, now);
+                    self.aggregator.lead(epoch, first_round, first, now);
                 }
                 Effect::StopPublishing { epoch } => {
                     self.news.push(format!("{epoch} stops"));

@@ -9,6 +9,7 @@ use crate::election::step::Effect;
 use crate::election::{Election, State};
 use crate::epoch::Epoch;
 use crate::names::NodeName;
+use crate::round::FirstRound;
 use crate::time::Timestamp;
 
 /// A node that knows of no leader.
@@ -18,6 +19,8 @@ pub(super) struct Seeking {
     since: Timestamp,
     /// The successors named by the lost leader; others come after them.
     order: Vec<NodeName>,
+    /// When the leader's sign of life was first asked for in vain.
+    asked_at: Option<Timestamp>,
     ask_at: Timestamp,
     /// Word of the lost leader must be newer than this to bring it back.
     pub(super) known_until: Timestamp,
@@ -25,7 +28,7 @@ pub(super) struct Seeking {
 
 impl Seeking {
     pub(super) fn new(since: Timestamp, order: Vec<NodeName>, ask_at: Timestamp) -> Self {
-        Self { since, order, ask_at, known_until: Timestamp::default() }
+        Self { since, order, asked_at: None, ask_at, known_until: Timestamp::default() }
     }
 }
 
@@ -77,19 +80,30 @@ impl Election {
 
     /// Seeks a leader; the first of `order` that can leads at once, the next one step later.
     pub(super) fn seek(&mut self, order: Vec<NodeName>, since: Timestamp, now: Timestamp) {
-        let known_until = match &self.state {
-            State::Following(following) => following.evidence_at() + self.config.beat(),
-            State::Seeking(_) | State::Leading(_) => now,
+        let (known_until, asked_at) = match &self.state {
+            State::Following(following) => (following.evidence_at() + self.config.beat(), following.asked_at),
+            State::Seeking(_) | State::Leading(_) => (now, None),
         };
         // Whoever is first in turn is heard before everyone has to ask.
         let ask_at = now + self.config.claim_step() * 2;
-        self.state = State::Seeking(Seeking { known_until, ..Seeking::new(since, order, ask_at) });
+        self.state = State::Seeking(Seeking { known_until, asked_at, ..Seeking::new(since, order, ask_at) });
         self.effects.push(Effect::Seek);
     }
 
     pub(super) fn ask_all(&mut self, now: Timestamp) {
         let ask = self.questions.ask(now);
         self.send_all(&Body::Ask { ask }, now);
+    }
+
+    /// Asks the leader itself, and those who hear it often.
+    pub(super) fn ask_near(&mut self, now: Timestamp) {
+        let State::Following(following) = &self.state else { return };
+        let near = following.successors.iter().filter(|name| **name != self.id);
+        let near: Vec<_> = near.chain([&following.epoch.leader]).cloned().collect();
+        let ask = self.questions.ask(now);
+        for peer in near {
+            self.send(&peer, Body::Ask { ask }, now);
+        }
     }
 
     /// Answers who leads and how lately it was heard.
@@ -134,8 +148,12 @@ impl Election {
         self.epoch = Some(epoch.clone());
         let known = self.standby().cloned();
         let successors = self.peers.successors(MAX_SUCCESSORS, now);
-        let on_time = !matches!(self.state, State::Seeking(_));
-        self.effects.push(Effect::Lead { epoch: epoch.clone(), first_round: self.round + 1, on_time });
+        let first = match &self.state {
+            State::Seeking(seeking) if seeking.order.first() == Some(&self.id) => FirstRound::Overdue,
+            State::Seeking(_) => FirstRound::AfterConnects,
+            State::Following(_) | State::Leading(_) => FirstRound::OnTime,
+        };
+        self.effects.push(Effect::Lead { epoch: epoch.clone(), first_round: self.round + 1, first });
         if known.as_ref() != successors.first() {
             self.effects.push(Effect::AnnounceStandby { epoch: epoch.clone(), standby: successors.first().cloned() });
         }
@@ -156,20 +174,30 @@ impl Election {
 
     /// When it is this node's turn to claim; `None` when it may not lead.
     ///
+    /// Whoever did not answer when the leader was doubted is as much out of reach as the leader, and waited for no
+    /// longer than an answer takes.
+    fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
+        let turn = |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
+        let in_order = turn(None);
+        let among_present = seeking.asked_at.map(|at| turn(Some(at)).max(at + self.config.claim_step() * 2));
+        self.standing().may_lead().then(|| among_present.map_or(in_order, |at| at.min(in_order)))
+    }
+
+    /// How many would claim before this node, of those heard at `since` or later if it is given.
+    ///
     /// The successors come first, in the order in which the lost leader named them: it heard them all, whereas what a
     /// follower knows of others may be as old as their first greeting.
-    fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
-        let (now, standing) = (self.clock.now(), self.standing());
-        standing.may_lead().then(|| {
-            let there = |name: &&NodeName| **name == self.id || self.peers.may_succeed(name, now);
-            let named: Vec<&NodeName> = seeking.order.iter().filter(there).collect();
-            let before = named.iter().position(|name| **name == self.id).unwrap_or_else(|| {
-                let place = |name: &NodeName, standing: Standing| (standing.class(), standing.load, name.clone());
-                let own = place(&self.id, standing);
-                let others = self.peers.candidates(now).filter(|(name, _)| !named.contains(name));
-                named.len() + others.filter(|&(name, other)| place(name, other) < own).count()
-            });
-            seeking.since + self.config.claim_step() * u32::try_from(before).unwrap_or(u32::MAX)
-        })
+    fn place(&self, order: &[NodeName], since: Option<Timestamp>) -> u32 {
+        let now = self.clock.now();
+        let present = |name: &NodeName| since.is_none_or(|at| self.peers.heard_since(name, at));
+        let there = |name: &&NodeName| **name == self.id || self.peers.may_succeed(name, now) && present(name);
+        let named: Vec<&NodeName> = order.iter().filter(there).collect();
+        let before = named.iter().position(|name| **name == self.id).unwrap_or_else(|| {
+            let place = |name: &NodeName, standing: Standing| (standing.class(), standing.load, name.clone());
+            let own = place(&self.id, self.standing());
+            let others = self.peers.candidates(now).filter(|(name, _)| !named.contains(name) && present(name));
+            named.len() + others.filter(|&(name, other)| place(name, other) < own).count()
+        });
+        u32::try_from(before).unwrap_or(u32::MAX)
     }
 }

@@ -18,6 +18,10 @@ pub(super) struct Following {
     pub(super) successors: Vec<NodeName>,
     /// How often the leader beats for this node.
     every: Duration,
+    /// When its last round was taken.
+    round_at: Option<Timestamp>,
+    /// How far apart its rounds come, as long as they come.
+    rhythm: Option<Duration>,
     /// When the leader was heard.
     direct_at: Timestamp,
     /// When the leader said that it hears this node.
@@ -26,6 +30,8 @@ pub(super) struct Following {
     pub(super) hearsay_at: Timestamp,
     /// Whether the membership gave the leader up since it was last heard.
     given_up: bool,
+    /// When it was first asked for since it was last heard.
+    pub(super) asked_at: Option<Timestamp>,
     /// When the leader last offered the lead.
     pub(super) offered_at: Option<Timestamp>,
     /// Whether this node is ready to take it.
@@ -38,26 +44,53 @@ impl Following {
         self.direct_at.max(self.hearsay_at)
     }
 
-    /// From when on the leader is doubted: it missed two beats and published no round, does not hear this node, or was
-    /// given up by the membership.
+    /// From when on the leader is doubted: a round is overdue by half, or worse.
     pub(super) fn doubt_at(&self, config: &ElectionConfig) -> Timestamp {
+        let silent_at = self.silent_at(config);
+        self.rhythm().map_or(silent_at, |gap| silent_at.min(self.direct_at + gap * 3 / 2))
+    }
+
+    /// From when on more than a round is missing: the leader missed two beats and published no round, does not hear this
+    /// node, or was given up by the membership.
+    fn silent_at(&self, config: &ElectionConfig) -> Timestamp {
         if self.given_up {
             return self.direct_at;
         }
         (self.direct_at + self.every * 2).min(self.mutual_at + (self.every * 2).max(config.patience() / 2))
     }
 
+    /// How far apart rounds come, where they tell more than beats do.
+    fn rhythm(&self) -> Option<Duration> {
+        self.rhythm.filter(|gap| *gap < self.every)
+    }
+
     /// From when on this node's own ear no longer counts.
     fn deaf_at(&self, config: &ElectionConfig) -> Timestamp {
         let silence = self.every * config.silence_beats;
         let deaf_at = (self.direct_at + silence).min(self.mutual_at + silence.max(config.patience()));
+        let deaf_at = self.rhythm().map_or(deaf_at, |gap| deaf_at.min(self.direct_at + gap * 5 / 2));
         if self.given_up { deaf_at.min(self.direct_at + config.patience() / 2) } else { deaf_at }
     }
 
     /// The leader was heard, or what it published.
-    pub(super) fn hear(&mut self, now: Timestamp) {
+    fn hear(&mut self, now: Timestamp) {
         self.direct_at = now;
         self.given_up = false;
+        self.asked_at = None;
+    }
+
+    /// A round of the leader's was taken. The rhythm follows a slower one at once, and a faster one in time.
+    pub(super) fn take_round(&mut self, least: Duration, now: Timestamp) {
+        if let Some(last) = self.round_at.replace(now) {
+            let known = self.rhythm.unwrap_or_default();
+            self.rhythm = Some(now.since(last).max(known * 7 / 8).max(least));
+        }
+        self.hear(now);
+    }
+
+    /// Rounds that have not come for long are not waited for.
+    fn forget_rhythm(&mut self, now: Timestamp) {
+        self.rhythm.take_if(|gap| self.round_at.is_none_or(|last| now.since(last) > *gap * PATIENT_GAPS));
     }
 
     /// From when on the leader is lost.
@@ -66,14 +99,22 @@ impl Following {
     /// word is enough, and allowed to be as old as the leader's slowest beat makes it.
     fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
         let deaf_at = self.deaf_at(config);
-        let margin = if self.given_up { config.beat() } else { self.every };
-        if self.hearsay_at > self.direct_at.min(self.mutual_at) + margin {
+        let late = self.rhythm().map(|gap| gap * 3 / 2);
+        let margin = late.unwrap_or(if self.given_up { config.beat() } else { self.every });
+        let hears_us_until = self.mutual_at + late.map_or(margin, |late| self.every + late);
+        if self.hearsay_at > (self.direct_at + margin).min(hears_us_until) {
             deaf_at.max(self.hearsay_at + config.patience())
+        } else if late.is_some() {
+            // The standby, which hears more, gives the leader up first.
+            deaf_at.max(self.hearsay_at + config.beat() * config.silence_beats)
         } else {
             deaf_at
         }
     }
 }
+
+/// So many gaps after the last round, rounds no longer come in a rhythm.
+const PATIENT_GAPS: u32 = 8;
 
 impl Election {
     pub(super) fn following_deadline(&self, following: &Following) -> Timestamp {
@@ -87,13 +128,32 @@ impl Election {
             self.peers.gone(&leader, now);
             self.lose_leader(now);
         } else if now >= self.ask_at(following) {
+            self.doubt(now);
+        }
+    }
+
+    /// Asks whether the leader is there: when just a round is late, for which all followers may be waiting, those who
+    /// know best at first.
+    fn doubt(&mut self, now: Timestamp) {
+        let State::Following(following) = &mut self.state else { return };
+        let first = following.asked_at.is_none();
+        following.asked_at.get_or_insert(now);
+        if first && now < following.silent_at(&self.config) {
+            self.ask_near(now);
+        } else {
             self.ask_all(now);
         }
     }
 
     fn ask_at(&self, following: &Following) -> Timestamp {
-        let deaf = self.clock.now() >= following.deaf_at(&self.config);
-        let pause = if deaf { self.config.patience() / 4 } else { self.config.beat() / 2 };
+        let now = self.clock.now();
+        let pause = if now >= following.deaf_at(&self.config) {
+            self.config.patience() / 4
+        } else if now < following.silent_at(&self.config) {
+            self.config.beat()
+        } else {
+            self.config.beat() / 2
+        };
         following.doubt_at(&self.config).max(self.questions.last_at() + pause)
     }
 
@@ -166,10 +226,13 @@ impl Election {
             epoch: beat.epoch,
             successors: beat.successors,
             every: Duration::from_millis(beat.every_ms),
+            round_at: None,
+            rhythm: None,
             direct_at: now,
             mutual_at: now,
             hearsay_at: Timestamp::default(),
             given_up: false,
+            asked_at: None,
             offered_at: None,
             prepared: false,
         });
@@ -185,10 +248,13 @@ impl Election {
             epoch,
             successors: Vec::new(),
             every: self.config.beat(),
+            round_at: None,
+            rhythm: None,
             direct_at: Timestamp::default(),
             mutual_at: Timestamp::default(),
             hearsay_at: heard_at,
             given_up: false,
+            asked_at: None,
             offered_at: None,
             prepared: false,
         });
@@ -201,6 +267,7 @@ impl Election {
         self.round = self.round.max(beat.round);
         following.every = Duration::from_millis(beat.every_ms);
         following.hear(now);
+        following.forget_rhythm(now);
         if beat.hears_us {
             following.mutual_at = now;
         }
@@ -278,6 +345,7 @@ impl Election {
             && following.epoch.leader == *peer
         {
             following.given_up = true;
+            following.asked_at.get_or_insert(now);
             self.ask_all(now);
         }
         self.peers.down(peer, now);

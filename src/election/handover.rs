@@ -72,8 +72,9 @@ impl Election {
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
         self.terms.seen = self.terms.seen.max(epoch.term.min(MAX_TERM));
         self.round = self.round.max(round);
+        let least = self.config.beat();
         match &mut self.state {
-            State::Following(following) if following.epoch == *epoch => following.hear(now),
+            State::Following(following) if following.epoch == *epoch => following.take_round(least, now),
             State::Leading(leading) => {
                 if let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some()) {
                     handover.yielded = true;

@@ -127,6 +127,11 @@ impl Peers {
         self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| now.since(at) <= self.contact)
     }
 
+    /// Whether a peer was heard at `since` or later.
+    pub(super) fn heard_since(&self, name: &NodeName, since: Timestamp) -> bool {
+        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| at >= since)
+    }
+
     /// How many nodes heard lately follow `epoch`.
     pub(super) fn followers(&self, epoch: &Epoch, now: Timestamp) -> usize {
         self.table.iter().filter(|(name, peer)| peer.epoch.as_ref() == Some(epoch) && self.hears(name, now)).count()

@@ -3,6 +3,7 @@
 use crate::election::message::ElectionMessage;
 use crate::epoch::Epoch;
 use crate::names::NodeName;
+use crate::round::FirstRound;
 
 /// What happened around the node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -92,9 +93,8 @@ pub enum Effect {
         epoch: Epoch,
         /// The number of the next round.
         first_round: u64,
-        /// Whether the round before has just been published, by this node or one that handed over: the first round is
-        /// then due a period later, otherwise at once.
-        on_time: bool,
+        /// When it is due.
+        first: FirstRound,
     },
     /// Publish nothing more in this epoch.
     StopPublishing {

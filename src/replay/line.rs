@@ -43,7 +43,6 @@ impl Line {
             return Err(RejectReason::Malformed);
         }
         let report: ObjectReport = decode(text, limits)?;
-        report.validate(limits)?;
         let Envelope { topic, received_at_us } = serde_json::from_slice(text).map_err(|_| RejectReason::Malformed)?;
         let kind = topic.map_or(Ok(ReportKind::default()), |topic| kind(&topic, &report.node))?;
         Ok(Self { kind, at: received_at_us.unwrap_or(report.captured_at_us), report })

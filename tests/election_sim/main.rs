@@ -66,6 +66,14 @@ fn a_silent_leader_is_replaced_in_400_ms() {
     report("silent", &mut gaps, 400 * MS);
 }
 
+/// Whoever a split cuts off from the leader is served by a leader of its own within 400 ms, wherever the standby is.
+#[test]
+fn a_side_without_the_leader_has_its_own_in_400_ms() {
+    let mut gaps = Vec::new();
+    for_seeds(seeds() / 10, |seed| gaps.extend(split_gap(seed)));
+    report("split", &mut gaps, 400 * MS);
+}
+
 /// An edge that returns is handed the lead, and no vehicle misses a round or takes one twice; 5 % of packets are lost.
 #[test]
 fn handing_back_misses_and_repeats_no_round() {
@@ -223,6 +231,42 @@ fn failover_gap(seed: u64, seen: bool, victims: usize) -> Option<u64> {
     Some(gap)
 }
 
+/// The largest gap between two accepted rounds of any vehicle that a split cuts off from the leader, in µs; `None` if
+/// none is, or none of them may lead.
+fn split_gap(seed: u64) -> Option<u64> {
+    let mut world = cell(seed);
+    start_all(&mut world);
+    let mut gap = None;
+    check(&mut world, seed, |world| {
+        let settle = world.random.between(0, 200 * MS);
+        world.run_for(9 * SECOND + settle);
+        let Some(leader) = world.leaders().first().copied() else { return Ok(()) };
+        let away: Vec<bool> = (0..world.nodes.len()).map(|node| node != leader && world.random.chance(50)).collect();
+        if !(0..away.len()).any(|node| away[node] && world.nodes[node].config.role != Role::Cav) {
+            return Ok(());
+        }
+        split(world, 0, &away);
+        let from = world.now;
+        world.run_for(2 * SECOND);
+        for (_, node) in world.alive().filter(|(index, _)| away[*index]) {
+            let times: Vec<u64> = node.accepted.iter().map(|map| map.at).filter(|at| at + SECOND > from).collect();
+            ensure(times.last().is_some_and(|at| at + SECOND > world.now), "a vehicle is not served")?;
+            gap = gap.max(times.windows(2).map(|pair| pair[1] - pair[0]).max());
+        }
+        Ok(())
+    });
+    gap
+}
+
+/// Cuts every link between nodes on different sides.
+fn split(world: &mut World, at: u64, sides: &[bool]) {
+    for from in 0..sides.len() {
+        for to in (0..sides.len()).filter(|to| sides[from] != sides[*to]) {
+            world.plan(at, Fault::Cut { from, to });
+        }
+    }
+}
+
 fn report(what: &str, gaps: &mut [u64], bound: u64) {
     gaps.sort_unstable();
     let at = |percent: usize| gaps[(gaps.len() - 1) * percent / 100] as f64 / MS as f64;
@@ -279,11 +323,7 @@ fn plan_fault(world: &mut World, nodes: usize) {
         }
         4 => {
             let sides: Vec<bool> = (0..nodes).map(|_| world.random.chance(50)).collect();
-            for from in 0..nodes {
-                for to in (0..nodes).filter(|to| sides[from] != sides[*to]) {
-                    world.plan(at, Fault::Cut { from, to });
-                }
-            }
+            split(world, at, &sides);
         }
         5 => {
             for _ in 0..world.random.between(1, 4) {

@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
 use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::epoch::{Epoch, EpochGate};
 use ecod::names::NodeName;
+use ecod::round::{CONNECT_TIME, FirstRound};
 use ecod::time::Timestamp;
 use ecod::wire::{Encoding, Role};
 
@@ -263,13 +264,13 @@ impl World {
             match effect {
                 Effect::PersistTerm { term } => self.nodes[index].persisted = term,
                 Effect::Send { to, message } => self.send(index, &to, &message),
-                Effect::Lead { epoch, first_round, on_time } => {
+                Effect::Lead { epoch, first_round, first } => {
                     assert!(epoch.term <= self.nodes[index].persisted, "led in a term that is not on disk");
                     let owner = self.owners.insert(epoch.clone(), (index, life));
                     assert_eq!(owner, None, "two leaderships share {epoch}");
                     self.led.push((self.now, epoch.clone()));
                     self.history.push(format!("{:>10} µs {epoch} leads", self.now - 1_732_154_400_000_000));
-                    self.begin_to_publish(index, epoch, first_round, on_time);
+                    self.begin_to_publish(index, epoch, first_round, first);
                 }
                 Effect::StopPublishing { .. } => self.nodes[index].publishing = None,
                 Effect::Follow { epoch, .. } => {
@@ -310,13 +311,18 @@ impl World {
         }
     }
 
-    fn begin_to_publish(&mut self, index: usize, epoch: Epoch, first_round: u64, on_time: bool) {
+    fn begin_to_publish(&mut self, index: usize, epoch: Epoch, first_round: u64, first: FirstRound) {
         let node = &mut self.nodes[index];
         let renewed = node.publishing.is_some();
         let last = node.accepted.last().map_or(0, |last| last.at);
         let term = epoch.term;
         node.publishing = Some((epoch, first_round));
-        let after = if on_time && !renewed { PERIOD } else { (last + PERIOD).saturating_sub(self.now) };
+        let due = (last + PERIOD).saturating_sub(self.now);
+        let after = match first {
+            FirstRound::OnTime if !renewed => PERIOD,
+            FirstRound::OnTime | FirstRound::Overdue => due,
+            FirstRound::AfterConnects => due.max(CONNECT_TIME.as_micros() as u64),
+        };
         let life = node.life;
         self.push(after, Event::Publish { to: index, life, term });
     }

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{NodeState, NodeStatus, ObjectReport, Role, SCHEMA_VERSION};
+use ecod::wire::{NodeStatus, ObjectReport, Role};
 use ractor::{Actor, ActorRef};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
@@ -39,17 +39,7 @@ impl Observer {
     pub(super) async fn start(brokers: Vec<BrokerAddress>, name: NodeName) -> anyhow::Result<Self> {
         let seen: Arc<Mutex<Seen>> = Arc::default();
         let kept = Arc::clone(&seen);
-        let status = NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: name,
-            id: Uuid::now_v7(),
-            role: Role::Cav,
-            state: NodeState::Following,
-            epoch: 0,
-            aggregator: None,
-            fit: None,
-            version: env!("CARGO_PKG_VERSION").into(),
-        };
+        let status = NodeStatus::starting(name, Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static("testbed"),
             part: Part::Candidate,

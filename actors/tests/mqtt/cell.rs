@@ -59,17 +59,7 @@ impl Node {
     pub(crate) async fn start(node: &str, part: Part, mqtt: MqttConfig) -> Self {
         let (sender, deliveries) = mpsc::unbounded_channel();
         let counters = Arc::new(Counters::default());
-        let status = NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: name(node),
-            id: Uuid::new_v4(),
-            role: Role::Auto,
-            state: NodeState::Following,
-            epoch: 1,
-            aggregator: None,
-            fit: None,
-            version: "0.1.0".to_owned(),
-        };
+        let status = NodeStatus { epoch: 1, ..NodeStatus::starting(name(node), Uuid::new_v4(), Role::Auto, "0.1.0") };
         let arguments = GatewayArguments {
             cell: name("test"),
             part,

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use ecod::names::NodeName;
-use ecod::wire::{NodeState, NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
+use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
 use ecod_actors::clock;
 use ecod_actors::gateway::{
     Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, ReportKind,
@@ -36,17 +36,8 @@ impl Voters {
     pub(crate) async fn connect(brokers: Vec<SocketAddr>) -> anyhow::Result<Self> {
         let newest: Arc<Mutex<Option<Arc<Reputations>>>> = Arc::default();
         let kept = Arc::clone(&newest);
-        let status = NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: NodeName::from_static("voters"),
-            id: Uuid::now_v7(),
-            role: Role::Cav,
-            state: NodeState::Following,
-            epoch: 0,
-            aggregator: None,
-            fit: None,
-            version: env!("CARGO_PKG_VERSION").into(),
-        };
+        let status =
+            NodeStatus::starting(NodeName::from_static("voters"), Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static(CELL),
             part: Part::Follower,

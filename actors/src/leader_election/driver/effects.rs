@@ -24,11 +24,11 @@ impl ElectionDriver {
                     let payload = message.encode(Encoding::Cbor).into();
                     self.parts.membership.send(MembershipMessage::Send { to, payload });
                 }
-                Effect::Lead { epoch, first_round, on_time } => {
+                Effect::Lead { epoch, first_round, first } => {
                     self.terms.settle(epoch.term).await;
-                    tracing::info!(%epoch, first_round, on_time, "leading");
+                    tracing::info!(%epoch, first_round, ?first, "leading");
                     self.preparing = None;
-                    self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, on_time });
+                    self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, first });
                 }
                 Effect::StopPublishing { epoch } => {
                     tracing::info!(%epoch, "no longer leading");

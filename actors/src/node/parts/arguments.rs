@@ -6,7 +6,7 @@ use std::time::Duration;
 use ecod::aggregator::Aggregator;
 use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
-use ecod::wire::{NodeState as NodeCondition, NodeStatus, SCHEMA_VERSION};
+use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
 use super::Assembly;
 use crate::clock;
@@ -140,15 +140,11 @@ impl Assembly {
         let leadership = self.leadership.borrow();
         let epoch = leadership.epoch.clone().filter(|_| leadership.leader().is_some()).or(taken);
         NodeStatus {
-            schema: SCHEMA_VERSION,
-            node: self.name.clone(),
-            id: self.run,
-            role: self.config.role,
             state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
             epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
             aggregator: epoch.map(|epoch| epoch.leader),
             fit: self.config.may_lead().then_some(false),
-            version: env!("CARGO_PKG_VERSION").into(),
+            ..NodeStatus::starting(self.name.clone(), self.run, self.config.role, env!("CARGO_PKG_VERSION"))
         }
     }
 }
@@ -156,7 +152,7 @@ impl Assembly {
 #[cfg(test)]
 mod tests {
     use ecod::time::Timestamp;
-    use ecod::wire::{GlobalMap, Role};
+    use ecod::wire::{GlobalMap, Role, SCHEMA_VERSION};
 
     use ecod::names::NodeName;
     use tokio::sync::watch;
