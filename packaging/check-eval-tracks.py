@@ -135,11 +135,16 @@ def trackeval_figures(frames):
 def motmetrics_figures(frames):
     """By distances instead of similarities; ties and contests may be settled otherwise than by TrackEval."""
     seen = motmetrics.MOTAccumulator(auto_id=True)
+    true_ids, said_ids = {}, {}
     for here, said in frames:
         far = np.array([[distance(true, s) for s in said] for true in here.values()], dtype=float)
         far = far.reshape(len(here), len(said))
         far[far > MATCH_M] = np.nan
-        seen.update(list(here), [s[0] for s in said], far)
+        seen.update(
+            [true_ids.setdefault(key, len(true_ids)) for key in here],
+            [said_ids.setdefault(s[0], len(said_ids)) for s in said],
+            far,
+        )
     names = ["num_switches", "mota", "motp", "idf1"]
     row = motmetrics.metrics.create().compute(seen, metrics=names).iloc[0]
     return {name: float(row[name]) for name in names}

@@ -189,7 +189,6 @@ fn body(label: &'static str, center: Point2<f64>, heading_rad: f64) -> Body {
 struct Watch<'a> {
     config: &'a TrafficConfig,
     observers: Vec<Watcher>,
-    labels: Vec<&'static str>,
     /// By body, when an observer could see it last.
     seen_at: Vec<Option<u64>>,
     arrived: Vec<(Timestamp, ArrivedReport)>,
@@ -223,10 +222,7 @@ impl<'a> Watch<'a> {
             }
         };
         let observers = (0..config.observers).map(&mut watcher).collect();
-        let mut labels = vec!["car"];
-        labels.extend((config.people > 0).then_some("person"));
-        labels.extend((config.bicycles > 0).then_some("bicycle"));
-        Self { config, observers, labels, seen_at: vec![None; bodies], arrived: Vec::new(), truth: Truth::default() }
+        Self { config, observers, seen_at: vec![None; bodies], arrived: Vec::new(), truth: Truth::default() }
     }
 
     fn step(&mut self, step: u64, town: &Town, dice: &mut Dice<'_>) {
@@ -255,14 +251,7 @@ impl<'a> Watch<'a> {
         }
         let is_open = |lure: &&Point2<f64>| !town.buildings.iter().any(|building| building.hides(&pose.position, lure));
         let lures: Vec<Point2<f64>> = town.lures.iter().filter(is_open).copied().collect();
-        let around = Surroundings {
-            pose,
-            bodies,
-            sights: &sights,
-            lures: &lures,
-            labels: &self.labels,
-            at_s: step as f64 * STEP_S,
-        };
+        let around = Surroundings { pose, bodies, sights: &sights, lures: &lures, at_s: step as f64 * STEP_S };
         let watcher = &mut self.observers[number];
         watcher.seq += 1;
         let mut report = ObjectReport::new(watcher.name.clone(), watcher.seq, time_of(step).shifted(watcher.clock_us));

@@ -62,8 +62,14 @@ pub(super) struct Surroundings<'a> {
     pub(super) sights: &'a [Sight],
     /// Places that look like an object, in view.
     pub(super) lures: &'a [Point2<f64>],
-    pub(super) labels: &'a [&'static str],
     pub(super) at_s: f64,
+}
+
+impl Surroundings<'_> {
+    /// A class, as often as there are such.
+    fn label(&self, dice: &mut Dice<'_>) -> &'static str {
+        self.bodies[dice.below(self.bodies.len())].label
+    }
 }
 
 /// How sure a detector is, and how likely it finds something, as log odds.
@@ -119,7 +125,7 @@ impl Observer {
         for _ in 0..dice.poisson(sensor.clutter) {
             found.push((
                 somewhere(config, &around.pose, dice),
-                around.labels[dice.below(around.labels.len())],
+                around.label(dice),
                 share_of(0.8 * dice.normal() - 0.9),
             ));
         }
@@ -187,7 +193,7 @@ impl Observer {
         for _ in 0..dice.poisson(config.sensor.ghosts_per_s * passed_s.min(1.0)) {
             self.ghosts.push(Ghost {
                 position: somewhere(config, &around.pose, dice),
-                label: around.labels[dice.below(around.labels.len())],
+                label: around.label(dice),
                 until_s: around.at_s + dice.exponential(GHOST_S),
             });
         }
