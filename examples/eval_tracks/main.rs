@@ -119,10 +119,10 @@ fn run(
         Event::Report(report) => latest.report(report),
         Event::Map(at) => {
             let all = latest.union(at);
-            union.said(at, union_tracker.track(at, &all));
+            union.said(at, &union_tracker.track(at, &all));
             let suppressed = late_tracker.track(at, &suppressed(all));
             write(at, &suppressed);
-            late.said(at, suppressed);
+            late.said(at, &suppressed);
         }
     }) {
         ours.map(&map);
@@ -171,7 +171,7 @@ fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluati
     let mut own: Vec<_> = recording.reports.iter().map(|arrived| &arrived.report).filter(|r| r.node == *name).collect();
     own.sort_by_key(|report| report.captured_at_us);
     for report in own {
-        judge.said(report.captured_at_us, tracker.track(report.captured_at_us, &found(report)));
+        judge.said(report.captured_at_us, &tracker.track(report.captured_at_us, &found(report)));
     }
     judge.result()
 }

@@ -15,7 +15,7 @@ const DRAWN: [usize; 6] = [0, 2, 4, 5, 6, 7];
 
 /// Draws a panel for each figure; `courses` has the figures of all methods by the number of vehicles.
 pub(crate) fn draw(path: &Path, courses: &[(usize, [Figures; METHODS.len()])]) -> anyhow::Result<()> {
-    let (first, last) = (courses.first().context("nothing to draw")?.0, courses[courses.len() - 1].0);
+    let last = courses.len().checked_sub(1).context("nothing to draw")?;
     let area = SVGBackend::new(path, (960, 640)).into_drawing_area();
     area.fill(&WHITE)?;
     let (legend, panels) = area.split_vertically(30);
@@ -33,19 +33,27 @@ pub(crate) fn draw(path: &Path, courses: &[(usize, [Figures; METHODS.len()])]) -
             .caption(format!("{} %", FIGURES[figure]), ("sans-serif", 16))
             .x_label_area_size(34)
             .y_label_area_size(36)
-            .build_cartesian_2d((first as f64..last as f64).log_scale(), lowest..100.0)?;
-        let ticks: Vec<f64> = courses.iter().map(|(vehicles, _)| *vehicles as f64).collect();
+            .build_cartesian_2d(-0.2..last as f64 + 0.2, lowest..100.0)?;
+        // Numbers of vehicles double from point to point, nearly: each has the same room.
+        let name = |x: &f64| {
+            let is_point = (x - x.round()).abs() < 0.01;
+            courses
+                .get(x.round() as usize)
+                .filter(|_| is_point)
+                .map_or(String::new(), |(vehicles, _)| vehicles.to_string())
+        };
         chart
             .configure_mesh()
-            .x_labels(ticks.len())
-            .x_label_formatter(&|x| format!("{x:.0}"))
+            .x_labels(courses.len() + 1)
+            .x_label_formatter(&name)
             .y_labels(6)
             .y_label_formatter(&|y| format!("{y:.0}"))
             .x_desc("vehicles")
             .light_line_style(WHITE)
             .draw()?;
         for (method, color) in COLORS.into_iter().enumerate() {
-            let points = courses.iter().map(|(vehicles, methods)| (*vehicles as f64, methods[method][figure]));
+            let points =
+                courses.iter().enumerate().map(|(place, (_, methods))| (place as f64, methods[method][figure]));
             chart.draw_series(LineSeries::new(points.clone(), color.stroke_width(2)))?;
             chart.draw_series(points.map(|at| Circle::new(at, 3, color.filled())))?;
         }

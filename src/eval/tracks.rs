@@ -223,19 +223,19 @@ impl TrackEvaluation {
                 position: Point2::new(object.x_m, object.y_m),
             }
         });
-        let said = said.collect();
-        self.said(map.fused_at_us, said);
+        let said: Vec<SaidObject> = said.collect();
+        self.said(map.fused_at_us, &said);
     }
 
     /// Takes what was said, in any other way, to be there at a time.
-    pub fn said(&mut self, at: Timestamp, said: Vec<SaidObject>) {
+    pub fn said(&mut self, at: Timestamp, said: &[SaidObject]) {
         let frames = self.truth.frames();
         let first = frames.partition_point(|frame| at.micros_from(frame.at) > self.reach_us);
         let near = frames[first..].iter().take_while(|frame| frame.at.micros_from(at) <= self.reach_us);
         for (frame, nearest) in near.zip(&mut self.maps[first..]) {
             let distance = |time: Timestamp| frame.at.micros_from(time).abs();
             if nearest.as_ref().is_none_or(|(other, _)| distance(*other) >= distance(at)) {
-                *nearest = Some((at, said.clone()));
+                *nearest = Some((at, said.to_owned()));
             }
         }
     }

@@ -59,17 +59,15 @@ fn settle(contest: &[Pair]) -> Vec<Pair> {
         all.dedup();
         all
     };
-    let (mut rows, mut columns): (fn(&Pair) -> usize, fn(&Pair) -> usize) = (|pair| pair.truth, |pair| pair.said);
+    let (truths, saids) = (places(|pair| pair.truth), places(|pair| pair.said));
     // The algorithm wants at least as many columns as rows.
-    if places(rows).len() > places(columns).len() {
-        (rows, columns) = (columns, rows);
-    }
-    let (row_places, column_places) = (places(rows), places(columns));
+    let is_turned = truths.len() > saids.len();
     let cell = |pair: &Pair| {
-        let row = row_places.partition_point(|place| *place < rows(pair));
-        (row, column_places.partition_point(|place| *place < columns(pair)))
+        let truth = truths.partition_point(|place| *place < pair.truth);
+        let said = saids.partition_point(|place| *place < pair.said);
+        if is_turned { (said, truth) } else { (truth, said) }
     };
-    let mut values = Matrix::new(row_places.len(), column_places.len(), 0);
+    let mut values = Matrix::new(truths.len().min(saids.len()), truths.len().max(saids.len()), 0);
     for pair in contest {
         values[cell(pair)] = units(pair.value);
     }

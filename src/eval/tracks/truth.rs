@@ -100,8 +100,8 @@ impl TrackTruth {
     pub fn parse(text: &str) -> Result<Self, TrackTruthError> {
         let mut source = serde_json::Deserializer::from_str(trimmed(text));
         let fields: Fields = serde_path_to_error::deserialize(&mut source)
-            .map_err(|error| form(error.path().to_string(), error.into_inner()))?;
-        source.end().map_err(|error| form("the end", error))?;
+            .map_err(|error| form(error.path().to_string(), error.into_inner().to_string()))?;
+        source.end().map_err(|error| form("the end", error.to_string()))?;
         let mut ids = HashMap::new();
         let mut frames: Vec<TrueFrame> = Vec::with_capacity(fields.frames.len());
         for (number, frame) in fields.frames.into_iter().enumerate() {
@@ -174,8 +174,8 @@ fn trimmed(text: &str) -> &str {
     text.trim_start_matches('\u{feff}')
 }
 
-fn form(place: impl Into<String>, reason: impl ToString) -> TrackTruthError {
-    TrackTruthError::Form { place: place.into(), reason: reason.to_string() }
+fn form(place: impl Into<String>, reason: impl Into<String>) -> TrackTruthError {
+    TrackTruthError::Form { place: place.into(), reason: reason.into() }
 }
 
 #[cfg(test)]
