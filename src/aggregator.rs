@@ -25,6 +25,7 @@ use crate::pace::Pace;
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
+use crate::tracks::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::window::ReportWindow;
 use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
@@ -40,7 +41,7 @@ pub struct Fused {
     pub map: Option<GlobalMap>,
     /// What VOTE made of it, if the cell runs VOTE; in `paper` mode only when a packet of frames is complete.
     pub verdicts: Option<Verdicts>,
-    /// Votes of which it has been settled whether they were right.
+    /// Votes, and words about tracked objects, of which it has been settled whether they were right.
     pub evidence: Vec<Evidence>,
     /// In VOTE's `paper` mode, with the verdicts, how far each vehicle is trusted: no function of the evidence there.
     pub reputations: Option<BTreeMap<NodeName, Reputation>>,
@@ -54,6 +55,9 @@ pub struct Aggregator {
     windows: [ReportWindow; ReportKind::COUNT],
     rounds: RoundTrigger,
     pace: Option<Pace>,
+    tracks: Option<Tracker>,
+    /// Whether tracking ends with the first known location.
+    tracks_open_cell: bool,
     vote: Option<Vote>,
     by_packets: bool,
     /// Whether anyone has voted: a cell that runs both algorithms spares its network verdicts about nothing until then.
@@ -63,9 +67,16 @@ pub struct Aggregator {
 impl Aggregator {
     /// An aggregator without evidence that does not lead; `config` is taken as valid.
     pub fn standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let FusionConfig { algorithms, window, round, pace, vote, reputation: _ } = config;
+        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation: _ } = config;
         let by_packets = vote.mode == VoteMode::Paper;
         let vote = algorithms.vote().then(|| Vote::new(vote, landmarks.clone()));
+        let tracks_open_cell = tracks.mode == TracksMode::Auto;
+        let is_tracking = match tracks.mode {
+            TracksMode::Auto => landmarks.is_empty(),
+            TracksMode::On => true,
+            TracksMode::Off => false,
+        };
+        let tracks = (algorithms.pace() && is_tracking).then(|| Tracker::new(tracks));
         let gate_m = pace.gate_m;
         let pace = algorithms.pace().then(|| Pace::new(pace, Arc::new(LandmarkIndex::new(landmarks, gate_m))));
         Self {
@@ -74,6 +85,8 @@ impl Aggregator {
             windows: [ReportWindow::new(window.clone()), ReportWindow::new(window)],
             rounds: RoundTrigger::new(round, now),
             pace,
+            tracks,
+            tracks_open_cell,
             vote,
             by_packets,
             voted: false,
@@ -124,7 +137,11 @@ impl Aggregator {
         match kind {
             ReportKind::Detections => {
                 let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
-                pace.observe(report, window.admit(report, now)?);
+                let captured_at = window.admit(report, now)?;
+                pace.observe(report, captured_at);
+                if let Some(tracks) = &mut self.tracks {
+                    tracks.observe_only(report, captured_at, |object| !pace.is_at_landmark(object));
+                }
             }
             ReportKind::VoteDetections => {
                 let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
@@ -146,8 +163,12 @@ impl Aggregator {
         self.rounds.deadline()
     }
 
-    /// Adds known locations for PACE; evidence stays. VOTE takes locations from reports by itself where none are known.
+    /// Adds known locations for PACE; evidence stays, but tracks of `auto` end. VOTE takes locations from reports by
+    /// itself where none are known.
     pub fn add_landmarks(&mut self, landmarks: Vec<Landmark>) {
+        if self.tracks_open_cell && !landmarks.is_empty() {
+            self.tracks = None;
+        }
         if let Some(pace) = &mut self.pace {
             pace.add_landmarks(landmarks);
         }
@@ -180,6 +201,21 @@ impl Aggregator {
         if let Some(vote) = &mut self.vote {
             vote.adopt(ledger);
         }
+        if let Some(tracks) = &mut self.tracks {
+            tracks.adopt(ledger);
+        }
+    }
+
+    /// Goes on with the identities of the objects in another aggregator's map, received at `now`.
+    pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
+        if let Some(tracks) = &mut self.tracks {
+            tracks.adopt_map(map, now);
+        }
+    }
+
+    /// What tracking could not use so far.
+    pub fn tracks_losses(&self) -> TracksLosses {
+        self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
     }
 
     /// Goes on, in VOTE's `paper` mode, from reputations that were published.
@@ -196,6 +232,7 @@ impl Aggregator {
 
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
+        let tracks = self.tracks.as_mut().map(|tracks| tracks.close(now)).unwrap_or_default();
         let by_packets = self.by_packets;
         let wanted = self.voted || pace.is_none();
         let is_due = |vote: &&mut Vote| if by_packets { vote.is_packet_complete() } else { wanted };
@@ -206,17 +243,19 @@ impl Aggregator {
         }
         let round = self.next_round;
         self.next_round = round.saturating_add(1);
-        let (verdicts, evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
+        let TracksRound { objects, pose_corrections, oldest_capture, evidence: seen } = tracks;
+        let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
+        evidence.extend(seen);
         let map = pace.map(|pace| GlobalMap {
             schema: SCHEMA_VERSION,
             aggregator: epoch.leader.clone(),
             epoch: epoch.term,
             round,
             fused_at_us: now,
-            oldest_capture_us: pace.oldest_capture,
+            oldest_capture_us: [pace.oldest_capture, oldest_capture].into_iter().flatten().min(),
             landmarks: pace.landmarks,
-            objects: Vec::new(),
-            pose_corrections: BTreeMap::new(),
+            objects,
+            pose_corrections,
         });
         let verdicts = verdicts.map(|verdicts: Vec<Verdict>| Verdicts {
             schema: SCHEMA_VERSION,

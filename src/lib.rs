@@ -23,6 +23,7 @@ pub mod reputation;
 pub mod round;
 pub mod testbed;
 pub mod time;
+pub mod tracks;
 pub mod traffic;
 pub mod view;
 pub mod vote;

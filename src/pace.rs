@@ -12,6 +12,7 @@ mod paper;
 use std::sync::Arc;
 use std::time::Duration;
 
+use nalgebra::Point2;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -161,6 +162,16 @@ impl Pace {
             Self::Paper(pace) => pace.add_landmarks(added),
             Self::Bayes(pace) => pace.add_landmarks(added),
         }
+    }
+
+    /// Whether an object names a known location or is within the gate of one.
+    pub fn is_at_landmark(&self, object: &PerceivedObject) -> bool {
+        let (landmarks, gate_m) = match self {
+            Self::Paper(pace) => pace.places(),
+            Self::Bayes(pace) => pace.places(),
+        };
+        let point = Point2::new(object.x_m, object.y_m);
+        object.landmark.is_some() || landmarks.within(&point, gate_m).next().is_some()
     }
 
     /// Takes one admitted report, captured at `captured_at` on the aggregator's clock.

@@ -226,15 +226,18 @@ impl Replay {
         self.cell.get_or_insert_with(|| Aggregator::new(aggregator.clone(), 1, fusion.clone(), landmarks.clone(), now))
     }
 
-    /// Closes the rounds that are due up to `now`; of a silence since `before`, only those at its beginning.
+    /// Closes the rounds that were due before `now`; of a silence since `before`, only those at its beginning. A round that
+    /// nobody has reported to waits for a line that comes up to half a period late, and all lines of one time go into one
+    /// round: recordings with the period of the rounds would be cut anywhere.
     fn catch_up(&mut self, before: Timestamp, now: Timestamp, output: &mut Vec<FusedLine>) {
         let period = Duration::from_secs_f64(self.config.fusion.round.period_s);
         let silent_from = before + SILENCE.max(3 * period);
         while let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline) {
-            if deadline > now || deadline > silent_from {
+            let patience = if self.pending { Duration::ZERO } else { period / 2 };
+            if deadline + patience >= now || deadline > silent_from {
                 break;
             }
-            self.tick(deadline, output);
+            self.tick(deadline.max(before), output);
         }
     }
 

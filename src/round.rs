@@ -99,7 +99,8 @@ impl RoundTrigger {
         Self { config, last_close: now, live: Default::default(), missing: 0, held: false }
     }
 
-    /// Takes note of a report; true when the round closes now.
+    /// Takes note of a report; true when the round closes with it, because it was the last that was waited for. A period
+    /// that is over is left to [`Self::tick`], so that of reports that come at the end of it none is cut off.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
         let live = &mut self.live[kind as usize];
         if let Some(vehicle) = live.get_mut(node) {
@@ -110,7 +111,7 @@ impl RoundTrigger {
         } else {
             live.insert(node.clone(), Vehicle { last_report: now, reported: true });
         }
-        self.tick(now)
+        self.missing == 0 && self.tick(now)
     }
 
     /// True when the round closes now; call it at the latest at [`Self::deadline`].

@@ -1,13 +1,14 @@
 //! The actor that closes the rounds: reports in, maps and verdicts out while the node leads.
 //!
 //! ```text
-//! Gateway ── TakeReport ─────────> Fuser ── PublishMap, PublishVerdicts ──> Gateway
+//! Gateway ── TakeReport, TakeMap ─> Fuser ── PublishMap, PublishVerdicts ──> Gateway
 //! LeaderElection ── Lead, … ─────> │ ▲ └─── Record ──> ReputationKeeper
 //! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::aggregator::{Aggregator, Fused};
 use ecod::epoch::Epoch;
@@ -15,7 +16,7 @@ use ecod::names::NodeName;
 use ecod::reputation::ReputationLedger;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::wire::Reputation;
+use ecod::wire::{GlobalMap, Reputation};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
@@ -32,6 +33,13 @@ pub enum FuserMessage {
     TakeReport {
         /// The report and when it came.
         delivery: Delivery,
+    },
+    /// Keep another aggregator's map, to go on from when leading.
+    TakeMap {
+        /// The map.
+        map: Arc<GlobalMap>,
+        /// When it came.
+        received_at: Timestamp,
     },
     /// Close the round if it is due.
     CloseRound,
@@ -72,6 +80,9 @@ pub struct FuserArguments {
     pub counters: Arc<Counters>,
 }
 
+/// How old a map may be whose objects a new leader goes on with.
+const FRESH_MAP: Duration = Duration::from_secs(1);
+
 /// Drives an [`Aggregator`] with the clock and the gateway.
 #[derive(Debug, Default)]
 pub struct Fuser;
@@ -82,6 +93,8 @@ pub struct FuserState {
     gateway: Seat<GatewayMessage>,
     keeper: Seat<ReputationKeeperMessage>,
     counters: Arc<Counters>,
+    /// The newest map of another aggregator, and when it came.
+    last_map: Option<(Arc<GlobalMap>, Timestamp)>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
 }
@@ -97,7 +110,15 @@ impl Actor for Fuser {
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let FuserArguments { aggregator, gateway, keeper, counters } = arguments;
-        let mut state = FuserState { aggregator, gateway, keeper, counters, alarm: Timestamp(u64::MAX), timer: None };
+        let mut state = FuserState {
+            aggregator,
+            gateway,
+            keeper,
+            counters,
+            last_map: None,
+            alarm: Timestamp(u64::MAX),
+            timer: None,
+        };
         state.set_alarm(&myself);
         Ok(state)
     }
@@ -110,6 +131,7 @@ impl Actor for Fuser {
     ) -> Result<(), ActorProcessingErr> {
         match message {
             FuserMessage::TakeReport { delivery } => state.take(&delivery),
+            FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
@@ -147,10 +169,25 @@ impl FuserState {
         }
     }
 
+    fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
+        let order = |map: &GlobalMap| (Epoch::new(map.epoch, map.aggregator.clone()), map.round);
+        if self.aggregator.leads().is_none() && self.last_map.as_ref().is_none_or(|(last, _)| order(last) < order(&map))
+        {
+            self.last_map = Some((map, received_at));
+        }
+    }
+
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
         self.keeper
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
-        self.aggregator.lead(epoch, first_round, first, clock::now());
+        let now = clock::now();
+        if let Some((map, received_at)) = self.last_map.take()
+            && now.since(received_at) < FRESH_MAP
+            && map.epoch <= epoch.term
+        {
+            self.aggregator.adopt_map(&map, received_at);
+        }
+        self.aggregator.lead(epoch, first_round, first, now);
         self.tick();
     }
 
@@ -161,11 +198,14 @@ impl FuserState {
 
     fn publish(&self, fused: Option<Fused>) {
         let Some(Fused { epoch, round, map, verdicts, evidence, reputations }) = fused else { return };
+        let has_verdicts = verdicts.is_some();
         if let Some(map) = map {
             self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });
         }
         if let Some(verdicts) = verdicts {
             self.gateway.send(GatewayMessage::PublishVerdicts { verdicts: Arc::new(verdicts) });
+        }
+        if has_verdicts || !evidence.is_empty() {
             self.keeper.send(ReputationKeeperMessage::Record { epoch, round, evidence, reputations });
         }
     }

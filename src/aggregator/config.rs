@@ -6,6 +6,7 @@ use crate::config::ConfigError;
 use crate::pace::PaceConfig;
 use crate::reputation::ReputationConfig;
 use crate::round::RoundConfig;
+use crate::tracks::TracksConfig;
 use crate::vote::VoteConfig;
 use crate::window::WindowConfig;
 
@@ -47,6 +48,8 @@ pub struct FusionConfig {
     pub round: RoundConfig,
     /// Parameters of PACE.
     pub pace: PaceConfig,
+    /// Parameters of tracking: what maps say of objects without a known place.
+    pub tracks: TracksConfig,
     /// Parameters of VOTE.
     pub vote: VoteConfig,
     /// How evidence becomes the reputations that are published.
@@ -62,6 +65,7 @@ impl FusionConfig {
         self.window.validate().map_err(|error| error.within("window"))?;
         self.round.validate().map_err(|error| error.within("round"))?;
         self.pace.validate().map_err(|error| error.within("pace"))?;
+        self.tracks.validate().map_err(|error| error.within("tracks"))?;
         self.vote.validate().map_err(|error| error.within("vote"))?;
         self.reputation.validate().map_err(|error| error.within("reputation"))
     }

@@ -64,6 +64,11 @@ impl BayesPace {
         self.published.resize(self.landmarks.landmarks().len(), None);
     }
 
+    /// The known locations, and how near an object must be to one.
+    pub(super) fn places(&self) -> (&LandmarkIndex, f64) {
+        (&self.landmarks, self.config.gate_m)
+    }
+
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
         let sightings = self.sightings(report);
         let vehicle = self.vehicles.entry(report.node.clone()).or_default();

@@ -59,6 +59,11 @@ impl PaperPace {
         self.landmarks = Arc::new(self.landmarks.extended(added, self.gate_m));
     }
 
+    /// The known locations, and how near an object must be to one.
+    pub(super) fn places(&self) -> (&LandmarkIndex, f64) {
+        (&self.landmarks, self.gate_m)
+    }
+
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
         let freshest = self.vehicles.entry(report.node.clone()).or_default();
         freshest.captured_at = captured_at;

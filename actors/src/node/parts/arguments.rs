@@ -56,7 +56,10 @@ impl Assembly {
         Arc::new(move |delivery| {
             match &delivery.message {
                 Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
-                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
+                Incoming::Map(map) => {
+                    fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at: delivery.received_at });
+                    follower.send(FollowerMessage::TakeMap { delivery })
+                }
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
                 Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
                 Incoming::Ledger(share) => {

@@ -1,0 +1,222 @@
+//! Objects without a known place: followed across vehicles that move, each once, under one identity.
+//!
+//! A [`Tracker`] takes admitted reports by [`Tracker::observe`] and makes the objects of a map by [`Tracker::close`]. Within a
+//! round, reports count in the order of their capture, whatever order they came in. `docs/tracks.md` has the equations.
+//!
+//! Nothing has to be known of a vehicle beforehand: how noisy its positions are, where it sees and how surely, and by how
+//! much its pose is off, are learnt from what it has in common with the others. An object is never founded on a map:
+//! maps that are received lend identities, not evidence.
+
+mod align;
+mod assignment;
+mod calibration;
+mod config;
+mod evidence;
+mod grid;
+mod motion;
+mod source;
+mod taking;
+#[cfg(test)]
+mod tests;
+mod track;
+mod trust;
+mod upkeep;
+
+use std::collections::BTreeMap;
+
+use hashbrown::HashMap;
+
+pub use config::{TracksConfig, TracksMode};
+
+use crate::names::NodeName;
+use crate::reputation::{Evidence, ReputationLedger};
+use crate::time::Timestamp;
+use crate::wire::{FusedObject, ObjectReport, PerceivedObject, PoseCorrection};
+use align::{Alignment, Spread};
+use grid::Grid;
+use source::Source;
+use taking::Taking;
+use track::Track;
+use trust::{Fleet, Standing};
+
+/// What a round came to.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TracksRound {
+    /// The objects, where they are when the round is closed, the oldest first.
+    pub objects: Vec<FusedObject>,
+    /// By vehicle, how its positions were corrected.
+    pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
+    /// Capture time of the oldest report of the round.
+    pub oldest_capture: Option<Timestamp>,
+    /// What has been settled about the vehicles' words.
+    pub evidence: Vec<Evidence>,
+}
+
+/// Reports that were not used, and objects for which there was no room.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TracksLosses {
+    /// Reports that came later than [`TracksConfig::max_lag_s`].
+    pub late: u64,
+    /// New objects beyond [`TracksConfig::max_tracks`] or [`TracksConfig::max_density`].
+    pub refused: u64,
+}
+
+/// Follows objects; see the module.
+#[derive(Debug, Clone)]
+pub struct Tracker {
+    config: TracksConfig,
+    /// By number; numbers of forgotten vehicles are given anew.
+    sources: Vec<Option<Source>>,
+    numbers: HashMap<NodeName, u32>,
+    /// What was known of vehicles before they were heard.
+    standings: BTreeMap<NodeName, Standing>,
+    fleet: Fleet,
+    /// The oldest first.
+    tracks: Vec<Track>,
+    /// Tracks by place, in cells of the gate's size and in large ones.
+    near: Grid,
+    wide: Grid,
+    pending: Vec<(Timestamp, ObjectReport)>,
+    fused_until: Timestamp,
+    late: u64,
+    refused: u64,
+    evidence: Vec<Evidence>,
+}
+
+/// Side of a large cell in metres.
+const WIDE_M: f64 = 16.0;
+
+impl Tracker {
+    /// Knows nothing yet; `config` is taken as valid.
+    pub fn new(config: TracksConfig) -> Self {
+        Self {
+            near: Grid::new(config.gate_m),
+            wide: Grid::new(WIDE_M.max(config.gate_m)),
+            config,
+            sources: Vec::new(),
+            numbers: HashMap::new(),
+            standings: BTreeMap::new(),
+            fleet: Fleet::default(),
+            tracks: Vec::new(),
+            pending: Vec::new(),
+            fused_until: Timestamp(0),
+            late: 0,
+            refused: 0,
+            evidence: Vec::new(),
+        }
+    }
+
+    /// Takes one admitted report, captured at `captured_at` on the aggregator's clock.
+    pub fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
+        self.observe_only(report, captured_at, |_| true);
+    }
+
+    /// The same with only some of the report's objects: those that are at no known place.
+    pub fn observe_only(
+        &mut self,
+        report: &ObjectReport,
+        captured_at: Timestamp,
+        wanted: impl Fn(&PerceivedObject) -> bool,
+    ) {
+        if self.fused_until.since(captured_at).as_secs_f64() > self.config.max_lag_s {
+            self.late += 1;
+            return;
+        }
+        let objects = report.objects.iter().filter(|object| wanted(object)).cloned().collect();
+        let (pose, view) = (report.pose, report.view);
+        let report = ObjectReport {
+            pose,
+            view,
+            objects,
+            ..ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us)
+        };
+        self.pending.push((captured_at, report));
+    }
+
+    /// Starts from what a ledger knows of the vehicles.
+    pub fn adopt(&mut self, ledger: &ReputationLedger) {
+        for (node, (correct, incorrect)) in ledger.totals() {
+            let standing = Standing::new(correct, incorrect);
+            if let Some(source) = self.numbers.get(&node).and_then(|number| self.sources[*number as usize].as_mut()) {
+                source.standing = standing;
+            }
+            self.standings.insert(node, standing);
+        }
+    }
+
+    /// What could not be used so far.
+    pub fn losses(&self) -> TracksLosses {
+        TracksLosses { late: self.late, refused: self.refused }
+    }
+
+    /// Closes a round at `now`.
+    pub fn close(&mut self, now: Timestamp) -> TracksRound {
+        let mut pending = std::mem::take(&mut self.pending);
+        pending.sort_by(|(a, x), (b, y)| (a, &x.node, x.seq).cmp(&(b, &y.node, y.seq)));
+        let oldest_capture = pending.first().map(|(at, _)| *at);
+        self.index(pending.last().map_or(now, |(at, _)| *at));
+        let mut pairs = Vec::new();
+        for (at, report) in &pending {
+            let number = self.number_of(&report.node, *at);
+            let Some(mut source) = self.sources[number as usize].take() else { continue };
+            let mut taking = Taking { number, source: &mut source, report, at: *at, pairs: Vec::new() };
+            self.take(&mut taking);
+            pairs.push((number, *at, taking.pairs));
+            self.sources[number as usize] = Some(source);
+            self.fused_until = self.fused_until.max(*at);
+        }
+        if self.config.align {
+            let spread = self.spread();
+            for (number, at, pairs) in pairs {
+                if let Some(source) = &mut self.sources[number as usize] {
+                    source.alignment.observe(at, &pairs, &spread);
+                }
+            }
+        }
+        self.merge(now);
+        self.forget(now);
+        TracksRound {
+            objects: self.objects(now),
+            pose_corrections: self.corrections(),
+            oldest_capture,
+            evidence: std::mem::take(&mut self.evidence),
+        }
+    }
+
+    fn spread(&self) -> Spread {
+        let TracksConfig { align_offset_m, align_heading_rad, align_memory_s, .. } = self.config;
+        Spread { offset_m: align_offset_m, heading_rad: align_heading_rad, memory_s: align_memory_s }
+    }
+
+    /// The vehicle's number, given now if it has none.
+    fn number_of(&mut self, node: &NodeName, at: Timestamp) -> u32 {
+        if let Some(number) = self.numbers.get(node) {
+            return *number;
+        }
+        let standing = self.standings.get(node).copied().unwrap_or_default();
+        let source = Source::new(node.clone(), at, Alignment::new(at, &self.spread()), standing, &self.config);
+        let number = self.sources.iter().position(Option::is_none).unwrap_or(self.sources.len());
+        if number == self.sources.len() {
+            self.sources.push(None);
+        }
+        self.sources[number] = Some(source);
+        self.numbers.insert(node.clone(), number as u32);
+        number as u32
+    }
+
+    fn objects(&self, now: Timestamp) -> Vec<FusedObject> {
+        let source = |number: u32| self.sources.get(number as usize).and_then(Option::as_ref);
+        let trust = |number: u32| source(number).map_or(0.0, Source::trust);
+        let name = |number: u32| source(number).map(|source| source.node.clone());
+        let objects = self.tracks.iter().map(|track| track.fused(now, &self.config, trust, name));
+        objects.filter(|object| object.confidence >= self.config.min_confidence).collect()
+    }
+
+    fn corrections(&self) -> BTreeMap<NodeName, PoseCorrection> {
+        if !self.config.align {
+            return BTreeMap::new();
+        }
+        let sources = self.sources.iter().flatten();
+        sources.filter_map(|source| Some((source.node.clone(), source.alignment.published()?))).collect()
+    }
+}

@@ -1,0 +1,144 @@
+//! By how much a vehicle's positions are off, from what others see of the same objects.
+//!
+//! The error is an offset and a rotation, small and changing slowly: a Gauss-Markov process of three states with a known
+//! spread at rest, so that what all vehicles are off by together, which nobody can see, decays. Every round is one step of
+//! an extended Kalman filter in information form over all pairs, reweighted against wrong ones by Cauchy's function (Holland, Welsch,
+//! "Robust regression using iteratively reweighted least-squares", 1977).
+
+use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
+
+use crate::geometry::wrap_angle;
+use crate::time::Timestamp;
+use crate::wire::PoseCorrection;
+
+/// A position as a vehicle reported it, and where others saw the same object.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pair {
+    pub(super) reported: Vector2<f64>,
+    pub(super) reference: Vector2<f64>,
+    /// Variance of the difference in each direction, m²: what is independent from pair to pair.
+    pub(super) variance: f64,
+    /// Variance of what the references may be off by together, m².
+    pub(super) common: f64,
+}
+
+/// The spread of pose errors and how fast they change.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Spread {
+    pub(super) offset_m: f64,
+    pub(super) heading_rad: f64,
+    pub(super) memory_s: f64,
+}
+
+impl Spread {
+    fn covariance(&self) -> Matrix3<f64> {
+        let (offset, heading) = (self.offset_m * self.offset_m, self.heading_rad * self.heading_rad);
+        Matrix3::from_diagonal(&Vector3::new(offset, offset, heading))
+    }
+}
+
+/// The estimate for one vehicle.
+#[derive(Debug, Clone)]
+pub(super) struct Alignment {
+    at: Timestamp,
+    about: Vector2<f64>,
+    /// East, north, rotation.
+    error: Vector3<f64>,
+    covariance: Matrix3<f64>,
+    pairs: f64,
+}
+
+/// How often pairs are weighted anew in a round.
+const ITERATIONS: usize = 3;
+
+/// Residual, in standard deviations, at which a pair counts half.
+const CAUCHY: f64 = 2.0;
+
+/// Fewest pairs that a correction is published for.
+const MIN_PAIRS: f64 = 3.0;
+
+impl Alignment {
+    pub(super) fn new(at: Timestamp, spread: &Spread) -> Self {
+        Self { at, about: Vector2::zeros(), error: Vector3::zeros(), covariance: spread.covariance(), pairs: 0.0 }
+    }
+
+    /// The centre of rotation from now on; what is known about the old one holds for it.
+    pub(super) fn turn_about(&mut self, about: Vector2<f64>) {
+        let moved = about - self.about;
+        let shift = self.turned(&moved) - moved;
+        self.error.x += shift.x;
+        self.error.y += shift.y;
+        self.about = about;
+    }
+
+    /// Where a reported position belongs.
+    pub(super) fn correct(&self, reported: &Vector2<f64>) -> Vector2<f64> {
+        self.about + self.turned(&(reported - self.about)) + self.error.xy()
+    }
+
+    /// A reported direction as it should be.
+    pub(super) fn correct_heading(&self, heading_rad: f64) -> f64 {
+        wrap_angle(heading_rad + self.error.z)
+    }
+
+    /// A reported velocity as it should be.
+    pub(super) fn turned(&self, vector: &Vector2<f64>) -> Vector2<f64> {
+        let (sin, cos) = self.error.z.sin_cos();
+        Vector2::new(cos * vector.x - sin * vector.y, sin * vector.x + cos * vector.y)
+    }
+
+    /// Variance of a corrected position in each direction, on average, m².
+    pub(super) fn variance_at(&self, reported: &Vector2<f64>) -> f64 {
+        let lever = (reported - self.about).norm_squared();
+        (self.covariance.m11 + self.covariance.m22 + lever * self.covariance.m33) / 2.0
+    }
+
+    /// Takes the pairs of a round in.
+    pub(super) fn observe(&mut self, at: Timestamp, pairs: &[Pair], spread: &Spread) {
+        self.fade(at, spread);
+        let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty()) else { return };
+        let prior = self.error;
+        let mut counted = 0.0;
+        for _ in 0..ITERATIONS {
+            let mut information = prior_information;
+            let mut vector = prior_information * prior;
+            counted = 0.0;
+            for pair in pairs {
+                let arm = self.turned(&(pair.reported - self.about));
+                let jacobian = Matrix2x3::new(1.0, 0.0, -arm.y, 0.0, 1.0, arm.x);
+                let residual = pair.reference - self.correct(&pair.reported);
+                let squared = residual.norm_squared() / (pair.variance + pair.common);
+                let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
+                // What the references share is no better known for their number.
+                let weight = trust / (pair.variance + pair.common * pairs.len() as f64);
+                information += jacobian.transpose() * jacobian * weight;
+                vector += jacobian.transpose() * (residual + jacobian * self.error) * weight;
+                counted += trust;
+            }
+            let Some(covariance) = information.try_inverse() else { return };
+            self.error = covariance * vector;
+            self.covariance = (covariance + covariance.transpose()) * 0.5;
+        }
+        self.pairs += counted;
+    }
+
+    /// Forgets with time.
+    fn fade(&mut self, at: Timestamp, spread: &Spread) {
+        let kept = (-at.since(self.at).as_secs_f64() / spread.memory_s).exp();
+        self.error *= kept;
+        self.covariance = self.covariance * (kept * kept) + spread.covariance() * (1.0 - kept * kept);
+        self.pairs *= kept;
+        self.at = self.at.max(at);
+    }
+
+    /// For the map, if there is anything to say.
+    pub(super) fn published(&self) -> Option<PoseCorrection> {
+        (self.pairs >= MIN_PAIRS).then(|| PoseCorrection {
+            about_m: [self.about.x, self.about.y],
+            dx_m: self.error.x,
+            dy_m: self.error.y,
+            dheading_rad: self.error.z,
+            pairs: self.pairs,
+        })
+    }
+}

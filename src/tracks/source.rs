@@ -1,0 +1,213 @@
+//! What is learnt about one vehicle: how noisy its positions are, where it sees, what its confidences are worth.
+
+use std::f64::consts::TAU;
+
+use nalgebra::{Matrix2, Vector2};
+
+use super::align::Alignment;
+use super::calibration::Calibration;
+use super::config::TracksConfig;
+use super::evidence::Rates;
+use super::trust::Standing;
+use crate::geometry::{Covariance, Pose, wrap_angle};
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::{FieldOfView, ObjectReport, PerceivedObject};
+
+/// One vehicle.
+#[derive(Debug, Clone)]
+pub(super) struct Source {
+    pub(super) node: NodeName,
+    pub(super) last_report: Timestamp,
+    pub(super) alignment: Alignment,
+    pub(super) noise: Noise,
+    pub(super) calibration: Calibration,
+    pub(super) view: View,
+    pub(super) standing: Standing,
+}
+
+impl Source {
+    pub(super) fn new(
+        node: NodeName,
+        at: Timestamp,
+        alignment: Alignment,
+        standing: Standing,
+        config: &TracksConfig,
+    ) -> Self {
+        Self {
+            node,
+            last_report: at,
+            alignment,
+            noise: Noise::default(),
+            calibration: Calibration::new(config.even_confidence),
+            view: View::default(),
+            standing,
+        }
+    }
+
+    /// Weight of its word, 0 to 1.
+    pub(super) fn trust(&self) -> f64 {
+        self.standing.trust()
+    }
+}
+
+/// How far reported positions scatter about their tracks, as a multiple of what was assumed.
+#[derive(Debug, Clone)]
+pub(super) struct Noise {
+    scale: f64,
+    weight: f64,
+}
+
+impl Default for Noise {
+    fn default() -> Self {
+        Self { scale: 1.0, weight: 30.0 }
+    }
+}
+
+impl Noise {
+    /// Weight beyond which older detections are forgotten.
+    const MEMORY: f64 = 500.0;
+
+    /// Covariance of a position, m².
+    pub(super) fn covariance(&self, object: &PerceivedObject, config: &TracksConfig) -> Matrix2<f64> {
+        let floor = Matrix2::identity() * (config.noise_floor_m * config.noise_floor_m);
+        stated(object, config).matrix() * self.scale + floor
+    }
+
+    /// A detection was so far from a track that is well known; `expected` is the part of the squared distance that is
+    /// the track's.
+    pub(super) fn learn(&mut self, object: &PerceivedObject, squared: f64, expected: f64, config: &TracksConfig) {
+        let stated = stated(object, config);
+        let ratio = ((squared - expected) / (stated.xx + stated.yy)).clamp(0.0, 25.0);
+        self.weight = (self.weight + 1.0).min(Self::MEMORY);
+        self.scale += (ratio - self.scale) / self.weight;
+        // A covariance that was stated is never taken for better than it says.
+        let least = if object.covariance_m2.is_some() { 1.0 } else { 0.05 };
+        self.scale = self.scale.max(least);
+    }
+}
+
+fn stated(object: &PerceivedObject, config: &TracksConfig) -> Covariance {
+    object.covariance().unwrap_or_else(|| Covariance::isotropic(config.noise_m))
+}
+
+/// Where a vehicle sees things and how surely.
+#[derive(Debug, Clone)]
+pub(super) struct View {
+    pose: Option<Pose>,
+    stated: Option<FieldOfView>,
+    /// The pose, or the middle of what it sees.
+    centre: Option<Vector2<f64>>,
+    /// Detections by direction from the heading, fading.
+    directions: [f32; Self::DIRECTIONS],
+    /// By distance from the centre.
+    rates: [Bin; Self::BINS],
+    farthest_m: f64,
+}
+
+/// (Hits, looks) after a hit and after a miss.
+#[derive(Debug, Clone, Copy)]
+struct Bin {
+    stay: (f32, f32),
+    find: (f32, f32),
+}
+
+impl Default for View {
+    fn default() -> Self {
+        let (stay, find) = (0.9, 0.15);
+        let bin = Bin { stay: (stay * 20.0, 20.0), find: (find * 20.0, 20.0) };
+        Self {
+            pose: None,
+            stated: None,
+            centre: None,
+            directions: [0.0; Self::DIRECTIONS],
+            rates: [bin; Self::BINS],
+            farthest_m: 0.0,
+        }
+    }
+}
+
+impl View {
+    const BINS: usize = 16;
+    const BIN_M: f64 = 10.0;
+    const DIRECTIONS: usize = 24;
+    /// Looks after which older ones are forgotten.
+    const MEMORY: f32 = 400.0;
+
+    /// Takes note of where a report comes from.
+    pub(super) fn observe(&mut self, report: &ObjectReport) {
+        self.pose = report.pose.map(Pose::from);
+        self.stated = report.view;
+        let count = report.objects.len() as f64;
+        let sum: Vector2<f64> = report.objects.iter().map(|object| Vector2::new(object.x_m, object.y_m)).sum();
+        self.centre = match (self.pose, self.centre) {
+            (Some(pose), _) => Some(pose.position.coords),
+            (None, before) if report.objects.is_empty() => before,
+            (None, None) => Some(sum / count),
+            (None, Some(before)) => Some(before + (sum / count - before) * 0.2),
+        };
+        let Some(centre) = self.centre else { return };
+        self.farthest_m *= 0.995;
+        self.directions.iter_mut().for_each(|count| *count *= 0.99);
+        for object in &report.objects {
+            let offset = Vector2::new(object.x_m, object.y_m) - centre;
+            self.farthest_m = self.farthest_m.max(offset.norm());
+            self.directions[self.direction(&offset)] += 1.0;
+        }
+    }
+
+    /// The pose, or the middle of what it sees.
+    pub(super) fn centre(&self) -> Option<Vector2<f64>> {
+        self.centre
+    }
+
+    /// How far it sees, metres.
+    pub(super) fn reach_m(&self) -> f64 {
+        self.stated.map_or(self.farthest_m, |view| view.range_m).min(Self::BIN_M * Self::BINS as f64)
+    }
+
+    /// How surely it detects what is at a reported position; `None` out of its view.
+    pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<Rates> {
+        let offset = reported - self.centre?;
+        let distance = offset.norm();
+        if distance > self.reach_m() || !self.faces(&offset) {
+            return None;
+        }
+        let bin = &self.rates[Self::bin(distance)];
+        let rate = |(hits, looks): (f32, f32)| f64::from(hits / looks).clamp(0.02, 0.98);
+        Some(Rates { stay: rate(bin.stay), find: rate(bin.find) })
+    }
+
+    /// It looked at an object that is sure to exist.
+    pub(super) fn learn(&mut self, reported: &Vector2<f64>, was_hit: bool, is_hit: bool) {
+        let Some(centre) = self.centre else { return };
+        let bin = &mut self.rates[Self::bin((reported - centre).norm())];
+        let (hits, looks) = if was_hit { &mut bin.stay } else { &mut bin.find };
+        *hits += f32::from(u8::from(is_hit));
+        *looks += 1.0;
+        if *looks > Self::MEMORY {
+            let kept = Self::MEMORY / *looks;
+            *hits *= kept;
+            *looks *= kept;
+        }
+    }
+
+    fn faces(&self, offset: &Vector2<f64>) -> bool {
+        let Some(pose) = self.pose else { return true };
+        if let Some(view) = self.stated {
+            return wrap_angle(offset.y.atan2(offset.x) - pose.heading_rad).abs() <= view.angle_rad / 2.0;
+        }
+        let mean = self.directions.iter().sum::<f32>() / Self::DIRECTIONS as f32;
+        self.directions[self.direction(offset)] > 0.1 * mean
+    }
+
+    fn direction(&self, offset: &Vector2<f64>) -> usize {
+        let heading_rad = self.pose.map_or(0.0, |pose| pose.heading_rad);
+        let turn = (offset.y.atan2(offset.x) - heading_rad).rem_euclid(TAU) / TAU;
+        ((turn * Self::DIRECTIONS as f64) as usize).min(Self::DIRECTIONS - 1)
+    }
+
+    fn bin(distance_m: f64) -> usize {
+        ((distance_m / Self::BIN_M) as usize).min(Self::BINS - 1)
+    }
+}

@@ -1,0 +1,298 @@
+//! What becomes of one report: detections are matched to objects, the rest found new ones, and what is overlooked counts.
+
+use std::time::Duration;
+
+use nalgebra::{Matrix2, Vector2};
+use uuid::Uuid;
+
+use super::Tracker;
+use super::align::Pair;
+use super::assignment::{Pairing, assign};
+use super::calibration::log_odds;
+use super::evidence::Rates;
+use super::motion::Measurement;
+use super::source::Source;
+use super::track::Track;
+use super::trust::{Others, Word, judge};
+use crate::reputation::Evidence;
+use crate::time::Timestamp;
+use crate::wire::{ObjectReport, PerceivedObject};
+
+/// A detection on its way to an object.
+struct Seen<'a> {
+    /// Its place in the report.
+    index: usize,
+    object: &'a PerceivedObject,
+    reported: Vector2<f64>,
+    measurement: Measurement,
+}
+
+/// One vehicle's report on its way in.
+pub(super) struct Taking<'a> {
+    /// Number of the vehicle.
+    pub(super) number: u32,
+    pub(super) source: &'a mut Source,
+    pub(super) report: &'a ObjectReport,
+    pub(super) at: Timestamp,
+    /// What the vehicle's alignment is estimated from.
+    pub(super) pairs: Vec<Pair>,
+}
+
+/// Where nothing is known of a vehicle's view.
+const UNKNOWN: Rates = Rates { stay: 0.9, find: 0.15 };
+
+/// Standard deviation of reported velocities, m/s.
+const VELOCITY_SIGMA_MPS: f64 = 1.0;
+
+/// Within how much time another vehicle's detection still tells where an object was.
+const SIMULTANEOUS: Duration = Duration::from_millis(300);
+
+/// Within how much time another vehicle's detection confirms that an object is there.
+const CONFIRMED_WITHIN: Duration = Duration::from_millis(500);
+
+/// Detections after which a track is known well enough to measure detections by.
+const MATURE_HITS: u32 = 8;
+
+/// Detections after which a track says what a vehicle sees.
+const SURE_HITS: u32 = 5;
+
+/// Confidence of a vehicle that it exists itself, log-odds.
+const SELF_NATS: f64 = 4.0;
+
+impl Tracker {
+    pub(super) fn take(&mut self, taking: &mut Taking<'_>) {
+        let Taking { source, report, at, .. } = taking;
+        source.last_report = source.last_report.max(*at);
+        source.view.observe(report);
+        if let Some(centre) = source.view.centre() {
+            source.alignment.turn_about(centre);
+        }
+        self.take_own_pose(taking);
+        let seen = self.seen(taking.source, taking.report);
+        let chosen = self.associate(taking.number, &seen, taking.at);
+        let mut chosen = chosen.iter().peekable();
+        let mut founding = Vec::new();
+        for (detection, seen) in seen.iter().enumerate() {
+            match chosen.next_if(|pairing| pairing.detection as usize == detection) {
+                Some(pairing) => self.confirm(taking, pairing.track, seen),
+                None => founding.push(seen),
+            }
+        }
+        self.look(taking);
+        for seen in founding {
+            self.found(taking, seen);
+        }
+    }
+
+    /// The vehicle is an object too, and the only one whose word that is.
+    fn take_own_pose(&mut self, taking: &mut Taking<'_>) {
+        let Some(pose) = taking.report.pose else { return };
+        let reported = Vector2::new(pose.x_m, pose.y_m);
+        let sigma_m = (self.config.vehicle_radius_m / 2.0).max(self.config.noise_floor_m);
+        let measurement = Measurement {
+            position: taking.source.alignment.correct(&reported),
+            independent: Matrix2::identity() * (sigma_m * sigma_m),
+            common_m: self.config.common_m,
+        };
+        let reach_m = self.config.gate_m.max(self.config.vehicle_radius_m);
+        let offset =
+            |track: u32| (self.tracks[track as usize].motion.position_at(taking.at) - measurement.position).norm();
+        let around = || self.near.around(&measurement.position, reach_m);
+        let own = around().find(|track| self.tracks[*track as usize].vehicle == Some(taking.number));
+        let unclaimed = around().filter(|track| {
+            self.tracks[*track as usize].vehicle.is_none() && offset(*track) <= 2.0 * self.config.vehicle_radius_m
+        });
+        let known = own.or_else(|| unclaimed.min_by(|a, b| offset(*a).total_cmp(&offset(*b)).then(a.cmp(b))));
+        let track = match known {
+            Some(track) => track as usize,
+            None => {
+                let id = founding_id(taking.report, usize::MAX);
+                let Some(track) = self.add(Track::new(id, taking.at, &measurement, &self.config)) else { return };
+                track
+            }
+        };
+        let (density, number, at) = (self.config.density(), taking.number, taking.at);
+        let track = &mut self.tracks[track];
+        track.vehicle = Some(number);
+        track.motion.update(at, &measurement, density);
+        track.refresh(at);
+        track.witness(number, at).hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
+    }
+
+    /// The report's detections, corrected; those of the vehicle itself are left out.
+    fn seen<'a>(&self, source: &Source, report: &'a ObjectReport) -> Vec<Seen<'a>> {
+        let own = report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
+        let seen = |(index, object): (usize, &'a PerceivedObject)| {
+            let reported = Vector2::new(object.x_m, object.y_m);
+            let is_itself = own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
+            let measurement = Measurement {
+                position: source.alignment.correct(&reported),
+                independent: source.noise.covariance(object, &self.config),
+                common_m: self.config.common_m,
+            };
+            (!is_itself).then_some(Seen { index, object, reported, measurement })
+        };
+        report.objects.iter().enumerate().filter_map(seen).collect()
+    }
+
+    /// Which detections are which objects: within the gate, and the likeliest for all together.
+    fn associate(&self, number: u32, seen: &[Seen<'_>], at: Timestamp) -> Vec<Pairing> {
+        let gate = self.config.gate_sigmas * self.config.gate_sigmas;
+        let density = self.config.density();
+        let mut pairings = Vec::with_capacity(2 * seen.len());
+        for (detection, seen) in seen.iter().enumerate() {
+            let alone = seen.measurement.independent.trace() / 2.0 + self.config.common_m.powi(2);
+            for candidate in self.near.around(&seen.measurement.position, self.config.gate_m) {
+                let track = &self.tracks[candidate as usize];
+                if track.vehicle == Some(number) {
+                    continue;
+                }
+                let innovation = track.motion.innovation(at, &seen.measurement, density);
+                if innovation.distance_squared > gate || innovation.offset.norm() > self.config.gate_m {
+                    continue;
+                }
+                let likeness = track.likeness(seen.object);
+                let spread = (innovation.covariance.determinant().sqrt() / alone).ln();
+                let maturity = f64::from(track.hits.clamp(1, 10)).ln();
+                let benefit = gate - innovation.distance_squared - spread + maturity + 2.0 * likeness.ln();
+                if benefit > 0.0 || likeness > super::track::OTHER_LABEL {
+                    let benefit = benefit.max(0.01);
+                    pairings.push(Pairing { detection: detection as u32, track: candidate, benefit });
+                }
+            }
+        }
+        assign(seen.len(), &pairings)
+    }
+
+    /// An object was detected again.
+    fn confirm(&mut self, taking: &mut Taking<'_>, track: u32, seen: &Seen<'_>) {
+        let Taking { number, source, at, pairs, .. } = taking;
+        let (number, at, config) = (*number, *at, &self.config);
+        let index = track as usize;
+        let track = &mut self.tracks[index];
+        let density = config.density();
+        if track.hits >= MATURE_HITS && track.vehicle.is_none() {
+            let offset = track.motion.innovation(at, &seen.measurement, density).offset;
+            let expected = track.motion.covariance_at(at, density).trace();
+            source.noise.learn(seen.object, offset.norm_squared(), expected, config);
+        }
+        let (mut sum, mut count, mut common) = (Vector2::zeros(), 0.0, 0.0);
+        for other in track.seen_by(at - SIMULTANEOUS).filter(|witness| witness.source != number) {
+            let Some(hit) = other.last_hit else { continue };
+            sum += other.position + track.motion.velocity * (at.micros_from(hit) as f64 * 1e-6);
+            let theirs = self.sources.get(other.source as usize).and_then(Option::as_ref);
+            common += theirs.map_or(0.0, |theirs| theirs.alignment.variance_at(&seen.reported));
+            count += 1.0;
+        }
+        let is_confirmed = count > 0.0;
+        if is_confirmed && track.hits >= SURE_HITS && track.vehicle.is_none() {
+            let variance = seen.measurement.independent.trace() * (1.0 + 1.0 / count) / 2.0;
+            pairs.push(Pair { reported: seen.reported, reference: sum / count, variance, common: common / count });
+        }
+        let rates = source.view.rates_at(&seen.reported).unwrap_or(UNKNOWN);
+        let last = track.witnesses.iter().find(|witness| witness.source == number && witness.was_hit);
+        let last = last.map(|witness| witness.log_odds);
+        let was_hit = last.is_some();
+        if track.hits >= SURE_HITS && (is_confirmed || was_hit) {
+            source.view.learn(&seen.reported, was_hit, true);
+        }
+        track.motion.update(at, &seen.measurement, density);
+        describe(track, source, seen, at);
+        track.motion.limit_speed(config.max_speed_mps);
+        if let Some(log_odds) = last {
+            source.calibration.learn(log_odds, true);
+        }
+        let nats = source.calibration.nats(seen.object.confidence);
+        let witness = track.witness(number, at);
+        witness.hit(at, seen.measurement.position, nats, rates, true);
+        witness.log_odds = log_odds(seen.object.confidence);
+        self.settle(taking, index, &seen.reported);
+    }
+
+    /// What is in the vehicle's view and was not detected.
+    fn look(&mut self, taking: &mut Taking<'_>) {
+        let (number, at) = (taking.number, taking.at);
+        let Some(centre) = taking.source.view.centre() else { return };
+        let candidates: Vec<u32> = self.wide.around(&centre, taking.source.view.reach_m()).collect();
+        for candidate in candidates {
+            let track = &mut self.tracks[candidate as usize];
+            let witness = track.witnesses.iter().find(|witness| witness.source == number);
+            if track.vehicle == Some(number) || witness.is_some_and(|witness| witness.last_look >= at) {
+                continue;
+            }
+            let position = track.motion.position_at(at);
+            let view = &mut taking.source.view;
+            let Some(rates) = view.rates_at(&position) else { continue };
+            let was_hit = witness.is_some_and(|witness| witness.was_hit);
+            if let Some(witness) = witness.filter(|witness| witness.was_hit) {
+                taking.source.calibration.learn(witness.log_odds, false);
+            }
+            let knew_it = witness.is_some_and(|witness| witness.last_hit.is_some());
+            let dt_s = witness.map_or(0.0, |witness| at.since(witness.last_look).as_secs_f64());
+            let is_confirmed = track.seen_by(at - CONFIRMED_WITHIN).any(|witness| witness.source != number);
+            if track.hits >= SURE_HITS && (is_confirmed || was_hit) {
+                view.learn(&position, was_hit, false);
+            }
+            track.witness(number, at).miss(at, rates);
+            if knew_it {
+                track.overlooked(at, dt_s, rates.of(was_hit));
+            }
+            self.settle(taking, candidate as usize, &position);
+        }
+    }
+
+    /// Holds what the vehicle said of an object for a while against the others' word.
+    fn settle(&mut self, taking: &mut Taking<'_>, track: usize, reported: &Vector2<f64>) {
+        let (number, at) = (taking.number, taking.at);
+        let track = &mut self.tracks[track];
+        let Some(witness) = track.witnesses.iter().position(|witness| witness.source == number) else { return };
+        let Some((hits, looks)) = track.witnesses[witness].settled(at) else { return };
+        let trust = |other: u32| self.sources.get(other as usize).and_then(Option::as_ref).map_or(0.0, Source::trust);
+        let others = Others::of(&track.witnesses, number, at, trust);
+        let Some(word) = judge(hits, looks, &others) else { return };
+        let distance_m = taking.source.view.centre().map_or(0.0, |centre| (reported - centre).norm());
+        if word != Word::Invented {
+            self.fleet.learn(distance_m, word == Word::True);
+        }
+        if word == Word::Denied && !self.fleet.expects(distance_m) {
+            return;
+        }
+        let correct = word == Word::True;
+        taking.source.standing.count(correct);
+        self.evidence.push(Evidence { node: taking.source.node.clone(), label: track.label(), correct });
+    }
+
+    /// A detection that is none of the known objects is a new one.
+    fn found(&mut self, taking: &Taking<'_>, seen: &Seen<'_>) {
+        let (number, at) = (taking.number, taking.at);
+        let mut track = Track::new(founding_id(taking.report, seen.index), at, &seen.measurement, &self.config);
+        describe(&mut track, taking.source, seen, at);
+        let nats = taking.source.calibration.nats(seen.object.confidence);
+        let witness = track.witness(number, at);
+        witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
+        witness.log_odds = log_odds(seen.object.confidence);
+        self.add(track);
+    }
+}
+
+/// Takes over what a detection says beside its place.
+fn describe(track: &mut Track, source: &Source, seen: &Seen<'_>, at: Timestamp) {
+    if let Some([x, y]) = seen.object.velocity_mps {
+        let velocity = source.alignment.turned(&Vector2::new(x, y));
+        track.motion.update_velocity(velocity, VELOCITY_SIGMA_MPS);
+    }
+    let heading_rad = seen.object.heading_rad.map(|heading_rad| source.alignment.correct_heading(heading_rad));
+    track.describe(seen.object, heading_rad);
+    track.refresh(at);
+}
+
+/// The same for whoever hears of the founding detection: FNV-1a of 128 bits over what names it
+/// (draft-eastlake-fnv), as a UUID of version 8.
+fn founding_id(report: &ObjectReport, index: usize) -> Uuid {
+    const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
+    const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
+    let numbers = [report.captured_at_us.micros(), report.seq, index as u64];
+    let bytes = report.node.as_str().bytes().chain([0]).chain(numbers.into_iter().flat_map(u64::to_be_bytes));
+    let hash = bytes.fold(OFFSET, |hash, byte| (hash ^ u128::from(byte)).wrapping_mul(PRIME));
+    Uuid::new_v8(hash.to_be_bytes())
+}

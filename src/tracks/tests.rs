@@ -1,0 +1,349 @@
+use std::collections::BTreeSet;
+
+use proptest::collection::vec;
+use proptest::prelude::*;
+use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use uuid::Uuid;
+
+use super::*;
+use crate::geometry::Covariance;
+use crate::wire::{FieldOfView, GlobalMap, SCHEMA_VERSION, WirePose};
+
+const START: Timestamp = Timestamp(1_732_154_400_000_000);
+
+fn at(frame: u64) -> Timestamp {
+    Timestamp(START.0 + frame * 100_000)
+}
+
+fn name(node: &str) -> NodeName {
+    NodeName::new(node).unwrap()
+}
+
+fn car(x_m: f64, y_m: f64) -> PerceivedObject {
+    PerceivedObject::new("car", 0.8, x_m, y_m)
+}
+
+fn report(node: &str, frame: u64, objects: Vec<PerceivedObject>) -> ObjectReport {
+    ObjectReport { objects, ..ObjectReport::new(name(node), frame, at(frame)) }
+}
+
+fn tracker() -> Tracker {
+    Tracker::new(TracksConfig::default())
+}
+
+/// What is published with more than even confidence.
+fn sure(round: &TracksRound) -> Vec<&FusedObject> {
+    round.objects.iter().filter(|object| object.confidence > 0.5).collect()
+}
+
+fn noise(rng: &mut ChaCha8Rng, m: f64) -> f64 {
+    rng.random_range(-m..m)
+}
+
+/// Two cars, one standing and one going east at 10 m/s, seen by two vehicles; returns the last round.
+fn two_cars(tracker: &mut Tracker, frames: std::ops::Range<u64>, seen: impl Fn(u64) -> bool) -> TracksRound {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut last = TracksRound::default();
+    for frame in frames {
+        for node in ["euclid", "gauss"] {
+            let mut place = |x: f64, y: f64| car(x + noise(&mut rng, 0.3), y + noise(&mut rng, 0.3));
+            let mut objects = vec![place(0.0, 20.0)];
+            if seen(frame) {
+                objects.push(place(frame as f64, 0.0));
+            }
+            tracker.observe(&report(node, frame, objects), at(frame));
+        }
+        last = tracker.close(at(frame));
+    }
+    last
+}
+
+fn near(object: &FusedObject, x_m: f64, y_m: f64, within_m: f64) -> bool {
+    (object.x_m - x_m).hypot(object.y_m - y_m) < within_m
+}
+
+#[test]
+fn what_several_vehicles_see_is_one_object_with_a_velocity() {
+    let round = two_cars(&mut tracker(), 0..30, |_| true);
+    let cars = sure(&round);
+    assert_eq!(cars.len(), 2, "{cars:?}");
+    assert!(near(cars[0], 0.0, 20.0, 0.3) && near(cars[1], 29.0, 0.0, 0.5), "{cars:?}");
+    let [east, north] = cars[1].velocity_mps.unwrap();
+    assert!((east - 10.0).abs() < 1.0 && north.abs() < 1.0, "{east} {north}");
+    assert_eq!(cars[1].contributors, [name("euclid"), name("gauss")]);
+    assert_eq!((&*cars[1].label, cars[1].age_s), ("car", Some(0.0)));
+}
+
+#[test]
+fn an_object_keeps_its_identity_through_occlusion_and_fades_while_it_is_hidden() {
+    let mut tracker = tracker();
+    let before = two_cars(&mut tracker, 0..30, |_| true);
+    let hidden = two_cars(&mut tracker, 30..38, |_| false);
+    let find = |round: &TracksRound| round.objects.iter().find(|object| object.y_m.abs() < 3.0).cloned();
+    let (seen, coasting) = (find(&before).unwrap(), find(&hidden).unwrap());
+    assert_eq!(seen.id, coasting.id);
+    assert!(near(&coasting, 37.0, 0.0, 2.0), "{coasting:?}");
+    assert!(coasting.confidence < seen.confidence);
+    let again = two_cars(&mut tracker, 38..45, |_| true);
+    assert_eq!(find(&again).unwrap().id, seen.id);
+    let gone = two_cars(&mut tracker, 45..90, |_| false);
+    assert!(find(&gone).is_none());
+}
+
+#[test]
+fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..20 {
+        let x_m = frame as f64 * 0.5;
+        for (node, x_m, sees) in [("euclid", x_m, x_m + 0.4), ("gauss", 30.0, x_m - 0.5)] {
+            // euclid detects its own bonnet, gauss detects euclid.
+            let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+            tracker.observe(&ObjectReport { pose, ..report(node, frame, vec![car(sees, 0.2)]) }, at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    let vehicles: Vec<_> = round.objects.iter().map(|object| object.vehicle.clone()).collect();
+    assert_eq!(vehicles, [Some(name("euclid")), Some(name("gauss"))], "{:?}", round.objects);
+    assert!(near(&round.objects[0], 9.5, 0.0, 1.0));
+    assert_eq!((&*round.objects[0].label, &*round.objects[1].label), ("car", "vehicle"));
+}
+
+#[test]
+fn a_late_report_is_used_within_the_bound_and_counted_beyond() {
+    let mut on_time = tracker();
+    let mut late = tracker();
+    for frame in 0..30 {
+        let x_m = frame as f64 * 1.5;
+        for tracker in [&mut on_time, &mut late] {
+            tracker.observe(&report("euclid", frame, vec![car(x_m, 0.0)]), at(frame));
+        }
+        on_time.observe(&report("gauss", frame, vec![car(x_m, 0.0)]), at(frame));
+        if frame >= 3 {
+            late.observe(&report("gauss", frame - 3, vec![car(x_m - 4.5, 0.0)]), at(frame - 3));
+        }
+        on_time.close(at(frame));
+        late.close(at(frame));
+    }
+    let [a, b] = [&mut on_time, &mut late].map(|tracker| tracker.close(at(30)));
+    assert_eq!((a.objects.len(), b.objects.len()), (1, 1), "{:?}", b.objects);
+    assert!(near(&b.objects[0], a.objects[0].x_m, a.objects[0].y_m, 0.3), "held against where it was then");
+    assert_eq!(b.objects[0].contributors.len(), 2);
+    late.observe(&report("gauss", 20, vec![car(0.0, 0.0)]), at(20));
+    assert_eq!(late.losses().late, 1);
+}
+
+/// Twelve parked cars seen by both, `gauss` off by an offset and a rotation; returns the last round.
+fn misaligned(config: TracksConfig) -> TracksRound {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let mut tracker = Tracker::new(config);
+    let mut round = TracksRound::default();
+    for frame in 0..60 {
+        let place = |n: u64| ((n % 4) as f64 * 12.0 - 18.0, (n / 4) as f64 * 14.0 - 14.0);
+        for (node, dx, turn) in [("euclid", 0.0, 0.0), ("gauss", 0.7, 0.01f64)] {
+            let mut seen = |n| {
+                let (x, y): (f64, f64) = place(n);
+                let (sin, cos) = turn.sin_cos();
+                car(cos * x - sin * y + dx + noise(&mut rng, 0.2), sin * x + cos * y + noise(&mut rng, 0.2))
+            };
+            let objects = (0..12).map(&mut seen).collect();
+            tracker.observe(&report(node, frame, objects), at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    round
+}
+
+#[test]
+fn offsets_and_rotations_of_poses_are_found_and_published() {
+    let round = misaligned(TracksConfig::default());
+    assert_eq!(sure(&round).len(), 12);
+    let [a, b] = ["euclid", "gauss"].map(|node| round.pose_corrections[&name(node)]);
+    assert!((a.dx_m - b.dx_m - 0.7).abs() < 0.15, "{a:?} {b:?}");
+    assert!((a.dheading_rad - b.dheading_rad - 0.01).abs() < 0.004, "{a:?} {b:?}");
+    let off = misaligned(TracksConfig { align: false, ..TracksConfig::default() });
+    assert!(off.pose_corrections.is_empty());
+}
+
+#[test]
+fn whoever_invents_or_hides_objects_loses_its_standing() {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let mut tracker = tracker();
+    let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+    let mut counts: BTreeMap<NodeName, (u32, u32)> = BTreeMap::new();
+    for frame in 0..150 {
+        for (n, node) in ["a", "b", "c", "d", "hider", "liar"].into_iter().enumerate() {
+            let pose = Some(WirePose { x_m: n as f64 * 6.0, y_m: 0.0, heading_rad: 0.0 });
+            let places = (0..10).map(|n| (n as f64 * 4.0 - 4.0, if n % 2 == 0 { 12.0 } else { -12.0 }));
+            let mut objects: Vec<_> = places.map(|(x, y)| car(x + noise(&mut rng, 0.2), y)).collect();
+            match node {
+                "hider" => objects.truncate(2),
+                "liar" => objects = (0..10).map(|n| car(n as f64 * 5.0, 25.0)).collect(),
+                _ => {}
+            }
+            let report = ObjectReport { pose, view, ..report(node, frame, objects) };
+            tracker.observe(&report, at(frame));
+        }
+        for evidence in tracker.close(at(frame)).evidence {
+            let (right, wrong) = counts.entry(evidence.node).or_default();
+            *(if evidence.correct { right } else { wrong }) += 1;
+        }
+    }
+    for honest in ["a", "b", "c", "d"] {
+        let (right, wrong) = counts[&name(honest)];
+        assert!(right > 20 && wrong == 0, "{honest} {right} {wrong}");
+    }
+    for false_one in ["hider", "liar"] {
+        let (right, wrong) = counts[&name(false_one)];
+        assert!(wrong > 10 && wrong > 2 * right, "{false_one} {right} {wrong}");
+    }
+    let round = tracker.close(at(150));
+    let invented = sure(&round).iter().filter(|object| (object.y_m - 25.0).abs() < 3.0).count();
+    assert_eq!(invented, 0, "nobody believes a liar");
+}
+
+#[test]
+fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_takes_them_over() {
+    let (mut leader, mut standby, mut newcomer) = (tracker(), tracker(), tracker());
+    let map = two_cars(&mut leader, 0..30, |_| true);
+    assert_eq!(two_cars(&mut standby, 0..30, |_| true), map);
+    let other = two_cars(&mut newcomer, 20..30, |_| true);
+    let ids = |round: &TracksRound| sure(round).iter().map(|object| object.id).collect::<BTreeSet<Uuid>>();
+    assert!(ids(&map).is_disjoint(&ids(&other)));
+    let unseen = FusedObject {
+        existence: Some(0.9),
+        ..FusedObject::new(Uuid::from_u128(7), "bus", 0.9, 60.0, 60.0, Covariance::isotropic(0.2))
+    };
+    let map = GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: name("edge"),
+        epoch: 1,
+        round: 30,
+        fused_at_us: at(29),
+        oldest_capture_us: None,
+        landmarks: Vec::new(),
+        objects: map.objects.into_iter().chain([unseen]).collect(),
+        pose_corrections: BTreeMap::new(),
+    };
+    newcomer.adopt_map(&map, at(29));
+    let adopted = two_cars(&mut newcomer, 30..31, |_| true);
+    assert!(ids(&adopted).is_superset(&map.objects[..2].iter().map(|object| object.id).collect()));
+    assert!(adopted.objects.iter().any(|object| object.id == Uuid::from_u128(7)));
+    let later = two_cars(&mut newcomer, 31..80, |_| true);
+    assert_eq!(later.objects.len(), 2, "a map alone keeps nothing alive");
+}
+
+#[test]
+fn a_person_beside_a_car_is_not_the_car() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..20 {
+        let person = PerceivedObject {
+            scores: [("person".into(), 0.7), ("cyclist".into(), 0.2)].into(),
+            ..PerceivedObject::new("person", 0.7, 1.2, 0.0)
+        };
+        let objects = if frame % 2 == 0 { vec![car(0.0, 0.0), person] } else { vec![person, car(0.0, 0.0)] };
+        tracker.observe(&report("euclid", frame, objects), at(frame));
+        round = tracker.close(at(frame));
+    }
+    let labels: Vec<_> = sure(&round).iter().map(|object| (object.label.to_string(), object.x_m.round())).collect();
+    assert_eq!(labels, [("car".to_owned(), 0.0), ("person".to_owned(), 1.0)]);
+    let person = sure(&round)[1];
+    assert!(person.scores["person"] > 0.7 && person.scores["cyclist"] < 0.3);
+}
+
+#[test]
+fn a_detector_with_low_confidences_is_understood_after_a_while() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..200 {
+        let mut objects: Vec<_> =
+            (0..10).map(|n| PerceivedObject::new("car", rng.random_range(0.12..0.3), n as f64 * 10.0, 0.0)).collect();
+        for _ in 0..5 {
+            let (x, y) = (rng.random_range(0.0..90.0), rng.random_range(10.0..60.0));
+            objects.push(PerceivedObject::new("car", rng.random_range(0.02..0.08), x, y));
+        }
+        tracker.observe(&report("euclid", frame, objects), at(frame));
+        round = tracker.close(at(frame));
+    }
+    assert_eq!(sure(&round).len(), 10, "{:?}", sure(&round));
+}
+
+#[test]
+fn no_more_objects_than_an_area_can_hold_are_kept() {
+    let config = TracksConfig { max_density: 4, max_tracks: 20, ..TracksConfig::default() };
+    let mut tracker = Tracker::new(config);
+    let crowd = (0..100).map(|n| car((n % 10) as f64 * 0.3, (n / 10) as f64 * 0.3)).collect();
+    tracker.observe(&report("euclid", 0, crowd), at(0));
+    let round = tracker.close(at(0));
+    assert!(round.objects.len() <= 4, "{}", round.objects.len());
+    let wide = (0..100).map(|n| car(n as f64 * 50.0, 0.0)).collect();
+    tracker.observe(&report("euclid", 1, wide), at(1));
+    assert!(tracker.close(at(1)).objects.len() <= 20);
+    assert!(tracker.losses().refused >= 150);
+}
+
+prop_compose! {
+    fn object()(
+        label in prop_oneof![Just("car"), Just("person")],
+        confidence in 0.0..=1.0f64,
+        (x, y) in prop_oneof![(-20.0..20.0f64, -20.0..20.0f64), (-1e8..1e8f64, -1e8..1e8f64)],
+        covariance_m2 in prop::option::of(prop_oneof![Just([0.0, 0.0, 0.0]), Just([1e12, 0.0, 1e-12]), Just([0.5, 0.5, 0.5])]),
+        velocity_mps in prop::option::of([-1e4..1e4f64, -1e4..1e4f64]),
+        heading_rad in prop::option::of(-1e6..1e6f64),
+    ) -> PerceivedObject {
+        PerceivedObject { covariance_m2, velocity_mps, heading_rad, ..PerceivedObject::new(label, confidence, x, y) }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn whatever_is_reported_comes_to_numbers_that_can_be_computed_with(
+        rounds in vec(vec((0..4u64, 0..9u64, vec(object(), 0..12), prop::option::of((-50.0..50.0f64, -4.0..4.0f64))), 0..6), 1..8),
+    ) {
+        let mut tracker = tracker();
+        for (frame, reports) in rounds.into_iter().enumerate() {
+            for (seq, (node, lag, objects, pose)) in reports.into_iter().enumerate() {
+                let pose = pose.map(|(x_m, heading_rad)| WirePose { x_m, y_m: 0.0, heading_rad });
+                let seq = (frame * 10 + seq) as u64;
+                let report = ObjectReport { pose, seq, ..report(&format!("v{node}"), frame as u64, objects) };
+                tracker.observe(&report, at(frame as u64 + 10 - lag));
+            }
+            let round = tracker.close(at(frame as u64 + 10));
+            let mut ids = BTreeSet::new();
+            for object in &round.objects {
+                prop_assert!(object.x_m.is_finite() && object.y_m.is_finite() && object.covariance().is_valid(), "{:?}", object);
+                prop_assert!((0.0..=1.0).contains(&object.confidence) && (0.0..=1.0).contains(&object.existence.unwrap()));
+                prop_assert!(object.velocity_mps.iter().flatten().all(|speed| speed.abs() <= 71.0), "{:?}", object);
+                prop_assert!(object.covariance_m2[0] >= 1e-3 && object.covariance_m2[2] >= 1e-3, "floors hold");
+                prop_assert!(ids.insert(object.id), "each once");
+            }
+        }
+    }
+
+    #[test]
+    fn the_order_in_which_the_reports_of_a_round_come_does_not_matter(
+        rounds in vec(vec((0..4u64, vec(object(), 0..8)), 0..6), 1..6),
+        seed in any::<u64>(),
+    ) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (mut straight, mut shuffled) = (tracker(), tracker());
+        for (frame, reports) in rounds.into_iter().enumerate() {
+            let frame = frame as u64;
+            let mut reports: Vec<_> = reports
+                .into_iter()
+                .enumerate()
+                .map(|(seq, (node, objects))| ObjectReport { seq: seq as u64, ..report(&format!("v{node}"), frame, objects) })
+                .collect();
+            reports.iter().for_each(|report| straight.observe(report, at(frame)));
+            reports.shuffle(&mut rng);
+            reports.iter().for_each(|report| shuffled.observe(report, at(frame)));
+            prop_assert_eq!(straight.close(at(frame)), shuffled.close(at(frame)));
+        }
+    }
+}

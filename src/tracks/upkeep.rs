@@ -1,0 +1,147 @@
+//! What happens to the objects between reports: those that turn out to be one are joined, those that are gone forgotten.
+
+use std::time::Duration;
+
+use nalgebra::Vector2;
+
+use super::Tracker;
+use super::motion::Measurement;
+use super::track::Track;
+use crate::geometry::Covariance;
+use crate::time::Timestamp;
+use crate::wire::{FusedObject, GlobalMap};
+
+/// How long a silent vehicle is remembered after its last object.
+const REMEMBERED: Duration = Duration::from_secs(10);
+
+/// Two objects are never taken for one beyond this distance in metres.
+const MERGE_M: f64 = 2.0;
+
+/// Nor beyond this distance in standard deviations.
+const MERGE_SIGMAS: f64 = 3.0;
+
+/// Probability of being there below which an unseen object is forgotten.
+const LEAST_PRESENCE: f64 = 0.02;
+
+impl Tracker {
+    /// Adds an object unless there is no room for it; says where.
+    pub(super) fn add(&mut self, track: Track) -> Option<usize> {
+        let position = track.motion.position;
+        if self.tracks.len() >= self.config.max_tracks || self.near.crowd(&position) >= self.config.max_density {
+            self.refused += 1;
+            return None;
+        }
+        let index = self.tracks.len();
+        self.near.insert(&position, index as u32);
+        self.wide.insert(&position, index as u32);
+        self.tracks.push(track);
+        Some(index)
+    }
+
+    /// Indexes the objects where they are at `at`.
+    pub(super) fn index(&mut self, at: Timestamp) {
+        self.near.clear();
+        self.wide.clear();
+        for (index, track) in self.tracks.iter().enumerate() {
+            let position = track.motion.position_at(at);
+            self.near.insert(&position, index as u32);
+            self.wide.insert(&position, index as u32);
+        }
+    }
+
+    /// Joins objects that are one: near each other, and never told apart by one vehicle in one frame. The older stays.
+    pub(super) fn merge(&mut self, now: Timestamp) {
+        self.index(now);
+        let mut joined: Vec<(usize, usize)> = Vec::new();
+        for (older, track) in self.tracks.iter().enumerate() {
+            let position = track.motion.position_at(now);
+            let later = self.near.around(&position, MERGE_M).map(|other| other as usize).filter(|other| *other > older);
+            joined.extend(
+                later.filter(|other| self.are_one(track, &self.tracks[*other], now)).map(|other| (older, other)),
+            );
+        }
+        if joined.is_empty() {
+            return;
+        }
+        let mut tracks: Vec<Option<Track>> = std::mem::take(&mut self.tracks).into_iter().map(Some).collect();
+        for (older, later) in joined {
+            if tracks[older].is_some()
+                && let Some(later) = tracks[later].take()
+                && let Some(older) = &mut tracks[older]
+            {
+                older.absorb(later);
+            }
+        }
+        self.tracks = tracks.into_iter().flatten().collect();
+    }
+
+    fn are_one(&self, track: &Track, other: &Track, now: Timestamp) -> bool {
+        let offset = other.motion.position_at(now) - track.motion.position_at(now);
+        if offset.norm() >= MERGE_M || track.vehicle.is_some() && other.vehicle.is_some() || track.is_told_apart(other)
+        {
+            return false;
+        }
+        let density = self.config.density();
+        let covariance = track.motion.covariance_at(now, density) + other.motion.covariance_at(now, density);
+        offset.norm_squared() < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
+    }
+
+    /// Forgets objects that are gone, and vehicles that have been silent for longer than any object lives.
+    pub(super) fn forget(&mut self, now: Timestamp) {
+        let life = Duration::from_secs_f64(self.config.life_s);
+        self.tracks.retain(|track| now.since(track.last_seen) <= life && track.presence(now) > LEAST_PRESENCE);
+        let limit = now - life - REMEMBERED;
+        let silent = |slot: &Option<super::Source>| slot.as_ref().is_some_and(|source| source.last_report < limit);
+        if !self.sources.iter().any(silent) {
+            return;
+        }
+        for slot in self.sources.iter_mut().filter(|slot| silent(slot)) {
+            if let Some(source) = slot.take() {
+                self.numbers.remove(&source.node);
+            }
+        }
+        for track in &mut self.tracks {
+            track.witnesses.retain(|witness| self.sources[witness.source as usize].is_some());
+            track.vehicle = track.vehicle.filter(|number| self.sources[*number as usize].is_some());
+        }
+    }
+
+    /// Takes over the objects of another aggregator's map, received at `now`: its identities for those known by another,
+    /// and those unknown, on its word, which fades.
+    pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
+        self.index(now);
+        for object in &map.objects {
+            if self.tracks.iter().any(|track| track.id == object.id) {
+                continue;
+            }
+            let seen = self.inherited(object);
+            let nearest = self.near.around(&seen.position, MERGE_M).map(|track| {
+                let offset = self.tracks[track as usize].motion.position_at(now) - seen.position;
+                (track as usize, offset.norm())
+            });
+            let nearest = nearest.filter(|(track, distance)| {
+                *distance < MERGE_M && !map.objects.iter().any(|object| object.id == self.tracks[*track].id)
+            });
+            match nearest.min_by(|a, b| a.1.total_cmp(&b.1)) {
+                Some((track, _)) => self.tracks[track].id = object.id,
+                None => {
+                    let mut track = Track::new(object.id, now, &seen, &self.config);
+                    if let Some([x, y]) = object.velocity_mps {
+                        track.motion.update_velocity(Vector2::new(x, y), 1.0);
+                    }
+                    track.inherit(object, now);
+                    self.add(track);
+                }
+            }
+        }
+    }
+
+    fn inherited(&self, object: &FusedObject) -> Measurement {
+        let floor = Covariance::isotropic(self.config.noise_floor_m);
+        Measurement {
+            position: Vector2::new(object.x_m, object.y_m),
+            independent: (object.covariance() + floor).matrix(),
+            common_m: self.config.common_m,
+        }
+    }
+}
