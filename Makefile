@@ -8,10 +8,10 @@ SETS ?= examples/crowd_labels
 VERDICTS ?= 200
 PASSES ?= 50
 
-.PHONY: help setup demo testbed eval-labels liars test test-dashboard monitoring sim trials lint doc audit bench core-only replay-check edge-only recording-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only replay-check edge-only recording-check clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: ## install the system packages that are missing
 	@missing=$$(for p in $(PACKAGES); do dpkg-query -W -f='$${Status}' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -36,6 +36,14 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 	cargo build --release --locked --bin ecod-node
 	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
+
+eval-tracks: setup ## tracks in generated traffic beside single vehicles and late fusion; table and drawing go into docs/
+	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
+	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/evaluation.md --svg docs/tracks.svg)
+
+eval-tracks-check: PACKAGES += python3-venv
+eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics from PyPI
+	packaging/check-eval-tracks
 
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
 test: PACKAGES += mosquitto

@@ -8,6 +8,7 @@
 //! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines, [`Evaluation::report`] with every
 //! report, in any order; then [`Evaluation::result`].
 
+pub mod tracks;
 mod truth;
 mod votes;
 

@@ -24,6 +24,7 @@ pub mod round;
 pub mod testbed;
 pub mod time;
 pub mod tracks;
+pub mod traffic;
 pub mod view;
 pub mod vote;
 pub mod window;

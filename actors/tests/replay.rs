@@ -174,6 +174,28 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
     assert!(!Path::new(out).exists());
 }
 
+#[test]
+fn objects_that_move_are_judged_by_where_they_were() {
+    let folder = TempDir::new().unwrap();
+    let recorded = |name: &str| Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/eval_tracks")).join(name);
+    let (truth, maps, result) = (recorded("truth.json"), recorded("maps.jsonl"), folder.path().join("result.json"));
+    let run = ecod(&["eval", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)]);
+    assert!(run.status.success(), "{}", said(&run));
+    let table = String::from_utf8(run.stdout).unwrap();
+    assert!(
+        ["AP@0.5 %", "AP@4 %", "bicycle", "MODA %", "HOTA %", "switches"].iter().all(|p| table.contains(p)),
+        "{table}"
+    );
+    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+    let ap_pct = result["tracks"]["ap_pct"].as_array().unwrap();
+    assert!(ap_pct.len() == 4 && ap_pct.iter().all(|ap| ap.as_f64().is_some_and(|ap| ap > 10.0)), "{result}");
+    let broken = folder.path().join("broken.json");
+    fs::write(&broken, r#"{"frames": [{"t_us": 1, "objects": [{"id": 1, "label": "car", "x_m": 0}]}]}"#).unwrap();
+    let run = ecod(&["eval", "--truth", text(&broken), "--input", text(&maps)]);
+    assert_eq!(run.status.code(), Some(2));
+    assert!(said(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"), "{}", said(&run));
+}
+
 #[cfg(feature = "camera")]
 #[test]
 fn the_recorded_intersection_is_judged_right() {

@@ -1,10 +1,13 @@
 //! `ecod-node eval`: how right the output of a replay is.
 
+mod tracks;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
+use ecod::eval::tracks::TrackTruth;
 use ecod::eval::{EvalResult, Evaluation, Scores, Truth};
 use ecod::landmark::LandmarkIndex;
 use ecod::replay::{FusedLine, ReplayConfig, read_report};
@@ -19,7 +22,7 @@ use crate::lines::{self, LineRead, read_line};
 /// Flags of `eval`.
 #[derive(Debug, Args)]
 pub(super) struct EvalArguments {
-    /// What really stands at each location (JSON, or CSV with the columns item,truth)
+    /// What really stands at each location (JSON, or CSV with the columns item,truth), or where all objects were (JSON)
     #[arg(long, value_name = "FILE")]
     truth: PathBuf,
     /// Output of `replay`, or the map log of a node; `-` for standard input
@@ -51,16 +54,20 @@ enum InputLine {
 }
 
 pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
-    let config = cell(arguments.config.as_deref())?;
     let path = &arguments.truth;
     let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
-    let truth = text.and_then(|text| Truth::parse(&text).with_context(|| format!("truth {}", path.display())));
+    let text = text.map_err(Failure::usage)?;
+    if TrackTruth::is_in(&text) {
+        return tracks::run(arguments, &text);
+    }
+    let config = cell(arguments.config.as_deref())?;
+    let truth = Truth::parse(&text).with_context(|| format!("truth {}", path.display()));
     let mut evaluation = Evaluation::new(truth.map_err(Failure::usage)?);
     if !config.landmarks.is_empty() {
         let gate = config.fusion.pace.gate();
         evaluation = evaluation.with_landmarks(LandmarkIndex::new(config.landmarks.clone(), gate.radius_m), gate);
     }
-    read_output(&mut evaluation, &arguments.input)?;
+    read_output(&arguments.input, |line| evaluation.fused(&line))?;
     if let Some(reports) = &arguments.reports {
         read_reports(&mut evaluation, reports, &config)?;
     }
@@ -72,12 +79,12 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     Ok(())
 }
 
-fn read_output(evaluation: &mut Evaluation, path: &Path) -> Result<(), Failure> {
+fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failure> {
     let (mut read, mut unreadable) = (0u64, 0u64);
     each_line(path, MAX_LINE_BYTES, |line| {
         match line.map(serde_json::from_slice) {
-            Some(Ok(InputLine::Fused(line))) => evaluation.fused(&line),
-            Some(Ok(InputLine::Received { map })) => evaluation.fused(&FusedLine::Map(map)),
+            Some(Ok(InputLine::Fused(line))) => take(line),
+            Some(Ok(InputLine::Received { map })) => take(FusedLine::Map(map)),
             _ => return unreadable += 1,
         }
         read += 1;

@@ -1,0 +1,148 @@
+//! What is done elsewhere with the same reports: one vehicle alone, all together, and late fusion.
+//!
+//! Late fusion as OPV2V and V2V4Real have it: what all vehicles found, with non-maximum suppression by score, here by
+//! centre distance. Identities come from a tracker as plain as AB3DMOT's (Weng et al., IROS 2020): a constant velocity and
+//! the nearest detection.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use ecod::eval::tracks::SaidObject;
+use ecod::names::{Label, NodeName};
+use ecod::time::Timestamp;
+use ecod::wire::ObjectReport;
+use nalgebra::{Point2, Vector2};
+
+/// Age beyond which a vehicle's last report is not used.
+const MAX_AGE: Duration = Duration::from_millis(300);
+/// Distances within which the suppression takes two cars, and two of anything else, for one.
+const SAME_CAR_M: f64 = 2.0;
+const SAME_OTHER_M: f64 = 1.0;
+/// The tracker's gate, what a new velocity counts, and how long it waits for what is gone.
+const GATE_M: f64 = 3.0;
+const GAIN: f64 = 0.3;
+const PATIENCE: Duration = Duration::from_millis(500);
+
+/// What was found, with its score.
+#[derive(Debug, Clone)]
+pub(crate) struct Found {
+    label: Label,
+    score: f64,
+    position: Point2<f64>,
+}
+
+/// All that one report says, the vehicle itself too if its pose is known.
+pub(crate) fn found(report: &ObjectReport) -> Vec<Found> {
+    let objects = report.objects.iter().map(|object| Found {
+        label: object.label.clone(),
+        score: object.confidence,
+        position: Point2::new(object.x_m, object.y_m),
+    });
+    let own = report.pose.map(|pose| Found {
+        label: Label::new_static("car"),
+        score: 1.0,
+        position: Point2::new(pose.x_m, pose.y_m),
+    });
+    objects.chain(own).collect()
+}
+
+/// The last reports of all vehicles.
+#[derive(Debug, Default)]
+pub(crate) struct Latest(BTreeMap<NodeName, (Timestamp, Vec<Found>)>);
+
+impl Latest {
+    /// Takes a report, unless a later one is there already.
+    pub(crate) fn report(&mut self, report: &ObjectReport) {
+        let last = self.0.entry(report.node.clone()).or_default();
+        if report.captured_at_us > last.0 {
+            *last = (report.captured_at_us, found(report));
+        }
+    }
+
+    /// What all vehicles found.
+    pub(crate) fn union(&self, now: Timestamp) -> Vec<Found> {
+        let fresh = self.0.values().filter(|(captured, _)| now.since(*captured) <= MAX_AGE);
+        fresh.flat_map(|(_, found)| found.iter().cloned()).collect()
+    }
+}
+
+/// Of those of one label near each other, the one with the highest score.
+pub(crate) fn suppressed(mut found: Vec<Found>) -> Vec<Found> {
+    found.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let mut kept: Vec<Found> = Vec::new();
+    for candidate in found {
+        let limit_m = if candidate.label == "car" { SAME_CAR_M } else { SAME_OTHER_M };
+        let is_same =
+            |other: &Found| other.label == candidate.label && (other.position - candidate.position).norm() < limit_m;
+        if !kept.iter().any(is_same) {
+            kept.push(candidate);
+        }
+    }
+    kept
+}
+
+/// Gives identities to what is found.
+#[derive(Debug, Default)]
+pub(crate) struct Tracker {
+    tracks: Vec<Track>,
+    identities: u32,
+}
+
+#[derive(Debug)]
+struct Track {
+    id: u32,
+    label: Label,
+    position: Point2<f64>,
+    velocity: Vector2<f64>,
+    at: Timestamp,
+}
+
+impl Tracker {
+    /// Takes what is there at a time.
+    pub(crate) fn track(&mut self, at: Timestamp, found: &[Found]) -> Vec<SaidObject> {
+        self.tracks.retain(|track| at.since(track.at) <= PATIENCE);
+        let mut pairs = Vec::new();
+        for (number, track) in self.tracks.iter().enumerate() {
+            let expected = track.position + track.velocity * at.since(track.at).as_secs_f64();
+            for (place, object) in found.iter().enumerate().filter(|(_, object)| object.label == track.label) {
+                let distance_m = (object.position - expected).norm();
+                if distance_m < GATE_M {
+                    pairs.push((distance_m, number, place));
+                }
+            }
+        }
+        pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let (mut continued, mut ids) = (vec![false; self.tracks.len()], vec![None; found.len()]);
+        for (_, number, place) in pairs {
+            if !continued[number] && ids[place].is_none() {
+                continued[number] = true;
+                ids[place] = Some(self.tracks[number].follow(at, found[place].position));
+            }
+        }
+        let identified = found.iter().zip(ids).map(|(object, id)| SaidObject {
+            id: id.unwrap_or_else(|| self.begin(at, object)),
+            label: object.label.clone(),
+            score: object.score,
+            position: object.position,
+        });
+        identified.collect()
+    }
+
+    fn begin(&mut self, at: Timestamp, Found { label, position, .. }: &Found) -> u32 {
+        let id = self.identities;
+        self.identities += 1;
+        self.tracks.push(Track { id, label: label.clone(), position: *position, velocity: Vector2::zeros(), at });
+        id
+    }
+}
+
+impl Track {
+    fn follow(&mut self, at: Timestamp, position: Point2<f64>) -> u32 {
+        let passed_s = at.since(self.at).as_secs_f64();
+        if passed_s > 0.0 {
+            self.velocity += ((position - self.position) / passed_s - self.velocity) * GAIN;
+        }
+        (self.position, self.at) = (position, at);
+        self.id
+    }
+}

@@ -1,0 +1,291 @@
+//! Tracks in generated traffic, beside the best vehicle alone, all reports together, and late fusion.
+//!
+//! `make eval-tracks`, or `cargo run --release --example eval_tracks -- [--seeds tuning|report] [--count N] [--seconds S]
+//! [--observers 2,4,8] [--write-table FILE] [--svg FILE] [--recordings DIR]`
+//!
+//! Parameters are chosen on the seeds `tuning` and figures reported on the seeds `report`; `--count` takes the first
+//! of them. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
+//! `ecod-node eval`.
+
+mod baselines;
+mod plot;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, File};
+use std::io::{BufWriter, Write as _};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
+use ecod::eval::tracks::{AP_DISTANCES_M, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
+use ecod::geometry::Covariance;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
+use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind, SCHEMA_VERSION};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use uuid::Uuid;
+
+use baselines::{Latest, Tracker, found, suppressed};
+
+const TUNING: Range<u64> = 1..5;
+const REPORT: Range<u64> = 1001..1005;
+const OBSERVERS: [usize; 6] = [2, 4, 8, 16, 32, 50];
+
+/// Ways to make a map of the same reports.
+pub(crate) const METHODS: [&str; 4] = ["best vehicle", "union", "late fusion", "ecod"];
+
+/// Columns of the table.
+pub(crate) const FIGURES: [&str; 9] =
+    ["AP@0.5", "AP@1", "AP@2", "AP@4", "best F1", "MODA", "HOTA", "IDF1", "switches per object"];
+
+/// The figures of one method, in the order of [`FIGURES`].
+pub(crate) type Figures = [f64; FIGURES.len()];
+
+struct Options {
+    seeds: Range<u64>,
+    count: usize,
+    seconds: f64,
+    observers: Vec<usize>,
+    table: Option<PathBuf>,
+    svg: Option<PathBuf>,
+    recordings: Option<PathBuf>,
+}
+
+fn options() -> anyhow::Result<Options> {
+    let mut options = Options {
+        seeds: REPORT,
+        count: usize::MAX,
+        seconds: 30.0,
+        observers: OBSERVERS.to_vec(),
+        table: None,
+        svg: None,
+        recordings: None,
+    };
+    let mut args = std::env::args().skip(1);
+    while let Some(key) = args.next() {
+        let value = args.next().with_context(|| format!("{key} needs a value"))?;
+        match key.as_str() {
+            "--seeds" if value == "tuning" => options.seeds = TUNING,
+            "--seeds" if value == "report" => options.seeds = REPORT,
+            "--seeds" => bail!("--seeds is tuning or report, not {value}"),
+            "--count" => options.count = value.parse()?,
+            "--seconds" => options.seconds = value.parse()?,
+            "--observers" => options.observers = value.split(',').map(str::parse).collect::<Result<_, _>>()?,
+            "--write-table" => options.table = Some(value.into()),
+            "--svg" => options.svg = Some(value.into()),
+            "--recordings" => options.recordings = Some(value.into()),
+            _ => bail!("unknown option {key}"),
+        }
+    }
+    Ok(options)
+}
+
+/// A kind of traffic and the name of its rows.
+struct Scene {
+    name: String,
+    config: TrafficConfig,
+}
+
+impl Scene {
+    /// A town with every number of observers, and a recording of two vehicles.
+    fn all(options: &Options) -> Vec<Self> {
+        let town = |&observers: &usize| Self {
+            name: observers.to_string(),
+            config: TrafficConfig { observers, duration_s: options.seconds, ..TrafficConfig::default() },
+        };
+        let recorded = Self {
+            name: "recorded".into(),
+            config: TrafficConfig { duration_s: options.seconds, ..TrafficConfig::two_vehicle_recording() },
+        };
+        options.observers.iter().map(town).chain([recorded]).collect()
+    }
+}
+
+/// All methods on one recording; `write` gets every map of late fusion.
+fn run(
+    recording: &TrafficRecording,
+    observers: usize,
+    write: &mut dyn FnMut(Timestamp, &[SaidObject]),
+) -> anyhow::Result<[TrackScores; METHODS.len()]> {
+    let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth)?)?;
+    let judge = || TrackEvaluation::new(truth.clone());
+    let (mut union, mut late, mut ours) = (judge(), judge(), judge());
+    let (mut union_tracker, mut late_tracker) = (Tracker::default(), Tracker::default());
+    let mut latest = Latest::default();
+    for map in maps(recording, &mut |report_or_map| match report_or_map {
+        Event::Report(report) => latest.report(report),
+        Event::Map(at) => {
+            let all = latest.union(at);
+            union.said(at, &union_tracker.track(at, &all));
+            let suppressed = late_tracker.track(at, &suppressed(all));
+            write(at, &suppressed);
+            late.said(at, &suppressed);
+        }
+    }) {
+        ours.map(&map);
+    }
+    let alone = (0..observers).map(|number| alone(recording, &observer_name(number), judge()));
+    let best = alone.max_by(|a, b| a.ap_pct[2].unwrap_or_default().total_cmp(&b.ap_pct[2].unwrap_or_default()));
+    Ok([best.context("no observer")?, union.result(), late.result(), ours.result()])
+}
+
+enum Event<'a> {
+    Report(&'a ObjectReport),
+    Map(Timestamp),
+}
+
+/// What an aggregator makes of a recording; `watch` hears of every report and every map as it comes.
+fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<GlobalMap> {
+    let config = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
+    let mut aggregator: Option<Aggregator> = None;
+    let mut maps = Vec::new();
+    let mut take = |fused: Option<Fused>, watch: &mut dyn FnMut(Event<'_>)| {
+        if let Some(map) = fused.and_then(|fused| fused.map) {
+            watch(Event::Map(map.fused_at_us));
+            maps.push(map);
+        }
+    };
+    for arrived in &recording.reports {
+        let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
+        let aggregator = aggregator
+            .get_or_insert_with(|| Aggregator::new(NodeName::from_static("edge"), 1, config.clone(), Vec::new(), now));
+        while aggregator.deadline() <= now {
+            take(aggregator.tick(aggregator.deadline()), watch);
+        }
+        watch(Event::Report(&arrived.report));
+        // A rejected report is one that comes too late.
+        take(aggregator.report(ReportKind::Detections, &arrived.report, now).unwrap_or_default(), watch);
+    }
+    if let Some(aggregator) = &mut aggregator {
+        take(aggregator.tick(aggregator.deadline()), watch);
+    }
+    maps
+}
+
+/// One vehicle by itself, at the times of its captures: nothing takes time.
+fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluation) -> TrackScores {
+    let mut tracker = Tracker::default();
+    let mut own: Vec<_> = recording.reports.iter().map(|arrived| &arrived.report).filter(|r| r.node == *name).collect();
+    own.sort_by_key(|report| report.captured_at_us);
+    for report in own {
+        judge.said(report.captured_at_us, &tracker.track(report.captured_at_us, &found(report)));
+    }
+    judge.result()
+}
+
+fn figures(scores: &TrackScores, truth_ids: usize) -> Figures {
+    let at = &scores.at_best_f1;
+    let [a, b, c, d] = scores.ap_pct.map(Option::unwrap_or_default);
+    let rest = [scores.best_f1_pct, at.moda_pct, at.hota_pct, at.idf1_pct].map(Option::unwrap_or_default);
+    let [f1, moda, hota, idf1] = rest;
+    [a, b, c, d, f1, moda, hota, idf1, at.id_switches as f64 / truth_ids.max(1) as f64]
+}
+
+/// Where a recording is written to, line by line.
+struct Files {
+    maps: BufWriter<File>,
+}
+
+impl Files {
+    fn new(folder: &Path, name: &str, recording: &TrafficRecording) -> anyhow::Result<Self> {
+        fs::create_dir_all(folder)?;
+        let file = |kind: &str| folder.join(format!("{name}.{kind}"));
+        let mut reports = BufWriter::new(File::create(file("reports.jsonl"))?);
+        for arrived in &recording.reports {
+            writeln!(reports, "{}", serde_json::to_string(arrived)?)?;
+        }
+        reports.flush()?;
+        fs::write(file("truth.json"), serde_json::to_vec(&recording.truth)?)?;
+        Ok(Self { maps: BufWriter::new(File::create(file("late.jsonl"))?) })
+    }
+
+    fn map(&mut self, at: Timestamp, said: &[SaidObject]) -> anyhow::Result<()> {
+        let objects = said.iter().map(|said| {
+            let id = Uuid::from_u128(u128::from(said.id));
+            let covariance = Covariance::isotropic(1.0);
+            FusedObject::new(id, said.label.clone(), said.score, said.position.x, said.position.y, covariance)
+        });
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("late-fusion"),
+            epoch: 1,
+            round: 1,
+            fused_at_us: at,
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: objects.collect(),
+            pose_corrections: BTreeMap::new(),
+        };
+        Ok(writeln!(self.maps, "{}", serde_json::to_string(&map)?)?)
+    }
+}
+
+fn header() -> String {
+    let line = |cells: &mut dyn Iterator<Item = String>| format!("| {} |\n", cells.collect::<Vec<_>>().join(" | "));
+    let names = ["vehicles", "method"].into_iter().chain(FIGURES).map(str::to_owned);
+    line(&mut names.clone()) + &line(&mut names.map(|_| "---".to_owned()))
+}
+
+fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
+    const BEGIN: &str = "<!-- track table begin -->\n";
+    const END: &str = "<!-- track table end -->";
+    let text = fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let (before, rest) = text.split_once(BEGIN).context("no begin marker")?;
+    let (_, after) = rest.split_once(END).context("no end marker")?;
+    Ok(fs::write(path, format!("{before}{BEGIN}{table}{END}{after}"))?)
+}
+
+fn main() -> anyhow::Result<()> {
+    const { assert!(AP_DISTANCES_M.len() == 4) };
+    let options = options()?;
+    let mut table = header();
+    print!("{table}");
+    let mut courses: Vec<(usize, [Figures; METHODS.len()])> = Vec::new();
+    for Scene { name, config } in Scene::all(&options) {
+        config.validate()?;
+        let seeds: Vec<u64> = options.seeds.clone().take(options.count).collect();
+        let mut mean = [[0.0; FIGURES.len()]; METHODS.len()];
+        for seed in &seeds {
+            let mut rng = ChaCha8Rng::seed_from_u64(*seed);
+            let recording = generate(&config, &mut || rng.random());
+            let folder = options.recordings.as_ref();
+            let mut files =
+                folder.map(|folder| Files::new(folder, &format!("{name}-{seed}"), &recording)).transpose()?;
+            let mut written = Ok(());
+            let mut write = |at, said: &[SaidObject]| {
+                if let (Some(files), Ok(())) = (&mut files, &written) {
+                    written = files.map(at, said);
+                }
+            };
+            let ids: BTreeSet<usize> =
+                recording.truth.frames.iter().flat_map(|frame| frame.objects.iter().map(|object| object.id)).collect();
+            let scores = run(&recording, config.observers, &mut write)?;
+            written?;
+            for (method, scores) in scores.iter().enumerate() {
+                for (sum, figure) in mean[method].iter_mut().zip(figures(scores, ids.len())) {
+                    *sum += figure / seeds.len() as f64;
+                }
+            }
+        }
+        for (method, figures) in METHODS.iter().zip(&mean) {
+            let (shares, switches) = figures.split_at(FIGURES.len() - 1);
+            let shares: Vec<String> = shares.iter().map(|figure| format!("{figure:.1}")).collect();
+            let row = format!("| {name} | {method} | {} | {:.2} |\n", shares.join(" | "), switches[0]);
+            print!("{row}");
+            table.push_str(&row);
+        }
+        if name == config.observers.to_string() {
+            courses.push((config.observers, mean));
+        }
+    }
+    if let Some(path) = &options.table {
+        write_table(path, &table)?;
+    }
+    if let Some(path) = &options.svg {
+        plot::draw(path, &courses)?;
+    }
+    Ok(())
+}
