@@ -14,7 +14,7 @@ use crate::recorder::RecordConfig;
 pub(super) struct RecordArguments {
     #[command(flatten)]
     observer: ObserverArguments,
-    /// Directory of the log; default that of [record] in the configuration
+    /// Directory of the log; default that of `record` in the configuration
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
 }

@@ -61,7 +61,7 @@ pub struct RunArguments {
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1, default_missing_value = "127.0.0.1:8080")]
     #[serde(skip)]
     dashboard: Option<SocketAddr>,
-    /// Record in this directory (MCAP); the table [record] of the configuration file has more
+    /// Record in this directory (MCAP); the table `record` of the configuration file has more
     #[arg(long, value_name = "DIR")]
     #[serde(skip_serializing_if = "Option::is_none")]
     record: Option<PathBuf>,
