@@ -196,9 +196,11 @@ impl Vote {
         if geometry.is_some_and(|(distance, _)| distance > self.max_range_m()) {
             return false;
         }
-        if let Tally::Weighted(tally) = &self.tally
-            && !tally.has_room_for(&label, self.config.max_labels)
-        {
+        let has_room = match &self.tally {
+            Tally::Paper(tally) => tally.has_room_for(landmark, &label, self.config.max_labels),
+            Tally::Weighted(tally) => tally.has_room_for(&label, self.config.max_labels),
+        };
+        if !has_room {
             return false;
         }
         if known.is_none() {

@@ -176,7 +176,7 @@ pub struct Verdict {
     pub label: Option<Label>,
     /// Score of the label; 0 without a label.
     pub score: f64,
-    /// Score of the label minus that of the next best.
+    /// Score of the label minus that of the next best; below 0 while a label is held against flicker.
     pub margin: f64,
     /// Score of every label that was voted for.
     pub votes: BTreeMap<Label, f64>,

@@ -51,9 +51,15 @@ impl PaperTally {
         self.scores.remove(landmark);
     }
 
-    /// Forgets vehicles' reputations; what they said stays in the sums.
+    /// Forgets vehicles' reputations and names; what they said stays in the sums.
     pub fn forget_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.vehicles.retain(|node, _| !nodes.contains(node));
+        self.scores.values_mut().for_each(|(_, contributors)| contributors.retain(|node| !nodes.contains(node)));
+    }
+
+    /// Whether a location can take a label with at most `most` labels in all.
+    pub fn has_room_for(&self, landmark: &LandmarkId, label: &Label, most: usize) -> bool {
+        self.scores.get(landmark).is_none_or(|(scores, _)| scores.len() < most || scores.contains_key(label))
     }
 
     /// Adds r_v · c_ω · k for one detection.

@@ -1,0 +1,71 @@
+//! VOTE where nothing moves: vehicles look at the same objects again and again and take a frame wrong now and then.
+
+use std::time::Duration;
+
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::vote::{Vote, VoteConfig};
+use ecod::wire::{ObjectReport, PerceivedObject};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+const LABELS: [&str; 5] = ["car", "cup", "mouse", "sports ball", "vase"];
+const PERIOD: Duration = Duration::from_millis(100);
+const ROUNDS: u64 = 600;
+
+/// Vehicles of which the first `liars` state the same wrong labels always; the others are right in 80 % of frames.
+struct Cell {
+    vehicles: usize,
+    liars: usize,
+    landmarks: usize,
+}
+
+/// Percent of right verdicts in the second half of a minute, and changes of verdicts in it.
+fn run(cell: &Cell, seed: u64) -> (f64, usize) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    let truths: Vec<usize> = (0..cell.landmarks).map(|_| rng.random_range(0..LABELS.len())).collect();
+    let mut now = Timestamp(1_700_000_000_000_000);
+    let (mut right, mut changes) = (0, 0);
+    let mut shown = vec![None; cell.landmarks];
+    for round in 0..ROUNDS {
+        now = now + PERIOD;
+        for vehicle in 0..cell.vehicles {
+            let mut see = |truth: usize| match (vehicle < cell.liars, rng.random_bool(0.8)) {
+                (true, _) => (truth + 1) % LABELS.len(),
+                (false, true) => truth,
+                (false, false) => (truth + rng.random_range(1..LABELS.len())) % LABELS.len(),
+            };
+            let objects = truths.iter().enumerate().map(|(place, &truth)| PerceivedObject {
+                landmark: Some(format!("place-{place}").into()),
+                ..PerceivedObject::new(LABELS[see(truth)], 0.8, 0.0, 0.0)
+            });
+            let node = NodeName::new(format!("vehicle-{vehicle}")).unwrap();
+            let report = ObjectReport { objects: objects.collect(), ..ObjectReport::new(node, round, now) };
+            vote.observe(&report, now).unwrap();
+        }
+        for verdict in vote.close(now).verdicts {
+            let place: usize = verdict.landmark["place-".len()..].parse().unwrap();
+            if round >= ROUNDS / 2 {
+                right += usize::from(verdict.label.as_deref() == Some(LABELS[truths[place]]));
+                changes += usize::from(shown[place] != verdict.label);
+            }
+            shown[place] = verdict.label;
+        }
+    }
+    (100.0 * right as f64 / (ROUNDS as usize / 2 * cell.landmarks) as f64, changes)
+}
+
+#[test]
+fn verdicts_about_objects_that_stay_are_right_and_do_not_flicker() {
+    for (vehicles, liars) in [(3, 0), (5, 0), (3, 1), (5, 2), (9, 4)] {
+        for landmarks in [1, 3, 6] {
+            for seed in 1..=3 {
+                let (right, changes) = run(&Cell { vehicles, liars, landmarks }, seed);
+                let cell = format!("{vehicles} vehicles, {liars} liars, {landmarks} landmarks, seed {seed}");
+                assert!(right >= 99.0, "{cell}: {right} % right");
+                assert!(changes <= landmarks, "{cell}: {changes} changes");
+            }
+        }
+    }
+}
