@@ -77,41 +77,45 @@ impl ReputationConfig {
 }
 
 type Vehicles = BTreeMap<NodeName, BTreeMap<Label, Counts>>;
+type Lanes = BTreeMap<u64, BTreeMap<NodeName, Vehicles>>;
 
 /// The evidence of all epochs. Serialised, it is the snapshot that is persisted and replicated.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(from = "Snapshot")]
 pub struct ReputationLedger {
     /// By epoch, the aggregator that wrote the lane, vehicle and stated label.
-    lanes: BTreeMap<u64, BTreeMap<NodeName, Vehicles>>,
+    lanes: Lanes,
+    /// Number of counts in all lanes.
+    #[serde(skip)]
+    entries: usize,
+}
+
+/// A ledger as it was written.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Snapshot {
+    lanes: Lanes,
+}
+
+impl From<Snapshot> for ReputationLedger {
+    fn from(Snapshot { lanes }: Snapshot) -> Self {
+        let entries = lanes.values().flat_map(BTreeMap::values).flat_map(BTreeMap::values).map(BTreeMap::len).sum();
+        Self { lanes, entries }
+    }
 }
 
 impl ReputationLedger {
-    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there.
+    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. It is not counted
+    /// where the bounds leave no room, see [`Self::merge_entries`].
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
-        let is_new = !self.lanes.get(&epoch).is_some_and(|aggregators| aggregators.contains_key(aggregator));
-        let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
-        let counts = lane.entry(evidence.node.clone()).or_default().entry(evidence.label.clone()).or_default();
+        let Some(counts) = self.counts_mut(epoch, aggregator, &evidence.node, &evidence.label) else { return };
         let count = if evidence.correct { &mut counts.correct } else { &mut counts.incorrect };
         *count = count.saturating_add(1);
-        if is_new {
-            self.prune();
-        }
     }
 
-    /// Takes in all that `other` knows.
+    /// Takes in all that `other` knows, within the same bounds.
     pub fn merge(&mut self, other: &Self) {
-        for (epoch, aggregators) in &other.lanes {
-            for (aggregator, vehicles) in aggregators {
-                let lane = self.lanes.entry(*epoch).or_default().entry(aggregator.clone()).or_default();
-                for (node, labels) in vehicles {
-                    let known = lane.entry(node.clone()).or_default();
-                    for (label, counts) in labels {
-                        known.entry(label.clone()).or_default().merge(*counts);
-                    }
-                }
-            }
-        }
+        self.merge_entries(other.entries());
     }
 
     fn counts(&self) -> impl Iterator<Item = (u64, &NodeName, &Label, Counts)> {

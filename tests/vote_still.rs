@@ -69,3 +69,23 @@ fn verdicts_about_objects_that_stay_are_right_and_do_not_flicker() {
         }
     }
 }
+
+#[test]
+fn vehicles_that_waver_do_not_outvote_one_that_is_sure() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    let mut now = Timestamp(1_700_000_000_000_000);
+    let mut right = 0;
+    for round in 0..ROUNDS {
+        now = now + PERIOD;
+        for (vehicle, bowl) in [("riemann", 0.6), ("galileo", 0.55), ("watson", 0.0)] {
+            let label = if rng.random_bool(bowl) { "bowl" } else { "sports ball" };
+            let object =
+                PerceivedObject { landmark: Some("place".into()), ..PerceivedObject::new(label, 0.5, 0.0, 0.0) };
+            let node = NodeName::new(vehicle).unwrap();
+            vote.observe(&ObjectReport { objects: vec![object], ..ObjectReport::new(node, round, now) }, now).unwrap();
+        }
+        right += usize::from(vote.close(now).verdicts[0].label.as_deref() == Some("sports ball"));
+    }
+    assert!(right as f64 >= 0.95 * ROUNDS as f64, "{right} of {ROUNDS} right");
+}

@@ -228,7 +228,7 @@ impl ReputationKeeperState {
             self.leads.as_ref().is_some_and(|own| own.term == entry.epoch && own.leader == entry.aggregator)
         };
         let news: Vec<_> = share.entries.iter().filter(|entry| !own(entry)).cloned().collect();
-        if self.arguments.book.open().ledger.merge_entries(&news) {
+        if self.arguments.book.open().ledger.merge_entries(news) {
             self.arguments.counters.count(Event::LedgerMerged);
             self.unsaved = true;
             self.unadopted = true;

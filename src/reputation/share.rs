@@ -10,8 +10,8 @@ use crate::wire::LedgerEntry;
 /// Most lanes that are kept: the latest.
 pub const MAX_LANES: usize = 64;
 
-/// Most entries that are kept: lanes are dropped, the oldest first, until the rest fits; entries of the latest lane
-/// beyond it are not taken.
+/// Most entries that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its own and
+/// later ones are left.
 pub const MAX_ENTRIES: usize = 65_536;
 
 /// Which count: what an entry is about, without the numbers.
@@ -48,19 +48,14 @@ impl ReputationLedger {
 
     /// Takes the larger of every count; true when that changed anything. What is beyond [`MAX_LANES`] and
     /// [`MAX_ENTRIES`] is forgotten, the oldest lanes first, so that all who merge the same forget the same.
-    pub fn merge_entries(&mut self, entries: &[LedgerEntry]) -> bool {
+    pub fn merge_entries(&mut self, entries: impl IntoIterator<Item = LedgerEntry>) -> bool {
         let mut changed = false;
         for LedgerEntry { epoch, aggregator, node, label, correct, incorrect } in entries {
-            if !self.has_room_in(*epoch, aggregator) {
-                continue;
-            }
-            let lane = self.lanes.entry(*epoch).or_default().entry(aggregator.clone()).or_default();
-            let counts = lane.entry(node.clone()).or_default().entry(label.clone()).or_default();
+            let Some(counts) = self.counts_mut(epoch, &aggregator, &node, &label) else { continue };
             let before = *counts;
-            counts.merge(Counts { correct: *correct, incorrect: *incorrect });
+            counts.merge(Counts { correct, incorrect });
             changed |= *counts != before;
         }
-        self.prune();
         changed
     }
 
@@ -69,25 +64,49 @@ impl ReputationLedger {
         self.lanes.values().map(|aggregators| aggregators.len()).sum()
     }
 
-    /// False for a new lane that would be the first to be forgotten.
-    fn has_room_in(&self, epoch: u64, aggregator: &NodeName) -> bool {
-        let oldest = self.lanes.iter().next().and_then(|(term, lanes)| Some((*term, lanes.keys().next()?)));
-        self.lanes() < MAX_LANES || oldest.is_none_or(|oldest| (epoch, aggregator) >= oldest)
+    /// The counts of a vehicle and label, new ones where there is room or older lanes make some; `None` elsewhere.
+    pub(super) fn counts_mut(
+        &mut self,
+        epoch: u64,
+        aggregator: &NodeName,
+        node: &NodeName,
+        label: &Label,
+    ) -> Option<&mut Counts> {
+        let lane = self.lanes.get(&epoch).and_then(|aggregators| aggregators.get(aggregator));
+        let is_new = !lane.is_some_and(|lane| lane.get(node).is_some_and(|labels| labels.contains_key(label)));
+        if is_new {
+            let is_full = |ledger: &Self| {
+                ledger.entries >= MAX_ENTRIES || (lane_is_new(ledger, epoch, aggregator) && ledger.lanes() >= MAX_LANES)
+            };
+            while is_full(self) {
+                if !self.forget_lane_before(epoch, aggregator) {
+                    return None;
+                }
+            }
+            self.entries += 1;
+        }
+        let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
+        Some(lane.entry(node.clone()).or_default().entry(label.clone()).or_default())
     }
 
-    /// Forgets the oldest lanes beyond the bounds.
-    pub(super) fn prune(&mut self) {
-        let mut entries = self.entries().count();
-        while self.lanes() > MAX_LANES || (entries > MAX_ENTRIES && self.lanes() > 1) {
-            let Some(mut aggregators) = self.lanes.first_entry() else { return };
-            if let Some((_, vehicles)) = aggregators.get_mut().pop_first() {
-                entries -= vehicles.values().map(|labels| labels.len()).sum::<usize>();
-            }
-            if aggregators.get().is_empty() {
-                aggregators.remove();
-            }
+    /// Forgets the oldest lane if it is older than that of `epoch` and `aggregator`.
+    fn forget_lane_before(&mut self, epoch: u64, aggregator: &NodeName) -> bool {
+        let Some(mut oldest) = self.lanes.first_entry() else { return false };
+        let term = *oldest.key();
+        if oldest.get().keys().next().is_none_or(|leader| (term, leader) >= (epoch, aggregator)) {
+            return false;
         }
+        let forgotten = oldest.get_mut().pop_first();
+        if oldest.get().is_empty() {
+            oldest.remove();
+        }
+        self.entries -= forgotten.iter().flat_map(|(_, lane)| lane.values()).map(|labels| labels.len()).sum::<usize>();
+        true
     }
+}
+
+fn lane_is_new(ledger: &ReputationLedger, epoch: u64, aggregator: &NodeName) -> bool {
+    !ledger.lanes.get(&epoch).is_some_and(|aggregators| aggregators.contains_key(aggregator))
 }
 
 fn entry(epoch: u64, aggregator: &NodeName, node: &NodeName, label: &Label, counts: Counts) -> LedgerEntry {
@@ -124,15 +143,15 @@ mod tests {
         entries.reverse();
         let mut copy = ReputationLedger::default();
         for share in entries.chunks(2) {
-            assert!(copy.merge_entries(share));
-            assert!(!copy.merge_entries(share), "the same again changes nothing");
+            assert!(copy.merge_entries(share.to_vec()));
+            assert!(!copy.merge_entries(share.to_vec()), "the same again changes nothing");
         }
         assert_eq!(copy, ledger);
 
         let lane = Epoch::new(3, name("edge"));
         ledger.record(3, &name("edge"), &vote(false));
         let changed = [EntryKey { lane, node: name("euclid"), label: "cup".into() }].into();
-        copy.merge_entries(&ledger.entries_of(&changed));
+        copy.merge_entries(ledger.entries_of(&changed));
         assert_eq!(copy, ledger);
     }
 
@@ -142,12 +161,25 @@ mod tests {
         for epoch in 0..(2 * MAX_LANES as u64) {
             let entry =
                 entry(epoch, &name("edge"), &name("euclid"), &"cup".into(), Counts { correct: 1, incorrect: 0 });
-            ledger.merge_entries(&[entry]);
+            ledger.merge_entries([entry]);
         }
         assert_eq!(ledger.lanes(), MAX_LANES);
         let oldest = ledger.entries().next().unwrap();
         assert_eq!(oldest.epoch, MAX_LANES as u64);
         let forgotten = LedgerEntry { epoch: 0, ..oldest };
-        assert!(!ledger.merge_entries(&[forgotten]), "an old lane does not come back");
+        assert!(!ledger.merge_entries([forgotten]), "an old lane does not come back");
+    }
+    #[test]
+    fn names_used_up_in_one_lane_displace_older_lanes_and_nothing_else() {
+        let mut ledger = ReputationLedger::default();
+        ledger.record(1, &name("edge"), &vote(true));
+        ledger.record(2, &name("edge"), &vote(true));
+        for number in 0..MAX_ENTRIES {
+            let node = name(&format!("v{number}"));
+            ledger.record(2, &name("edge"), &Evidence { node, label: "cup".into(), correct: true });
+        }
+        ledger.record(2, &name("edge"), &vote(true));
+        assert_eq!((ledger.entries().count(), ledger.lanes()), (MAX_ENTRIES, 1));
+        assert_eq!(ledger.totals()[&name("euclid")], (2, 0), "who is known goes on being counted");
     }
 }

@@ -8,6 +8,11 @@ use super::dependence::Dependence;
 use super::model::{Model, Word};
 use crate::time::Timestamp;
 
+/// Part of a vehicle's statements that counts as independent: one frame is much like the next.
+const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;
+/// tanh(0.8 z) is the two-sided normal probability of z, within 0.02.
+const NORMAL_TO_LOGISTIC: f64 = 0.8;
+
 /// A vote that counts.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cast {
@@ -36,18 +41,36 @@ pub(super) struct Cast {
 /// What one vehicle stated lately on one landmark: the weight of its votes for each label, fading. One frame in which an
 /// object was taken for another does not change the vehicle's vote.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Recent([(LabelIndex, f64); 3]);
+pub(super) struct Recent {
+    labels: [(LabelIndex, f64); 3],
+    /// Number of statements, fading likewise.
+    statements: f64,
+}
 
 impl Recent {
     /// Adds a statement of `weight` when all before have faded to `kept`; returns the label stated most.
     pub(super) fn state(&mut self, label: LabelIndex, weight: f64, kept: f64) -> LabelIndex {
-        self.0.iter_mut().for_each(|(_, sum)| *sum *= kept);
-        let known = self.0.iter().position(|(known, sum)| *known == label && *sum > 0.0);
-        let least = (0..self.0.len()).min_by(|&a, &b| self.0[a].1.total_cmp(&self.0[b].1)).unwrap_or_default();
-        let place = &mut self.0[known.unwrap_or(least)];
+        self.statements = self.statements * kept + 1.0;
+        self.labels.iter_mut().for_each(|(_, sum)| *sum *= kept);
+        let known = self.labels.iter().position(|(known, sum)| *known == label && *sum > 0.0);
+        let least = (0..self.labels.len()).min_by(|&a, &b| self.labels[a].1.total_cmp(&self.labels[b].1));
+        let place = &mut self.labels[known.or(least).unwrap_or_default()];
         *place = (label, weight + known.map_or(0.0, |_| place.1));
         let stated = *place;
-        self.0.iter().copied().filter(|(_, sum)| *sum > stated.1).max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
+        let more = self.labels.iter().copied().filter(|(_, sum)| *sum > stated.1);
+        more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
+    }
+
+    /// How sure it is that the label stated most is not so by chance, 0 to 1: the difference to the next in standard
+    /// deviations of a multinomial draw, as a two-sided probability. Who wavers between two labels hardly votes.
+    pub(super) fn certainty(&self) -> f64 {
+        let mut sums = self.labels.map(|(_, sum)| sum);
+        sums.sort_by(f64::total_cmp);
+        let [third, second, first] = sums;
+        let total = (first + second + third).max(f64::MIN_POSITIVE);
+        let lead = (first - second) / total;
+        let variance = ((first + second) / total - lead * lead) / (INDEPENDENT_FRAMES * self.statements).max(1.0);
+        (NORMAL_TO_LOGISTIC * lead / variance.max(1e-9).sqrt()).tanh()
     }
 }
 
@@ -98,14 +121,15 @@ impl Ballot {
 
     pub(super) fn weigh(&mut self, dependence: &Dependence, calibration: &Calibration, weights: &Weights) {
         for place in 0..self.casts.len() {
-            let Cast { vehicle, label, confidence, visibility, .. } = self.casts[place];
+            let Cast { vehicle, label, confidence, visibility, recent, .. } = self.casts[place];
             let says_the_same = |other: usize| {
                 self.casts.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.casts[at].label == label)
             };
             let own = dependence.own_part(vehicle, says_the_same);
             let band = calibration.band(vehicle, confidence);
             let cast = &mut self.casts[place];
-            (cast.own, cast.band, cast.weight) = (own, band, weights.of(band, confidence) * visibility);
+            (cast.own, cast.band, cast.weight) =
+                (own, band, weights.of(band, confidence) * visibility * recent.certainty());
         }
     }
 
