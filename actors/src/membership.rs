@@ -1,9 +1,8 @@
 //! The actor that owns the node's gossip socket: who is alive, independent of MQTT, and small datagrams between nodes.
 //!
 //! ```text
-//! LeaderElection ── Send ─────> Membership <──── UDP ────> other nodes
-//! Broker ───────── SetBroker ─>     │
-//!                                   └──> MembershipEvent, watch of all members
+//! LeaderElection ── Send ──> Membership <──── UDP ────> other nodes
+//!                                └──> MembershipEvent, watch of all members
 //! ```
 
 mod config;
@@ -53,18 +52,6 @@ pub enum MembershipMessage {
         to: NodeName,
         /// At most [`MAX_PAYLOAD_BYTES`].
         payload: Bytes,
-    },
-    /// Tell all where this node's broker listens, or that it has none.
-    SetBroker {
-        /// The address; others put what they see of this node in place of 0.0.0.0.
-        address: Option<SocketAddr>,
-    },
-    /// Say goodbye to all, who then take this node for down at once.
-    Leave,
-    /// Name all living nodes but this one.
-    Members {
-        /// Gets the answer.
-        reply: RpcReplyPort<Vec<Member>>,
     },
     /// Tell where the node gossips: the bound address, which may be unspecified.
     Address {
@@ -150,7 +137,7 @@ pub struct MembershipArguments {
     pub run: u64,
     /// The role it was started with.
     pub role: Role,
-    /// Where the node's broker listens, if it has one.
+    /// Where the node's broker listens, if it has one; others put what they see of this node in place of 0.0.0.0.
     pub broker: Option<SocketAddr>,
     /// Timings, seeds and limits.
     pub config: MembershipConfig,
@@ -227,10 +214,7 @@ impl Actor for Membership {
         let now = clock::now();
         match message {
             MembershipMessage::Send { to, payload } => state.machine.send(&to, &payload, now),
-            MembershipMessage::SetBroker { address } => state.machine.set_broker(address, now),
-            MembershipMessage::Leave => state.machine.leave(now),
             MembershipMessage::SetSeeds { addresses } => state.machine.set_seeds(addresses),
-            MembershipMessage::Members { reply } => drop(reply.send(state.machine.members())),
             MembershipMessage::Address { reply } => drop(reply.send(state.socket.address())),
             MembershipMessage::Wake => state.wake(),
         }

@@ -1,7 +1,7 @@
 //! Membership actors on loopback, with real sockets.
 
 use std::collections::BTreeSet;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -21,6 +21,8 @@ use tokio::time::{sleep, timeout};
 
 /// Long enough for a loaded machine.
 const SOON: Duration = Duration::from_secs(20);
+/// Where every node says that its broker listens.
+const BROKER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 1883);
 
 struct Node {
     name: NodeName,
@@ -57,7 +59,7 @@ impl Node {
             cell: NodeName::from_static("lot-1"),
             run: clock::now().micros(),
             role: Role::Auto,
-            broker: None,
+            broker: Some(BROKER),
             config,
             events: Arc::new(move |event| sink.lock().unwrap().push(event)),
             members: sender,
@@ -129,8 +131,6 @@ async fn datagrams_and_broker_addresses_reach_the_others() {
     let payload = Bytes::from_static(b"who leads?");
     let to = nodes[4].name.clone();
     nodes[1].actor.cast(MembershipMessage::Send { to, payload: payload.clone() }).unwrap();
-    let broker = Some(SocketAddr::from(([0, 0, 0, 0], 1883)));
-    nodes[1].actor.cast(MembershipMessage::SetBroker { address: broker }).unwrap();
     let reached = |members: &Vec<Member>| {
         let member = members.iter().find(|member| member.name.as_str() == "node-2");
         member.and_then(|member| member.broker) == Some(SocketAddr::from(([127, 0, 0, 1], 1883)))

@@ -159,15 +159,6 @@ impl Machine {
         }
     }
 
-    /// Tells all where this node's broker listens.
-    pub(super) fn set_broker(&mut self, broker: Option<SocketAddr>, now: Timestamp) {
-        let at = self.advance(now);
-        if self.gossip.own().broker != broker && !self.left {
-            self.gossip.change(at, |own| own.broker = broker);
-            self.spread(at);
-        }
-    }
-
     /// Addresses that are greeted besides the multicast group.
     pub(super) fn set_seeds(&mut self, seeds: Vec<SocketAddr>) {
         if self.seeds != seeds {

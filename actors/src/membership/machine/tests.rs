@@ -305,23 +305,6 @@ fn two_running_nodes_with_one_name_are_reported_and_the_later_one_is_heard() {
 }
 
 #[test]
-fn a_broker_address_reaches_all() {
-    let mut cell = Cell::of(5);
-    cell.forget_events();
-    let now = cell.now;
-    cell.nodes.get_mut(&1).unwrap().machine.set_broker(Some(SocketAddr::from(([10, 0, 0, 1], 2000))), now);
-    cell.run(1000);
-    cell.assert_complete();
-    for node in 2..=5 {
-        let changed = |event: &MembershipEvent| match event {
-            MembershipEvent::Changed { member } => member.broker.is_some_and(|broker| broker.port() == 2000),
-            _ => panic!("{event:?}"),
-        };
-        assert_eq!(cell.nodes[&node].events.iter().filter(|event| changed(event)).count(), 1);
-    }
-}
-
-#[test]
 fn datagrams_arrive_with_their_sender() {
     let mut cell = Cell::of(3);
     cell.forget_events();
