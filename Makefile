@@ -8,7 +8,9 @@ SETS ?= examples/crowd_labels
 VERDICTS ?= 200
 PASSES ?= 50
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only replay-check edge-only recording-check clean
+comma := ,
+
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only fuzz replay-check edge-only recording-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -85,6 +87,9 @@ recording-check: setup ## prove that the Python reader of MCAP reads what nodes 
 	python3 -m venv $(BUILD)/recording-venv
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap
 	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --nocapture python
+
+fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each; TARGETS=payload,... runs those only
+	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features

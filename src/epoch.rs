@@ -5,6 +5,7 @@
 
 use std::fmt;
 
+use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -12,11 +13,13 @@ use crate::names::NodeName;
 use crate::wire::{GlobalMap, RejectReason, Verdicts};
 
 /// One leadership: ordered by term, then by the leader's name; no two leaderships share one.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Epoch {
     /// Counts up with every leadership that a component of the network has seen; the `epoch` of maps and verdicts.
+    #[n(0)]
     pub term: u64,
     /// The leading node; the `aggregator` of maps and verdicts.
+    #[n(1)]
     pub leader: NodeName,
 }
 

@@ -16,6 +16,7 @@
 
 mod check;
 mod codec;
+mod compact;
 mod ledger;
 mod object;
 mod reject;
@@ -23,6 +24,7 @@ mod topic;
 
 use std::collections::BTreeMap;
 
+use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
@@ -37,31 +39,40 @@ pub use topic::{ReportKind, Topic, Topics};
 use crate::geometry::Pose;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::time::Timestamp;
+use compact::{Form, Half, Id, Millimetres, Single, Text, if_any};
 
 /// Major version of every payload; others are rejected.
 pub const SCHEMA_VERSION: u32 = 1;
 
 /// What one vehicle saw in one frame.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct ObjectReport {
     /// Major version of the payload, [`SCHEMA_VERSION`].
+    #[n(0)]
     pub schema: u32,
     /// The reporting node; equals the last level of the topic.
+    #[n(1)]
     pub node: NodeName,
     /// Counts up by one with every report of a node since it started.
+    #[n(2)]
     pub seq: u64,
     /// When the frame was captured, by the node's own clock.
+    #[n(3)]
     pub captured_at_us: Timestamp,
     /// Where the camera was; absent when the node does not know.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(5)]
     pub pose: Option<WirePose>,
     /// What was detected.
+    #[n(4)]
     pub objects: Vec<PerceivedObject>,
     /// Landmarks that were in view, near enough and not hidden, whether or not something was detected there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(6), with = "Text", has_nil)]
     pub seen: Option<Vec<LandmarkId>>,
     /// What the sensor covers from the pose; without it, the aggregator learns from the detections where a miss counts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(7)]
     pub view: Option<FieldOfView>,
 }
 
@@ -82,13 +93,16 @@ impl ObjectReport {
 }
 
 /// A camera pose on the wire.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct WirePose {
     /// East in metres.
+    #[cbor(n(0), with = "Millimetres")]
     pub x_m: f64,
     /// North in metres.
+    #[cbor(n(1), with = "Millimetres")]
     pub y_m: f64,
     /// Direction of the camera's axis in radians, counter-clockwise from east.
+    #[cbor(n(2), with = "Single")]
     pub heading_rad: f64,
 }
 
@@ -105,165 +119,220 @@ impl From<Pose> for WirePose {
 }
 
 /// The fused map of one round (PACE).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct GlobalMap {
     /// Major version of the payload, [`SCHEMA_VERSION`].
+    #[n(0)]
     pub schema: u32,
     /// The node that fused this map.
+    #[n(1)]
     pub aggregator: NodeName,
     /// Term of leadership in which it was fused.
+    #[n(2)]
     pub epoch: u64,
     /// Counts up by one with every round of an epoch.
+    #[n(3)]
     pub round: u64,
     /// When the round was closed, by the aggregator's clock.
+    #[n(4)]
     pub fused_at_us: Timestamp,
     /// Capture time, on the aggregator's clock, of the oldest report that the map rests on; absent when none did.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(5)]
     pub oldest_capture_us: Option<Timestamp>,
     /// One entry per known location, in configuration order.
+    #[n(6)]
     pub landmarks: Vec<LandmarkState>,
     /// Objects that matched no known location.
+    #[n(7)]
     pub objects: Vec<FusedObject>,
     /// By vehicle, how its positions were corrected before they were fused.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[cbor(n(8), with = "if_any", has_nil)]
     pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
 }
 
 /// What is agreed to be at one known location.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LandmarkState {
     /// The location.
+    #[cbor(n(0), with = "Text")]
     pub id: LandmarkId,
     /// The agreed label, or null when nothing was detected there.
+    #[cbor(n(1), with = "Text", has_nil)]
     pub label: Option<Label>,
     /// Confidence in the label, 0 to 1; 0 without a label.
+    #[cbor(n(2), with = "Half")]
     pub confidence: f64,
     /// Fused east in metres, or the location's own.
+    #[cbor(n(3), with = "Millimetres")]
     pub x_m: f64,
     /// Fused north in metres, or the location's own.
+    #[cbor(n(4), with = "Millimetres")]
     pub y_m: f64,
     /// The nodes whose detections went into the entry.
+    #[n(5)]
     pub contributors: Vec<NodeName>,
     /// The nodes that had the location in view, with or without a detection: a null label with observers is
     /// known to be empty, without observers it is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(6), with = "if_any", has_nil)]
     pub observers: Vec<NodeName>,
 }
 
 /// The verdicts of one round (VOTE).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Verdicts {
     /// Major version of the payload, [`SCHEMA_VERSION`].
+    #[n(0)]
     pub schema: u32,
     /// The node that counted the votes.
+    #[n(1)]
     pub aggregator: NodeName,
     /// Term of leadership in which they were counted.
+    #[n(2)]
     pub epoch: u64,
     /// Counts up by one with every round of an epoch.
+    #[n(3)]
     pub round: u64,
     /// When the round was closed, by the aggregator's clock.
+    #[n(4)]
     pub fused_at_us: Timestamp,
     /// One entry per known location.
+    #[n(5)]
     pub verdicts: Vec<Verdict>,
 }
 
 /// The agreed label of one known location.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Verdict {
     /// The location.
+    #[cbor(n(0), with = "Text")]
     pub landmark: LandmarkId,
     /// The label with the highest score, or null without votes.
+    #[cbor(n(1), with = "Text", has_nil)]
     pub label: Option<Label>,
     /// Score of the label; 0 without a label.
+    #[cbor(n(2), with = "Half")]
     pub score: f64,
     /// Score of the label minus that of the next best; below 0 while a label is held against flicker.
+    #[cbor(n(3), with = "Half")]
     pub margin: f64,
     /// Score of every label that was voted for.
+    #[cbor(n(4), with = "Half", has_nil)]
     pub votes: BTreeMap<Label, f64>,
     /// The nodes whose votes went into the entry.
+    #[n(5)]
     pub contributors: Vec<NodeName>,
 }
 
 /// How far each vehicle is trusted.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Reputations {
     /// Major version of the payload, [`SCHEMA_VERSION`].
+    #[n(0)]
     pub schema: u32,
     /// The node that publishes them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(1)]
     pub aggregator: Option<NodeName>,
     /// Term of leadership.
+    #[n(2)]
     pub epoch: u64,
     /// The last round that went into the reputations.
+    #[n(3)]
     pub round: u64,
     /// One entry per known vehicle.
+    #[n(4)]
     pub reputations: BTreeMap<NodeName, Reputation>,
 }
 
 /// The trust in one vehicle and what it rests on.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Reputation {
     /// Weight of the vehicle's votes, 0.30 to 1.00.
+    #[cbor(n(0), with = "Half")]
     pub score: f64,
     /// Votes that agreed with the verdict.
+    #[n(1)]
     pub correct: u64,
     /// Votes that did not.
+    #[n(2)]
     pub incorrect: u64,
 }
 
 /// A part of the evidence that reputations rest on; receivers keep the larger of every count.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerShare {
     /// Major version of the payload, [`SCHEMA_VERSION`].
+    #[n(0)]
     pub schema: u32,
     /// The sender; equals the last level of the topic.
+    #[n(1)]
     pub node: NodeName,
     /// Term in which the sender leads; absent when it does not.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(2)]
     pub epoch: Option<u64>,
     /// Counts, at most [`MAX_SHARE_ENTRIES`].
+    #[n(3)]
     pub entries: Vec<LedgerEntry>,
 }
 
 /// How often one vehicle was right and wrong with one label under one leadership.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerEntry {
     /// Term of the leadership that counted.
+    #[n(0)]
     pub epoch: u64,
     /// Its aggregator.
+    #[n(1)]
     pub aggregator: NodeName,
     /// The vehicle.
+    #[n(2)]
     pub node: NodeName,
     /// The label that it stated.
+    #[cbor(n(3), with = "Text")]
     pub label: Label,
     /// Votes that agreed with the verdict, since the leadership began.
+    #[n(4)]
     pub correct: u64,
     /// Votes that did not.
+    #[n(5)]
     pub incorrect: u64,
 }
 
 /// A node's own word about itself; the broker publishes the last will when the node goes silent.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct NodeStatus {
     /// Major version of the payload, [`SCHEMA_VERSION`].
+    #[n(0)]
     pub schema: u32,
     /// The node; equals the last level of the topic.
+    #[n(1)]
     pub node: NodeName,
     /// Identity of this run of the node.
+    #[cbor(n(2), with = "Id")]
     pub id: Uuid,
     /// The role it was started with.
+    #[n(3)]
     pub role: Role,
     /// What it does now.
+    #[n(4)]
     pub state: NodeState,
     /// The epoch it follows or leads.
+    #[n(5)]
     pub epoch: u64,
     /// The aggregator it follows, or itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(6)]
     pub aggregator: Option<NodeName>,
     /// Whether its broker, fuser and gateway work, so that it could lead; absent on a node that never leads.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(7)]
     pub fit: Option<bool>,
     /// Version of the software.
+    #[n(8)]
     pub version: String,
 }
 
@@ -285,26 +354,34 @@ impl NodeStatus {
 }
 
 /// What a node is meant to do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 #[serde(rename_all = "lowercase")]
+#[cbor(index_only)]
 pub enum Role {
     /// Aggregates if no better candidate is alive, otherwise follows.
+    #[n(0)]
     Auto,
     /// Never aggregates.
+    #[n(1)]
     Cav,
     /// Always the preferred aggregator, has no camera.
+    #[n(2)]
     Edge,
 }
 
 /// What a node does now.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 #[serde(rename_all = "lowercase")]
+#[cbor(index_only)]
 pub enum NodeState {
     /// Takes maps and verdicts from an aggregator.
+    #[n(0)]
     Following,
     /// Makes maps and verdicts.
+    #[n(1)]
     Aggregating,
     /// Not there.
+    #[n(2)]
     Offline,
 }
 

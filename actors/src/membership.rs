@@ -8,6 +8,8 @@
 mod config;
 mod counters;
 mod frame;
+#[cfg(fuzzing)]
+pub mod fuzzing;
 mod gossip;
 mod key;
 mod machine;

@@ -1,5 +1,6 @@
 //! What the nodes of a cell say to each other about leadership.
 
+use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -19,39 +20,52 @@ pub const MAX_MESSAGE_BYTES: usize = 1200;
 /// One message; may be lost, repeated, delayed and re-ordered on its way.
 ///
 /// Who sent it must be proven by the transport: the election believes [`Self::from`].
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct ElectionMessage {
     /// Major version of the message, [`wire::SCHEMA_VERSION`].
+    #[n(0)]
     pub schema: u32,
     /// The sender.
+    #[n(1)]
     pub from: NodeName,
     /// The sender's run: when it started, in Unix microseconds by its own clock.
+    #[n(2)]
     pub run: u64,
     /// Counts up with every message of a run, whoever it is for.
+    #[n(3)]
     pub seq: u64,
     /// The sender as a candidate.
+    #[n(4)]
     pub standing: Standing,
     /// The highest term that the sender knows to have been used.
+    #[n(5)]
     pub term: u64,
     /// The epoch that the sender follows or leads; absent while it has no leader.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(8)]
     pub epoch: Option<Epoch>,
     /// Whether the sender lately heard the addressee: links may work one way only.
+    #[n(6)]
     pub hears_you: bool,
     /// What it says.
+    #[n(7)]
     pub body: Body,
 }
 
 /// What makes a node a better or worse leader.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Standing {
     /// The role it was started with.
+    #[n(0)]
     pub role: Role,
     /// Its configured priority, higher leads first.
+    #[n(1)]
     pub priority: u8,
     /// Its processor load in quarters, damped.
+    #[n(2)]
     pub load: u8,
     /// Whether broker, fuser and gateway all work.
+    #[n(3)]
     pub fit: bool,
 }
 
@@ -81,55 +95,76 @@ pub struct Standing {
 /// ```
 ///
 /// A leader that cannot go on says `Resign` to all.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 #[serde(rename_all = "snake_case")]
+#[cbor(flat)]
 pub enum Body {
     /// "This is how I stand": a greeting, and the answer to a beat.
+    #[n(0)]
     Status {
         /// The highest epoch that the sender knows to be over, such as that of a leader whose broker refused it.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[n(0)]
         over: Option<Epoch>,
     },
     /// "Who leads, and who hears it?"
+    #[n(1)]
     Ask {
         /// Counts up with every question of the sender's run.
+        #[n(0)]
         ask: u64,
     },
     /// "I hear the leader of my epoch": the answer to [`Body::Ask`].
+    #[n(2)]
     Vouch {
         /// The question answered.
+        #[n(0)]
         ask: u64,
         /// Time since the leader was heard, in ms.
+        #[n(1)]
         age_ms: u64,
     },
     /// "I lead": the leader's sign of life.
+    #[n(3)]
     Beat {
         /// When the addressee gets the next one, in ms.
+        #[n(0)]
         every_ms: u64,
         /// The round published last.
+        #[n(1)]
         round: u64,
         /// How many nodes follow and are heard.
+        #[n(2)]
         followers: u8,
         /// The epoch that this one succeeded, if any.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[n(3)]
         after: Option<Epoch>,
         /// Who leads next, the standby first; at most [`MAX_SUCCESSORS`].
+        #[n(4)]
         successors: Vec<NodeName>,
     },
     /// "Get ready to lead in my place": to the challenger.
+    #[n(4)]
     Offer,
     /// "I am ready": to the leader.
+    #[n(5)]
     Ready,
     /// "Lead from the next round on": to the challenger.
+    #[n(6)]
     Yield {
         /// The last round published by the leader.
+        #[n(0)]
         last_round: u64,
     },
     /// "I no longer lead": to all.
+    #[n(7)]
     Resign {
         /// The epoch that is over.
+        #[n(0)]
         epoch: Epoch,
         /// The last round published in it.
+        #[n(1)]
         last_round: u64,
     },
 }
@@ -192,14 +227,14 @@ mod tests {
     }
 
     #[test]
-    fn messages_survive_both_encodings_and_fit_a_packet() {
+    fn messages_survive_every_encoding_and_fit_a_packet() {
         let mut message = beat(4, "edge");
         let long = NodeName::new("x".repeat(64)).unwrap();
         if let Body::Beat { successors, after, .. } = &mut message.body {
             *successors = vec![long.clone(), long.clone(), long.clone()];
             *after = Some(Epoch::new(3, long));
         }
-        for encoding in [Encoding::Json, Encoding::Cbor] {
+        for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
             let bytes = message.encode(encoding);
             assert!(bytes.len() <= MAX_MESSAGE_BYTES, "{}", bytes.len());
             assert_eq!(ElectionMessage::decode(&bytes), Ok(message.clone()));

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use minicbor::{Decode, Encode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -56,7 +57,7 @@ const MAX_SCORES: usize = 256;
 const SCORE_BOUND: f64 = 1e9;
 
 /// What travels on a topic, with the version of its form.
-pub trait Payload: Serialize + DeserializeOwned {
+pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b, ()> {
     /// Major version that the payload claims to have.
     fn schema(&self) -> u32;
 

@@ -1,8 +1,9 @@
-//! JSON and CBOR; the first byte tells them apart.
+//! JSON, CBOR and compact CBOR; the first byte tells them apart.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::compact::{self, is_compact};
 use super::{Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
 use crate::names::NodeName;
 
@@ -15,17 +16,20 @@ pub enum Encoding {
     Json,
     /// RFC 8949 with the same field names.
     Cbor,
+    /// RFC 8949 with places for names and rounded numbers, for links that are short of bytes.
+    Compact,
 }
 
 /// Writes a payload.
 ///
 /// # Panics
 /// Never for the payloads of this crate: they serialise into memory.
-pub fn encode<T: Serialize>(payload: &T, encoding: Encoding) -> Vec<u8> {
+pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
     match encoding {
         Encoding::Json => serde_json::to_writer(&mut bytes, payload).expect("payloads serialise into memory"),
         Encoding::Cbor => ciborium::into_writer(payload, &mut bytes).expect("payloads serialise into memory"),
+        Encoding::Compact => compact::write(payload, &mut bytes),
     }
     bytes
 }
@@ -38,8 +42,8 @@ pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReas
     if bytes.len() > T::max_bytes(limits) {
         return Err(RejectReason::TooLarge);
     }
-    let payload: T = read(bytes).map_err(|reason| match read::<SchemaOnly>(bytes) {
-        Ok(SchemaOnly { schema }) if schema != SCHEMA_VERSION => RejectReason::UnknownSchema,
+    let payload: T = read(bytes).map_err(|reason| match schema(bytes) {
+        Some(schema) if schema != SCHEMA_VERSION => RejectReason::UnknownSchema,
         _ => reason,
     })?;
     if payload.schema() != SCHEMA_VERSION {
@@ -61,12 +65,28 @@ pub fn decode_report(bytes: &[u8], topic_node: &NodeName, limits: &Limits) -> Re
     Ok(report)
 }
 
-#[derive(Deserialize)]
-struct SchemaOnly {
-    schema: u32,
+/// The version of a payload that cannot be read otherwise.
+fn schema(bytes: &[u8]) -> Option<u32> {
+    #[derive(Deserialize)]
+    struct SchemaOnly {
+        schema: u32,
+    }
+
+    match bytes.first() {
+        Some(&first) if is_compact(first) => compact::schema(bytes),
+        _ => read_named(bytes).ok().map(|SchemaOnly { schema }| schema),
+    }
 }
 
-fn read<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
+fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
+    match bytes.first() {
+        Some(&first) if is_compact(first) => compact::read(bytes),
+        _ => read_named(bytes),
+    }
+}
+
+/// Reads JSON, or CBOR with names.
+fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
         Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|error| {
             // serde_json has no other way to tell 1e999 from a syntax error.
@@ -104,9 +124,11 @@ mod tests {
         }
     }
 
-    /// The reason for which a report is rejected, the same in both encodings.
+    /// The reason for which a report is rejected, the same in all encodings.
     fn reason(report: &ObjectReport) -> Option<RejectReason> {
         let cbor = decode_report(&encode(report, Encoding::Cbor), &node(), &Limits::default()).err();
+        let compact = decode_report(&encode(report, Encoding::Compact), &node(), &Limits::default()).err();
+        assert_eq!(compact, cbor);
         let finite = report.objects.iter().all(|o| o.x_m.is_finite() && o.confidence.is_finite());
         // JSON has no word for a number that is none.
         if finite && report.pose.is_none_or(|pose| pose.heading_rad.is_finite()) {
@@ -159,10 +181,15 @@ mod tests {
         let mut not_utf8 = json.clone().into_bytes();
         not_utf8[json.find("ABCD").unwrap()] = 0xff;
         let cbor = encode(&report(), Encoding::Cbor);
+        let compact = encode(&report(), Encoding::Compact);
         let table: Vec<(Vec<u8>, RejectReason)> = vec![
             (vec![], RejectReason::Malformed),
             (json.as_bytes()[..json.len() - 1].to_vec(), RejectReason::Malformed),
             (cbor[..cbor.len() - 1].to_vec(), RejectReason::Malformed),
+            (compact[..compact.len() - 1].to_vec(), RejectReason::Malformed),
+            ([&*compact, &[0]].concat(), RejectReason::Malformed),
+            (vec![0x80], RejectReason::Malformed),
+            (vec![0x82, 2, 0xf6], RejectReason::UnknownSchema),
             (not_utf8, RejectReason::Malformed),
             (b"null".to_vec(), RejectReason::Malformed),
             (json.replace("\"seq\":412,", "").into(), RejectReason::Malformed),
@@ -196,13 +223,13 @@ mod tests {
             label in "[a-zA-Z0-9 é]{1,20}",
             confidence in 0.0..=1.0f64,
             (x_m, y_m) in (-1e8..1e8f64, -1e8..1e8f64),
-            variances in option::of((1e-6..1e6f64, 1e-6..1e6f64)),
+            variances in option::of((1e-6..1e6f64, 1e-6..1e6f64, -1.0..=1.0f64)),
             landmark in option::of("[a-z0-9-]{1,64}"),
             velocity_mps in option::of([-1e4..1e4f64, -1e4..1e4f64]),
             (heading_rad, size_m) in (option::of(-10.0..10.0f64), option::of([0.0..1e5f64, 0.0..1e5f64])),
             scores in collection::btree_map("[a-z]{1,8}".prop_map(Into::into), 0.0..=1.0f64, 0..4),
         ) -> PerceivedObject {
-            PerceivedObject { covariance_m2: variances.map(|(xx, yy)| [xx, 0.0, yy]), landmark: landmark.map(Into::into), velocity_mps, heading_rad, size_m, scores, ..PerceivedObject::new(label, confidence, x_m, y_m) }
+            PerceivedObject { covariance_m2: variances.map(|(xx, yy, correlation)| [xx, correlation * (xx * yy).sqrt(), yy]), landmark: landmark.map(Into::into), velocity_mps, heading_rad, size_m, scores, ..PerceivedObject::new(label, confidence, x_m, y_m) }
         }
     }
 
@@ -217,6 +244,11 @@ mod tests {
         }
     }
 
+    /// Whether a number was rounded to no less than 11 significant bits.
+    fn near(read: f64, written: f64) -> bool {
+        (read - written).abs() <= written.abs() / 2048.0
+    }
+
     proptest! {
         #[test]
         fn what_is_encoded_is_decoded(report in reports()) {
@@ -227,13 +259,37 @@ mod tests {
         }
 
         #[test]
+        fn compact_reports_are_as_close_as_promised_and_lose_no_more(report in reports()) {
+            let bytes = encode(&report, Encoding::Compact);
+            let decoded = decode_report(&bytes, &node(), &Limits::default()).unwrap();
+            prop_assert_eq!((decoded.seq, decoded.captured_at_us, &decoded.seen), (report.seq, report.captured_at_us, &report.seen));
+            prop_assert_eq!(decoded.objects.len(), report.objects.len());
+            for (read, written) in decoded.objects.iter().zip(&report.objects) {
+                prop_assert_eq!((&read.label, &read.landmark), (&written.label, &written.landmark));
+                prop_assert!((read.x_m - written.x_m).abs() <= 0.000_501 && (read.y_m - written.y_m).abs() <= 0.000_501);
+                prop_assert!(near(read.confidence, written.confidence));
+                prop_assert!(read.scores.keys().eq(written.scores.keys()));
+                prop_assert!(read.scores.values().zip(written.scores.values()).all(|(&read, &written)| near(read, written)));
+                let pairs = read.velocity_mps.into_iter().chain(read.size_m).flatten();
+                let originals = written.velocity_mps.into_iter().chain(written.size_m).flatten();
+                prop_assert!(pairs.zip(originals).all(|(read, written)| near(read, written)));
+                prop_assert!(near(read.heading_rad.unwrap_or(0.0), written.heading_rad.unwrap_or(0.0)));
+                if let (Some([xx, xy, yy]), Some(of)) = (read.covariance_m2, written.covariance_m2) {
+                    prop_assert!(xx >= of[0] && xy.abs() <= of[1].abs() && yy >= of[2], "certainty is gained");
+                    prop_assert!((xx - of[0]) <= of[0] / 1024.0 && (yy - of[2]) <= of[2] / 1024.0);
+                }
+            }
+            prop_assert_eq!(encode(&decoded, Encoding::Compact), bytes);
+        }
+
+        #[test]
         fn no_bytes_panic(
             bytes in collection::vec(any::<u8>(), 0..300),
             report in reports(),
             cut in any::<prop::sample::Index>(),
             flip in any::<u8>(),
         ) {
-            let mut spoiled = encode(&report, if flip % 2 == 0 { Encoding::Json } else { Encoding::Cbor });
+            let mut spoiled = encode(&report, [Encoding::Json, Encoding::Cbor, Encoding::Compact][usize::from(flip % 3)]);
             let at = cut.index(spoiled.len());
             spoiled[at] ^= flip;
             for payload in [&bytes, &spoiled] {

@@ -45,6 +45,7 @@ mod tests {
         let read =
             |encoding| decode_share(&encode(share, encoding), &NodeName::from_static("edge"), &Limits::default());
         assert_eq!(read(Encoding::Json), read(Encoding::Cbor));
+        assert_eq!(read(Encoding::Json), read(Encoding::Compact));
         read(Encoding::Json).err()
     }
 

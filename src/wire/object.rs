@@ -2,42 +2,54 @@
 
 use std::collections::BTreeMap;
 
+use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+use super::compact::{Form, Half, Id, Millimetres, Single, Spread, Text};
 use crate::geometry::Covariance;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::time::Timestamp;
 
 /// A detection with its place in the world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct PerceivedObject {
     /// Class label or decoded text.
+    #[cbor(n(0), with = "Text")]
     pub label: Label,
     /// The detector's confidence, 0 to 1.
+    #[cbor(n(1), with = "Half")]
     pub confidence: f64,
     /// East in metres.
+    #[cbor(n(2), with = "Millimetres")]
     pub x_m: f64,
     /// North in metres.
+    #[cbor(n(3), with = "Millimetres")]
     pub y_m: f64,
     /// Position covariance `[xx, xy, yy]` in m².
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(4), with = "Spread", has_nil)]
     pub covariance_m2: Option<[f64; 3]>,
     /// The known location that the node takes this object for; required in VOTE.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(5), with = "Text", has_nil)]
     pub landmark: Option<LandmarkId>,
     /// Velocity over ground `[east, north]` in metres per second.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(6), with = "Half", has_nil)]
     pub velocity_mps: Option<[f64; 2]>,
     /// Direction in which the object points, in radians counter-clockwise from east.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(7), with = "Half", has_nil)]
     pub heading_rad: Option<f64>,
     /// Size `[length, width]` in metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(8), with = "Half", has_nil)]
     pub size_m: Option<[f64; 2]>,
     /// The detector's confidence in each class, 0 to 1, if it tells more than the best one.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[cbor(n(9), with = "Half", has_nil)]
     pub scores: BTreeMap<Label, f64>,
 }
 
@@ -65,54 +77,71 @@ impl PerceivedObject {
 }
 
 /// What a camera or scanner covers, seen from the pose of its report and centred on its heading.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FieldOfView {
     /// Range in metres within which objects are found as a rule.
+    #[cbor(n(0), with = "Half")]
     pub range_m: f64,
     /// Opening angle in radians, both sides together; 2π for all around.
+    #[cbor(n(1), with = "Single")]
     pub angle_rad: f64,
 }
 
 /// An object of the open world, where it is at the time of fusion.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FusedObject {
     /// Stable identity of the object.
+    #[cbor(n(0), with = "Id")]
     pub id: Uuid,
     /// The agreed label.
+    #[cbor(n(1), with = "Text")]
     pub label: Label,
     /// How far the entry may be relied on, 0 to 1: existence probability times the label's.
+    #[cbor(n(2), with = "Half")]
     pub confidence: f64,
     /// East in metres.
+    #[cbor(n(3), with = "Millimetres")]
     pub x_m: f64,
     /// North in metres.
+    #[cbor(n(4), with = "Millimetres")]
     pub y_m: f64,
     /// Position covariance `[xx, xy, yy]` in m².
+    #[cbor(n(5), with = "Spread")]
     pub covariance_m2: [f64; 3],
     /// The nodes whose detections went into the entry.
+    #[n(6)]
     pub contributors: Vec<NodeName>,
     /// Probability that the object exists and is still there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(7), with = "Half", has_nil)]
     pub existence: Option<f64>,
     /// Probability of each class.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[cbor(n(14), with = "Half", has_nil)]
     pub scores: BTreeMap<Label, f64>,
     /// Velocity over ground `[east, north]` in metres per second.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(8), with = "Half", has_nil)]
     pub velocity_mps: Option<[f64; 2]>,
     /// Direction in which the object points, in radians counter-clockwise from east.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(9), with = "Half", has_nil)]
     pub heading_rad: Option<f64>,
     /// Size `[length, width]` in metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(10), with = "Half", has_nil)]
     pub size_m: Option<[f64; 2]>,
     /// Time in seconds since it was last detected.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(11), with = "Half", has_nil)]
     pub age_s: Option<f64>,
     /// When it was first detected, by the aggregator's clock.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(12)]
     pub first_seen_us: Option<Timestamp>,
     /// The node that this object is, by its own word.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(13)]
     pub vehicle: Option<NodeName>,
 }
 
@@ -148,16 +177,21 @@ impl FusedObject {
 /// By how much a vehicle's positions are off, as estimated from what several vehicles see.
 ///
 /// A reported position p belongs at R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`, `dy_m`).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct PoseCorrection {
     /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of what the vehicle sees.
+    #[cbor(n(0), with = "Millimetres")]
     pub about_m: [f64; 2],
     /// East in metres.
+    #[cbor(n(1), with = "Millimetres")]
     pub dx_m: f64,
     /// North in metres.
+    #[cbor(n(2), with = "Millimetres")]
     pub dy_m: f64,
     /// Rotation in radians, counter-clockwise.
+    #[cbor(n(3), with = "Half")]
     pub dheading_rad: f64,
     /// Pairs of detections that the estimate rests on, older ones counting less.
+    #[cbor(n(4), with = "Half")]
     pub pairs: f64,
 }

@@ -31,7 +31,7 @@ async fn settle(receiver: &mut Node, sender: &Node) {
 async fn reports_and_maps_pass_the_embedded_broker_in_both_versions_and_encodings() {
     let (_broker, address) = embedded();
     for version in [MqttVersion::V311, MqttVersion::V5] {
-        for encoding in [Encoding::Json, Encoding::Cbor] {
+        for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
             report_and_map_pass(&address, MqttConfig { version, encoding, ..MqttConfig::default() }).await;
         }
     }

@@ -90,12 +90,14 @@ type Flaw<T> = (fn(&mut T), RejectReason);
 
 /// Spoils a sound payload in every listed way and sends it; CBOR, because JSON has no word for NaN.
 fn each_flaw_has_its_reason<T: Payload>(sound: impl Fn() -> T, flaws: &[Flaw<T>]) {
-    let received = |payload: &T| decode::<T>(&encode(payload, Encoding::Cbor), &Limits::default()).err();
-    assert_eq!(received(&sound()), None);
-    for (index, (spoil, expected)) in flaws.iter().enumerate() {
-        let mut payload = sound();
-        spoil(&mut payload);
-        assert_eq!(received(&payload), Some(*expected), "flaw {index}");
+    for encoding in [Encoding::Cbor, Encoding::Compact] {
+        let received = |payload: &T| decode::<T>(&encode(payload, encoding), &Limits::default()).err();
+        assert_eq!(received(&sound()), None);
+        for (index, (spoil, expected)) in flaws.iter().enumerate() {
+            let mut payload = sound();
+            spoil(&mut payload);
+            assert_eq!(received(&payload), Some(*expected), "flaw {index} in {encoding:?}");
+        }
     }
 }
 

@@ -1,0 +1,28 @@
+//! A node of the membership hears datagrams of strangers, and of a node that has the key and says anything with it.
+
+#![no_main]
+
+use ecod_actors::membership::fuzzing::Listener;
+use libfuzzer_sys::arbitrary::{self, Arbitrary};
+use libfuzzer_sys::fuzz_target;
+
+#[derive(Debug, Arbitrary)]
+enum Step {
+    /// A datagram as it is.
+    Datagram(Vec<u8>),
+    /// A body under the peer's seal.
+    Sealed { kind: u8, body: Vec<u8> },
+    /// Nothing for a while.
+    Wait { ms: u16 },
+}
+
+fuzz_target!(|steps: Vec<Step>| {
+    let mut listener = Listener::meet();
+    for step in steps {
+        match step {
+            Step::Datagram(frame) => listener.hear(&frame),
+            Step::Sealed { kind, body } => listener.hear_sealed(kind, &body),
+            Step::Wait { ms } => listener.wait(ms.into()),
+        }
+    }
+});

@@ -1,0 +1,229 @@
+//! The compact encoding: CBOR in which a struct is an array and a number is no wider than what it tells.
+//!
+//! The number `n` at a field of a payload is its place in the array. Places never change their meaning, new fields are
+//! appended. What is absent is null, or left out at the end; places beyond the known ones are passed over. Every number
+//! may be read as an integer or a float of any width; [`Form`] says how it is written.
+
+mod number;
+
+use std::collections::BTreeMap;
+
+use minicbor::data::Type;
+use minicbor::decode::{self, Decode, Decoder};
+use minicbor::encode::{self, Encode, Encoder, Write};
+use smol_str::SmolStr;
+use uuid::Uuid;
+
+use super::RejectReason;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+pub(crate) use number::{Half, Millimetres, Single, Spread};
+
+/// Whether a payload begins as a compact one: with an array, where JSON and CBOR with names begin with a map.
+pub(super) fn is_compact(first: u8) -> bool {
+    const ARRAY: u8 = 4;
+    first >> 5 == ARRAY
+}
+
+/// Writes a payload.
+pub(super) fn write<T: Encode<()>>(payload: &T, bytes: &mut Vec<u8>) {
+    minicbor::encode(payload, bytes).expect("payloads are written into memory");
+}
+
+/// Reads a payload that fills all of `bytes`.
+pub(super) fn read<T: for<'b> Decode<'b, ()>>(bytes: &[u8]) -> Result<T, RejectReason> {
+    let mut decoder = Decoder::new(bytes);
+    let payload = decoder.decode().map_err(|_| RejectReason::Malformed)?;
+    if decoder.position() == bytes.len() { Ok(payload) } else { Err(RejectReason::Malformed) }
+}
+
+/// The `schema` of a payload that may be of a later version: it stays the first.
+pub(super) fn schema(bytes: &[u8]) -> Option<u32> {
+    let mut decoder = Decoder::new(bytes);
+    decoder.array().ok()?;
+    decoder.u32().ok()
+}
+
+/// A way to write values of type `T`, where the type alone does not tell it.
+pub(crate) trait Form<T> {
+    fn encode<C, W: Write>(value: &T, e: &mut Encoder<W>, context: &mut C) -> Result<(), encode::Error<W::Error>>;
+
+    fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<T, decode::Error>;
+
+    /// What is meant where nothing is written.
+    fn nil() -> Option<T> {
+        None
+    }
+
+    /// Whether nothing need be written.
+    fn is_nil(_value: &T) -> bool {
+        false
+    }
+}
+
+/// Labels and ids.
+pub(crate) struct Text;
+
+impl Form<SmolStr> for Text {
+    fn encode<C, W: Write>(value: &SmolStr, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+        e.str(value)?.ok()
+    }
+
+    fn decode<C>(d: &mut Decoder<'_>, _: &mut C) -> Result<SmolStr, decode::Error> {
+        d.str().map(SmolStr::new)
+    }
+}
+
+/// The 16 bytes of a UUID.
+pub(crate) struct Id;
+
+impl Form<Uuid> for Id {
+    fn encode<C, W: Write>(value: &Uuid, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+        e.bytes(value.as_bytes())?.ok()
+    }
+
+    fn decode<C>(d: &mut Decoder<'_>, _: &mut C) -> Result<Uuid, decode::Error> {
+        Uuid::from_slice(d.bytes()?).map_err(|_| decode::Error::message("an id has 16 bytes"))
+    }
+}
+
+/// Collections that are left out when they are empty.
+pub(crate) mod if_any {
+    use super::{Decode, Decoder, Encode, Encoder, Write, decode, encode};
+
+    pub(crate) fn encode<C, T: Encode<()>, W: Write>(
+        value: &T,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
+        e.encode(value)?.ok()
+    }
+
+    pub(crate) fn decode<'b, C, T: Decode<'b, ()>>(d: &mut Decoder<'b>, _: &mut C) -> Result<T, decode::Error> {
+        d.decode()
+    }
+
+    pub(crate) fn nil<T: Default>() -> Option<T> {
+        Some(T::default())
+    }
+
+    pub(crate) fn is_nil<T: Default + PartialEq>(value: &T) -> bool {
+        *value == T::default()
+    }
+}
+
+impl<T, F: Form<T>> Form<Option<T>> for F {
+    fn encode<C, W: Write>(
+        value: &Option<T>,
+        e: &mut Encoder<W>,
+        context: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
+        match value {
+            Some(value) => F::encode(value, e, context),
+            None => e.null()?.ok(),
+        }
+    }
+
+    fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<Option<T>, decode::Error> {
+        match d.datatype()? {
+            Type::Null => d.null().map(|()| None),
+            _ => F::decode(d, context).map(Some),
+        }
+    }
+
+    fn nil() -> Option<Option<T>> {
+        Some(None)
+    }
+
+    fn is_nil(value: &Option<T>) -> bool {
+        value.is_none()
+    }
+}
+
+impl<T, F: Form<T>> Form<Vec<T>> for F {
+    fn encode<C, W: Write>(
+        values: &Vec<T>,
+        e: &mut Encoder<W>,
+        context: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
+        e.array(values.len() as u64)?;
+        values.iter().try_for_each(|value| F::encode(value, e, context))
+    }
+
+    fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<Vec<T>, decode::Error> {
+        let count = d.array()?;
+        let mut values = Vec::new();
+        while goes_on(d, count, values.len())? {
+            values.push(F::decode(d, context)?);
+        }
+        Ok(values)
+    }
+}
+
+impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
+    fn encode<C, W: Write>(
+        values: &BTreeMap<SmolStr, f64>,
+        e: &mut Encoder<W>,
+        context: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
+        e.map(values.len() as u64)?;
+        values.iter().try_for_each(|(label, value)| {
+            e.str(label)?;
+            F::encode(value, e, context)
+        })
+    }
+
+    fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<BTreeMap<SmolStr, f64>, decode::Error> {
+        let count = d.map()?;
+        let (mut values, mut read) = (BTreeMap::new(), 0);
+        while goes_on(d, count, read)? {
+            values.insert(d.str()?.into(), F::decode(d, context)?);
+            read += 1;
+        }
+        Ok(values)
+    }
+
+    fn nil() -> Option<BTreeMap<SmolStr, f64>> {
+        Some(BTreeMap::new())
+    }
+
+    fn is_nil(values: &BTreeMap<SmolStr, f64>) -> bool {
+        values.is_empty()
+    }
+}
+
+/// Whether a collection has more entries than were read; one without a count ends with a break.
+fn goes_on(d: &mut Decoder<'_>, count: Option<u64>, read: usize) -> Result<bool, decode::Error> {
+    match count {
+        Some(count) => Ok((read as u64) < count),
+        None if d.datatype()? == Type::Break => d.skip().map(|()| false),
+        None => Ok(true),
+    }
+}
+
+impl<C> Encode<C> for NodeName {
+    fn encode<W: Write>(&self, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+        e.str(self.as_str())?.ok()
+    }
+}
+
+impl<C> Decode<'_, C> for NodeName {
+    fn decode(d: &mut Decoder<'_>, _: &mut C) -> Result<Self, decode::Error> {
+        Self::new(d.str()?).map_err(|_| decode::Error::message("not a name"))
+    }
+}
+
+impl<C> Encode<C> for Timestamp {
+    fn encode<W: Write>(&self, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+        e.u64(self.micros())?.ok()
+    }
+}
+
+impl<C> Decode<'_, C> for Timestamp {
+    fn decode(d: &mut Decoder<'_>, _: &mut C) -> Result<Self, decode::Error> {
+        d.u64().map(Self)
+    }
+}
+
+#[cfg(test)]
+mod tests;
