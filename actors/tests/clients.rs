@@ -66,7 +66,18 @@ async fn the_python_example_feeds_a_cell_and_prints_what_it_agrees_on() {
     let output = tokio::task::spawn_blocking(move || {
         let mut example = Command::new(python);
         example.arg(root().join("examples/python/feed_detections.py"));
-        example.args(["--broker", &broker.to_string(), "--cell", "lot-1", "--node", "euclid", "--pose", "1", "6", "-90"]);
+        example.args([
+            "--broker",
+            &broker.to_string(),
+            "--cell",
+            "lot-1",
+            "--node",
+            "euclid",
+            "--pose",
+            "1",
+            "6",
+            "-90",
+        ]);
         let mut example = example.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let mut detector = example.stdin.take().unwrap();
         for _ in 0..20 {
@@ -126,5 +137,8 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
     let messages: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let [map, verdicts] = &*messages else { panic!("{said}") };
     assert_eq!((&map["landmarks"][0]["id"], &map["landmarks"][0]["label"]), (&"slot-0".into(), &"car".into()));
-    assert_eq!((&verdicts["verdicts"][0]["landmark"], &verdicts["verdicts"][0]["label"]), (&"slot-0".into(), &"car".into()));
+    assert_eq!(
+        (&verdicts["verdicts"][0]["landmark"], &verdicts["verdicts"][0]["label"]),
+        (&"slot-0".into(), &"car".into())
+    );
 }

@@ -66,7 +66,13 @@ fn text() -> AnyLayer {
 }
 
 fn json() -> AnyLayer {
-    tracing_subscriber::fmt::layer().json().flatten_event(true).with_current_span(false).with_writer(stderr).boxed()
+    tracing_subscriber::fmt::layer()
+        .json()
+        .flatten_event(true)
+        .with_current_span(false)
+        .with_span_list(false)
+        .with_writer(stderr)
+        .boxed()
 }
 
 fn journal() -> std::io::Result<AnyLayer> {
