@@ -244,7 +244,8 @@ mod tests {
             "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0,
             "landmarks": [entry, LandmarkState { id: "slot-1".into(), label: None, ..entry.clone() }],
             "objects": [{
-                "id": uuid::Uuid::nil(), "label": "van", "confidence": 0.8, "x_m": 12.4, "y_m": -3.1, "contributors": ["gauss"]
+                "id": uuid::Uuid::nil(), "label": "van", "confidence": 0.8, "x_m": 12.4, "y_m": -3.1,
+                "covariance_m2": [0.04, 0.0, 0.04], "contributors": ["gauss"]
             }]
         }))
         .unwrap();
