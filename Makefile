@@ -89,15 +89,17 @@ recording-check: setup ## prove that the Python reader of MCAP reads what nodes 
 asyncapi-check: ## validate docs/asyncapi.yaml by the parser of its standard, where npm is there
 	packaging/check-asyncapi
 
+python-check: PACKAGES += mosquitto-clients python3-venv
 python-check: setup ## feed a live cell by the Python example; installs paho-mqtt in a directory of its own
 	python3 -m venv $(BUILD)/python-venv
 	$(BUILD)/python-venv/bin/pip install --quiet 'paho-mqtt>=2,<3'
-	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --nocapture python
+	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --nocapture
 
 deb: setup ## Debian packages of a node, with camera and without, in target/debian
 	packaging/deb
 
-package-check: ## build the package without camera, and install, run, upgrade and remove it in a Debian of its own; needs root
+package-check: PACKAGES += debootstrap systemd-container
+package-check: setup ## build the package without camera, and install, run, upgrade and remove it in a Debian of its own; needs root
 	packaging/check-package
 
 edge-only: setup ## an aggregator without camera and OpenCV
