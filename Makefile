@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only fuzz replay-check edge-only recording-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only fuzz replay-check edge-only recording-check asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -48,7 +48,7 @@ eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics f
 	packaging/check-eval-tracks
 
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
-test: PACKAGES += mosquitto
+test: PACKAGES += mosquitto mosquitto-clients
 test: setup ## all tests
 	cargo test --locked --workspace
 
@@ -90,6 +90,22 @@ recording-check: setup ## prove that the Python reader of MCAP reads what nodes 
 
 fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each; TARGETS=payload,... runs those only
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
+
+asyncapi-check: ## validate docs/asyncapi.yaml by the parser of its standard, where npm is there
+	packaging/check-asyncapi
+
+python-check: PACKAGES += mosquitto-clients python3-venv
+python-check: setup ## feed a live cell by the Python example; installs paho-mqtt in a directory of its own
+	python3 -m venv $(BUILD)/python-venv
+	$(BUILD)/python-venv/bin/pip install --quiet 'paho-mqtt>=2,<3'
+	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --nocapture
+
+deb: setup ## Debian packages of a node, with camera and without, in target/debian
+	packaging/deb
+
+package-check: PACKAGES += debootstrap systemd-container
+package-check: setup ## build the package without camera, and install, run, upgrade and remove it in a Debian of its own; needs root
+	packaging/check-package
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features

@@ -9,26 +9,29 @@ mod doctor;
 mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
+mod logging;
 mod record;
 mod replay;
 mod report;
 mod run;
 mod schema;
+mod shell;
 #[cfg(feature = "camera")]
 mod testbed;
 mod top;
 
 use std::fs;
-use std::io::{ErrorKind, IsTerminal, Write};
+use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use serde::Serialize;
-use tracing_subscriber::EnvFilter;
 
 pub use run::RunArguments;
+
+use logging::LogFormat;
 
 /// Camera vehicles that see together: run a node of a cell, or one of the commands.
 #[derive(Debug, Parser)]
@@ -38,6 +41,9 @@ struct Cli {
     command: Option<Command>,
     #[command(flatten)]
     run: RunArguments,
+    /// Form of the log; RUST_LOG sets what is in it
+    #[arg(long, global = true, value_enum, value_name = "FORM", default_value_t)]
+    log_format: LogFormat,
 }
 
 #[derive(Debug, Subcommand)]
@@ -65,6 +71,10 @@ enum Command {
     Calibrate(calibrate::CalibrateArguments),
     /// Print the JSON Schemas of every payload
     Schema,
+    /// Print what a shell needs to complete these commands
+    Completions(shell::CompletionsArguments),
+    /// Write manual pages
+    Man(shell::ManArguments),
 }
 
 /// A command that failed, and how the process says so.
@@ -85,12 +95,8 @@ pub fn main() -> ExitCode {
         Some(Command::Top(_)) => "off",
         Some(_) => "warn",
     };
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
-        .init();
+    let runs_on = matches!(&cli.command, None | Some(Command::Record(_)));
+    logging::start(cli.log_format, runs_on, level);
     let outcome = match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
@@ -106,6 +112,8 @@ pub fn main() -> ExitCode {
         Some(Command::Report(arguments)) => report::run(&arguments),
         Some(Command::Eval(arguments)) => eval::run(&arguments),
         Some(Command::Schema) => schema::run(),
+        Some(Command::Completions(arguments)) => shell::completions(&arguments, Cli::command()),
+        Some(Command::Man(arguments)) => shell::man(&arguments, Cli::command()),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

@@ -21,7 +21,6 @@ mod metrics;
 mod observer;
 mod picture;
 mod process;
-mod readiness;
 mod routes;
 mod server;
 mod sources;

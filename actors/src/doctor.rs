@@ -123,6 +123,17 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn addresses_of_elsewhere_and_logs_without_a_directory_are_named() {
+        let mut config = config();
+        config.listen = Some("192.0.2.1:1883".parse().unwrap());
+        config.map_log = Some("/no/such/maps".into());
+        let port = finding(&config, "broker port").await;
+        assert!(port.verdict == Verdict::Broken && port.fix.unwrap().contains("an address of this machine"));
+        let log = finding(&config, "map log").await;
+        assert!(log.verdict == Verdict::Broken && log.seen.contains("/no/such"), "{log:?}");
+    }
+
+    #[tokio::test]
     async fn an_external_broker_must_be_there() {
         let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
         let mut config = config();

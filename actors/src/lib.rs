@@ -43,10 +43,12 @@ pub mod node;
 pub mod perception;
 #[cfg(feature = "camera")]
 pub mod projector;
+pub mod readiness;
 pub mod recorder;
 pub mod report;
 pub mod reputation_keeper;
 pub mod seat;
+pub mod service;
 pub mod state_file;
 #[cfg(feature = "camera")]
 pub mod testbed;

@@ -31,6 +31,7 @@ use ecod::wire::{Reputations, Verdicts};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
+use tokio::time::MissedTickBehavior;
 
 use crate::clock;
 use crate::config::NodeConfig;
@@ -38,6 +39,8 @@ use crate::counters::Counters;
 use crate::follower::{Newest, Received, ReceivedMap};
 use crate::leader_election::Leadership;
 use crate::membership::Member;
+use crate::readiness::{Readiness, Vitals};
+use crate::service::ServiceManager;
 
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
 pub use seats::{Part, Seats};
@@ -50,6 +53,16 @@ use restarts::Restarts;
 pub enum NodeMessage {
     /// Log how the node is.
     LogHealth,
+    /// Tell the service manager from now on how the node is.
+    ReportTo {
+        /// The manager.
+        manager: ServiceManager,
+    },
+    /// This is how the node is.
+    NoteReadiness {
+        /// Whether it does what it is there for.
+        readiness: Readiness,
+    },
 }
 
 /// Starts the parts of a node and starts them again.
@@ -61,6 +74,7 @@ struct NodeState {
     assembly: Assembly,
     running: HashMap<ActorId, Part>,
     restarts: Restarts,
+    manager: Option<ServiceManager>,
 }
 
 /// A node that could not start or had to give up.
@@ -169,6 +183,12 @@ impl NodeHandle {
         &self.counters
     }
 
+    /// Has the supervisor tell a service manager that the node runs, and how it is, until it ends.
+    pub fn report_to(&self, manager: ServiceManager) {
+        // A supervisor that has ended is noticed by `failed`.
+        let _ = self.supervisor.cast(NodeMessage::ReportTo { manager });
+    }
+
     /// Waits until the node has given up.
     ///
     /// # Errors
@@ -197,7 +217,7 @@ impl Actor for Node {
         myself: ActorRef<Self::Msg>,
         assembly: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let mut state = NodeState { assembly, running: HashMap::new(), restarts: Restarts::default() };
+        let mut state = NodeState { assembly, running: HashMap::new(), restarts: Restarts::default(), manager: None };
         for part in state.assembly.parts() {
             state.start(part, &myself.get_cell()).await?;
         }
@@ -206,14 +226,23 @@ impl Actor for Node {
 
     async fn handle(
         &self,
-        _myself: ActorRef<Self::Msg>,
+        myself: ActorRef<Self::Msg>,
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let NodeMessage::LogHealth = message;
-        let snapshot = state.assembly.counters().snapshot();
-        let frames = state.assembly.frames().snapshot();
-        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?frames, "health");
+        match message {
+            NodeMessage::LogHealth => state.log_health(),
+            NodeMessage::ReportTo { mut manager } => {
+                manager.started();
+                tokio::spawn(watch_readiness(state.assembly.vitals(), manager.period(), myself));
+                state.manager = Some(manager);
+            }
+            NodeMessage::NoteReadiness { readiness } => {
+                if let Some(manager) = &mut state.manager {
+                    manager.beat(readiness);
+                }
+            }
+        }
         Ok(())
     }
 
@@ -244,6 +273,9 @@ impl Actor for Node {
     }
 
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+        if let Some(manager) = &mut state.manager {
+            manager.stopping();
+        }
         state.running.clear();
         state.assembly.stop_all().await;
         Ok(())
@@ -251,9 +283,29 @@ impl Actor for Node {
 }
 
 impl NodeState {
+    fn log_health(&self) {
+        let snapshot = self.assembly.counters().snapshot();
+        let frames = self.assembly.frames().snapshot();
+        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?frames, "health");
+    }
+
     async fn start(&mut self, part: Part, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
         let actor = self.assembly.start(part, supervisor.clone()).await?;
         self.running.insert(actor, part);
         Ok(())
+    }
+}
+
+/// Asks the parts again and again, and tells the supervisor: what hangs, be it part or supervisor, is not passed off as
+/// well. Ends with the supervisor.
+async fn watch_readiness(vitals: Vitals, period: Duration, supervisor: ActorRef<NodeMessage>) {
+    let mut ticks = tokio::time::interval(period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        ticks.tick().await;
+        let readiness = vitals.readiness(&vitals.probe().await);
+        if supervisor.cast(NodeMessage::NoteReadiness { readiness }).is_err() {
+            break;
+        }
     }
 }

@@ -15,11 +15,14 @@ mod config;
 mod disk;
 mod foxglove;
 mod identity;
+#[cfg(feature = "foxglove")]
+mod live;
 mod log_file;
 #[cfg(feature = "camera")]
 mod pictures;
 mod reader;
 mod recording;
+mod scribe;
 mod writer;
 
 use std::sync::Arc;

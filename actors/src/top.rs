@@ -126,9 +126,10 @@ fn landmarks(view: &View) -> Table<'_> {
             [verdict.label.as_deref().unwrap_or("-").to_owned(), format!("{:.2}", verdict.margin)]
         });
         let [label, margin] = voted;
+        let nothing = if entry.observers.is_empty() { "unknown" } else { "empty" };
         rows.push(Row::new([
             entry.id.to_string(),
-            entry.label.as_deref().unwrap_or("-").to_owned(),
+            entry.label.as_deref().unwrap_or(nothing).to_owned(),
             format!("{:.2}", entry.confidence),
             label,
             margin,
@@ -146,6 +147,16 @@ fn landmarks(view: &View) -> Table<'_> {
             listed(&verdict.contributors),
         ]));
     }
+    for object in view.map.iter().flat_map(|received| &received.map.objects) {
+        rows.push(Row::new([
+            format!("{:.1}, {:.1} m", object.x_m, object.y_m),
+            object.label.to_string(),
+            format!("{:.2}", object.confidence),
+            String::new(),
+            String::new(),
+            listed(&object.contributors),
+        ]));
+    }
     let widths = [16, 16, 6, 16, 7].map(Constraint::Length).into_iter().chain([Constraint::Fill(1)]);
     let head = Row::new(["location", "map", "conf.", "verdict", "margin", "by"]).style(Style::new().bold());
     Table::new(rows, widths).header(head).block(Block::bordered().title(" what is where "))
@@ -153,7 +164,12 @@ fn landmarks(view: &View) -> Table<'_> {
 
 fn vehicles(view: &View) -> Table<'_> {
     let reputations = view.reputations.as_ref().map(|received| &received.message.reputations);
-    let rows = view.members.iter().map(|member| {
+    let trusted = |node: &NodeName| {
+        reputations
+            .and_then(|reputations| reputations.get(node))
+            .map_or_else(String::new, |it| format!("{:.2} {}+ {}-", it.score, it.correct, it.incorrect))
+    };
+    let members = view.members.iter().map(|member| {
         let role = match member.role {
             Role::Auto => "auto",
             Role::Cav => "cav",
@@ -164,14 +180,17 @@ fn vehicles(view: &View) -> Table<'_> {
             it if it.standby.as_ref() == Some(&member.name) => "next",
             _ => "",
         };
-        let reputation = reputations.and_then(|reputations| reputations.get(&member.name));
-        let reputation =
-            reputation.map_or_else(String::new, |it| format!("{:.2} {}+ {}-", it.score, it.correct, it.incorrect));
-        Row::new([member.name.to_string(), role.to_owned(), part.to_owned(), reputation])
+        Row::new([member.name.to_string(), role.to_owned(), part.to_owned(), trusted(&member.name)])
     });
+    // Vehicles that take part by MQTT alone.
+    let is_member = |node: &NodeName| view.members.iter().any(|member| member.name == *node);
+    let others = reputations.into_iter().flat_map(|reputations| reputations.keys()).filter(|node| !is_member(node));
+    let others = others.map(|node| Row::new([node.to_string(), "mqtt".to_owned(), String::new(), trusted(node)]));
+    let rows: Vec<_> = members.chain(others).collect();
+    let title = format!(" {} node{} ", rows.len(), if rows.len() == 1 { "" } else { "s" });
     let widths = [Constraint::Fill(1), Constraint::Length(5), Constraint::Length(6), Constraint::Length(20)];
     let head = Row::new(["node", "role", "", "reputation"]).style(Style::new().bold());
-    Table::new(rows, widths).header(head).block(Block::bordered().title(format!(" {} nodes ", view.members.len())))
+    Table::new(rows, widths).header(head).block(Block::bordered().title(title))
 }
 
 fn counted(view: &View) -> Table<'_> {
@@ -223,7 +242,16 @@ mod tests {
         };
         let map: GlobalMap = serde_json::from_value(serde_json::json!({
             "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0,
-            "landmarks": [entry], "objects": []
+            "landmarks": [entry, LandmarkState { id: "slot-1".into(), label: None, ..entry.clone() }],
+            "objects": [{
+                "id": uuid::Uuid::nil(), "label": "van", "confidence": 0.8, "x_m": 12.4, "y_m": -3.1,
+                "covariance_m2": [0.04, 0.0, 0.04], "contributors": ["gauss"]
+            }]
+        }))
+        .unwrap();
+        let reputations: Reputations = serde_json::from_value(serde_json::json!({
+            "schema": SCHEMA_VERSION, "epoch": 4, "round": 9,
+            "reputations": {"hertz": {"score": 0.62, "correct": 41, "incorrect": 22}}
         }))
         .unwrap();
         let epoch = Epoch::new(4, name("euclid"));
@@ -241,7 +269,7 @@ mod tests {
             }],
             map: Some(ReceivedMap { received_at: Timestamp(7_000_000), map: Arc::new(map) }),
             verdicts: None,
-            reputations: None,
+            reputations: Some(Received { received_at: Timestamp(7_000_000), message: Arc::new(reputations) }),
             counters: Counters::default().snapshot(),
         };
         view.remember();
@@ -266,6 +294,10 @@ mod tests {
             "car",
             "0.93",
             "before: edge@3",
+            "slot-1           unknown",
+            "12.4, -3.1 m     van",
+            " 2 nodes ",
+            "mqtt         0.62 41+ 22-",
         ] {
             assert!(text.contains(part), "{part}: {text}");
         }

@@ -1,12 +1,20 @@
-//! The JSON Schemas in `docs/schemas` are those of the code.
+//! The JSON Schemas in `docs/schemas` are those of the code, and `docs/asyncapi.yaml` has its topics.
 
-use std::path::Path;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use ecod::names::NodeName;
+use ecod::wire::{Topic, Topics};
 
 const REGENERATE: &str = "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test schema";
 
+fn docs() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs")
+}
+
 #[test]
 fn documented_schemas_are_those_of_the_code() {
-    let directory = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/schemas"));
+    let directory = docs().join("schemas");
     let schemas = ecod::wire::schemas();
     for (name, schema) in &schemas {
         let file = directory.join(format!("{name}.json"));
@@ -17,6 +25,38 @@ fn documented_schemas_are_those_of_the_code() {
         let documented = std::fs::read_to_string(&file).unwrap_or_default();
         assert!(documented == current, "{} is out of date; {REGENERATE}", file.display());
     }
-    let documented = std::fs::read_dir(directory).unwrap().count();
+    let documented = std::fs::read_dir(&directory).unwrap().count();
     assert_eq!(documented, schemas.len(), "a schema of no payload in {}", directory.display());
+}
+
+/// What follows `before` in a line, up to `end`.
+fn values<'a>(text: &'a str, before: &'a str, end: char) -> BTreeSet<&'a str> {
+    let rest = text.lines().filter_map(|line| line.split_once(before));
+    rest.map(|(_, rest)| rest.split(end).next().unwrap_or(rest)).collect()
+}
+
+/// `make asyncapi-check` sees to the rest of the document.
+#[test]
+fn the_asyncapi_document_has_every_topic_and_every_schema() {
+    let document = std::fs::read_to_string(docs().join("asyncapi.yaml")).unwrap();
+    let node = NodeName::from_static("node");
+    let topics = Topics::new(&NodeName::from_static("cell"));
+    let kinds = [
+        Topic::Detections(node.clone()),
+        Topic::VoteDetections(node.clone()),
+        Topic::GlobalDetections,
+        Topic::GlobalVerdicts,
+        Topic::Reputations,
+        Topic::Ledger(node.clone()),
+        Topic::Nodes(node),
+    ];
+    let spoken: BTreeSet<_> = kinds.iter().map(|topic| topics.path(topic)).collect();
+    let addresses = values(&document, "address: ", '\n');
+    let documented: BTreeSet<_> =
+        addresses.iter().map(|address| address.replace("{cell}", "cell").replace("{node}", "node")).collect();
+    assert_eq!(documented, spoken);
+    let schemas = ecod::wire::schemas();
+    let files: BTreeSet<_> = schemas.keys().map(|name| format!("{name}.json")).collect();
+    let referenced = values(&document, "$ref: 'schemas/", '\'').into_iter().map(str::to_owned).collect();
+    assert_eq!(files, referenced);
 }

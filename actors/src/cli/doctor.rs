@@ -47,6 +47,6 @@ fn line(Finding { check, verdict, seen, fix }: &Finding) -> String {
         Verdict::Doubtful => "warn",
         Verdict::Broken => "FAIL",
     };
-    let fix = fix.as_ref().map_or_else(String::new, |fix| format!(": {fix}"));
+    let fix = fix.as_ref().map_or_else(String::new, |fix| format!("  -> {fix}"));
     format!("{sign}  {check:<16}  {}{fix}\n", seen.replace('\n', " "))
 }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::anyhow;
+use anyhow::{Context, anyhow};
 use clap::Args;
 
 use super::Failure;
@@ -29,6 +29,8 @@ pub(super) fn run(arguments: &RecordArguments) -> Result<(), Failure> {
         (None, Some(record)) => record,
         (None, None) => return Err(Failure::usage(anyhow!("where is recorded? give --dir, or [record] in --config"))),
     };
+    // A node goes on without its log; an observer that records has nothing else to do.
+    std::fs::create_dir_all(&record.dir).with_context(|| format!("cannot record in {}", record.dir.display()))?;
     config.record = Some(RecordConfig { reports: true, ..record });
     run_node(config, false)
 }

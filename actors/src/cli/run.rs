@@ -17,6 +17,7 @@ use super::{Failure, print};
 use crate::config::NodeConfig;
 use crate::gateway::BrokerAddress;
 use crate::node;
+use crate::service::ServiceManager;
 
 /// Flags of a node; each overrides the key of its name in the configuration file.
 #[derive(Debug, Default, Args, Serialize)]
@@ -147,6 +148,9 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
         tracing::warn!("no [camera] is configured: this vehicle reports nothing, it only follows");
     }
     let mut node = node::start(config).await?;
+    if let Some(manager) = ServiceManager::from_environment() {
+        node.report_to(manager);
+    }
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}

@@ -71,7 +71,7 @@ fn node(registry: &mut Registry, observer: &Observer) {
 }
 
 fn election(registry: &mut Registry, observer: &Observer) {
-    let leadership = observer.sources().leadership.borrow().clone();
+    let leadership = observer.sources().vitals.leadership.borrow().clone();
     let states = family(registry, "election_state", "What the node has to do with the lead; 1 for the present state.");
     for (label, position) in [
         ("seeking", Position::Seeking),
@@ -97,8 +97,8 @@ fn rounds(registry: &mut Registry, observer: &Observer) {
     ] {
         registry.register_with_unit(name, help, Unit::Seconds, histogram.clone());
     }
-    let newest = sources.newest.map.borrow().clone();
-    let verdicts = sources.newest.verdicts.borrow().clone();
+    let newest = sources.vitals.newest.map.borrow().clone();
+    let verdicts = sources.vitals.newest.verdicts.borrow().clone();
     if let Some(newest) = &newest {
         gauge(registry, "map_landmarks", "Known locations in the newest map.", count(newest.map.landmarks.len()));
         gauge(registry, "map_objects", "Objects in the newest map beside known locations.", {
@@ -150,7 +150,7 @@ fn traffic(registry: &mut Registry, observer: &Observer) {
 }
 
 fn reputations(registry: &mut Registry, observer: &Observer) {
-    let Some(newest) = observer.sources().newest.reputations.borrow().clone() else { return };
+    let Some(newest) = observer.sources().vitals.newest.reputations.borrow().clone() else { return };
     let vehicles = &newest.message.reputations;
     gauge(registry, "reputation_vehicles", "Vehicles that have a reputation.", count(vehicles.len()));
     let scores = Family::<Labels, Float>::default();

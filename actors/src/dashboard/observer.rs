@@ -12,11 +12,11 @@ use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
 use super::history::{History, SAMPLE_PERIOD};
 use super::latency::Latencies;
 use super::picture::{API_VERSION, LeadershipFacts, Picture, Stamped, nodes};
-use super::readiness::{Readiness, patience, readiness};
-use super::sources::{Probe, Sources};
+use super::sources::Sources;
 use crate::clock;
 use crate::gateway::{GatewayMessage, LinkState};
 use crate::leader_election::Position;
+use crate::readiness::{Probe, Readiness};
 
 /// What requests are answered from.
 #[derive(Debug)]
@@ -108,10 +108,7 @@ impl Observer {
 
     /// Whether the node is ready.
     pub(super) fn readiness(&self) -> Readiness {
-        let works = self.sources.broker_works(&self.seen().probe);
-        let period = Duration::from_secs_f64(self.sources.node.round_period_s);
-        let leadership = self.sources.leadership.borrow().clone();
-        readiness(&leadership, self.sources.last_round().as_ref(), works, patience(period), clock::now())
+        self.sources.vitals.readiness(&self.seen().probe)
     }
 
     /// What the node knows now.
@@ -122,16 +119,16 @@ impl Observer {
         let history = &seen.history;
         let since = history.reigns.back().filter(|reign| reign.until_us.is_none()).map(|reign| reign.from_us);
         let links = seen.probe.links.iter().flatten().map(|(broker, state)| (broker.to_string(), link_label(*state)));
-        let newest_map = sources.newest.map.borrow().clone();
+        let newest_map = sources.vitals.newest.map.borrow().clone();
         Picture {
             schema: API_VERSION,
             now_us: now,
             node: sources.node.clone(),
             readiness,
-            leadership: LeadershipFacts::new(&sources.leadership.borrow(), since, history.failovers),
+            leadership: LeadershipFacts::new(&sources.vitals.leadership.borrow(), since, history.failovers),
             map: newest_map.map(|newest| Stamped { received_at_us: newest.received_at, message: newest.map }),
-            verdicts: sources.newest.verdicts.borrow().clone().map(Stamped::from),
-            reputations: sources.newest.reputations.borrow().clone().map(Stamped::from),
+            verdicts: sources.vitals.newest.verdicts.borrow().clone().map(Stamped::from),
+            reputations: sources.vitals.newest.reputations.borrow().clone().map(Stamped::from),
             vehicles: sources.feed.sightings_since(now - FORGET_AFTER),
             nodes: nodes(sources),
             links: links.collect(),
@@ -171,9 +168,9 @@ impl Observer {
     }
 
     async fn look_on(&self) {
-        let mut leadership = self.sources.leadership.clone();
-        let mut maps = self.sources.newest.map.subscribe();
-        let mut verdicts = self.sources.newest.verdicts.subscribe();
+        let mut leadership = self.sources.vitals.leadership.clone();
+        let mut maps = self.sources.vitals.newest.map.subscribe();
+        let mut verdicts = self.sources.vitals.newest.verdicts.subscribe();
         let mut samples = ticks(SAMPLE_PERIOD);
         let (mut next_picture, mut changed, mut pictured) = (Instant::now(), true, Instant::now());
         self.note_leadership();
@@ -208,19 +205,19 @@ impl Observer {
         let mut probes = ticks(PROBE_PERIOD);
         loop {
             probes.tick().await;
-            let probe = self.sources.probe().await;
+            let probe = self.sources.vitals.probe().await;
             self.seen().probe = probe;
             self.watch_reports();
         }
     }
 
     fn note_leadership(&self) {
-        let leadership = self.sources.leadership.borrow().clone();
+        let leadership = self.sources.vitals.leadership.borrow().clone();
         self.seen().history.note_leadership(&leadership, clock::now());
     }
 
     fn note_map(&self) {
-        let Some(newest) = self.sources.newest.map.borrow().clone() else { return };
+        let Some(newest) = self.sources.vitals.newest.map.borrow().clone() else { return };
         let epoch = Epoch::new(newest.map.epoch, newest.map.aggregator.clone());
         self.latencies.observe(newest.map.oldest_capture_us, newest.map.fused_at_us, newest.received_at);
         self.seen().history.note_round(&epoch, newest.map.oldest_capture_us, newest.received_at);
@@ -228,8 +225,8 @@ impl Observer {
 
     /// A round's verdicts count for it in a cell without maps.
     fn note_verdicts(&self) {
-        let Some(newest) = self.sources.newest.verdicts.borrow().clone() else { return };
-        let map_at = self.sources.newest.map.borrow().as_ref().map(|map| map.received_at);
+        let Some(newest) = self.sources.vitals.newest.verdicts.borrow().clone() else { return };
+        let map_at = self.sources.vitals.newest.map.borrow().as_ref().map(|map| map.received_at);
         if map_at.is_none_or(|map_at| newest.received_at.since(map_at) > HEARTBEAT) {
             let epoch = Epoch::new(newest.message.epoch, newest.message.aggregator.clone());
             self.seen().history.note_round(&epoch, None, newest.received_at);
@@ -237,16 +234,16 @@ impl Observer {
     }
 
     fn sample(&self) {
-        let reputations = self.sources.newest.reputations.borrow().clone();
+        let reputations = self.sources.vitals.newest.reputations.borrow().clone();
         self.seen().history.sample(reputations.as_ref().map(|newest| &*newest.message), clock::now());
     }
 
     /// A node that only follows takes the vehicles' reports while anyone looks.
     fn watch_reports(&self) {
-        let wanted = self.viewers() > 0 && self.sources.leadership.borrow().position == Position::Following;
+        let wanted = self.viewers() > 0 && self.sources.vitals.leadership.borrow().position == Position::Following;
         if wanted || self.sources.feed.watches() {
             self.sources.feed.set_watches(wanted);
-            self.sources.gateway.send(GatewayMessage::WatchReports { wanted });
+            self.sources.vitals.gateway.send(GatewayMessage::WatchReports { wanted });
         }
     }
 

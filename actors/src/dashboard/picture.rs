@@ -9,11 +9,11 @@ use ecod::wire::{GlobalMap, NodeState, Reputations, Role, Verdicts};
 use serde::Serialize;
 
 use super::feed::{MAX_SHOWN, Sighting};
-use super::readiness::Readiness;
 use super::sources::Sources;
 use crate::counters::CounterSnapshot;
 use crate::follower::Received;
 use crate::leader_election::{Leadership, Position};
+use crate::readiness::Readiness;
 
 /// Version of [`Picture`] and of the other answers of the API.
 pub(super) const API_VERSION: u32 = 1;
@@ -144,7 +144,7 @@ impl LeadershipFacts {
 pub(super) fn nodes(sources: &Sources) -> Vec<NodeEntry> {
     let mut statuses = sources.feed.statuses();
     let own = &sources.node;
-    let leading = sources.leadership.borrow().is_leading();
+    let leading = sources.vitals.leadership.borrow().is_leading();
     let me = NodeEntry {
         name: own.name.clone(),
         role: own.role,

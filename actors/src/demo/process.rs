@@ -98,7 +98,7 @@ fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
         command.env_remove(key);
     }
     command
-        .arg("--config")
+        .args(["--log-format", "text", "--config"])
         .arg(file)
         // The pipe is never written to; it closes with this process, however that ends, and so ends the node.
         .arg("--stop-at-eof")

@@ -50,7 +50,9 @@ fn calibration(camera: &CameraConfig) -> Finding {
     let check = "calibration";
     match (&camera.optics.calibration, camera.optics.lens()) {
         (Some(path), Ok(_)) => Finding::fine(check, path.display().to_string()),
-        (_, Err(error)) => Finding::broken(check, error.to_string(), "make one with `ecod-node calibrate`"),
+        (_, Err(error)) => {
+            Finding::broken(check, format!("{:#}", anyhow::Error::from(error)), "make one with `ecod-node calibrate`")
+        }
         (None, Ok(_)) => Finding::doubtful(
             check,
             "none: the data sheet's field of view is used, ranges are off by as much as it is",

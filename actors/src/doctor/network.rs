@@ -30,11 +30,7 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
         let address = config.broker_listen();
         findings.push(match TcpListener::bind(address) {
             Ok(_) => Finding::fine("broker port", format!("{address} is free")),
-            Err(error) => Finding::broken(
-                "broker port",
-                format!("{address}: {}", words(&error)),
-                "stop what uses it, perhaps this node itself, or set `listen` to another",
-            ),
+            Err(error) => not_bound("broker port", address, &error, "listen"),
         });
     }
     findings
@@ -53,12 +49,17 @@ pub(super) fn gossip(config: &NodeConfig) -> Option<Finding> {
             format!("{address}: {}, a free one will be taken", words(&error)),
             "set `membership.bind` if others have this node as a seed",
         ),
-        Err(error) => Finding::broken(
-            check,
-            format!("{address}: {}", words(&error)),
-            "stop what uses it, perhaps this node itself, or set `membership.bind` to another",
-        ),
+        Err(error) => not_bound(check, address, &error, "membership.bind"),
     })
+}
+
+fn not_bound(check: &'static str, address: SocketAddr, error: &io::Error, key: &str) -> Finding {
+    let fix = match error.kind() {
+        io::ErrorKind::AddrNotAvailable => format!("set `{key}` to an address of this machine, or 0.0.0.0 for all"),
+        io::ErrorKind::PermissionDenied => format!("set `{key}` to a port from 1024"),
+        _ => format!("stop what uses it, perhaps this node itself, or set `{key}` to another"),
+    };
+    Finding::broken(check, format!("{address}: {}", words(error)), fix)
 }
 
 /// Whether a datagram to the group comes back.
@@ -83,6 +84,7 @@ pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
     };
     let check = "multicast";
     Some(match returned() {
+        Ok(()) if interface.is_unspecified() => Finding::fine(check, format!("{} comes back", multicast.group)),
         Ok(()) => Finding::fine(check, format!("{} comes back by {interface}", multicast.group)),
         Err(error) => Finding::doubtful(
             check,

@@ -57,7 +57,13 @@ pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
     }
     if let Some(log) = &config.map_log {
         let dir = log.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        findings.push(directory("map log", dir, LITTLE, "map_log"));
+        findings.push(if dir.is_dir() {
+            directory("map log", dir, LITTLE, "map_log")
+        } else {
+            // Directories of state and logs are made by the node, this one is not.
+            let seen = format!("{} is no directory", dir.display());
+            Finding::broken("map log", seen, "make it, or set `map_log` to another")
+        });
     }
     findings
 }

@@ -15,6 +15,7 @@ use ecod::wire::{NodeState, NodeStatus, Role};
 use ractor::{ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
+use tracing::field::display;
 use uuid::Uuid;
 
 use super::health::{self, HealthMonitor, Probe};
@@ -266,7 +267,8 @@ impl ElectionDriver {
         let leadership = Leadership::of(&self.election, &self.name);
         if *self.leadership.borrow() != leadership {
             let Leadership { position, epoch, standby } = &leadership;
-            tracing::info!(?position, epoch = ?epoch.as_ref().map(ToString::to_string), ?standby, "leadership");
+            let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
+            tracing::info!(?position, epoch, standby, "leadership");
             self.leadership.send_replace(leadership.clone());
         }
         self.reflect_links(&leadership);

@@ -17,7 +17,7 @@ pub(super) struct GossipSocket {
 
 /// A gossip socket that could not be opened.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot gossip on {address}: {source}")]
+#[error("key `membership.bind`: cannot gossip on {address}: {source}")]
 pub struct BindError {
     address: SocketAddr,
     source: io::Error,

@@ -32,6 +32,11 @@ pub struct RecordConfig {
     pub reports: bool,
     /// Pictures of the camera a second, as JPEG; default 0, none. Each has some 50 to 100 kB at 640x480.
     pub camera_hz: f64,
+    /// Port on 127.0.0.1 where Foxglove and Lichtblick see live what is recorded; default none. 8765 is what they ask
+    /// for, 0 a free one.
+    #[cfg(feature = "foxglove")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub live_port: Option<u16>,
 }
 
 impl RecordConfig {
@@ -47,6 +52,8 @@ impl RecordConfig {
             drawable: true,
             reports: false,
             camera_hz: 0.0,
+            #[cfg(feature = "foxglove")]
+            live_port: None,
         }
     }
 
@@ -99,6 +106,8 @@ struct Table {
     drawable: Option<bool>,
     reports: Option<bool>,
     camera_hz: Option<f64>,
+    #[cfg(feature = "foxglove")]
+    live_port: Option<u16>,
 }
 
 impl From<Table> for RecordConfig {
@@ -113,6 +122,8 @@ impl From<Table> for RecordConfig {
             drawable: table.drawable.unwrap_or(default.drawable),
             reports: table.reports.unwrap_or(default.reports),
             camera_hz: table.camera_hz.unwrap_or(default.camera_hz),
+            #[cfg(feature = "foxglove")]
+            live_port: table.live_port,
             dir: default.dir,
         }
     }

@@ -10,8 +10,11 @@ use mcap::{McapError, McapResult};
 use super::config::RecordConfig;
 use super::disk;
 use super::identity::Identity;
+#[cfg(feature = "foxglove")]
+use super::live::Live;
 use super::log_file::LogFile;
 use super::recording::{Entry, Item, Recording, Standing};
+use super::scribe::Scribe;
 use crate::counters::Event;
 
 /// How often the log is made safe from the end of the process.
@@ -25,7 +28,10 @@ pub(super) struct LogWriter {
     config: RecordConfig,
     identity: Identity,
     recording: Recording,
+    scribe: Scribe,
     file: Option<LogFile>,
+    #[cfg(feature = "foxglove")]
+    live: Option<Live>,
     flush_due: Instant,
     retry_at: Option<Instant>,
     /// A failure is told of once.
@@ -35,7 +41,21 @@ pub(super) struct LogWriter {
 impl LogWriter {
     pub(super) fn new(config: RecordConfig, identity: Identity, recording: Recording) -> Self {
         let flush_due = Instant::now() + FLUSH_PERIOD;
-        Self { config, identity, recording, file: None, flush_due, retry_at: None, failing: false }
+        let scribe = Scribe::new(identity.node.clone(), config.drawable);
+        #[cfg(feature = "foxglove")]
+        let live = config.live_port.map(|port| Live::new(port, identity.node.clone()));
+        Self {
+            config,
+            identity,
+            recording,
+            scribe,
+            file: None,
+            #[cfg(feature = "foxglove")]
+            live,
+            flush_due,
+            retry_at: None,
+            failing: false,
+        }
     }
 
     /// Writes until nobody can send any more.
@@ -58,15 +78,19 @@ impl LogWriter {
     }
 
     fn take(&mut self, entry: &Entry) {
+        #[cfg(feature = "foxglove")]
+        if let Some(live) = &mut self.live {
+            live.show(entry);
+        }
         self.open(entry);
         self.follow(&entry.item);
         let is_of_journal = entry.item.is_of_journal();
         let Some(file) = &mut self.file else { return self.recording.lost(is_of_journal) };
         let written = match self.recording.take_missing() {
             0 => Ok(()),
-            entries => file.journal(entry.at, &JournalEvent::Missing { entries }),
+            entries => self.scribe.journal(entry.at, &JournalEvent::Missing { entries }, file),
         };
-        match written.and_then(|()| file.write(entry)) {
+        match written.and_then(|()| self.scribe.write(entry, file)) {
             Ok(()) => self.recording.counters().count(Event::Recorded),
             Err(error) => {
                 self.recording.lost(is_of_journal);
@@ -90,13 +114,12 @@ impl LogWriter {
         }
     }
 
-    fn begin(&self, entry: &Entry) -> McapResult<LogFile> {
-        let RecordConfig { dir, drawable, .. } = &self.config;
-        let (path, file) = disk::create(dir, &self.identity.node, entry.at, self.config.min_free_bytes())?;
-        let mut file = LogFile::begin(path, file, &self.identity, *drawable)?;
+    fn begin(&mut self, entry: &Entry) -> McapResult<LogFile> {
+        let (path, file) = disk::create(&self.config.dir, &self.identity.node, entry.at, self.config.min_free_bytes())?;
+        let mut file = LogFile::begin(path, file, &self.identity)?;
         let Standing { runs, leads, next_round } = self.recording.standing().clone();
         if runs && !matches!(entry.item, Item::Journal(JournalEvent::Start { .. })) {
-            file.journal(entry.at, &JournalEvent::Continue { leads, next_round })?;
+            self.scribe.journal(entry.at, &JournalEvent::Continue { leads, next_round }, &mut file)?;
         }
         Ok(file)
     }
@@ -140,7 +163,11 @@ impl LogWriter {
         self.retry_at = Some(Instant::now() + RETRY_AFTER);
         if !std::mem::replace(&mut self.failing, true) {
             let directory = self.config.dir.display();
-            tracing::warn!(%directory, %error, "not recording, the node goes on; tried again every {RETRY_AFTER:?}");
+            let error = match error {
+                McapError::Io(of_disk) => of_disk.to_string(),
+                other => other.to_string(),
+            };
+            tracing::warn!(%directory, error, "not recording, the node goes on; tried again every {RETRY_AFTER:?}");
         }
     }
 }

@@ -6,7 +6,7 @@ use chrono::DateTime;
 use ecod::eval::Scores;
 use ecod::time::Timestamp;
 
-use super::plot::{Curve, Plot, bars, class};
+use super::plot::{Axis, Curve, Plot, bars, class};
 use super::series::{distribution, quantile};
 use super::{Report, Rounds};
 use crate::counters::Event;
@@ -154,14 +154,13 @@ fn latency(report: &Report) -> String {
         let points = distribution(values, PARTS).into_iter().map(|(value, share)| (value * 1000.0, share));
         Curve { name: name.to_owned(), points: points.collect() }
     };
-    let most = kinds.iter().filter_map(|(_, values)| quantile(values, 0.995)).fold(0.0, f64::max);
     let plot = Plot {
         title: "latency distribution",
         x_label: "ms",
         y_label: "% of rounds within",
         curves: kinds.iter().map(curves).collect(),
         marks: Vec::new(),
-        x_max: Some((most * 1000.0).max(1.0)),
+        x: Axis::Logarithmic,
     };
     let text = shown(&plot) + &table(&QUANTILES, &rows);
     section("Latency", "By the clocks of aggregator and recording node, as far apart as these are.", &text)
@@ -173,12 +172,14 @@ fn gaps(report: &Report) -> String {
     let kinds: Vec<_> = kinds.into_iter().filter(|(_, gaps)| gaps.newest().is_some()).collect();
     let rows: Vec<_> = kinds.iter().map(|(name, gaps)| quantiles(name, &gaps.values())).collect();
     let curve = |&(name, gaps): &(&str, &super::Samples)| {
-        let points = gaps.points(start, seconds(report), PARTS).into_iter().map(|(x, gap)| (x, gap * 1000.0));
+        // A gap lasts from the round before to the one that ends it.
+        let points = gaps.points(start, seconds(report), PARTS).into_iter();
+        let points = points.flat_map(|(x, gap)| [(x - gap, gap * 1000.0), (x, gap * 1000.0)]);
         Curve { name: name.to_owned(), points: points.collect() }
     };
     let plot = over_time(report, "time between rounds", "ms since the round before", kinds.iter().map(curve).collect());
     let text = shown(&plot) + &table(&QUANTILES, &rows);
-    section("Gaps", "Time between rounds as this node took them; upright lines are changes of leader.", &text)
+    section("Gaps", "Time between rounds as this node took them; dotted lines are changes of leader.", &text)
 }
 
 fn reputations(report: &Report) -> String {
@@ -245,7 +246,7 @@ fn over_time<'a>(report: &Report, title: &'a str, y_label: &'a str, curves: Vec<
     let start = report.first.unwrap_or_default();
     let marks = report.reigns.iter().skip(1);
     let marks = marks.map(|reign| (reign.first_at.since(start).as_secs_f64(), reign.epoch.to_string())).collect();
-    Plot { title, x_label: "s", y_label, curves, marks, x_max: Some(seconds(report)) }
+    Plot { title, x_label: "s", y_label, curves, marks, x: Axis::Linear(seconds(report)) }
 }
 
 /// The plot with its legend; nothing without points.

@@ -20,8 +20,17 @@ pub(super) struct Plot<'a> {
     pub(super) curves: Vec<Curve>,
     /// Vertical lines and what happened there.
     pub(super) marks: Vec<(f64, String)>,
-    /// Largest x that is shown, if not that of the points.
-    pub(super) x_max: Option<f64>,
+    /// The horizontal axis.
+    pub(super) x: Axis,
+}
+
+/// A horizontal axis.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Axis {
+    /// From 0 to this.
+    Linear(f64),
+    /// Powers of ten, from the one below the least point to the one above the largest, six at most.
+    Logarithmic,
 }
 
 /// How many colours the page has; further curves take the same ones dashed.
@@ -30,7 +39,7 @@ pub(super) const COLOURS: usize = 6;
 const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 250.0;
 const LEFT: f64 = 56.0;
-const RIGHT: f64 = 12.0;
+const RIGHT: f64 = 22.0;
 const TOP: f64 = 26.0;
 const BOTTOM: f64 = 40.0;
 const BAR: f64 = 24.0;
@@ -39,18 +48,18 @@ const TICKS: f64 = 6.0;
 impl Plot<'_> {
     pub(super) fn draw(&self) -> String {
         let points = || self.curves.iter().flat_map(|curve| &curve.points);
-        let x_max = self.x_max.unwrap_or_else(|| points().map(|point| point.0).fold(0.0, f64::max)).max(1e-9);
-        let y_max = points().filter(|point| point.0 <= x_max).map(|point| point.1).fold(0.0, f64::max).max(1e-9);
-        let (x_step, y_step) = (step(x_max), step(y_max * 1.05));
+        let scale = Scale::new(self.x, points().map(|point| point.0));
+        let y_max = points().filter(|point| scale.shows(point.0)).map(|point| point.1).fold(0.0, f64::max).max(1e-9);
+        let y_step = step(y_max * 1.05);
         let y_max = (y_max / y_step).ceil() * y_step;
-        let x = |value: f64| LEFT + (WIDTH - LEFT - RIGHT) * value / x_max;
+        let x = |value: f64| LEFT + (WIDTH - LEFT - RIGHT) * scale.share(value);
         let y = |value: f64| HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * value / y_max;
         let mut picture = picture(self.title, HEIGHT);
         for value in ticks(y_step, y_max) {
             picture = picture.add(line("grid", (LEFT, y(value)), (WIDTH - RIGHT, y(value))));
             picture = picture.add(text("tick", "end", LEFT - 6.0, y(value) + 4.0, &number(value)));
         }
-        for value in ticks(x_step, x_max) {
+        for value in scale.ticks() {
             picture = picture.add(text("tick", "middle", x(value), HEIGHT - BOTTOM + 16.0, &number(value)));
         }
         picture = picture
@@ -62,7 +71,7 @@ impl Plot<'_> {
             picture = picture.add(Group::new().add(mark).add(Title::new(what.as_str())));
         }
         for (index, curve) in self.curves.iter().enumerate() {
-            let shown = curve.points.iter().filter(|point| point.0 <= x_max);
+            let shown = curve.points.iter().filter(|point| scale.shows(point.0));
             let points: Vec<_> = shown.map(|point| format!("{:.1},{:.1}", x(point.0), y(point.1))).collect();
             let title = Title::new(curve.name.as_str());
             picture =
@@ -71,6 +80,54 @@ impl Plot<'_> {
                 ));
         }
         picture.to_string()
+    }
+}
+
+/// Where values are on a horizontal axis.
+#[derive(Debug)]
+enum Scale {
+    Linear { max: f64 },
+    Logarithmic { least: i32, most: i32 },
+}
+
+/// Powers of ten on a logarithmic axis.
+const DECADES: i32 = 6;
+
+impl Scale {
+    fn new(axis: Axis, values: impl Iterator<Item = f64>) -> Self {
+        match axis {
+            Axis::Linear(max) => Self::Linear { max: max.max(1e-9) },
+            Axis::Logarithmic => {
+                let (least, most) = values
+                    .filter(|value| *value > 0.0)
+                    .fold((f64::INFINITY, 0.0), |(least, most), value| (value.min(least), value.max(most)));
+                let most = if most > 0.0 { most.log10().ceil() as i32 } else { 0 };
+                let least = if least.is_finite() { least.log10().floor() as i32 } else { most };
+                Self::Logarithmic { least: least.clamp(most - DECADES, most - 1), most }
+            }
+        }
+    }
+
+    /// The place of a value, 0 to 1; values before the beginning are at the beginning.
+    fn share(&self, value: f64) -> f64 {
+        match self {
+            Self::Linear { max } => value / max,
+            Self::Logarithmic { least, most } => {
+                let least = f64::from(*least);
+                (value.max(10f64.powf(least)).log10() - least) / (f64::from(*most) - least)
+            }
+        }
+    }
+
+    fn shows(&self, value: f64) -> bool {
+        self.share(value) <= 1.0 + 1e-9
+    }
+
+    fn ticks(&self) -> Vec<f64> {
+        match *self {
+            Self::Linear { max } => ticks(step(max), max).collect(),
+            Self::Logarithmic { least, most } => (least..=most).map(|power| 10f64.powi(power)).collect(),
+        }
     }
 }
 
@@ -150,15 +207,27 @@ mod tests {
     }
 
     #[test]
+    fn a_logarithmic_axis_goes_from_power_to_power() {
+        let scale = Scale::new(Axis::Logarithmic, [0.0, 0.3, 45.0, 941.0].into_iter());
+        assert_eq!(scale.ticks(), [0.1, 1.0, 10.0, 100.0, 1000.0]);
+        assert_eq!([0.0, 0.1, 10.0, 1000.0].map(|value| scale.share(value)), [0.0, 0.0, 0.5, 1.0]);
+        assert_eq!(Scale::new(Axis::Logarithmic, [1e-9, 1.0].into_iter()).ticks().len(), 7);
+    }
+
+    #[test]
     fn a_plot_is_well_formed_whatever_it_is_given() {
         let curve = |points: Vec<(f64, f64)>| Curve { name: "<a & b>".into(), points };
         for points in [vec![], vec![(0.0, 0.0)], vec![(0.0, 1.0), (5.0, 2.0)]] {
             let marks = vec![(1.0, "new \"leader\" <x>".into())];
             let curves = vec![curve(points)];
-            let plot = Plot { title: "t & u", x_label: "s", y_label: "ms", curves, marks, x_max: None };
-            let drawn = plot.draw();
-            let document = roxmltree::Document::parse(&drawn).unwrap_or_else(|error| panic!("{error}: {drawn}"));
-            assert!(!drawn.contains("NaN") && document.descendants().any(|node| node.has_tag_name("polyline")));
+            let mut plot = Plot { title: "t & u", x_label: "s", y_label: "ms", curves, marks, x: Axis::Linear(0.0) };
+            for x in [Axis::Linear(0.0), Axis::Linear(5.0), Axis::Logarithmic] {
+                plot.x = x;
+                let drawn = plot.draw();
+                let document = roxmltree::Document::parse(&drawn).unwrap_or_else(|error| panic!("{error}: {drawn}"));
+                assert!(["NaN", "inf"].iter().all(|text| !drawn.contains(text)), "{drawn}");
+                assert!(document.descendants().any(|node| node.has_tag_name("polyline")));
+            }
         }
         assert!(roxmltree::Document::parse(&bars("b", &[("a<b".into(), 120.0)])).is_ok());
     }

@@ -96,6 +96,20 @@ fn a_disk_that_refuses_bytes_costs_entries_and_nothing_else() {
     assert!(log.messages.iter().any(|message| is(&message, "\"missing\"")), "and that something is lost");
 }
 
+/// A map log on a full disk ends, and maps go on.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_map_log_on_a_full_disk_holds_up_no_map() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = free_address();
+    let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
+    (config.map_log, config.record) = (Some("/dev/full".into()), None);
+    let node = node::start(config).await.unwrap();
+    let mut maps = node.newest_map();
+    let reached = maps.wait_for(|newest| newest.as_ref().is_some_and(|newest| newest.map.round > 5));
+    tokio::time::timeout(Duration::from_secs(30), reached).await.expect("maps go on").unwrap();
+    node.stop().await;
+}
+
 /// A directory that cannot be made is counted and tried again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_directory_that_cannot_be_made_is_tried_again() {

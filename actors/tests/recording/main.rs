@@ -3,6 +3,8 @@
 mod cell;
 mod disk;
 mod files;
+#[cfg(feature = "foxglove")]
+mod live;
 
 use std::collections::BTreeMap;
 use std::process::Command;

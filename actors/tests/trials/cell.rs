@@ -297,7 +297,11 @@ impl Node {
         let log = File::options().create(true).append(true).open(self.log())?;
         let mut command: Command = command(Path::new(PROGRAM), self.namespace.as_deref());
         command.env_clear().envs(std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")));
-        command.arg("--config").arg(self.directory.join("node.toml")).arg("--map-log").arg(self.map_log());
+        command
+            .args(["--log-format", "text", "--config"])
+            .arg(self.directory.join("node.toml"))
+            .arg("--map-log")
+            .arg(self.map_log());
         self.process = Some(Process::start(command.stderr(log).current_dir(&self.directory))?);
         Ok(())
     }

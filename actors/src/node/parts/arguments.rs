@@ -20,6 +20,7 @@ use crate::gateway::{self, GatewayArguments, Incoming, Subscriber};
 use crate::leader_election::{LeaderElectionArguments, LeaderElectionMessage, Parts, Position, saved_term};
 use crate::membership::{EventSink, MembershipArguments};
 use crate::node::Seats;
+use crate::readiness::{Vitals, patience};
 use crate::recorder::{Identity, RecorderArguments};
 use crate::reputation_keeper::{ReputationKeeperArguments, ReputationKeeperMessage};
 use crate::state_file::StateFile;
@@ -200,19 +201,27 @@ impl Assembly {
         let sources = Sources {
             node,
             landmarks: self.config.landmarks().into_iter().map(landmark).collect(),
-            newest: self.newest.clone(),
-            leadership: self.leadership(),
+            vitals: self.vitals(),
             members: self.members(),
-            plane: self.config.data_plane(),
             counters: self.counters(),
             frames: self.frames(),
             feed: Arc::clone(&self.feed),
-            gateway: self.seats.gateway.clone(),
-            broker: self.seats.broker.clone(),
         };
         let config = self.config.dashboard.clone();
         let listen = config.listen.unwrap_or(SocketAddr::from(([127, 0, 0, 1], 0)));
         DashboardArguments { config, listen, sources, bound: self.dashboard_address.clone() }
+    }
+
+    /// What the node's readiness is judged from.
+    pub(in crate::node) fn vitals(&self) -> Vitals {
+        Vitals {
+            newest: self.newest.clone(),
+            leadership: self.leadership(),
+            plane: self.config.data_plane(),
+            patience: patience(&self.config),
+            gateway: self.seats.gateway.clone(),
+            broker: self.seats.broker.clone(),
+        }
     }
 
     fn state_file(&self, what: &str) -> Option<StateFile> {

@@ -1,0 +1,81 @@
+//! Where the program's log goes, and in which form.
+
+use std::io::{IsTerminal, stderr};
+use std::os::unix::fs::MetadataExt;
+
+use clap::ValueEnum;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer, Registry};
+
+/// The form of the log.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
+pub(super) enum LogFormat {
+    /// To the journal if it is connected; else text on a terminal and for tools, and JSON for nodes
+    #[default]
+    Auto,
+    /// Lines for people, to standard error
+    Text,
+    /// A JSON object a line, to standard error
+    Json,
+    /// To systemd's journal, each field by its name
+    Journal,
+}
+
+/// What fields of events are called in the journal: `ECOD_` and their name.
+const JOURNAL_PREFIX: &str = "ECOD";
+
+/// Starts the log. `runs_on` tells programs that work until they are told to stop, whose logs machines read, from tools.
+/// `RUST_LOG` goes before `level`.
+pub(super) fn start(format: LogFormat, runs_on: bool, level: &str) {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    let (layer, problem) = match resolved(format, runs_on) {
+        LogFormat::Journal => match journal() {
+            Ok(layer) => (layer, None),
+            Err(error) => (json(), Some(error)),
+        },
+        LogFormat::Json => (json(), None),
+        LogFormat::Text | LogFormat::Auto => (text(), None),
+    };
+    tracing_subscriber::registry().with(layer.with_filter(filter)).init();
+    if let Some(error) = problem {
+        tracing::warn!(%error, "the journal does not answer, logging to standard error");
+    }
+}
+
+fn resolved(format: LogFormat, runs_on: bool) -> LogFormat {
+    match format {
+        LogFormat::Auto if stderr_is_journal() => LogFormat::Journal,
+        LogFormat::Auto if runs_on && !stderr().is_terminal() => LogFormat::Json,
+        LogFormat::Auto => LogFormat::Text,
+        chosen => chosen,
+    }
+}
+
+/// Whether standard error is the stream that the service manager connected to the journal, and not something that an
+/// inherited variable speaks of.
+fn stderr_is_journal() -> bool {
+    let Some(stream) = std::env::var("JOURNAL_STREAM").ok() else { return false };
+    std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))
+}
+
+type AnyLayer = Box<dyn Layer<Registry> + Send + Sync>;
+
+fn text() -> AnyLayer {
+    tracing_subscriber::fmt::layer().with_writer(stderr).with_ansi(stderr().is_terminal()).boxed()
+}
+
+fn json() -> AnyLayer {
+    tracing_subscriber::fmt::layer()
+        .json()
+        .flatten_event(true)
+        .with_current_span(false)
+        .with_span_list(false)
+        .with_writer(stderr)
+        .boxed()
+}
+
+fn journal() -> std::io::Result<AnyLayer> {
+    let layer = tracing_journald::layer()?.with_field_prefix(Some(JOURNAL_PREFIX.into()));
+    Ok(layer.with_syslog_identifier("ecod-node".into()).boxed())
+}

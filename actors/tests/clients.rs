@@ -1,0 +1,144 @@
+//! Plain MQTT clients against a live cell, as the documentation tells them: paho-mqtt in Python, and mosquitto's tools.
+
+use std::io::Write;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::thread::sleep;
+use std::time::Duration;
+
+use ecod::landmark::LandmarkConfig;
+use ecod::names::NodeName;
+use ecod::wire::Role;
+use ecod_actors::config::NodeConfig;
+use ecod_actors::node::{self, NodeHandle};
+
+/// An edge of the cell that the documentation speaks of.
+async fn edge() -> (NodeHandle, SocketAddr) {
+    let landmark = |id: &str, x_m| LandmarkConfig {
+        id: id.into(),
+        x_m,
+        y_m: 0.0,
+        facing_deg: None,
+        vacancy: None,
+        synonyms: Default::default(),
+    };
+    let mut config = NodeConfig {
+        name: Some(NodeName::from_static("edge")),
+        cell: NodeName::from_static("lot-1"),
+        role: Role::Edge,
+        listen: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
+        landmarks: vec![landmark("slot-0", 0.0), landmark("slot-1", 2.5)],
+        ..NodeConfig::default()
+    };
+    config.membership.bind = Some(SocketAddr::from(([127, 0, 0, 1], 0)));
+    config.membership.multicast.enabled = false;
+    config.validate().unwrap();
+    let node = node::start(config).await.unwrap();
+    let mut maps = node.newest_map();
+    tokio::time::timeout(Duration::from_secs(30), maps.wait_for(Option::is_some)).await.unwrap().unwrap();
+    let broker = node.broker_address().unwrap();
+    (node, broker)
+}
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
+}
+
+/// Whether a program is there that the test needs.
+fn found(program: &str, arguments: &[&str]) -> bool {
+    Command::new(program).args(arguments).output().is_ok_and(|output| output.status.success())
+}
+
+/// A detector of any kind writes lines; the example reports them, and prints maps and verdicts with what it saw.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_python_example_feeds_a_cell_and_prints_what_it_agrees_on() {
+    let python = std::env::var("PAHO_PYTHON").unwrap_or("python3".into());
+    if !found(&python, &["-c", "import paho.mqtt.client"]) {
+        eprintln!("SKIPPED: {python} has no paho-mqtt; `make python-check` installs it in a directory of its own");
+        return;
+    }
+    let (node, broker) = edge().await;
+    let output = tokio::task::spawn_blocking(move || {
+        let mut example = Command::new(python);
+        example.arg(root().join("examples/python/feed_detections.py"));
+        example.args([
+            "--broker",
+            &broker.to_string(),
+            "--cell",
+            "lot-1",
+            "--node",
+            "euclid",
+            "--pose",
+            "1",
+            "6",
+            "-90",
+        ]);
+        let mut example = example.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut detector = example.stdin.take().unwrap();
+        for _ in 0..20 {
+            let frame = r#"{"objects":[{"label":"car","confidence":0.9,"x_m":0.1,"y_m":0.1,"landmark":"slot-0"}],"seen":["slot-0","slot-1"]}"#;
+            writeln!(detector, "{frame}").unwrap();
+            sleep(Duration::from_millis(100));
+        }
+        drop(detector);
+        example.wait_with_output().unwrap()
+    });
+    let output = output.await.unwrap();
+    node.stop().await;
+    let said = said(&output);
+    assert!(output.status.success(), "{said}");
+    for parts in [["map ", "slot-0: car 0.", "slot-1: empty"], ["verdicts ", "edge round ", "slot-0: car by "]] {
+        assert!(said.lines().any(|line| parts.iter().all(|part| line.contains(part))), "{parts:?}: {said}");
+    }
+}
+
+/// The commands in the section of that name, one script a code block.
+fn commands(document: &str, section: &str) -> Vec<String> {
+    let text = std::fs::read_to_string(root().join(document)).unwrap();
+    let (_, rest) = text.split_once(&format!("\n## {section}\n")).unwrap();
+    let section = rest.split("\n## ").next().unwrap();
+    let blocks = section.split("```sh\n").skip(1);
+    blocks.map(|block| block.split("```").next().unwrap().to_owned()).collect()
+}
+
+/// Both blocks are run as they are, but for the port: the first reports, the second waits for a map and for verdicts.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_documented_commands_of_mosquitto_report_and_receive() {
+    if !found("sh", &["-c", "command -v mosquitto_pub mosquitto_sub"]) {
+        eprintln!("SKIPPED: mosquitto_pub is not installed (Debian: mosquitto-clients)");
+        return;
+    }
+    let (node, broker) = edge().await;
+    let output = tokio::task::spawn_blocking(move || {
+        let scripts = commands("docs/protocol.md", "From a shell");
+        let [report, receive] = &*scripts else { panic!("{scripts:?}") };
+        let run = |script: &str| {
+            let script = script.replace("-p 1883", &format!("-p {}", broker.port()));
+            let mut shell = Command::new("sh");
+            shell.args(["-e", "-c", &script]).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+            shell.spawn().unwrap()
+        };
+        let mut reporter = run(report);
+        // The second script begins when the cell has had time to fuse.
+        sleep(Duration::from_secs(1));
+        let output = run(receive).wait_with_output().unwrap();
+        reporter.wait().unwrap();
+        output
+    });
+    let output = output.await.unwrap();
+    node.stop().await;
+    let said = said(&output);
+    assert!(output.status.success(), "{said}");
+    let messages: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let [map, verdicts] = &*messages else { panic!("{said}") };
+    assert_eq!((&map["landmarks"][0]["id"], &map["landmarks"][0]["label"]), (&"slot-0".into(), &"car".into()));
+    assert_eq!(
+        (&verdicts["verdicts"][0]["landmark"], &verdicts["verdicts"][0]["label"]),
+        (&"slot-0".into(), &"car".into())
+    );
+}
