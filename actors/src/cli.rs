@@ -9,6 +9,7 @@ mod doctor;
 mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
+mod pki;
 mod record;
 mod replay;
 mod report;
@@ -63,6 +64,9 @@ enum Command {
     /// Calibrate a camera from photographs of a chessboard
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
+    /// Make a cell's certificates: its CA, one for each node, and the list of those that are revoked
+    #[command(subcommand)]
+    Pki(pki::PkiCommand),
     /// Print the JSON Schemas of every payload
     Schema,
 }
@@ -105,6 +109,7 @@ pub fn main() -> ExitCode {
         Some(Command::Replay(arguments)) => replay::run(&arguments),
         Some(Command::Report(arguments)) => report::run(&arguments),
         Some(Command::Eval(arguments)) => eval::run(&arguments),
+        Some(Command::Pki(command)) => pki::run(&command),
         Some(Command::Schema) => schema::run(),
     };
     match outcome {
