@@ -19,6 +19,7 @@ struct Sources {
     /// For addresses beyond those that are remembered.
     others: Throttle,
     pending: usize,
+    pruned: Timestamp,
     rate: Rate,
 }
 
@@ -43,6 +44,9 @@ const MAX_PENDING: usize = 1024;
 /// Most addresses that are remembered.
 const MAX_SOURCES: usize = 4096;
 
+/// Least time between two looks for addresses to forget: looking at all for every connection would be an attack's aim.
+const PRUNE: Duration = Duration::from_secs(1);
+
 /// A connection that was let in to log in; its place is free when dropped.
 #[derive(Debug)]
 pub(super) struct Ticket {
@@ -53,7 +57,7 @@ pub(super) struct Ticket {
 impl Admission {
     pub(super) fn new(rate: Rate, now: Timestamp) -> Self {
         let others = Throttle::new(rate.burst, rate.interval, now);
-        Self(Arc::new(Mutex::new(Sources { by_address: HashMap::new(), others, pending: 0, rate })))
+        Self(Arc::new(Mutex::new(Sources { by_address: HashMap::new(), others, pending: 0, pruned: now, rate })))
     }
 
     /// Lets a connection in, or not.
@@ -76,7 +80,10 @@ impl Sources {
         let Rate { burst, interval } = self.rate;
         if self.by_address.len() >= MAX_SOURCES && !self.by_address.contains_key(&source) {
             // Whose burst is whole again need not be remembered.
-            self.by_address.retain(|_, known| known.pending > 0 || now.since(known.seen) < interval * burst);
+            if now.since(self.pruned) >= PRUNE {
+                self.pruned = now;
+                self.by_address.retain(|_, known| known.pending > 0 || now.since(known.seen) < interval * burst);
+            }
             if self.by_address.len() >= MAX_SOURCES {
                 let admitted = self.others.allow(now);
                 self.pending += usize::from(admitted);
@@ -151,6 +158,7 @@ mod tests {
         }
         assert_eq!(admission.sources().by_address.len(), MAX_SOURCES);
         assert!(admission.admit(IpAddr::V4(u32::MAX.into()), at(60_000)).is_some(), "the old are forgotten");
-        assert_eq!((admission.sources().by_address.len(), admission.sources().pending), (1, 0));
+        let sources = admission.sources();
+        assert_eq!((sources.by_address.len(), sources.pending), (1, 0));
     }
 }
