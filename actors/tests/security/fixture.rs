@@ -33,7 +33,7 @@ pub(crate) fn node(name: &str) -> NodeName {
 
 /// A CA and its directory.
 pub(crate) struct Pki {
-    directory: TempDir,
+    _directory: TempDir,
     pub(crate) authority: Authority,
 }
 
@@ -41,7 +41,7 @@ impl Pki {
     pub(crate) fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
         let authority = Authority::init(directory.path(), &node("lot"), clock::now()).unwrap();
-        Self { directory, authority }
+        Self { _directory: directory, authority }
     }
 
     /// The files of a new certificate.
