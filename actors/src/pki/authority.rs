@@ -35,9 +35,9 @@ pub struct Authority {
 }
 
 /// Every certificate that was issued, in `issued.json`; the revocation list is made from it.
-#[derive(Debug, Default, Serialize, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 struct Register {
-    cell: Option<NodeName>,
+    cell: NodeName,
     revision: u64,
     issued: Vec<Issued>,
 }
@@ -111,7 +111,7 @@ impl Authority {
         let certificate = parameters.self_signed(&key)?;
         write_secret(&directory.join(CA_KEY), &key.serialize_pem())?;
         write(&directory.join(CA), &certificate.pem())?;
-        let register = Register { cell: Some(cell.clone()), ..Register::default() };
+        let register = Register { cell: cell.clone(), revision: 0, issued: Vec::new() };
         let mut authority = Self { directory: directory.into(), register };
         authority.save(now)?;
         Ok(authority)

@@ -139,7 +139,7 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
     let own =
         certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
     let identity = Identity::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, error))?;
-    if identity.name() != node && !identity.speaks_for(node.as_str()) {
+    if !identity.speaks_for(node.as_str()) {
         let (path, found) = (files.certificate.clone(), identity.name().clone());
         return Err(CredentialsError::AnothersName { path, found, node: node.clone() });
     }
