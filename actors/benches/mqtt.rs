@@ -16,7 +16,7 @@ use ecod_actors::clock;
 use ecod_actors::counters::Counters;
 use ecod_actors::gateway::{
     BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion,
-    Part, ReportKind,
+    Part, ReportKind, Security,
 };
 use figures::Figures;
 use hdrhistogram::Histogram;
@@ -104,6 +104,7 @@ async fn join(
         part,
         status,
         mqtt: MqttConfig { version, ..MqttConfig::default() },
+        security: Security::default(),
         counters: Arc::new(Counters::default()),
         subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
         seed: 1,

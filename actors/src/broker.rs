@@ -10,7 +10,10 @@
 //! another address, an external broker or giving up is right. One that ended by itself ends the actor as soon as anyone
 //! asks how it is, so that the node starts both anew.
 
+mod admission;
 mod embedded;
+mod gate;
+mod permissions;
 mod retained;
 
 use std::net::SocketAddr;
@@ -18,6 +21,8 @@ use std::net::SocketAddr;
 use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
 
 pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, Mqtt};
+pub use gate::Guard;
+pub use permissions::Elected;
 
 /// What the broker's actor is asked to do.
 #[derive(Debug)]

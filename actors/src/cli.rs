@@ -10,6 +10,7 @@ mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
 mod logging;
+mod pki;
 mod record;
 mod replay;
 mod report;
@@ -69,6 +70,9 @@ enum Command {
     /// Calibrate a camera from photographs of a chessboard
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
+    /// Make a cell's certificates: its CA, one for each node, and the list of those that are revoked
+    #[command(subcommand)]
+    Pki(pki::PkiCommand),
     /// Print the JSON Schemas of every payload
     Schema,
     /// Print what a shell needs to complete these commands
@@ -111,6 +115,7 @@ pub fn main() -> ExitCode {
         Some(Command::Replay(arguments)) => replay::run(&arguments),
         Some(Command::Report(arguments)) => report::run(&arguments),
         Some(Command::Eval(arguments)) => eval::run(&arguments),
+        Some(Command::Pki(command)) => pki::run(&command),
         Some(Command::Schema) => schema::run(),
         Some(Command::Completions(arguments)) => shell::completions(&arguments, Cli::command()),
         Some(Command::Man(arguments)) => shell::man(&arguments, Cli::command()),

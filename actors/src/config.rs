@@ -23,6 +23,7 @@ use crate::dashboard::DashboardConfig;
 use crate::gateway::MqttConfig;
 use crate::leader_election::DataPlane;
 use crate::membership::MembershipConfig;
+use crate::pki::TlsConfig;
 use crate::recorder::RecordConfig;
 use crate::reputation_keeper::ReputationKeeperConfig;
 
@@ -36,8 +37,8 @@ pub struct NodeConfig {
     pub cell: NodeName,
     /// What the node is meant to do. Default `auto`.
     pub role: Role,
-    /// Where the embedded broker of a node that may lead listens. Default port 1883, on all interfaces if the cell has a
-    /// key and on 127.0.0.1 without, where other machines do not reach it.
+    /// Where the embedded broker of a node that may lead listens. Default port 8883 on all interfaces with `[tls]`; without,
+    /// port 1883 on 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says otherwise.
     pub listen: Option<SocketAddr>,
     /// Directory for what survives a restart: reputations and the highest term of leadership. Default
     /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
@@ -54,6 +55,9 @@ pub struct NodeConfig {
     pub election: ElectionConfig,
     /// MQTT connections.
     pub mqtt: MqttConfig,
+    /// The node's certificates; default none: brokers are spoken to in plaintext.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls: Option<TlsConfig>,
     /// Limits of the embedded broker.
     pub broker: BrokerConfig,
     /// How reports are fused; used by aggregators.
@@ -97,6 +101,7 @@ impl Default for NodeConfig {
             membership: MembershipConfig::default(),
             election: ElectionConfig::default(),
             mqtt: MqttConfig::default(),
+            tls: None,
             broker: BrokerConfig::default(),
             fusion: FusionConfig::default(),
             reputations: ReputationKeeperConfig::default(),
@@ -179,7 +184,18 @@ impl NodeConfig {
         self.membership.validate().map_err(|error| error.within("membership"))?;
         self.election.validate().map_err(|error| error.within("election"))?;
         self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
+        if self.mqtt.sign && !self.membership.has_key() {
+            return Err(ConfigError::new(
+                "mqtt.sign",
+                true,
+                "false, or `membership.key_file` set: payloads are signed by it",
+            ));
+        }
+        if let Some(tls) = &self.tls {
+            tls.validate().map_err(|error| error.within("tls"))?;
+        }
         self.broker.validate().map_err(|error| error.within("broker"))?;
+        self.validate_listen()?;
         let needed = self.mqtt.max_packet_bytes();
         if let Some(bytes) = self.broker.max_packet_bytes
             && (bytes as usize) < needed
@@ -198,6 +214,18 @@ impl NodeConfig {
             record.validate().map_err(|error| error.within("record"))?;
         }
         LandmarkConfig::validate_all(&self.landmarks)
+    }
+
+    /// Others than this machine reach a broker without certificates only if somebody wants that.
+    fn validate_listen(&self) -> Result<(), ConfigError> {
+        let listen = self.broker_listen();
+        let open = self.tls.is_none() && !self.broker.allow_plaintext && !listen.ip().is_loopback();
+        if open && self.may_lead() && self.data_plane().embedded {
+            let allowed =
+                "a loopback address, unless there are certificates in `[tls]` or `broker.allow_plaintext` is true";
+            return Err(ConfigError::new("listen", listen, allowed));
+        }
+        Ok(())
     }
 
     /// The configuration as TOML that can be read back; secrets are left out, and a comment says so.
@@ -231,8 +259,12 @@ impl NodeConfig {
 
     /// Where the embedded broker listens.
     pub fn broker_listen(&self) -> SocketAddr {
-        let ip = if self.membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
-        self.listen.unwrap_or(SocketAddr::from((ip, 1883)))
+        let (ip, port) = match &self.tls {
+            Some(_) => ([0, 0, 0, 0], 8883),
+            None if self.broker.allow_plaintext => ([0, 0, 0, 0], 1883),
+            None => ([127, 0, 0, 1], 1883),
+        };
+        self.listen.unwrap_or(SocketAddr::from((ip, port)))
     }
 
     /// Whether the node may lead its cell.
@@ -371,7 +403,11 @@ mod tests {
         assert_eq!(config.cell.as_str(), "lot-9");
         assert_eq!(config.broker_listen().to_string(), "127.0.0.1:1883");
         let keyed = load("[membership]\nkey = \"a key for the lot\"").unwrap();
-        assert_eq!(keyed.broker_listen().to_string(), "0.0.0.0:1883");
+        assert_eq!(keyed.broker_listen().to_string(), "127.0.0.1:1883");
+        let open = load("[broker]\nallow_plaintext = true").unwrap();
+        assert_eq!(open.broker_listen().to_string(), "0.0.0.0:1883");
+        let closed = load("[tls]\nca = \"ca.pem\"\ncertificate = \"edge.pem\"\nkey = \"edge.key\"").unwrap();
+        assert_eq!(closed.broker_listen().to_string(), "0.0.0.0:8883");
     }
 
     #[test]
@@ -381,6 +417,9 @@ mod tests {
             ("role = \"edge\"\n[fusion.pace]\ngate = 1", ["`fusion.pace.gate`", "unknown field", "`gate_m`"]),
             ("role = \"edge\"\n[mqtt]\nkeep_alive_s = \"x\"", ["`mqtt.keep_alive_s`", "\"x\"", "u16"]),
             ("role = \"king\"", ["`role`", "king", "`edge`"]),
+            ("listen = \"0.0.0.0:1883\"", ["`listen`", "0.0.0.0:1883", "allow_plaintext"]),
+            ("[mqtt]\nsign = true", ["`mqtt.sign`", "true", "key_file"]),
+            ("[tls]\nca = \"\"\ncertificate = \"a\"\nkey = \"b\"", ["`tls.ca`", "nothing", "PEM"]),
             (
                 "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",
                 ["`broker.max_packet_bytes`", "1048576", "8392704"],

@@ -68,11 +68,25 @@ pub enum Event {
     DashboardNotBound,
     /// A detection could not be placed in the world and was left out of its report.
     DetectionUnplaced,
+    /// A client of the embedded broker was not let in: its address made too many connections lately, or too many wait.
+    ClientThrottled,
+    /// A client of the embedded broker did not log in within the time.
+    ClientTimedOut,
+    /// A client of the embedded broker showed no certificate, or one that is not valid.
+    ClientUntrusted,
+    /// A client of the embedded broker began with something else than a login, or left during it.
+    ClientMalformed,
+    /// A client of the embedded broker was not let in: as many as allowed are connected.
+    ClientsFull,
+    /// A client of the embedded broker spoke in another's name: its login or message was refused.
+    ClientDenied,
+    /// A client of the embedded broker was cut off: its certificate was revoked or expired.
+    ClientExpelled,
 }
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 30] = [
+    pub const ALL: [Self; 37] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -103,6 +117,13 @@ impl Event {
         Self::BrowserThrottled,
         Self::DashboardNotBound,
         Self::DetectionUnplaced,
+        Self::ClientThrottled,
+        Self::ClientTimedOut,
+        Self::ClientUntrusted,
+        Self::ClientMalformed,
+        Self::ClientsFull,
+        Self::ClientDenied,
+        Self::ClientExpelled,
     ];
 
     /// The event as a counter's label.
@@ -138,15 +159,31 @@ impl Event {
             Self::BrowserThrottled => "browser_throttled",
             Self::DashboardNotBound => "dashboard_not_bound",
             Self::DetectionUnplaced => "detection_unplaced",
+            Self::ClientThrottled => "client_throttled",
+            Self::ClientTimedOut => "client_timed_out",
+            Self::ClientUntrusted => "client_untrusted",
+            Self::ClientMalformed => "client_malformed",
+            Self::ClientsFull => "clients_full",
+            Self::ClientDenied => "client_denied",
+            Self::ClientExpelled => "client_expelled",
         }
     }
 }
 
 /// The counters of one node, shared by its actors.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Counters {
     events: [AtomicU64; Event::ALL.len()],
     rejects: [AtomicU64; RejectReason::ALL.len()],
+}
+
+impl Default for Counters {
+    fn default() -> Self {
+        Self {
+            events: [const { AtomicU64::new(0) }; Event::ALL.len()],
+            rejects: [const { AtomicU64::new(0) }; RejectReason::ALL.len()],
+        }
+    }
 }
 
 impl Counters {

@@ -5,6 +5,7 @@
 
 #[cfg(feature = "camera")]
 mod camera;
+mod certificates;
 mod clock;
 mod network;
 mod storage;
@@ -62,6 +63,7 @@ pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
     findings.extend(network::gossip(config));
     findings.extend(network::multicast(config));
     findings.push(storage::key(config));
+    findings.extend(certificates::examine(config));
     findings.push(clock::synchronised());
     findings.extend(storage::directories(config));
     findings

@@ -153,6 +153,7 @@ impl Actor for Follower {
             Ok(()) => {}
             Err(Refusal::Repeated) => state.counters.count(Event::Repeated),
             Err(Refusal::Superseded) => state.counters.reject(RejectReason::Superseded),
+            Err(Refusal::NotElected) => state.counters.reject(RejectReason::NotElected),
         }
         Ok(())
     }
@@ -167,7 +168,7 @@ impl FollowerState {
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
-        self.maps.admit(&epoch, map.round, received_at, self.may_lead(&epoch))?;
+        self.maps.admit(&epoch, map.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::MapAccepted);
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
@@ -179,7 +180,7 @@ impl FollowerState {
 
     fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
-        self.verdicts.admit(&epoch, verdicts.round, received_at, self.may_lead(&epoch))?;
+        self.verdicts.admit(&epoch, verdicts.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::VerdictsAccepted);
         self.recording.verdicts(verdicts, received_at);
         if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
@@ -192,17 +193,11 @@ impl FollowerState {
     fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), Refusal> {
         let aggregator = reputations.aggregator.clone().unwrap_or(UNNAMED);
         let epoch = Epoch::new(reputations.epoch, aggregator);
-        self.reputations.admit(&epoch, reputations.round, received_at, self.may_lead(&epoch))?;
+        self.reputations.admit(&epoch, reputations.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::ReputationsAccepted);
         self.recording.reputations(reputations, received_at);
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
         Ok(())
-    }
-
-    /// Whether the election knows of nobody else who leads.
-    fn may_lead(&self, epoch: &Epoch) -> bool {
-        let leadership = self.leadership.borrow();
-        leadership.leader().is_none() || leadership.epoch.as_ref() == Some(epoch)
     }
 
     fn write(&mut self, received: &ReceivedMap) {

@@ -22,6 +22,7 @@ mod inbox;
 mod link;
 mod part;
 mod probe;
+mod security;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -43,6 +44,7 @@ pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
 pub use part::Part;
 pub use probe::probe;
+pub use security::{Security, SecurityError};
 
 use crate::counters::{Counters, Event};
 use connection::{Handling, LastWill, last_will};
@@ -127,6 +129,8 @@ pub struct GatewayArguments {
     pub status: NodeStatus,
     /// Protocol, credentials and limits.
     pub mqtt: MqttConfig,
+    /// Certificates and signatures.
+    pub security: Security,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// Gets every message.
@@ -231,16 +235,18 @@ impl Actor for Gateway {
 
 impl GatewayState {
     fn new(arguments: GatewayArguments) -> Self {
-        let GatewayArguments { cell, part, status, mqtt, counters, subscriber, seed } = arguments;
+        let GatewayArguments { cell, part, status, mqtt, security, counters, subscriber, seed } = arguments;
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
         let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
         let filters = part.levels().iter().map(|level| topics.filter(level)).collect();
-        let will = Mutex::new(LastWill { topic: status_topic.clone(), payload: last_will(&status, encoding) });
+        let seal = |payload: Bytes| sealed(&security, &status_topic, payload);
+        let will = LastWill { topic: status_topic.clone(), payload: seal(last_will(&status, encoding)) };
+        let status_payload = seal(encode(&status, encoding).into());
         let inbox = Inbox::new(
             (status.node.clone(), status.id),
             topics.clone(),
-            mqtt.limits(),
+            (mqtt.limits(), security.signing.clone()),
             mqtt.inbox,
             Arc::clone(&counters),
             subscriber,
@@ -248,14 +254,15 @@ impl GatewayState {
         // One id for a run of the node: a broker that still holds the last connection ends it before it takes the next,
         // so that the will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
-        let setup = LinkSetup { client_id, filters, will, config: mqtt, inbox: Arc::new(inbox), counters, seed };
+        let (will, inbox) = (Mutex::new(will), Arc::new(inbox));
+        let setup = LinkSetup { client_id, filters, will, config: mqtt, security, inbox, counters, seed };
         Self {
             report_brokers: None,
             watches_reports: false,
             topics,
             part,
             encoding,
-            status_payload: encode(&status, encoding).into(),
+            status_payload,
             status,
             status_topic,
             links: BTreeMap::new(),
@@ -311,8 +318,10 @@ impl GatewayState {
     }
 
     fn set_status(&mut self, status: NodeStatus) {
-        self.status_payload = encode(&status, self.encoding).into();
-        self.setup.will.lock().unwrap_or_else(PoisonError::into_inner).payload = last_will(&status, self.encoding);
+        let seal = |payload: Bytes| sealed(&self.setup.security, &self.status_topic, payload);
+        self.status_payload = seal(encode(&status, self.encoding).into());
+        let will = seal(last_will(&status, self.encoding));
+        self.setup.will.lock().unwrap_or_else(PoisonError::into_inner).payload = will;
         self.status = status;
         self.send(&self.status_topic, &self.status_payload, Handling::State);
     }
@@ -321,7 +330,7 @@ impl GatewayState {
         let payload = Bytes::from(encode(payload, self.encoding));
         let path = self.topics.path(topic);
         if self.fits::<T>(&path, &payload) {
-            self.send(&path, &payload, handling);
+            self.send(&path, &sealed(&self.setup.security, &path, payload), handling);
         }
     }
 
@@ -391,6 +400,14 @@ impl GatewayState {
             tracing::info!(broker = %link.broker, ?state, "link changed");
             self.setup.inbox.deliver_local(Incoming::Link { broker: link.broker.clone(), state });
         }
+    }
+}
+
+/// The payload with its signature, where payloads are signed.
+fn sealed(security: &Security, topic: &str, payload: Bytes) -> Bytes {
+    match &security.signing {
+        Some(key) => key.seal(topic, &payload).into(),
+        None => payload,
     }
 }
 

@@ -41,6 +41,7 @@ pub mod membership;
 pub mod node;
 #[cfg(feature = "camera")]
 pub mod perception;
+pub mod pki;
 #[cfg(feature = "camera")]
 pub mod projector;
 pub mod readiness;

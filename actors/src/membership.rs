@@ -35,6 +35,7 @@ use tokio::task::JoinSet;
 
 pub use config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
 pub use counters::{FrameCounters, FrameEvent};
+pub(crate) use key::payload_key;
 pub use key::{KeyError, check_key};
 pub use socket::BindError;
 pub(crate) use throttle::Throttle;

@@ -37,6 +37,7 @@ use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
 use crate::follower::{Newest, Received, ReceivedMap};
+use crate::gateway::Security;
 use crate::leader_election::Leadership;
 use crate::membership::Member;
 use crate::readiness::{Readiness, Vitals};
@@ -108,8 +109,9 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 /// # Errors
 /// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
 pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
+    let security = Security::of(&config).map_err(|error| NodeError::Failed(error.to_string()))?;
     let (failed, failure) = watch::channel(None);
-    let assembly = Assembly::new(config, failed);
+    let assembly = Assembly::new(config, security, failed);
     let (newest, broker, gossip) = (assembly.newest(), assembly.broker_address(), assembly.gossip_address());
     let (members, leadership) = (assembly.members(), assembly.leadership());
     let dashboard = assembly.dashboard_address();

@@ -219,3 +219,31 @@ mod demo {
         until("all nodes have ended", || working_in(directory.path()).is_empty());
     }
 }
+
+/// From nothing to a node with certificates, and what it says when they are another's.
+#[test]
+fn certificates_are_made_used_and_revoked_by_command() {
+    let directory = tempfile::tempdir().unwrap();
+    let pki =
+        |arguments: &[&str]| ecod_node().current_dir(directory.path()).arg("pki").args(arguments).output().unwrap();
+    let made = pki(&["init", "--cell", "lot"]);
+    assert!(made.status.success(), "{}", stderr(&made));
+    assert!(stderr(&pki(&["init", "--cell", "lot"])).contains("has a CA already"));
+    assert!(stderr(&pki(&["revoke", "edge"])).contains("no certificate"));
+    let issued = pki(&["issue", "edge", "--role", "edge"]);
+    assert!(issued.status.success(), "{}", stderr(&issued));
+    std::fs::write(directory.path().join("edge.toml"), issued.stdout).unwrap();
+    let doctor = |name: &str| {
+        let mut command = ecod_node();
+        command.current_dir(directory.path()).envs([("ECOD_NAME", name), ("ECOD_ROLE", "edge")]);
+        let output = command.args(["doctor", "--config", "edge.toml"]).output().unwrap();
+        let text = String::from_utf8(output.stdout).unwrap();
+        text.lines().find(|line| line.contains("certificates")).unwrap_or_else(|| panic!("{text}")).to_owned()
+    };
+    let fine = doctor("edge");
+    assert!(fine.starts_with("ok") && fine.contains("days left"), "{fine}");
+    let foreign = doctor("gauss");
+    assert!(foreign.starts_with("FAIL") && foreign.contains("is for edge, this node is gauss"), "{foreign}");
+    let revoked = pki(&["revoke", "edge"]);
+    assert!(String::from_utf8_lossy(&revoked.stdout).contains("revoked 1 of edge"), "{}", stderr(&revoked));
+}

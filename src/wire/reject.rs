@@ -35,13 +35,17 @@ pub enum RejectReason {
     UnknownTopic,
     /// From an aggregator or epoch that has been superseded.
     Superseded,
+    /// From an aggregator that the election does not name.
+    NotElected,
     /// A report for an algorithm that the cell does not run.
     NotFused,
+    /// A payload without a signature of the cell, where every payload must have one.
+    BadSignature,
 }
 
 impl RejectReason {
     /// All reasons, for counters.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 18] = [
         Self::TooLarge,
         Self::Malformed,
         Self::UnknownSchema,
@@ -57,7 +61,9 @@ impl RejectReason {
         Self::TooManyVehicles,
         Self::UnknownTopic,
         Self::Superseded,
+        Self::NotElected,
         Self::NotFused,
+        Self::BadSignature,
     ];
 
     /// The reason as a counter's label.
@@ -78,7 +84,9 @@ impl RejectReason {
             Self::TooManyVehicles => "too_many_vehicles",
             Self::UnknownTopic => "unknown_topic",
             Self::Superseded => "superseded",
+            Self::NotElected => "not_elected",
             Self::NotFused => "not_fused",
+            Self::BadSignature => "bad_signature",
         }
     }
 }

@@ -1,6 +1,6 @@
-//! The embedded broker: rmqtt on a thread of its own.
+//! The embedded broker: rmqtt on a thread of its own, behind a gate where others than this machine's can reach it.
 
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::mpsc;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -11,10 +11,12 @@ use rmqtt::context::ServerContext;
 use rmqtt::net::{Builder, Listener};
 use rmqtt::server::MqttServer;
 use serde::{Deserialize, Serialize};
+use tokio::net::TcpListener;
 use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
+use super::gate::{Gate, Guard};
 use super::retained::RetainedMessages;
 
 /// An MQTT broker that lives inside the process.
@@ -84,11 +86,31 @@ pub struct BrokerConfig {
     pub max_waiting: usize,
     /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
     pub max_retained: usize,
+    /// Whether the broker may listen on others than loopback addresses without `[tls]`; default false. Whoever reaches it
+    /// then reads everything and may say anything in anybody's name.
+    pub allow_plaintext: bool,
+    /// Milliseconds within which a client must have shown its certificate and logged in; default 5000. Shorter frees its
+    /// place sooner, longer admits slow boards and lossy networks.
+    pub handshake_timeout_ms: u64,
+    /// Connections that one address may make at once; default 64. A cell behind address translation needs two or more for
+    /// each node.
+    pub connect_burst: u32,
+    /// Connections per second that one address may make after that; default 10.
+    pub connects_per_s: u32,
 }
 
 impl Default for BrokerConfig {
     fn default() -> Self {
-        Self { max_packet_bytes: None, max_clients: 2048, max_waiting: 256, max_retained: 8192 }
+        Self {
+            max_packet_bytes: None,
+            max_clients: 2048,
+            max_waiting: 256,
+            max_retained: 8192,
+            allow_plaintext: false,
+            handshake_timeout_ms: 5000,
+            connect_burst: 64,
+            connects_per_s: 10,
+        }
     }
 }
 
@@ -103,14 +125,18 @@ impl BrokerConfig {
         }
         check_range("max_clients", self.max_clients as f64, 1.0, 1e6)?;
         check_range("max_waiting", self.max_waiting as f64, 1.0, 1e6)?;
-        check_range("max_retained", self.max_retained as f64, 1.0, 1e6)
+        check_range("max_retained", self.max_retained as f64, 1.0, 1e6)?;
+        check_range("handshake_timeout_ms", self.handshake_timeout_ms as f64, 100.0, 60_000.0)?;
+        check_range("connect_burst", f64::from(self.connect_burst), 1.0, 1e6)?;
+        check_range("connects_per_s", f64::from(self.connects_per_s), 1.0, 1e4)
     }
 }
 
 /// rmqtt as a library, on one thread, with retained messages in memory.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct EmbeddedBroker {
     config: BrokerConfig,
+    guard: Option<Guard>,
     running: Option<Running>,
 }
 
@@ -130,7 +156,12 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 impl EmbeddedBroker {
     /// A broker that is not started.
     pub fn new(config: BrokerConfig) -> Self {
-        Self { config, running: None }
+        Self { config, guard: None, running: None }
+    }
+
+    /// A broker behind a gate: clients show certificates, if the guard has any, and strangers are limited.
+    pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
+        Self { config, guard: Some(guard), running: None }
     }
 
     fn listener(&self, address: SocketAddr) -> Builder {
@@ -155,10 +186,11 @@ impl Mqtt for EmbeddedBroker {
         let thread_error = |source| BrokerError::Thread { address, source };
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
-        let (listener, max_retained) = (self.listener(address), self.config.max_retained);
+        let plan =
+            Plan { address, listener: self.listener(address), config: self.config.clone(), guard: self.guard.clone() };
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
-            .spawn(move || serve(address, listener, max_retained, &ready, stopped))
+            .spawn(move || serve(plan, &ready, stopped))
             .map_err(thread_error)?;
         let outcome = started.recv().unwrap_or_else(|_| Err(thread_error(io::Error::other("it ended at once"))));
         let bound = match outcome {
@@ -197,14 +229,23 @@ impl Drop for EmbeddedBroker {
     }
 }
 
-/// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made here.
-fn serve(
+impl fmt::Debug for EmbeddedBroker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("EmbeddedBroker").field("running", &self.running).finish_non_exhaustive()
+    }
+}
+
+/// What the broker's thread is to do.
+struct Plan {
     address: SocketAddr,
     listener: Builder,
-    max_retained: usize,
-    ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>,
-    stopped: oneshot::Receiver<()>,
-) {
+    config: BrokerConfig,
+    guard: Option<Guard>,
+}
+
+/// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made here.
+fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
+    let address = plan.address;
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(source) => {
@@ -214,23 +255,52 @@ fn serve(
         }
     };
     runtime.block_on(async {
-        let bound = listener.bind().and_then(Listener::tcp).and_then(|l| l.local_addr().map(|bound| (l, bound)));
-        let (listener, bound) = match bound {
-            Ok(bound) => bound,
+        let (server, gate, bound) = match prepare(plan).await {
+            Ok(prepared) => prepared,
             Err(error) => {
                 let reason = error.root_cause().to_string();
                 return ready.send(Err(BrokerError::Bind { address, reason })).unwrap_or_default();
             }
         };
-        // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
-        let context = ServerContext::new().busy_check_enable(false).build().await;
-        *context.extends.retain_mut().await = Box::new(RetainedMessages::new(max_retained));
-        let server = MqttServer::new(context).listener_by_id(listener, 1).build();
         ready.send(Ok(bound)).unwrap_or_default();
+        let admitting = async {
+            match gate {
+                Some(gate) => gate.run().await,
+                None => std::future::pending().await,
+            }
+        };
         tokio::select! {
             ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
+            () = admitting => tracing::error!("gate ended by itself"),
             _ = stopped => {}
         }
     });
     runtime.shutdown_timeout(STOP_TIMEOUT);
+}
+
+/// Opens the sockets: rmqtt's own is the public one, or behind the gate's.
+async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketAddr)> {
+    let Plan { address, listener, config, guard } = plan;
+    let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+    let listener = match &guard {
+        // Without anonymous clients, the hooks are asked about each.
+        Some(_) => listener.laddr(behind).allow_anonymous(false),
+        None => listener,
+    };
+    let listener = listener.bind().and_then(Listener::tcp)?;
+    let own = listener.local_addr()?;
+    // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
+    let context = ServerContext::new().busy_check_enable(false).build().await;
+    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(config.max_retained));
+    let (gate, bound) = match &guard {
+        Some(guard) => {
+            let public = TcpListener::bind(address).await?;
+            let bound = public.local_addr()?;
+            let gate = Gate::new(public, own, guard, &config);
+            gate.permissions(guard).install(&context).await;
+            (Some(gate), bound)
+        }
+        None => (None, own),
+    };
+    Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), gate, bound))
 }

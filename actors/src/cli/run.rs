@@ -17,6 +17,7 @@ use super::{Failure, print};
 use crate::config::NodeConfig;
 use crate::gateway::BrokerAddress;
 use crate::node;
+use crate::pki::OBSERVER_MARK;
 use crate::service::ServiceManager;
 
 /// Flags of a node; each overrides the key of its name in the configuration file.
@@ -183,6 +184,12 @@ pub(super) struct ObserverArguments {
 }
 
 impl ObserverArguments {
+    /// Whose configuration this is.
+    fn holder(&self) -> Result<Option<NodeName>, Failure> {
+        let run = RunArguments { config: self.config.clone(), cell: self.cell.clone(), ..RunArguments::default() };
+        Ok(run.load()?.name)
+    }
+
     /// The configuration of a node that only listens: it leads nothing, has no camera, keeps nothing, and leaves the
     /// addresses in the file to the node that they are for. Without a name it has that of the process.
     pub(super) fn load(&self, purpose: &str) -> Result<NodeConfig, Failure> {
@@ -198,6 +205,11 @@ impl ObserverArguments {
             ..RunArguments::default()
         };
         let mut config = run.load()?;
+        // With the certificate of a node, the observer takes a name below that node's.
+        if let (Some(_), None, Some(holder)) = (&config.tls, &self.name, self.holder()?) {
+            let name = format!("{holder}{OBSERVER_MARK}{purpose}-{}", std::process::id());
+            config.name = Some(NodeName::new(&name).map_err(|error| Failure::usage(anyhow::anyhow!(error)))?);
+        }
         if let Some(bind) = &mut config.membership.bind {
             bind.set_port(0);
         }

@@ -10,7 +10,9 @@ use ractor::{Actor, ActorRef};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-use crate::gateway::{BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part};
+use crate::gateway::{
+    BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, Security,
+};
 
 /// A report and when it came.
 #[derive(Debug, Clone)]
@@ -45,6 +47,7 @@ impl Observer {
             part: Part::Candidate,
             status,
             mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },
+            security: Security::default(),
             counters: Arc::default(),
             subscriber: Arc::new(move |delivery| lock(&kept).take(delivery)),
             seed: 1,

@@ -4,9 +4,11 @@ use std::io;
 use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
+use ecod::names::NodeName;
+
 use super::Finding;
 use crate::config::NodeConfig;
-use crate::gateway;
+use crate::gateway::{self, Security};
 use crate::membership::DEFAULT_PORT;
 
 /// How long a datagram to oneself may take.
@@ -17,12 +19,17 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
     let mut findings = Vec::new();
     let plane = config.data_plane();
     if let Some(address) = &plane.external {
-        findings.push(match gateway::probe(address, &config.cell, &config.mqtt).await {
+        let node = config.name.as_ref().map_or("node", NodeName::as_str);
+        let asked = match Security::of(config) {
+            Ok(security) => gateway::probe(address, node, &config.mqtt, &security).await,
+            Err(error) => Err(error.to_string()),
+        };
+        findings.push(match asked {
             Ok(()) => Finding::fine("broker", format!("{address} accepts this node")),
             Err(error) => Finding::broken(
                 "broker",
                 format!("{address}: {error}"),
-                "start it, or set `mqtt.broker`, `mqtt.user`, `mqtt.password` and `mqtt.version` as it wants them",
+                "start it, or set `mqtt.broker`, `mqtt.user`, `mqtt.password`, `mqtt.ca` and `mqtt.version` as it wants them",
             ),
         });
     }

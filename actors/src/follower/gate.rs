@@ -1,13 +1,24 @@
-//! The gate of one topic: what was superseded does not pass, but nobody is shut out for good.
+//! The gate of one topic: what was superseded does not pass, and neither does who was not elected, but nobody is shut out
+//! for good.
 
 use std::time::Duration;
 
 use ecod::epoch::{Epoch, EpochGate};
+use ecod::names::NodeName;
 use ecod::time::Timestamp;
+
+use crate::leader_election::Leadership;
 
 /// How long the newest message outranks others after it came: one from a stranger with a huge epoch silences the elected
 /// leader, or where there is no election whoever publishes, for no longer than this.
 pub(super) const MEMORY: Duration = Duration::from_secs(3);
+
+/// How long the elected leader may be silent before another with a later epoch is believed to have taken over: the word of
+/// its election may have been lost.
+const SILENCE: Duration = Duration::from_millis(250);
+
+/// How long one with a later epoch is believed while the election names another: the word may be under way.
+const CREDIT: Duration = Duration::from_millis(500);
 
 /// Why a message did not pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -16,23 +27,85 @@ pub(super) enum Refusal {
     Repeated,
     /// A later leadership's have passed.
     Superseded,
+    /// The election names another leader.
+    NotElected,
 }
 
-/// Admits messages in the order of epoch, aggregator and round.
+/// Admits messages in the order of epoch, aggregator and round, of those that may lead.
 #[derive(Debug)]
 pub(super) struct Gate {
     gate: EpochGate,
     newest_at: Option<Timestamp>,
+    /// The last round of the elected, and when it came.
+    elected: Option<(Epoch, u64, Timestamp)>,
+    /// Since when others than the elected pass.
+    others_since: Option<Timestamp>,
+    /// The elected epoch in which others have used up their credit.
+    overruled: Option<Epoch>,
 }
 
 impl Gate {
     /// A gate that refuses terms below `least_term` at first.
     pub(super) fn new(least_term: u64) -> Self {
-        Self { gate: EpochGate::new(least_term), newest_at: None }
+        let gate = EpochGate::new(least_term);
+        Self { gate, newest_at: None, elected: None, others_since: None, overruled: None }
     }
 
-    /// Takes round `round` of `epoch`, or refuses it. `may_lead` says that nobody else is known to lead.
+    /// Takes round `round` of `epoch`, or refuses it, knowing what the election says.
     pub(super) fn admit(
+        &mut self,
+        epoch: &Epoch,
+        round: u64,
+        received_at: Timestamp,
+        leadership: &Leadership,
+    ) -> Result<(), Refusal> {
+        match leadership.epoch.as_ref().filter(|_| leadership.leader().is_some()) {
+            Some(elected) if elected == epoch => self.admit_elected(epoch, round, received_at),
+            Some(elected) => self.admit_other(epoch, round, received_at, elected, leadership.standby.as_ref()),
+            None => self.admit_in_order(epoch, round, received_at, true),
+        }
+    }
+
+    /// The elected is heard even after somebody else with a later epoch, unless that one is likely to be the next elected.
+    fn admit_elected(&mut self, epoch: &Epoch, round: u64, received_at: Timestamp) -> Result<(), Refusal> {
+        if self.elected.as_ref().is_some_and(|(last, last_round, _)| last == epoch && round <= *last_round) {
+            return Err(Refusal::Repeated);
+        }
+        let usurped = self.others_since.is_some_and(|since| received_at.since(since) >= CREDIT);
+        if usurped && self.gate.latest().is_some_and(|(latest, _)| latest > epoch) {
+            self.gate = EpochGate::default();
+            self.overruled = Some(epoch.clone());
+        }
+        self.admit_in_order(epoch, round, received_at, true)?;
+        self.elected = Some((epoch.clone(), round, received_at));
+        self.others_since = None;
+        Ok(())
+    }
+
+    fn admit_other(
+        &mut self,
+        epoch: &Epoch,
+        round: u64,
+        received_at: Timestamp,
+        elected: &Epoch,
+        standby: Option<&NodeName>,
+    ) -> Result<(), Refusal> {
+        if epoch > elected {
+            let heard = |(last, _, at): &(Epoch, u64, Timestamp)| last == elected && received_at.since(*at) < SILENCE;
+            let speaks = self.elected.as_ref().is_some_and(heard) && standby != Some(&epoch.leader);
+            if speaks || self.overruled.as_ref() == Some(elected) {
+                return Err(Refusal::NotElected);
+            }
+        }
+        self.admit_in_order(epoch, round, received_at, false)?;
+        if epoch > elected {
+            self.others_since.get_or_insert(received_at);
+        }
+        Ok(())
+    }
+
+    /// `may_lead` says that nobody else is known to lead.
+    fn admit_in_order(
         &mut self,
         epoch: &Epoch,
         round: u64,
@@ -51,5 +124,76 @@ impl Gate {
         })?;
         self.newest_at = Some(received_at);
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::leader_election::Position;
+
+    fn epoch(term: u64, leader: &str) -> Epoch {
+        Epoch::new(term, NodeName::new(leader).unwrap())
+    }
+
+    fn led_by(epoch: Epoch, standby: Option<&'static str>) -> Leadership {
+        let standby = standby.map(NodeName::from_static);
+        Leadership { position: Position::Following, epoch: Some(epoch), standby }
+    }
+
+    fn at(ms: u64) -> Timestamp {
+        Timestamp(ms * 1000)
+    }
+
+    #[test]
+    fn a_forged_epoch_does_not_silence_the_elected() {
+        let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "gauss"));
+        let leadership = led_by(elected.clone(), Some("euclid"));
+        let mut gate = Gate::new(0);
+        for round in 0..100 {
+            assert_eq!(gate.admit(&elected, round, at(100 * round), &leadership), Ok(()), "round {round}");
+            let refused = gate.admit(&forged, round, at(100 * round + 50), &leadership);
+            assert_eq!(refused, Err(Refusal::NotElected));
+        }
+    }
+
+    #[test]
+    fn one_that_poses_as_the_next_leader_is_believed_once_and_briefly() {
+        let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "euclid"));
+        let leadership = led_by(elected.clone(), Some("euclid"));
+        let mut gate = Gate::new(0);
+        let mut lost = Vec::new();
+        for round in 0..100 {
+            if gate.admit(&elected, round, at(100 * round), &leadership).is_err() {
+                lost.push(round);
+            }
+            gate.admit(&forged, round, at(100 * round + 50), &leadership).ok();
+        }
+        assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
+    }
+
+    #[test]
+    fn the_next_leader_is_taken_before_word_of_its_election_came() {
+        let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let mut gate = Gate::new(0);
+        let (before, after) = (led_by(old.clone(), Some("euclid")), led_by(new.clone(), None));
+        assert_eq!(gate.admit(&old, 1, at(0), &before), Ok(()));
+        assert_eq!(gate.admit(&new, 2, at(100), &before), Ok(()));
+        assert_eq!(gate.admit(&old, 2, at(110), &before), Err(Refusal::Superseded), "no way back");
+        assert_eq!(gate.admit(&new, 3, at(200), &after), Ok(()));
+        let unknown = epoch(9, "gauss");
+        assert_eq!(gate.admit(&unknown, 4, at(300), &after), Err(Refusal::NotElected));
+        assert_eq!(gate.admit(&unknown, 5, at(500), &after), Ok(()), "the elected has fallen silent");
+    }
+
+    #[test]
+    fn the_last_round_of_the_old_leader_passes_while_the_new_one_has_sent_none() {
+        let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let mut gate = Gate::new(0);
+        let after = led_by(new.clone(), None);
+        assert_eq!(gate.admit(&old, 1, at(0), &led_by(old.clone(), None)), Ok(()));
+        assert_eq!(gate.admit(&old, 2, at(100), &after), Ok(()));
+        assert_eq!(gate.admit(&new, 3, at(200), &after), Ok(()));
+        assert_eq!(gate.admit(&old, 4, at(300), &after), Err(Refusal::Superseded));
     }
 }

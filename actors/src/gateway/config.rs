@@ -1,6 +1,7 @@
 //! How a node talks MQTT.
 
 use std::fmt;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
@@ -24,6 +25,12 @@ pub struct MqttConfig {
     pub user: Option<String>,
     /// Password; default none. Never printed.
     pub password: Option<Secret>,
+    /// PEM file with the certificates of those who may have signed the external broker's; default none: it is spoken to in
+    /// plaintext. The host in `broker` must be a name in its certificate. A node with `[tls]` shows its own certificate.
+    pub ca: Option<PathBuf>,
+    /// Whether payloads are signed by the cell's key, and others not taken; default false. For an external broker that
+    /// others use too; the same on every node. Programs that only look on have to skip the signature.
+    pub sign: bool,
     /// How payloads are written: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a
     /// fifth of the bytes, rounded to millimetres and 0.05 %).
     pub encoding: Encoding,
@@ -59,6 +66,8 @@ impl Default for MqttConfig {
             version: MqttVersion::V311,
             user: None,
             password: None,
+            ca: None,
+            sign: false,
             encoding: Encoding::Json,
             keep_alive_s: 5,
             connect_timeout_ms: 2000,
@@ -95,6 +104,9 @@ impl MqttConfig {
         check_range("max_objects", self.max_objects as f64, 1.0, 1e6)?;
         if self.user.is_none() && self.password.is_some() {
             return Err(ConfigError::new("password", "a password", "set together with `user`"));
+        }
+        if self.ca.is_some() && self.broker.is_none() {
+            return Err(ConfigError::new("ca", "a file", "set together with `broker`"));
         }
         Ok(())
     }

@@ -1,15 +1,19 @@
 //! One MQTT connection, 3.1.1 or 5, to one broker; used once and never reconnected, so that nothing old is sent late.
 
+use std::error::Error;
 use std::io;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
 use rumqttc::v5::mqttbytes::QoS as QoS5;
-use rumqttc::{QoS as QoS4, v5};
+use rumqttc::{QoS as QoS4, TlsConfiguration, Transport, v5};
+use rustls::ClientConfig;
 
 use super::address::BrokerAddress;
 use super::config::{MqttConfig, MqttVersion};
+use crate::pki::CredentialsError;
 
 /// How the broker is to treat a message: contract of the topics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,6 +60,8 @@ pub(super) enum ConnectionError {
     V5(Box<v5::ConnectionError>),
     #[error("nothing within {0:?}")]
     Silent(Duration),
+    #[error(transparent)]
+    Credentials(#[from] Box<CredentialsError>),
 }
 
 impl ConnectionError {
@@ -65,12 +71,15 @@ impl ConnectionError {
         match self {
             Self::V311(error) => matches!(&**error, rumqttc::ConnectionError::Io(io) if refused(io)),
             Self::V5(error) => matches!(&**error, v5::ConnectionError::Io(io) if refused(io)),
-            Self::Silent(_) => false,
+            Self::Silent(_) | Self::Credentials(_) => false,
         }
     }
 
-    /// Why the broker took the connection and then refused the node, in its own words.
+    /// Why the broker took the connection and then refused the node, in its own words, or why this node does not trust it.
     pub(super) fn refusal(&self) -> Option<String> {
+        if let Some(reason) = self.mistrust() {
+            return Some(reason);
+        }
         match self {
             Self::V311(error) => match &**error {
                 rumqttc::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
@@ -80,8 +89,27 @@ impl ConnectionError {
                 v5::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
                 _ => None,
             },
-            Self::Silent(_) => None,
+            Self::Silent(_) | Self::Credentials(_) => None,
         }
+    }
+
+    /// What is wrong with one side's certificate.
+    fn mistrust(&self) -> Option<String> {
+        let mut next: Option<&(dyn Error + 'static)> = match self {
+            Self::V311(error) => Some(&**error),
+            Self::V5(error) => Some(&**error),
+            Self::Silent(_) | Self::Credentials(_) => None,
+        };
+        while let Some(error) = next {
+            let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
+            if let Some(rustls::Error::InvalidCertificate(_) | rustls::Error::AlertReceived(_)) =
+                inner.and_then(|inner| inner.downcast_ref())
+            {
+                return inner.map(ToString::to_string);
+            }
+            next = error.source();
+        }
+        None
     }
 
     /// Whether a packet beyond [`MqttConfig::max_packet_bytes`] came in.
@@ -100,7 +128,7 @@ impl ConnectionError {
                         | v5::StateError::IncomingPacketTooLarge { .. }
                 )
             ),
-            Self::Silent(_) => false,
+            Self::Silent(_) | Self::Credentials(_) => false,
         }
     }
 }
@@ -121,22 +149,32 @@ pub(super) fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
 pub(super) fn open(
     address: &BrokerAddress,
     client_id: &str,
-    will: &LastWill,
+    will: Option<&LastWill>,
     config: &MqttConfig,
+    tls: Option<Arc<ClientConfig>>,
 ) -> (Client, Connection) {
     let timeout_s = config.connect_timeout().as_secs().max(1);
     let mut network = rumqttc::NetworkOptions::new();
     network.set_tcp_nodelay(true);
     network.set_connection_timeout(timeout_s);
     let login = config.user.as_deref().map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
-    let (host, port) = (address.host(), address.port());
+    let port = address.port();
+    // The client library takes the host for the name in the broker's certificate, where brackets are none.
+    let host = if tls.is_some() { address.host().trim_matches(['[', ']']) } else { address.host() };
+    let transport = tls.map(|tls| Transport::tls_with_config(TlsConfiguration::Rustls(tls)));
     let max_packet_bytes = config.max_packet_bytes();
     match config.version {
         MqttVersion::V311 => {
             let mut options = rumqttc::MqttOptions::new(client_id, host, port);
             options.set_keep_alive(config.keep_alive());
             options.set_max_packet_size(max_packet_bytes, max_packet_bytes);
-            options.set_last_will(rumqttc::LastWill::new(&will.topic, will.payload.clone(), QoS4::AtLeastOnce, true));
+            if let Some(transport) = transport {
+                options.set_transport(transport);
+            }
+            if let Some(will) = will {
+                let payload = will.payload.clone();
+                options.set_last_will(rumqttc::LastWill::new(&will.topic, payload, QoS4::AtLeastOnce, true));
+            }
             if let Some((user, password)) = login {
                 options.set_credentials(user, password);
             }
@@ -149,9 +187,14 @@ pub(super) fn open(
             options.set_keep_alive(config.keep_alive());
             options.set_connection_timeout(timeout_s);
             options.set_max_packet_size(u32::try_from(max_packet_bytes).ok());
-            let will =
-                v5::mqttbytes::v5::LastWill::new(&will.topic, will.payload.clone(), QoS5::AtLeastOnce, true, None);
-            options.set_last_will(will);
+            if let Some(transport) = transport {
+                options.set_transport(transport);
+            }
+            if let Some(will) = will {
+                let payload = will.payload.clone();
+                let will = v5::mqttbytes::v5::LastWill::new(&will.topic, payload, QoS5::AtLeastOnce, true, None);
+                options.set_last_will(will);
+            }
             options.set_network_options(network);
             if let Some((user, password)) = login {
                 options.set_credentials(user, password);

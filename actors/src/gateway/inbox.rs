@@ -13,6 +13,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
 
 use super::address::BrokerAddress;
+use super::security::SigningKey;
 use crate::clock;
 use crate::counters::{Counters, Event};
 
@@ -78,6 +79,7 @@ pub(super) struct Inbox {
     run: Uuid,
     topics: Topics,
     limits: Limits,
+    signing: Option<SigningKey>,
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
     places: Arc<Semaphore>,
@@ -99,7 +101,7 @@ impl Inbox {
     pub(super) fn new(
         (node, run): (NodeName, Uuid),
         topics: Topics,
-        limits: Limits,
+        (limits, signing): (Limits, Option<SigningKey>),
         places: usize,
         counters: Arc<Counters>,
         subscriber: Subscriber,
@@ -109,6 +111,7 @@ impl Inbox {
             run,
             topics,
             limits,
+            signing,
             counters,
             subscriber: RwLock::new(subscriber),
             places: Arc::new(Semaphore::new(places)),
@@ -169,6 +172,11 @@ impl Inbox {
 
     fn read(&self, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Result<Read, RejectReason> {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
+        let payload = match &self.signing {
+            // Nothing is what takes a retained message back; it says nothing that could be signed.
+            Some(key) if !payload.is_empty() => key.open(topic, payload).ok_or(RejectReason::BadSignature)?,
+            _ => payload,
+        };
         let message = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
             Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload),
             Topic::VoteDetections(node) => return self.read_report(ReportKind::VoteDetections, &node, payload),
@@ -265,7 +273,7 @@ mod tests {
         let inbox = Inbox::new(
             (NodeName::new("edge").unwrap(), Uuid::nil()),
             Topics::new(&NodeName::new("lot").unwrap()),
-            Limits::default(),
+            (Limits::default(), None),
             2,
             Arc::clone(&counters),
             Arc::new(move |delivery| receiver.lock().unwrap().push(delivery)),

@@ -15,6 +15,7 @@ use super::address::BrokerAddress;
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet};
 use super::inbox::{Inbox, LinkState, Outcome};
+use super::security::Security;
 use crate::clock;
 use crate::counters::{Counters, Event};
 
@@ -49,6 +50,7 @@ pub(super) struct LinkSetup {
     /// The will of the next connection.
     pub(super) will: Mutex<LastWill>,
     pub(super) config: MqttConfig,
+    pub(super) security: Security,
     pub(super) inbox: Arc<Inbox>,
     pub(super) counters: Arc<Counters>,
     pub(super) seed: u64,
@@ -157,7 +159,8 @@ impl Task {
         let setup = Arc::clone(&self.setup);
         let LinkSetup { client_id, will, config, inbox, counters, .. } = &*setup;
         let will = will.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let (client, mut connection) = connection::open(&self.broker, client_id, &will, config);
+        let tls = setup.security.tls(&self.broker).map_err(Box::new)?;
+        let (client, mut connection) = connection::open(&self.broker, client_id, Some(&will), config, tls);
         // The protocol's own timeouts are whole seconds.
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
@@ -203,7 +206,7 @@ impl Task {
     /// Warns of what the broker refuses, once per change.
     fn tell_refusal(&mut self, refusal: String) {
         if self.told.as_ref() != Some(&refusal) {
-            tracing::warn!(broker = %self.broker, refusal, "broker refuses this node, check its password and permissions");
+            tracing::warn!(broker = %self.broker, refusal, "broker refuses this node, check its password, certificate and permissions");
             self.setup.counters.count(Event::BrokerRefused);
             self.told = Some(refusal);
         }

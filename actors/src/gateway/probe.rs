@@ -1,23 +1,26 @@
 //! Whether a broker takes this node, asked without being one of the cell.
 
-use bytes::Bytes;
-use ecod::names::NodeName;
-use ecod::wire::{Topic, Topics};
+use uuid::Uuid;
 
-use super::BrokerAddress;
 use super::config::MqttConfig;
-use super::connection::{LastWill, Packet, open};
+use super::connection::{Packet, open};
+use super::{BrokerAddress, Security};
+use crate::pki::OBSERVER_MARK;
 
-/// Connects as the configuration says and leaves again.
+/// Connects as the configuration says, as an observer beside the node of this name, and leaves again. There is no last
+/// will: whatever becomes of this connection, nothing is said about anybody.
 ///
 /// # Errors
 /// Why the broker is not there or refuses, in words.
-pub async fn probe(address: &BrokerAddress, cell: &NodeName, config: &MqttConfig) -> Result<(), String> {
-    let name = format!("probe-{}", std::process::id());
-    let node = NodeName::new(&name).map_err(|error| error.to_string())?;
-    // Whatever becomes of this connection, nothing is said about anybody.
-    let will = LastWill { topic: Topics::new(cell).path(&Topic::Nodes(node)), payload: Bytes::new() };
-    let (client, mut connection) = open(address, &name, &will, config);
+pub async fn probe(
+    address: &BrokerAddress,
+    node: &str,
+    config: &MqttConfig,
+    security: &Security,
+) -> Result<(), String> {
+    let client_id = format!("{node}{OBSERVER_MARK}probe-{}", Uuid::now_v7().simple());
+    let tls = security.tls(address).map_err(|error| error.to_string())?;
+    let (client, mut connection) = open(address, &client_id, None, config, tls);
     let patience = config.connect_timeout();
     loop {
         match connection.next(patience).await {

@@ -46,6 +46,14 @@ pub fn check_key(config: &MembershipConfig, cell: &NodeName) -> Result<(), KeyEr
     CellKey::load(config, cell).map(drop)
 }
 
+/// The key that signs payloads, derived from the cell's.
+///
+/// # Errors
+/// [`KeyError`] when the key file cannot be used.
+pub(crate) fn payload_key(config: &MembershipConfig, cell: &NodeName) -> Result<hmac::Key, KeyError> {
+    CellKey::load(config, cell).map(|key| key.payload_key())
+}
+
 impl CellKey {
     /// Reads the key that the configuration names. Without one, the cell's name is the key, which keeps cells apart and
     /// nobody out.
@@ -76,6 +84,13 @@ impl CellKey {
         let mut tag = [0; 4];
         tag.copy_from_slice(&hash.as_ref()[..4]);
         Self { root, tag }
+    }
+
+    /// Signs payloads that go through brokers of others.
+    pub(super) fn payload_key(&self) -> hmac::Key {
+        let info: [&[u8]; 1] = [b"ecod payload 1"];
+        let key = self.root.expand(&info, hmac::HMAC_SHA256).map(hmac::Key::from);
+        key.expect("HKDF gives as much as a hash's length")
     }
 
     /// Tells frames of other cells; no secret.

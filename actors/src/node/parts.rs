@@ -1,6 +1,7 @@
 //! How the parts of a node are made, connected, started and stopped.
 
 mod arguments;
+mod elected;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -9,19 +10,20 @@ use std::time::Duration;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::vote::VoteMode;
+use ecod::wire::Topics;
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
 use tokio::sync::watch;
 use uuid::Uuid;
 
 use super::seats::{Part, Seats};
-use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker};
+use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker, Guard};
 use crate::clock;
 use crate::config::NodeConfig;
 use crate::counters::Counters;
 use crate::dashboard::{Dashboard, Feed};
 use crate::follower::{Follower, Newest};
 use crate::fuser::Fuser;
-use crate::gateway::Gateway;
+use crate::gateway::{Gateway, Security};
 use crate::leader_election::{LeaderElection, LeaderElectionMessage, Leadership};
 use crate::membership::{FrameCounters, Member, Membership, MembershipMessage};
 use crate::recorder::{Recorder, Recording};
@@ -38,6 +40,7 @@ use crate::{
 /// What the parts are made from; kept to make them again.
 pub(super) struct Assembly {
     config: NodeConfig,
+    security: Security,
     name: NodeName,
     run: Uuid,
     started_at: Timestamp,
@@ -64,12 +67,13 @@ const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl Assembly {
-    pub(super) fn new(config: NodeConfig, failed: watch::Sender<Option<String>>) -> Self {
+    pub(super) fn new(config: NodeConfig, security: Security, failed: watch::Sender<Option<String>>) -> Self {
         let by_evidence = config.fusion.vote.mode != VoteMode::Paper;
         let counters = Arc::<Counters>::default();
         Self {
             name: config.name.clone().unwrap_or(NodeName::from_static("node")),
             config,
+            security,
             run: Uuid::now_v7(),
             started_at: clock::now(),
             seats: Seats::default(),
@@ -229,8 +233,8 @@ impl Assembly {
     /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
     /// leave it.
     async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let embedded = Box::new(EmbeddedBroker::new(self.config.broker()));
-        let (broker, _) = Actor::spawn_linked(None, Broker, embedded, supervisor).await.map_err(cause)?;
+        let (broker, _) =
+            Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor).await.map_err(cause)?;
         let before = *self.broker_address.borrow();
         let address = before.unwrap_or(self.config.broker_listen());
         let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
@@ -245,6 +249,22 @@ impl Assembly {
         let id = broker.get_id();
         self.seats.broker.take(broker);
         Ok(id)
+    }
+
+    /// Where only this machine reaches the broker, nothing has to stand between it and its clients.
+    fn embedded_broker(&self) -> EmbeddedBroker {
+        let (config, listen) = (self.config.broker(), self.config.broker_listen());
+        let credentials = self.security.credentials.clone();
+        match (&credentials, listen.ip().is_loopback()) {
+            (None, true) => {
+                tracing::info!("broker for this machine only: no certificates are configured");
+                return EmbeddedBroker::new(config);
+            }
+            (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
+            (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
+        }
+        let (topics, elected) = (Topics::new(&self.config.cell), elected::rule(self.leadership()));
+        EmbeddedBroker::guarded(config, Guard { credentials, topics, elected, counters: self.counters() })
     }
 
     async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {

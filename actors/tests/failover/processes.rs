@@ -1,11 +1,16 @@
 //! The same with processes of their own.
 
 use std::fs::File;
+use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use ecod::names::NodeName;
 use ecod::wire::Role;
+use ecod_actors::clock;
+use ecod_actors::pki::{Authority, TlsConfig};
+use tempfile::TempDir;
 
 use crate::cell::{PATIENCE, config, free_address};
 use crate::record::Record;
@@ -20,10 +25,12 @@ impl Drop for Process {
     }
 }
 
-fn start(name: &str, role: Role, seed: std::net::SocketAddr, directory: &Path) -> Process {
+fn start(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Process {
     let bind = (role == Role::Edge).then_some(seed);
     let file = directory.join(format!("{name}.toml"));
-    std::fs::write(&file, toml::to_string(&config(name, role, bind, seed, directory)).unwrap()).unwrap();
+    let mut config = config(name, role, bind, seed, directory);
+    config.tls = certificates(name, role, directory);
+    std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
     let log = File::options().create(true).append(true).open(directory.join(format!("{name}.log"))).unwrap();
     let child = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
         .arg("--config")
@@ -36,10 +43,33 @@ fn start(name: &str, role: Role, seed: std::net::SocketAddr, directory: &Path) -
     Process(child)
 }
 
+/// A node's certificates, if the cell has a CA in its directory.
+fn certificates(name: &str, role: Role, directory: &Path) -> Option<TlsConfig> {
+    let (mut authority, node) = (Authority::open(&directory.join(CA)).ok()?, NodeName::new(name).unwrap());
+    authority.issue(&node, role, Duration::from_secs(3600), clock::now()).unwrap();
+    let (certificate, key) = authority.files_of(&node);
+    Some(TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) })
+}
+
+/// Where a cell that has certificates keeps its CA.
+const CA: &str = "pki";
+
 /// SIGKILL for the edge's process: its vehicles go on at once, and hand back when it has started again.
 #[test]
 fn vehicles_go_on_when_the_process_of_the_edge_is_killed() {
     let directory = tempfile::tempdir().unwrap();
+    edge_is_killed(&directory);
+}
+
+/// The same with TLS between all: a broken connection and a refused port say as much as they do without.
+#[test]
+fn vehicles_with_certificates_go_on_when_the_process_of_the_edge_is_killed() {
+    let directory = tempfile::tempdir().unwrap();
+    Authority::init(&directory.path().join(CA), &NodeName::from_static("cell"), clock::now()).unwrap();
+    edge_is_killed(&directory);
+}
+
+fn edge_is_killed(directory: &TempDir) {
     let seed = free_address();
     let vehicles = ["euclid", "gauss"];
     let record = |name: &str| Record::read(&directory.path().join(format!("{name}.maps")));

@@ -11,7 +11,7 @@ use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
 use ecod_actors::counters::Counters;
 use ecod_actors::gateway::{
     BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, Part,
-    ReportKind,
+    ReportKind, Security,
 };
 use ractor::{Actor, ActorRef};
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};
@@ -65,6 +65,7 @@ impl Node {
             part,
             status: status.clone(),
             mqtt,
+            security: Security::default(),
             counters: Arc::clone(&counters),
             subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
             seed: 7,

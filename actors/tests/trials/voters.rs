@@ -9,7 +9,7 @@ use ecod::names::NodeName;
 use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
 use ecod_actors::clock;
 use ecod_actors::gateway::{
-    Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, ReportKind,
+    Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, ReportKind, Security,
 };
 use ractor::{Actor, ActorRef};
 use uuid::Uuid;
@@ -43,6 +43,7 @@ impl Voters {
             part: Part::Follower,
             status,
             mqtt: MqttConfig::default(),
+            security: Security::default(),
             counters: Arc::default(),
             subscriber: Arc::new(move |Delivery { message, .. }| {
                 if let Incoming::Reputations(reputations) = message {

@@ -50,6 +50,7 @@ impl Assembly {
             part: self.gateway_part(),
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
+            security: self.security.clone(),
             counters: self.counters(),
             subscriber: self.subscriber(),
             seed: self.run.as_u64_pair().1,
@@ -256,11 +257,12 @@ mod tests {
     use super::*;
     use crate::config::NodeConfig;
     use crate::follower::ReceivedMap;
+    use crate::gateway::Security;
 
     #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
-        let assembly = Assembly::new(config, watch::Sender::new(None));
+        let assembly = Assembly::new(config, Security::default(), watch::Sender::new(None));
         assert_eq!((assembly.status().epoch, assembly.status().aggregator), (0, None));
         let map = GlobalMap {
             schema: SCHEMA_VERSION,

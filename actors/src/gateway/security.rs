@@ -1,0 +1,135 @@
+//! How links and payloads are protected.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use ring::hmac;
+use rustls::ClientConfig;
+
+use super::address::BrokerAddress;
+use crate::config::NodeConfig;
+use crate::membership::{KeyError, payload_key};
+use crate::pki::{Credentials, CredentialsError, external_client};
+
+/// How links and payloads are protected; the default is not at all.
+#[derive(Debug, Clone, Default)]
+pub struct Security {
+    /// The node's certificates, for the brokers of the cell.
+    pub credentials: Option<Arc<Credentials>>,
+    external: Option<External>,
+    pub(super) signing: Option<SigningKey>,
+}
+
+/// A broker that is none of the cell's, and who signed its certificate, if it has one.
+#[derive(Debug, Clone)]
+struct External {
+    address: BrokerAddress,
+    ca: Option<PathBuf>,
+}
+
+/// Why links or payloads cannot be protected as configured.
+#[derive(Debug, thiserror::Error)]
+pub enum SecurityError {
+    /// The certificates cannot be used.
+    #[error(transparent)]
+    Credentials(#[from] CredentialsError),
+    /// The cell's key, by which payloads are signed, cannot be used.
+    #[error("key `mqtt.sign`: {0}")]
+    Key(#[from] KeyError),
+}
+
+impl Security {
+    /// What the configuration says; the files that it names are read.
+    ///
+    /// # Errors
+    /// [`SecurityError`] naming the file.
+    pub fn of(config: &NodeConfig) -> Result<Self, SecurityError> {
+        let credentials = match (&config.tls, &config.name) {
+            (Some(files), Some(name)) => Some(Arc::new(Credentials::load(files, name)?)),
+            _ => None,
+        };
+        let external = config.mqtt.broker.clone();
+        let external = external.map(|address| External { address, ca: config.mqtt.ca.clone() });
+        let signing = config.mqtt.sign.then(|| payload_key(&config.membership, &config.cell)).transpose()?;
+        let security = Self { credentials, external, signing: signing.map(SigningKey) };
+        if let Some(external) = &security.external {
+            security.tls(&external.address)?;
+        }
+        Ok(security)
+    }
+
+    /// How to speak TLS to a broker; none where it is spoken to in plaintext.
+    pub(super) fn tls(&self, broker: &BrokerAddress) -> Result<Option<Arc<ClientConfig>>, CredentialsError> {
+        let current = self.credentials.as_ref().map(|credentials| credentials.current());
+        match self.external.as_ref().filter(|external| external.address == *broker) {
+            Some(External { ca: Some(ca), .. }) => external_client(ca, current.as_deref()).map(Arc::new).map(Some),
+            Some(External { ca: None, .. }) => Ok(None),
+            None => Ok(current.map(|current| Arc::clone(&current.client))),
+        }
+    }
+}
+
+/// Signs payloads for brokers that others use too: HMAC-SHA256 by a key that is derived from the cell's, over the length of
+/// the topic, the topic and the payload.
+///
+/// ```text
+/// | ec | tag (32) | payload |
+/// ```
+///
+/// No payload begins with the byte of the envelope: JSON is text, and CBOR's `ec` is a value that nobody may use.
+#[derive(Debug, Clone)]
+pub(super) struct SigningKey(hmac::Key);
+
+const MARK: u8 = 0xec;
+const TAG_BYTES: usize = 32;
+
+impl SigningKey {
+    /// The payload in its envelope.
+    pub(super) fn seal(&self, topic: &str, payload: &[u8]) -> Vec<u8> {
+        let tag = hmac::sign(&self.0, &signed(topic.as_bytes(), payload));
+        [&[MARK], tag.as_ref(), payload].concat()
+    }
+
+    /// The payload of an envelope, if somebody who has the key sealed it for this topic.
+    pub(super) fn open<'a>(&self, topic: &[u8], envelope: &'a [u8]) -> Option<&'a [u8]> {
+        let (tag, payload) = envelope.strip_prefix(&[MARK])?.split_at_checked(TAG_BYTES)?;
+        hmac::verify(&self.0, &signed(topic, payload), tag).ok()?;
+        Some(payload)
+    }
+}
+
+fn signed(topic: &[u8], payload: &[u8]) -> Vec<u8> {
+    [&(topic.len() as u64).to_be_bytes(), topic, payload].concat()
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::names::NodeName;
+
+    use super::*;
+    use crate::membership::MembershipConfig;
+
+    fn key(text: &str, cell: &'static str) -> SigningKey {
+        let membership =
+            MembershipConfig { key: Some(crate::gateway::Secret::new(text)), ..MembershipConfig::default() };
+        SigningKey(payload_key(&membership, &NodeName::from_static(cell)).unwrap())
+    }
+
+    #[test]
+    fn only_key_cell_topic_and_payload_of_the_sealing_open_an_envelope() {
+        let key_of_cell = key("correct horse battery", "lot-1");
+        let envelope = key_of_cell.seal("a/b", b"payload");
+        assert_eq!(key_of_cell.open(b"a/b", &envelope), Some(&b"payload"[..]));
+        assert_eq!(key_of_cell.open(b"a/", &envelope), None);
+        assert_eq!(key("correct horse batterz", "lot-1").open(b"a/b", &envelope), None);
+        assert_eq!(key("correct horse battery", "lot-2").open(b"a/b", &envelope), None);
+        for at in 0..envelope.len() {
+            let mut changed = envelope.clone();
+            changed[at] ^= 1;
+            assert_eq!(key_of_cell.open(b"a/b", &changed), None, "byte {at}");
+        }
+        for bare in [&b"{}"[..], b"", &[MARK], &envelope[..TAG_BYTES]] {
+            assert_eq!(key_of_cell.open(b"a/b", bare), None);
+        }
+    }
+}

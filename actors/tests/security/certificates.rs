@@ -1,0 +1,103 @@
+//! Clients that have no certificate of the cell, or none that is still good.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::wire::Role;
+use ecod_actors::counters::Event;
+use ecod_actors::pki::{BROKER_NAME, TlsConfig, external_client};
+use rustls::pki_types::ServerName;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use tokio_rustls::TlsConnector;
+
+use crate::fixture::{Cell, Client, DAY, Pki, SOON, client_config};
+
+/// A login as MQTT 3.1.1 writes it, with an empty client id.
+const LOGIN_PACKET: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 4, 2, 0, 60, 0, 0];
+
+#[tokio::test]
+async fn without_a_certificate_nobody_gets_in() {
+    let mut cell = Cell::start().await;
+    let mut plain = TcpStream::connect(cell.address).await.unwrap();
+    plain.write_all(&LOGIN_PACKET).await.unwrap();
+    let mut answer = Vec::new();
+    timeout(SOON, plain.read_to_end(&mut answer)).await.expect("left waiting").ok();
+    assert_ne!(answer.first(), Some(&0x20), "no CONNACK");
+
+    let anonymous = Arc::new(external_client(&cell.pki.authority.ca(), None).unwrap());
+    let stream = TcpStream::connect(cell.address).await.unwrap();
+    let name = ServerName::try_from(BROKER_NAME).unwrap();
+    // With TLS 1.3 the client learns of the refusal from what it reads first.
+    if let Ok(mut stream) = TlsConnector::from(anonymous).connect(name, stream).await {
+        stream.write_all(&LOGIN_PACKET).await.ok();
+        let read = timeout(SOON, stream.read(&mut [0; 16])).await.expect("left waiting");
+        assert!(!matches!(read, Ok(1..)), "{read:?}");
+    }
+    cell.counted(Event::ClientUntrusted, 2).await;
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn a_certificate_of_another_cell_is_worth_nothing() {
+    let mut cell = Cell::start().await;
+    let theirs = Pki::new().issue_elsewhere("euclid", &cell);
+    let refused = Client::new(cell.address, "euclid", &client_config("euclid", &theirs.0)).log_in().await;
+    assert!(refused.is_err(), "{refused:?}");
+    cell.counted(Event::ClientUntrusted, 1).await;
+    cell.honest_traffic_goes_on().await;
+}
+
+impl Pki {
+    /// A certificate of this CA for somebody who trusts the cell's.
+    fn issue_elsewhere(mut self, name: &str, cell: &Cell) -> (TlsConfig, Self) {
+        let files = self.issue(name, Role::Edge, DAY);
+        (TlsConfig { ca: cell.pki.authority.ca(), revocation_list: None, ..files }, self)
+    }
+}
+
+#[tokio::test]
+async fn an_expired_certificate_is_refused() {
+    let mut cell = Cell::start().await;
+    let expired = cell.pki.issue("gauss", Role::Auto, Duration::ZERO);
+    tokio::time::sleep(Duration::from_millis(1100)).await;
+    let refused = Client::new(cell.address, "gauss", &client_config("gauss", &expired)).log_in().await;
+    assert!(refused.as_ref().is_err_and(|error| error.to_lowercase().contains("expired")), "{refused:?}");
+    cell.counted(Event::ClientUntrusted, 1).await;
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn who_is_revoked_is_cut_off_and_stays_out_and_the_broker_runs_on() {
+    let mut cell = Cell::start().await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let tls = client_config("gauss", &files);
+    let mut gauss = Client::new(cell.address, "gauss", &tls);
+    gauss.log_in().await.unwrap();
+    cell.pki.authority.revoke(&crate::fixture::node("gauss"), ecod_actors::clock::now()).unwrap();
+    timeout(SOON, gauss.drive()).await.expect("still connected");
+    cell.counted(Event::ClientExpelled, 1).await;
+    let refused = Client::new(cell.address, "gauss", &tls).log_in().await;
+    assert!(refused.as_ref().is_err_and(|error| error.to_lowercase().contains("revoked")), "{refused:?}");
+    cell.honest_traffic_goes_on().await;
+    let renewed = cell.pki.issue("gauss", Role::Auto, DAY);
+    Client::new(cell.address, "gauss", &client_config("gauss", &renewed)).log_in().await.unwrap();
+}
+
+/// A vehicle that never leads cannot pose as a broker: its own kind does not trust it.
+#[tokio::test]
+async fn a_client_trusts_no_broker_with_the_certificate_of_a_mere_vehicle() {
+    let mut pki = Pki::new();
+    let (cav, gauss) = (pki.issue("euclid", Role::Cav, DAY), pki.issue("gauss", Role::Auto, DAY));
+    let posing = ecod_actors::pki::Credentials::load(&cav, &crate::fixture::node("euclid")).unwrap();
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let server = tokio_rustls::TlsAcceptor::from(Arc::clone(&posing.current().server));
+    let serving = tokio::spawn(async move {
+        let (stream, _) = listener.accept().await.unwrap();
+        server.accept(stream).await.map(drop)
+    });
+    let refused = Client::new(address, "gauss", &client_config("gauss", &gauss)).log_in().await;
+    assert!(refused.is_err() && serving.await.unwrap().is_err());
+}

@@ -1,0 +1,43 @@
+//! Clients with a certificate of the cell that claim to be somebody else.
+
+use ecod::wire::Role;
+use ecod_actors::counters::Event;
+use rumqttc::{LastWill, QoS};
+use uuid::Uuid;
+
+use crate::fixture::{Cell, Client, DAY, client_config};
+
+#[tokio::test]
+async fn nobody_speaks_on_the_topics_of_another() {
+    let mut cell = Cell::start().await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
+    gauss.log_in().await.unwrap();
+    let others = ["detections/euclid", "vote_detections/euclid", "nodes/edge", "ledger/edge"];
+    // The last three are for the elected alone, which the broker's node knows from authenticated datagrams.
+    let elected = ["global_detections", "global_verdicts", "reputations"];
+    for (denied, topic) in (1..).zip(others.into_iter().chain(elected)) {
+        gauss.publish_and_wait(&format!("ecod/v1/lot/{topic}")).await.unwrap();
+        assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
+    }
+    // The edge sees the next report, and none of the above.
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn nobody_logs_in_as_another_or_leaves_its_last_will() {
+    let mut cell = Cell::start().await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let tls = client_config("gauss", &files);
+    let run = Uuid::now_v7().simple();
+    let posing = Client::with_id(cell.address, &format!("euclid-{run}"), &tls, |_| ()).log_in().await;
+    assert!(posing.is_err(), "a login under the name of another would end the other's");
+    let will = LastWill::new("ecod/v1/lot/nodes/euclid", "offline", QoS::AtLeastOnce, true);
+    let leaving = Client::with_id(cell.address, &format!("gauss-{run}"), &tls, |options| {
+        options.set_last_will(will);
+    });
+    let refused = { leaving }.log_in().await;
+    assert!(refused.is_err(), "{refused:?}");
+    cell.counted(Event::ClientDenied, 2).await;
+    cell.honest_traffic_goes_on().await;
+}

@@ -1,0 +1,201 @@
+//! A broker behind a gate, two honest clients, and what an attacker needs.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::names::NodeName;
+use ecod::wire::{Role, Topics};
+use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::clock;
+use ecod_actors::counters::{Counters, Event};
+use ecod_actors::pki::{Authority, Credentials, TlsConfig};
+use rumqttc::{AsyncClient, EventLoop, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
+use rustls::ClientConfig;
+use tempfile::TempDir;
+use tokio::time::{Instant, sleep, timeout};
+use uuid::Uuid;
+
+pub(crate) const DAY: Duration = Duration::from_secs(86_400);
+
+/// How long anything may take on a machine that does much else.
+pub(crate) const SOON: Duration = Duration::from_secs(20);
+
+/// Largest packet of the broker.
+pub(crate) const MAX_PACKET: usize = 64 * 1024;
+
+/// How long a client has to log in.
+pub(crate) const LOGIN: Duration = Duration::from_millis(700);
+
+pub(crate) fn node(name: &str) -> NodeName {
+    NodeName::new(name).unwrap()
+}
+
+/// A CA and its directory.
+pub(crate) struct Pki {
+    _directory: TempDir,
+    pub(crate) authority: Authority,
+}
+
+impl Pki {
+    pub(crate) fn new() -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let authority = Authority::init(directory.path(), &node("lot"), clock::now()).unwrap();
+        Self { _directory: directory, authority }
+    }
+
+    /// The files of a new certificate.
+    pub(crate) fn issue(&mut self, name: &str, role: Role, valid: Duration) -> TlsConfig {
+        self.authority.issue(&node(name), role, valid, clock::now()).unwrap();
+        let (certificate, key) = self.authority.files_of(&node(name));
+        let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
+        TlsConfig { ca, certificate, key, revocation_list: Some(list) }
+    }
+}
+
+/// The client's side of certificates.
+pub(crate) fn client_config(name: &str, files: &TlsConfig) -> Arc<ClientConfig> {
+    Arc::clone(&Credentials::load(files, &node(name)).unwrap().current().client)
+}
+
+/// An edge's broker, which `edge` is elected to use, and two honest clients.
+pub(crate) struct Cell {
+    pub(crate) pki: Pki,
+    pub(crate) address: SocketAddr,
+    pub(crate) counters: Arc<Counters>,
+    edge: Client,
+    euclid: Client,
+    sent: u64,
+    _broker: EmbeddedBroker,
+}
+
+impl Cell {
+    pub(crate) async fn start() -> Self {
+        let mut pki = Pki::new();
+        let edge = pki.issue("edge", Role::Edge, DAY);
+        let euclid = pki.issue("euclid", Role::Cav, DAY);
+        let counters = Arc::<Counters>::default();
+        let guard = Guard {
+            credentials: Some(Arc::new(Credentials::load(&edge, &node("edge")).unwrap())),
+            topics: Topics::new(&node("lot")),
+            elected: Arc::new(|name| name.as_str() == "edge"),
+            counters: Arc::clone(&counters),
+        };
+        let config = BrokerConfig {
+            max_packet_bytes: Some(MAX_PACKET as u32),
+            handshake_timeout_ms: LOGIN.as_millis() as u64,
+            connects_per_s: 1,
+            ..BrokerConfig::default()
+        };
+        let mut broker = EmbeddedBroker::guarded(config, guard);
+        let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+        let mut edge = Client::new(address, "edge", &client_config("edge", &edge));
+        edge.log_in().await.unwrap();
+        edge.subscribe("ecod/v1/lot/#").await;
+        let mut euclid = Client::new(address, "euclid", &client_config("euclid", &euclid));
+        euclid.log_in().await.unwrap();
+        Self { pki, address, counters, edge, euclid, sent: 0, _broker: broker }
+    }
+
+    /// Asserts that a report of the vehicle reaches the edge, and nothing else does.
+    pub(crate) async fn honest_traffic_goes_on(&mut self) {
+        self.sent += 1;
+        let report = format!("report {}", self.sent);
+        self.euclid.publish("ecod/v1/lot/detections/euclid", report.as_bytes());
+        let flush = self.euclid.drive();
+        tokio::pin!(flush);
+        let received = async {
+            tokio::select! {
+                error = &mut flush => panic!("the vehicle lost its broker: {error}"),
+                received = timeout(SOON, self.edge.message()) => received.expect("nothing came").unwrap(),
+            }
+        };
+        assert_eq!(received.await, ("ecod/v1/lot/detections/euclid".to_owned(), report));
+    }
+
+    /// Waits until something was counted.
+    pub(crate) async fn counted(&self, event: Event, at_least: u64) {
+        let until = Instant::now() + SOON;
+        while self.counters.events(event) < at_least {
+            assert!(Instant::now() < until, "{event:?}: {} of {at_least}", self.counters.events(event));
+            sleep(Duration::from_millis(10)).await;
+        }
+    }
+}
+
+/// A plain MQTT client.
+pub(crate) struct Client {
+    client: AsyncClient,
+    events: EventLoop,
+}
+
+impl Client {
+    pub(crate) fn new(address: SocketAddr, name: &str, tls: &Arc<ClientConfig>) -> Self {
+        Self::with_id(address, &format!("{name}-{}", Uuid::now_v7().simple()), tls, |_| ())
+    }
+
+    pub(crate) fn with_id(
+        address: SocketAddr,
+        client_id: &str,
+        tls: &Arc<ClientConfig>,
+        adjust: impl FnOnce(&mut MqttOptions),
+    ) -> Self {
+        let mut options = MqttOptions::new(client_id, address.ip().to_string(), address.port());
+        options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(Arc::clone(tls))));
+        options.set_max_packet_size(4 * MAX_PACKET, 4 * MAX_PACKET);
+        adjust(&mut options);
+        let (client, events) = AsyncClient::new(options, 64);
+        Self { client, events }
+    }
+
+    /// Connects, or says why not.
+    pub(crate) async fn log_in(&mut self) -> Result<(), String> {
+        let polled = timeout(SOON, self.events.poll()).await.map_err(|_| "no answer".to_owned())?;
+        polled.map(drop).map_err(|error| error.to_string())
+    }
+
+    pub(crate) async fn subscribe(&mut self, filter: &str) {
+        self.client.try_subscribe(filter, QoS::AtMostOnce).unwrap();
+        while !matches!(self.events.poll().await.unwrap(), rumqttc::Event::Incoming(Packet::SubAck(_))) {}
+    }
+
+    pub(crate) fn publish(&self, topic: &str, payload: &[u8]) {
+        self.client.try_publish(topic, QoS::AtMostOnce, false, payload).unwrap();
+    }
+
+    /// Publishes and waits until the broker has dealt with it, permitted or not.
+    pub(crate) async fn publish_and_wait(&mut self, topic: &str) -> Result<(), String> {
+        self.client.try_publish(topic, QoS::AtLeastOnce, true, "forged").unwrap();
+        let acknowledged = async {
+            loop {
+                match self.events.poll().await {
+                    Ok(rumqttc::Event::Incoming(Packet::PubAck(_))) => return Ok(()),
+                    Ok(_) => {}
+                    Err(error) => return Err(error.to_string()),
+                }
+            }
+        };
+        timeout(SOON, acknowledged).await.expect("no answer")
+    }
+
+    /// Sends and receives until the connection ends.
+    pub(crate) async fn drive(&mut self) -> String {
+        loop {
+            if let Err(error) = self.events.poll().await {
+                return error.to_string();
+            }
+        }
+    }
+
+    async fn message(&mut self) -> Result<(String, String), String> {
+        loop {
+            match self.events.poll().await {
+                Ok(rumqttc::Event::Incoming(Packet::Publish(publish))) => {
+                    return Ok((publish.topic, String::from_utf8_lossy(&publish.payload).into_owned()));
+                }
+                Ok(_) => {}
+                Err(error) => return Err(error.to_string()),
+            }
+        }
+    }
+}

@@ -1,0 +1,138 @@
+//! Clients that knock too often, wait too long, or send what is no MQTT or too much of it.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::wire::Role;
+use ecod_actors::counters::Event;
+use ecod_actors::pki::BROKER_NAME;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rustls::pki_types::ServerName;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpSocket, TcpStream};
+use tokio::time::timeout;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+
+use crate::fixture::{Cell, Client, DAY, MAX_PACKET, SOON, client_config};
+
+/// Another host than the honest ones, as far as a broker can see.
+const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
+
+async fn knock(broker: SocketAddr) -> TcpStream {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.bind((ELSEWHERE, 0).into()).unwrap();
+    socket.connect(broker).await.unwrap()
+}
+
+async fn secure(cell: &mut Cell, stream: TcpStream) -> TlsStream<TcpStream> {
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let name = ServerName::try_from(BROKER_NAME).unwrap();
+    TlsConnector::from(client_config("gauss", &files)).connect(name, stream).await.unwrap()
+}
+
+/// Waits until the other side has closed, whatever came before.
+async fn closed(stream: &mut (impl AsyncReadExt + Unpin)) {
+    let mut buffer = [0; 1024];
+    let ended = async { while matches!(stream.read(&mut buffer).await, Ok(1..)) {} };
+    timeout(SOON, ended).await.expect("left open");
+}
+
+#[tokio::test]
+async fn who_knocks_too_often_is_not_heard_and_others_are() {
+    let mut cell = Cell::start().await;
+    for _ in 0..300 {
+        drop(knock(cell.address).await);
+    }
+    cell.counted(Event::ClientThrottled, 100).await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    Client::new(cell.address, "gauss", &client_config("gauss", &files)).log_in().await.unwrap();
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn who_takes_its_time_to_log_in_loses_its_place() {
+    let mut cell = Cell::start().await;
+    let mut silent = Vec::new();
+    for _ in 0..20 {
+        silent.push(knock(cell.address).await);
+    }
+    let mut halfway = knock(cell.address).await;
+    // The beginning of a handshake whose rest never comes.
+    halfway.write_all(&[22, 3, 1, 2, 0, 1, 0]).await.unwrap();
+    let slow = knock(cell.address).await;
+    let mut slow = secure(&mut cell, slow).await;
+    slow.write_all(&[0x10, 60, 0, 4]).await.unwrap();
+    cell.honest_traffic_goes_on().await;
+    for stream in &mut silent {
+        closed(stream).await;
+    }
+    closed(&mut halfway).await;
+    closed(&mut slow).await;
+    cell.counted(Event::ClientTimedOut, 22).await;
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn what_is_no_mqtt_ends_its_own_connection_only() {
+    let mut cell = Cell::start().await;
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let login = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 4, 2, 0, 60, 0, 0];
+    let openings: [Vec<u8>; 6] = [
+        b"GET / HTTP/1.1\r\n\r\n".to_vec(),
+        // A length that does not end, and one beyond any login.
+        vec![0x10, 0xff, 0xff, 0xff, 0xff, 0xff],
+        vec![0x10, 0xff, 0xff, 0x7f],
+        // A login of an unknown protocol; two logins; a login and noise.
+        vec![0x10, 12, 0, 4, b'M', b'Q', b'X', b'X', 9, 2, 0, 60, 0, 0],
+        [login, login].concat(),
+        login.into_iter().chain((0..200).map(|_| rng.random())).chain([0x30, 0xff, 0xff, 0xff, 0xff, 0xff]).collect(),
+    ];
+    for opening in openings {
+        let stream = knock(cell.address).await;
+        let mut stream = secure(&mut cell, stream).await;
+        stream.write_all(&opening).await.unwrap();
+        closed(&mut stream).await;
+        cell.honest_traffic_goes_on().await;
+    }
+    cell.counted(Event::ClientMalformed, 3).await;
+}
+
+#[tokio::test]
+async fn a_packet_that_is_too_large_ends_its_own_connection_only() {
+    let mut cell = Cell::start().await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
+    gauss.log_in().await.unwrap();
+    gauss.publish("ecod/v1/lot/detections/gauss", &vec![b'x'; 2 * MAX_PACKET]);
+    timeout(SOON, gauss.drive()).await.expect("still connected");
+    cell.honest_traffic_goes_on().await;
+}
+
+/// A broker that is not behind TLS but open to others has the same limits.
+#[tokio::test]
+async fn limits_hold_without_certificates_too() {
+    use ecod::wire::Topics;
+    use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+    use ecod_actors::counters::Counters;
+
+    let counters = Arc::<Counters>::default();
+    let guard = Guard {
+        credentials: None,
+        topics: Topics::new(&crate::fixture::node("lot")),
+        elected: Arc::new(|_| true),
+        counters: Arc::clone(&counters),
+    };
+    let config = BrokerConfig { handshake_timeout_ms: 300, ..BrokerConfig::default() };
+    let mut broker = EmbeddedBroker::guarded(config, guard);
+    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let mut silent = knock(address).await;
+    closed(&mut silent).await;
+    assert_eq!(counters.events(Event::ClientTimedOut), 1);
+    let mut options = rumqttc::MqttOptions::new("anyone", "127.0.0.1", address.port());
+    options.set_keep_alive(Duration::from_secs(5));
+    let (_client, mut events) = rumqttc::AsyncClient::new(options, 8);
+    timeout(SOON, events.poll()).await.unwrap().unwrap();
+}

@@ -1,0 +1,8 @@
+//! Attacks on a cell; every one of them asserts that honest traffic goes on.
+
+mod certificates;
+mod claims;
+mod fixture;
+mod floods;
+mod frames;
+mod payloads;
