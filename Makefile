@@ -50,7 +50,7 @@ eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics f
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
 test: PACKAGES += mosquitto mosquitto-clients
 test: setup ## all tests
-	cargo test --locked --workspace
+	cargo test --locked
 
 test-dashboard: PACKAGES += chromium chromium-driver prometheus
 test-dashboard: setup monitoring ## the page in a real browser, with pictures in target/dashboard; installs Chromium
@@ -68,11 +68,11 @@ trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENAR
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --all-targets -- -D warnings
-	RUSTDOCFLAGS="-D warnings" cargo doc --locked --workspace --no-deps --document-private-items
+	cargo clippy --locked --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items
 
 doc: setup ## API documentation in target/doc
-	cargo doc --locked --workspace --no-deps
+	cargo doc --locked --no-deps
 
 audit: ## licences, sources and duplicate policies of all dependencies; known vulnerabilities where the database is reachable
 	packaging/audit
