@@ -160,7 +160,8 @@ fn pooled(bands: &Bands) -> Vec<(f64, f64, usize)> {
 fn beyond_noise(pools: &[(f64, f64, usize)]) -> f64 {
     let with_votes = || pools.iter().filter(|(_, votes, _)| *votes > 0.0);
     let (agreed, votes) = with_votes().fold((0.0, 0.0), |(a, n), (agreed, votes, _)| (a + agreed, n + votes));
-    let rate = agreed / f64::max(votes, 1e-9);
+    // Taking counts back leaves rounding errors: more may seem to have agreed than voted.
+    let rate = (agreed / f64::max(votes, 1e-9)).clamp(0.0, 1.0);
     let spread: f64 = with_votes().map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2)).sum();
     let noise = NOISE * rate * (1.0 - rate);
     if spread > noise { 1.0 - noise / spread } else { 0.0 }
@@ -245,6 +246,15 @@ mod tests {
             let weight = weight(&calibration, 0, f64::from(step) / 19.0 + 0.02);
             assert!((weight - 1.0).abs() < 0.02, "{weight}");
         }
+    }
+
+    #[test]
+    fn counts_that_rounding_leaves_behind_give_weights() {
+        let mut calibration = Calibration::new(10.0);
+        calibration.count(3, 0.3, 1.0);
+        calibration.count(3, 0.1 + 0.2, -1.0);
+        calibration.count(5, 1.0 + 1e-12, 1.0);
+        assert!(weight(&calibration, 0, 0.9).is_finite());
     }
 
     #[test]
