@@ -405,7 +405,10 @@ impl GatewayState {
 
 /// The payload with its signature, where payloads are signed.
 fn sealed(security: &Security, topic: &str, payload: Bytes) -> Bytes {
-    security.signing.as_ref().map_or(payload.clone(), |key| key.seal(topic, &payload).into())
+    match &security.signing {
+        Some(key) => key.seal(topic, &payload).into(),
+        None => payload,
+    }
 }
 
 /// Most runs of this node's name that are told of.

@@ -131,14 +131,14 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
     let roots = Arc::new(roots("tls.ca", &files.ca)?);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
     let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
-    let key = key.map_err(|error| file_error("tls.key", &files.key, error))?;
+    let key = key.map_err(|error| file_error("tls.key", &files.key, &error))?;
     let lists: Vec<CertificateRevocationListDer<'static>> = match &files.revocation_list {
         Some(path) => pem("tls.revocation_list", path)?,
         None => Vec::new(),
     };
     let own =
         certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
-    let identity = Identity::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, error))?;
+    let identity = Identity::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
     if !identity.speaks_for(node.as_str()) {
         let (path, found) = (files.certificate.clone(), identity.name().clone());
         return Err(CredentialsError::AnothersName { path, found, node: node.clone() });
@@ -232,7 +232,7 @@ fn crypto() -> Arc<CryptoProvider> {
 fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsError> {
     let mut roots = RootCertStore::empty();
     for certificate in pem::<CertificateDer<'static>>(key, path)? {
-        roots.add(certificate).map_err(|error| file_error(key, path, error))?;
+        roots.add(certificate).map_err(|error| file_error(key, path, &error))?;
     }
     if roots.is_empty() {
         return Err(file_error(key, path, "no certificate"));
@@ -242,14 +242,14 @@ fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsErr
 
 fn pem<T: PemObject>(key: &'static str, path: &Path) -> Result<Vec<T>, CredentialsError> {
     let items: Result<Vec<T>, _> = T::pem_slice_iter(&bytes(key, path)?).collect();
-    items.map_err(|error| file_error(key, path, error))
+    items.map_err(|error| file_error(key, path, &error))
 }
 
 fn bytes(key: &'static str, path: &Path) -> Result<Vec<u8>, CredentialsError> {
-    fs::read(path).map_err(|error| file_error(key, path, error))
+    fs::read(path).map_err(|error| file_error(key, path, &error))
 }
 
-fn file_error(key: &'static str, path: &Path, reason: impl ToString) -> CredentialsError {
+fn file_error(key: &'static str, path: &Path, reason: &(impl ToString + ?Sized)) -> CredentialsError {
     CredentialsError::File { key, path: path.into(), reason: reason.to_string() }
 }
 
