@@ -140,7 +140,12 @@ async fn datagrams_and_broker_addresses_reach_the_others() {
         MembershipEvent::Received { from, payload: received, .. } => from.as_str() == "node-2" && *received == payload,
         _ => false,
     };
-    assert!(nodes[4].events().iter().any(received));
+    let arrived = async {
+        while !nodes[4].events().iter().any(received) {
+            sleep(Duration::from_millis(10)).await;
+        }
+    };
+    assert!(timeout(SOON, arrived).await.is_ok());
     assert!(!nodes[3].events().iter().any(received));
 }
 

@@ -206,7 +206,10 @@ impl ObserverArguments {
         };
         let mut config = run.load()?;
         // With the certificate of a node, the observer takes a name below that node's.
-        if let (Some(_), None, Some(holder)) = (&config.tls, &self.name, self.holder()?) {
+        if config.tls.is_some()
+            && self.name.is_none()
+            && let Some(holder) = self.holder()?
+        {
             let name = format!("{holder}{OBSERVER_MARK}{purpose}-{}", std::process::id());
             config.name = Some(NodeName::new(&name).map_err(|error| Failure::usage(anyhow::anyhow!(error)))?);
         }
