@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only fuzz replay-check edge-only recording-check asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -112,6 +112,10 @@ edge-only: setup ## an aggregator without camera and OpenCV
 
 bench: setup ## speed of the core, the detectors and the path through the broker, in target/bench.json
 	packaging/bench
+
+instructions: PACKAGES := build-essential ca-certificates valgrind
+instructions: setup ## instructions of the core's hot paths against the baseline; SAVE=1 writes a new one
+	packaging/instructions $(if $(SAVE),--save)
 
 liars: setup ## what lying vehicles achieve against VOTE: table in target/liars.md, drawing in target/liars.svg
 	mkdir -p target

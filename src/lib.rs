@@ -4,7 +4,7 @@
 //! equal inputs give equal outputs. Lengths are metres, angles radians, positions east-north with counter-clockwise
 //! headings; other units are converted where they enter.
 
-#![warn(clippy::unwrap_used)]
+#![deny(clippy::unwrap_used, clippy::panic, clippy::todo, clippy::unimplemented)]
 
 pub mod aggregator;
 pub mod camera;

@@ -1,6 +1,6 @@
 //! ECOD nodes: the actors, transports and cameras around the core of [`ecod`].
 
-#![warn(clippy::unwrap_used)]
+#![deny(clippy::unwrap_used, clippy::panic, clippy::todo, clippy::unimplemented)]
 
 pub mod bench;
 pub mod broker;

@@ -32,7 +32,7 @@ pub struct MqttConfig {
     /// others use too; the same on every node. Programs that only look on have to skip the signature.
     pub sign: bool,
     /// How payloads are written: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a
-    /// fifth of the bytes, rounded to millimetres and 0.05 %).
+    /// quarter of the bytes, rounded to millimetres and 0.05 %).
     pub encoding: Encoding,
     /// Seconds of silence after which the broker is asked for a sign of life; default 5. Shorter notices a dead network
     /// path sooner and costs packets. Not a failure detector: nodes watch each other by other means.
