@@ -2,9 +2,10 @@
 //!
 //! A vehicle that sends both kinds of reports is waited for with both.
 //!
-//! Vehicles that report once a period report just as the period ends, some a little before and some a little after. So
-//! that their reports do not wait for another period, the end is put off for a moment while they come in, and those that
-//! the end cut off nevertheless have a round of their own as soon as the last of them is there.
+//! Vehicles that report once a period, all about the same time, report just as the period ends: a round must not end in
+//! the midst of them, or those that come after would wait for another period, and so in every round to come. The end is
+//! put off for a moment while reports come in. Where a round ended in their midst nevertheless, the rest have one of
+//! their own as soon as the last of them is there, and from then on rounds end after them.
 //!
 //! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at [`RoundTrigger::deadline`];
 //! either says when to close the round.
@@ -70,8 +71,8 @@ pub struct RoundTrigger {
     first_report: Option<Timestamp>,
     live: [BTreeMap<NodeName, Vehicle>; ReportKind::COUNT],
     missing: usize,
-    /// Vehicles that the end of the period cut off and that have not reported since.
-    late: usize,
+    /// Vehicles whose report was due when the last round closed and that have not reported since.
+    due: usize,
     held: bool,
 }
 
@@ -79,8 +80,8 @@ pub struct RoundTrigger {
 struct Vehicle {
     last_report: Timestamp,
     reported: bool,
-    /// Cut off by the end of the period.
-    late: bool,
+    /// Due to report when the last round closed.
+    due: bool,
 }
 
 /// When the first round of a leadership is due.
@@ -102,28 +103,20 @@ pub const CONNECT_TIME: Duration = Duration::from_millis(25);
 /// Periods after which a silent vehicle is no longer waited for.
 const LIVE_PERIODS: u32 = 3;
 
-/// Rounds close at most this many times as often as the period says, those of reports that were cut off excepted: of
-/// these there is one a period at most.
+/// Rounds close at most this many times as often as the period says, those that follow at once with the reports of
+/// vehicles that were due excepted. As a vehicle is not due again for half a period, these are few.
 const MAX_RATE: u32 = 5;
 
 /// The part of a period by which its end is put off after the first report of a round.
 const COMING_IN: u32 = 10;
 
-/// The part of a period within which reports that were cut off have a round of their own.
-const CUT_OFF: u32 = 2;
+/// A vehicle is due when its last report is older than this part of a period.
+const DUE: u32 = 2;
 
 impl RoundTrigger {
     /// Starts counting at `now`.
     pub fn new(config: RoundConfig, now: Timestamp) -> Self {
-        Self {
-            config,
-            last_close: now,
-            first_report: None,
-            live: Default::default(),
-            missing: 0,
-            late: 0,
-            held: false,
-        }
+        Self { config, last_close: now, first_report: None, live: Default::default(), missing: 0, due: 0, held: false }
     }
 
     /// Takes note of a report; true when the round closes with it, because it was the last that was waited for. A period
@@ -131,20 +124,20 @@ impl RoundTrigger {
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
         self.first_report.get_or_insert(now);
         let live = &mut self.live[kind as usize];
-        let mut was_last_cut_off = false;
+        let mut was_last_due = false;
         if let Some(vehicle) = live.get_mut(node) {
             vehicle.last_report = now;
             if !std::mem::replace(&mut vehicle.reported, true) {
                 self.missing -= 1;
             }
-            if std::mem::take(&mut vehicle.late) {
-                self.late -= 1;
-                was_last_cut_off = self.late == 0;
+            if std::mem::take(&mut vehicle.due) {
+                self.due -= 1;
+                was_last_due = self.due == 0;
             }
         } else {
-            live.insert(node.clone(), Vehicle { last_report: now, reported: true, late: false });
+            live.insert(node.clone(), Vehicle { last_report: now, reported: true, due: false });
         }
-        if was_last_cut_off && !self.held && now.since(self.last_close) <= self.config.period() / CUT_OFF {
+        if was_last_due && !self.held && now.since(self.last_close) < self.config.period() / MAX_RATE {
             self.close(now);
             return true;
         }
@@ -161,17 +154,18 @@ impl RoundTrigger {
     }
 
     fn close(&mut self, now: Timestamp) {
-        let limit = self.config.period() * LIVE_PERIODS;
-        let cuts_off = self.config.close == RoundClose::WhenComplete;
+        let period = self.config.period();
+        let by_reports = self.config.close == RoundClose::WhenComplete;
+        (self.missing, self.due) = (0, 0);
         for live in &mut self.live {
-            live.retain(|_, vehicle| now.since(vehicle.last_report) < limit);
+            live.retain(|_, vehicle| now.since(vehicle.last_report) < period * LIVE_PERIODS);
             for vehicle in live.values_mut() {
-                vehicle.late = cuts_off && !std::mem::take(&mut vehicle.reported);
+                vehicle.reported = false;
+                vehicle.due = by_reports && now.since(vehicle.last_report) > period / DUE;
+                self.missing += 1;
+                self.due += usize::from(vehicle.due);
             }
         }
-        let vehicles = || self.live.iter().flat_map(BTreeMap::values);
-        self.missing = vehicles().count();
-        self.late = vehicles().filter(|vehicle| vehicle.late).count();
         self.last_close = now;
         self.first_report = None;
         self.held = false;
@@ -297,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_that_were_cut_off_have_a_round_of_their_own() {
+    fn vehicles_that_the_end_of_the_period_left_out_have_a_round_of_their_own() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         for name in ["a", "b", "c"] {
             rounds.report(Detections, &node(name), at(1));
@@ -306,14 +300,31 @@ mod tests {
         rounds.report(Detections, &node("a"), at(100));
         assert!(rounds.tick(at(120)), "without b and c");
         assert!(!rounds.report(Detections, &node("b"), at(125)));
-        assert!(rounds.report(Detections, &node("c"), at(126)), "within a fifth of a period");
+        assert!(rounds.report(Detections, &node("c"), at(126)), "as soon as both are there");
         for name in ["a", "b"] {
             assert!(!rounds.report(Detections, &node(name), at(200)), "all are waited for again");
         }
         assert!(rounds.tick(at(226)), "without c");
         assert!(!rounds.report(Detections, &node("c"), at(290)), "too late: it counts for the next");
-        assert!(!rounds.report(Detections, &node("a"), at(300)));
-        assert!(rounds.report(Detections, &node("b"), at(301)));
+    }
+
+    #[test]
+    fn rounds_that_end_in_the_midst_of_reports_end_after_them_from_then_on() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        // The first vehicle is alone when it reports, and completes its round at once.
+        assert!(rounds.report(Detections, &node("a"), at(50)));
+        for (name, ms) in [("b", 51), ("c", 52)] {
+            assert!(!rounds.report(Detections, &node(name), at(ms)));
+        }
+        let mut closed = Vec::new();
+        for begin in [150, 250, 350] {
+            for (name, ms) in [("a", begin), ("b", begin + 1), ("c", begin + 2)] {
+                if rounds.report(Detections, &node(name), at(ms)) {
+                    closed.push(ms);
+                }
+            }
+        }
+        assert_eq!(closed, [150, 152, 252, 352]);
     }
 
     #[test]

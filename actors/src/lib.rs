@@ -54,4 +54,5 @@ pub mod service;
 pub mod state_file;
 #[cfg(feature = "camera")]
 pub mod testbed;
+mod throttles;
 pub mod top;

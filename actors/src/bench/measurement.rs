@@ -85,7 +85,8 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<Measurement>
         let report = load::report(index, &target.landmarks);
         let id = format!("ecod-bench-{}", report.node);
         let connected = Vehicle::connect(&id, load.ticks() as usize, &common).await;
-        let vehicle = connected.with_context(|| format!("vehicle {index} of {} at {}", load.vehicles, target.broker))?;
+        let vehicle =
+            connected.with_context(|| format!("vehicle {index} of {} at {}", load.vehicles, target.broker))?;
         let topic = common.topics.path(&ReportKind::Detections.topic(report.node.clone()));
         let bare_topic = format!("{OUT}/{}", report.node);
         senders.push(Sender { client: vehicle.client.clone(), report, topic, bare_topic });
@@ -112,12 +113,7 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<Measurement>
     })
 }
 
-async fn on_a_thread(
-    schedule: Schedule,
-    load: Load,
-    encoding: Encoding,
-    senders: Vec<Sender>,
-) -> anyhow::Result<Sent> {
+async fn on_a_thread(schedule: Schedule, load: Load, encoding: Encoding, senders: Vec<Sender>) -> anyhow::Result<Sent> {
     let (done, sent) = oneshot::channel();
     let drive = move || done.send(drive(schedule, load, encoding, senders)).unwrap_or_default();
     thread::Builder::new().name("bench-driver".into()).spawn(drive)?;

@@ -60,7 +60,11 @@ mod tests {
         for tick in [0, 1, 77] {
             let captured = schedule.captured_at(tick);
             assert_eq!(schedule.tick_captured_at(captured), Some(tick));
-            assert_eq!(schedule.tick_captured_at(captured.shifted(-20_000)), Some(tick), "a clock that is a little off");
+            assert_eq!(
+                schedule.tick_captured_at(captured.shifted(-20_000)),
+                Some(tick),
+                "a clock that is a little off"
+            );
         }
         assert_eq!(schedule.tick_captured_at(schedule.captured_at(0) - Duration::from_secs(1)), None);
     }

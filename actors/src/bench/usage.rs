@@ -19,6 +19,8 @@ pub struct Usage {
     pub threads: BTreeMap<String, f64>,
     /// Resident memory at the end, in bytes.
     pub resident_bytes: u64,
+    /// Of these, what no file holds: heap and stacks, not code and libraries.
+    pub anonymous_bytes: u64,
 }
 
 impl UsageMeter {
@@ -30,7 +32,8 @@ impl UsageMeter {
     /// What was used until now; threads that ended in between are not counted.
     pub fn stop(self) -> Usage {
         let span = self.begun.elapsed().as_secs_f64();
-        let mut usage = Usage { resident_bytes: resident_bytes(self.pid), ..Usage::default() };
+        let [resident_bytes, anonymous_bytes] = ["VmRSS:", "RssAnon:"].map(|key| memory_bytes(self.pid, key));
+        let mut usage = Usage { resident_bytes, anonymous_bytes, ..Usage::default() };
         for (thread, (name, time)) in threads(self.pid) {
             let before = self.before.get(&thread).map_or(Duration::ZERO, |(_, time)| *time);
             let percent = 100.0 * time.saturating_sub(before).as_secs_f64() / span;
@@ -66,9 +69,9 @@ fn threads(pid: u32) -> BTreeMap<u32, (String, Duration)> {
     tasks.flatten().filter_map(thread).collect()
 }
 
-fn resident_bytes(pid: u32) -> u64 {
+fn memory_bytes(pid: u32, key: &str) -> u64 {
     let text = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
-    let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap_or_default();
+    let line = text.lines().find_map(|line| line.strip_prefix(key)).unwrap_or_default();
     let kilobytes: u64 = line.trim().trim_end_matches("kB").trim_end().parse().unwrap_or(0);
     kilobytes * 1024
 }

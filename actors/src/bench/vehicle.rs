@@ -44,7 +44,11 @@ pub(super) struct Vehicle {
 }
 
 impl Vehicle {
-    pub(super) async fn connect(id: &str, ticks: usize, common: &Arc<Common>) -> Result<Self, rumqttc::ConnectionError> {
+    pub(super) async fn connect(
+        id: &str,
+        ticks: usize,
+        common: &Arc<Common>,
+    ) -> Result<Self, rumqttc::ConnectionError> {
         let map_topic = common.topics.path(&Topic::GlobalDetections);
         let (client, events) = subscribed(&common.broker, id, &[&map_topic, BACK]).await?;
         let arrivals = Arrivals { maps: vec![None; ticks], echoes: vec![None; ticks] };

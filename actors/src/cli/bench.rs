@@ -49,6 +49,9 @@ pub(super) struct BenchArguments {
     /// Measure what the own aggregator costs with 32 vehicles: memory, processor time, recording
     #[arg(long, conflicts_with_all = ["connect", "config"])]
     costs: bool,
+    /// Program that is run as the own aggregator, such as one built without OpenCV; without it this program
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["connect", "config"])]
+    program: Option<PathBuf>,
     /// Write the figures to this file as JSON, in the section `cell`; other sections stay
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -118,7 +121,8 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
         compare(&target, arguments, &mut figures).await?;
         saturate(&target, arguments, &mut figures).await?;
     } else {
-        let program = std::env::current_exe().context("this program cannot be found")?;
+        let own = || std::env::current_exe().context("this program cannot be found");
+        let program = arguments.program.clone().map_or_else(own, Ok)?;
         print("an aggregator of this program's own with its embedded broker, in a process of its own, on loopback\n")?;
         let mut aggregator = OwnAggregator::start(&program, false).await?;
         compare(aggregator.target()?, arguments, &mut figures).await?;
@@ -239,6 +243,7 @@ async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures
     figures.costs = Some(json!({
         "vehicles": COST_VEHICLES,
         "resident_mb": resident_mb,
+        "resident_mb_without_files": plain.anonymous_bytes as f64 / 1e6,
         "cpu_percent": plain.percent(),
         "cpu_percent_by_thread": plain.threads,
         "recording_resident_mb": recording.resident_bytes as f64 / 1e6,
@@ -264,7 +269,8 @@ fn save(path: &Path, figures: &Figures) -> anyhow::Result<()> {
 
 /// Every vehicle is a descriptor here and another at the broker, which inherits the limit.
 fn allow_many_connections() {
-    let raised = getrlimit(Resource::RLIMIT_NOFILE).and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
+    let raised =
+        getrlimit(Resource::RLIMIT_NOFILE).and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
     if let Err(error) = raised {
         tracing::warn!(%error, "the limit of open files stays");
     }
