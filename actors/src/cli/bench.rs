@@ -46,13 +46,10 @@ pub(super) struct BenchArguments {
     /// Look for the highest load at which 99 of 100 reports are answered within 100 ms, up to 1000 vehicles
     #[arg(long)]
     saturate: bool,
-    /// Measure what the own aggregator costs with 32 vehicles: memory, processor time, recording
-    #[arg(long, conflicts_with_all = ["connect", "config"])]
+    /// Measure instead what an aggregator of its own costs with 32 vehicles: memory, processor time, recording
+    #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "saturate"])]
     costs: bool,
-    /// Program that is run as the own aggregator, such as one built without OpenCV; without it this program
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["connect", "config"])]
-    program: Option<PathBuf>,
-    /// Write the figures to this file as JSON, in the section `cell`; other sections stay
+    /// Write the figures to this file as JSON, in the section `cell` or `costs`; other sections stay
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 }
@@ -60,6 +57,7 @@ pub(super) struct BenchArguments {
 /// Everything that was measured.
 #[derive(Debug, Default, Serialize)]
 struct Figures {
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     vehicles: BTreeMap<usize, Comparison>,
     goals: BTreeMap<String, Goal>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -121,15 +119,15 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
         compare(&target, arguments, &mut figures).await?;
         saturate(&target, arguments, &mut figures).await?;
     } else {
-        let own = || std::env::current_exe().context("this program cannot be found");
-        let program = arguments.program.clone().map_or_else(own, Ok)?;
+        let program = std::env::current_exe().context("this program cannot be found")?;
         print("an aggregator of this program's own with its embedded broker, in a process of its own, on loopback\n")?;
-        let mut aggregator = OwnAggregator::start(&program, false).await?;
-        compare(aggregator.target()?, arguments, &mut figures).await?;
-        saturate(aggregator.target()?, arguments, &mut figures).await?;
-        aggregator.stop().await;
         if arguments.costs {
             costs(&program, arguments, &mut figures).await?;
+        } else {
+            let mut aggregator = OwnAggregator::start(&program, false).await?;
+            compare(aggregator.target()?, arguments, &mut figures).await?;
+            saturate(aggregator.target()?, arguments, &mut figures).await?;
+            aggregator.stop().await;
         }
     }
     print("\n")?;
@@ -137,7 +135,7 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
         print(&format!("{name}: {figure:.2}, goal {goal}: {}\n", if *met { "met" } else { "MISSED" }))?;
     }
     match &arguments.out {
-        Some(path) => save(path, &figures),
+        Some(path) => save(path, if arguments.costs { "costs" } else { "cell" }, &figures),
         None => Ok(()),
     }
 }
@@ -260,10 +258,10 @@ impl Figures {
 }
 
 /// Replaces the section and keeps the others.
-fn save(path: &Path, figures: &Figures) -> anyhow::Result<()> {
+fn save(path: &Path, section: &str, figures: &Figures) -> anyhow::Result<()> {
     let read = std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
     let mut sections: Map<String, Value> = read.unwrap_or_default();
-    sections.insert("cell".into(), serde_json::to_value(figures)?);
+    sections.insert(section.into(), serde_json::to_value(figures)?);
     super::write_json(path, &sections)
 }
 
