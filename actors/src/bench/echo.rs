@@ -66,7 +66,7 @@ impl Echo {
                 }
             });
         })?;
-        started.await.context("the echo ended at once")?.context("echo")?;
+        started.await.context("the echo ended at once")??;
         Ok(Self { _stop: stop })
     }
 }

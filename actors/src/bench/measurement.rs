@@ -76,8 +76,12 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<Measurement>
         map_bytes: Arc::clone(&map_bytes),
         has_map: watch::Sender::new(false),
     });
+    let at_broker = || format!("broker {}", target.broker);
     let _echo = match load.bare {
-        true => Some(Echo::start(target.broker.clone(), load.vehicles, Arc::clone(&map_bytes)).await?),
+        true => {
+            let echo = Echo::start(target.broker.clone(), load.vehicles, Arc::clone(&map_bytes)).await;
+            Some(echo.with_context(at_broker)?)
+        }
         false => None,
     };
     let (mut vehicles, mut senders) = (Vec::new(), Vec::new());
@@ -86,7 +90,7 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<Measurement>
         let id = format!("ecod-bench-{}", report.node);
         let connected = Vehicle::connect(&id, load.ticks() as usize, &common).await;
         let vehicle =
-            connected.with_context(|| format!("vehicle {index} of {} at {}", load.vehicles, target.broker))?;
+            connected.with_context(|| format!("vehicle {index} of {}", load.vehicles)).with_context(at_broker)?;
         let topic = common.topics.path(&ReportKind::Detections.topic(report.node.clone()));
         let bare_topic = format!("{OUT}/{}", report.node);
         senders.push(Sender { client: vehicle.client.clone(), report, topic, bare_topic });
