@@ -155,7 +155,8 @@ impl RoundTrigger {
 
     fn close(&mut self, now: Timestamp) {
         let period = self.config.period();
-        let by_reports = self.config.close == RoundClose::WhenComplete;
+        // After a round that was held, whoever takes over has the word.
+        let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
         (self.missing, self.due) = (0, 0);
         for live in &mut self.live {
             live.retain(|_, vehicle| now.since(vehicle.last_report) < period * LIVE_PERIODS);

@@ -202,8 +202,13 @@ impl Mqtt for EmbeddedBroker {
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
         let throttle = ClientThrottle::new(self.config.max_messages_hz, Arc::clone(&self.counters));
-        let plan =
-            Plan { address, listener: self.listener(address), config: self.config.clone(), guard: self.guard.clone(), throttle };
+        let plan = Plan {
+            address,
+            listener: self.listener(address),
+            config: self.config.clone(),
+            guard: self.guard.clone(),
+            throttle,
+        };
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
             .spawn(move || serve(plan, &ready, stopped))
