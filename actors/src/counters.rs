@@ -188,6 +188,7 @@ impl Default for Counters {
         Self {
             events: [const { AtomicU64::new(0) }; Event::ALL.len()],
             rejects: [const { AtomicU64::new(0) }; RejectReason::ALL.len()],
+            shedding: Shedding::default(),
         }
     }
 }
