@@ -2,6 +2,11 @@
 //!
 //! A vehicle that sends both kinds of reports is waited for with both.
 //!
+//! Vehicles that report once a period, all about the same time, report just as the period ends: a round must not end in
+//! the midst of them, or those that come after would wait for another period, and so in every round to come. The end is
+//! put off for a moment while reports come in. Where a round ended in their midst nevertheless, the rest have one of
+//! their own as soon as the last of them is there, and from then on rounds end after them.
+//!
 //! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at [`RoundTrigger::deadline`];
 //! either says when to close the round.
 
@@ -32,7 +37,8 @@ pub struct RoundConfig {
 pub enum RoundClose {
     /// Nothing but the period, as in the paper. Adds up to a period of latency.
     Periodic,
-    /// Every live vehicle has reported since the last round; the period is the bound. The default.
+    /// Every live vehicle has reported since the last round; the period is the bound, or a tenth more while reports
+    /// come in. The default.
     WhenComplete,
 }
 
@@ -61,8 +67,12 @@ impl RoundConfig {
 pub struct RoundTrigger {
     config: RoundConfig,
     last_close: Timestamp,
+    /// When the first report of the present round came.
+    first_report: Option<Timestamp>,
     live: [BTreeMap<NodeName, Vehicle>; ReportKind::COUNT],
     missing: usize,
+    /// Vehicles whose report was due when the last round closed and that have not reported since.
+    due: usize,
     held: bool,
 }
 
@@ -70,6 +80,8 @@ pub struct RoundTrigger {
 struct Vehicle {
     last_report: Timestamp,
     reported: bool,
+    /// Due to report when the last round closed.
+    due: bool,
 }
 
 /// When the first round of a leadership is due.
@@ -91,44 +103,73 @@ pub const CONNECT_TIME: Duration = Duration::from_millis(25);
 /// Periods after which a silent vehicle is no longer waited for.
 const LIVE_PERIODS: u32 = 3;
 
-/// Rounds close at most this many times as often as the period says.
+/// Rounds close at most this many times as often as the period says, those that follow at once with the reports of
+/// vehicles that were due excepted. As a vehicle is not due again for half a period, these are few.
 const MAX_RATE: u32 = 5;
+
+/// The part of a period by which its end is put off after the first report of a round.
+const COMING_IN: u32 = 10;
+
+/// A vehicle is due when its last report is older than this part of a period.
+const DUE: u32 = 2;
 
 impl RoundTrigger {
     /// Starts counting at `now`.
     pub fn new(config: RoundConfig, now: Timestamp) -> Self {
-        Self { config, last_close: now, live: Default::default(), missing: 0, held: false }
+        Self { config, last_close: now, first_report: None, live: Default::default(), missing: 0, due: 0, held: false }
     }
 
     /// Takes note of a report; true when the round closes with it, because it was the last that was waited for. A period
     /// that is over is left to [`Self::tick`], so that of reports that come at the end of it none is cut off.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
+        self.first_report.get_or_insert(now);
         let live = &mut self.live[kind as usize];
+        let mut was_last_due = false;
         if let Some(vehicle) = live.get_mut(node) {
             vehicle.last_report = now;
             if !std::mem::replace(&mut vehicle.reported, true) {
                 self.missing -= 1;
             }
+            if std::mem::take(&mut vehicle.due) {
+                self.due -= 1;
+                was_last_due = self.due == 0;
+            }
         } else {
-            live.insert(node.clone(), Vehicle { last_report: now, reported: true });
+            live.insert(node.clone(), Vehicle { last_report: now, reported: true, due: false });
+        }
+        if was_last_due && !self.held && now.since(self.last_close) < self.config.period() / MAX_RATE {
+            self.close(now);
+            return true;
         }
         self.missing == 0 && self.tick(now)
     }
 
     /// True when the round closes now; call it at the latest at [`Self::deadline`].
     pub fn tick(&mut self, now: Timestamp) -> bool {
-        if now < self.deadline() {
-            return false;
+        let is_due = now >= self.deadline();
+        if is_due {
+            self.close(now);
         }
-        let limit = self.config.period() * LIVE_PERIODS;
+        is_due
+    }
+
+    fn close(&mut self, now: Timestamp) {
+        let period = self.config.period();
+        // After a round that was held, whoever takes over has the word.
+        let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
+        (self.missing, self.due) = (0, 0);
         for live in &mut self.live {
-            live.retain(|_, vehicle| now.since(vehicle.last_report) < limit);
-            live.values_mut().for_each(|vehicle| vehicle.reported = false);
+            live.retain(|_, vehicle| now.since(vehicle.last_report) < period * LIVE_PERIODS);
+            for vehicle in live.values_mut() {
+                vehicle.reported = false;
+                vehicle.due = by_reports && now.since(vehicle.last_report) > period / DUE;
+                self.missing += 1;
+                self.due += usize::from(vehicle.due);
+            }
         }
-        self.missing = self.live.iter().map(BTreeMap::len).sum();
         self.last_close = now;
+        self.first_report = None;
         self.held = false;
-        true
     }
 
     /// Starts a run of rounds.
@@ -150,11 +191,17 @@ impl RoundTrigger {
 
     /// When the round closes without a further report.
     pub fn deadline(&self) -> Timestamp {
+        let period = self.config.period();
+        let end = self.last_close + period;
+        if self.config.close == RoundClose::Periodic || self.held {
+            return end;
+        }
         let anyone = self.live.iter().any(|live| !live.is_empty());
-        let early = self.config.close == RoundClose::WhenComplete && !self.held;
-        let complete = early && self.missing == 0 && anyone;
-        let wait = if complete { self.config.period() / MAX_RATE } else { self.config.period() };
-        self.last_close + wait
+        match self.first_report {
+            _ if self.missing == 0 && anyone => self.last_close + period / MAX_RATE,
+            Some(first) => end.max(first + period / COMING_IN).min(end + period / COMING_IN),
+            None => end,
+        }
     }
 }
 
@@ -228,6 +275,57 @@ mod tests {
             rounds.tick(at(round * 100 + 99));
         }
         assert!(rounds.report(Detections, &node("a"), at(600)), "closes without the vehicle that left");
+    }
+
+    #[test]
+    fn reports_that_come_once_a_period_are_waited_for_at_its_end() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        for name in ["a", "b"] {
+            rounds.report(Detections, &node(name), at(1));
+        }
+        assert!(rounds.tick(at(20)));
+        assert!(!rounds.report(Detections, &node("a"), at(118)));
+        assert!(!rounds.tick(at(120)), "b is on its way");
+        assert!(rounds.report(Detections, &node("b"), at(123)));
+        assert!(!rounds.report(Detections, &node("a"), at(220)));
+        assert!(rounds.tick(at(230)), "but not for long");
+    }
+
+    #[test]
+    fn vehicles_that_the_end_of_the_period_left_out_have_a_round_of_their_own() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        for name in ["a", "b", "c"] {
+            rounds.report(Detections, &node(name), at(1));
+        }
+        assert!(rounds.tick(at(20)));
+        rounds.report(Detections, &node("a"), at(100));
+        assert!(rounds.tick(at(120)), "without b and c");
+        assert!(!rounds.report(Detections, &node("b"), at(125)));
+        assert!(rounds.report(Detections, &node("c"), at(126)), "as soon as both are there");
+        for name in ["a", "b"] {
+            assert!(!rounds.report(Detections, &node(name), at(200)), "all are waited for again");
+        }
+        assert!(rounds.tick(at(226)), "without c");
+        assert!(!rounds.report(Detections, &node("c"), at(290)), "too late: it counts for the next");
+    }
+
+    #[test]
+    fn rounds_that_end_in_the_midst_of_reports_end_after_them_from_then_on() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        // The first vehicle is alone when it reports, and completes its round at once.
+        assert!(rounds.report(Detections, &node("a"), at(50)));
+        for (name, ms) in [("b", 51), ("c", 52)] {
+            assert!(!rounds.report(Detections, &node(name), at(ms)));
+        }
+        let mut closed = Vec::new();
+        for begin in [150, 250, 350] {
+            for (name, ms) in [("a", begin), ("b", begin + 1), ("c", begin + 2)] {
+                if rounds.report(Detections, &node(name), at(ms)) {
+                    closed.push(ms);
+                }
+            }
+        }
+        assert_eq!(closed, [150, 152, 252, 352]);
     }
 
     #[test]

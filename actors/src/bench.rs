@@ -1,4 +1,26 @@
-//! Measurements that the `bench` command and the benchmarks share.
+//! Measures a live cell from outside: how long reports take to come back as maps, beside the bare broker, and how many
+//! vehicles it carries.
+//!
+//! ```text
+//! driver ── on schedule ──> vehicles ── reports ───────> broker ──> aggregator ── map ──────────────> broker ──> vehicles
+//!        └─ in between ───> vehicles ── same bytes ────> broker ──> echo ── as many bytes ──────────> broker ──> vehicles
+//! ```
+//!
+//! - Open loop: when each report is due is fixed before the run, and time counts from then. What delays a report, in this
+//!   process too, is part of its time, and no slow answer makes the load lighter (no coordinated omission).
+//! - The bare way differs from the cell's in the aggregator alone: the same connections, packets of the same size, the
+//!   same fan-in and fan-out, half a period later. Its echo answers when the packets of all vehicles are there.
+//! - A vehicle reads no more of a map than whose reports it rests on: a thousand vehicles in one process that decode
+//!   maps would measure each other.
 
-pub mod rounds;
+pub mod aggregator;
+mod driver;
+mod echo;
+pub mod latency;
+pub mod load;
+pub mod measurement;
+pub mod saturation;
+mod schedule;
 pub mod two_hop;
+pub mod usage;
+mod vehicle;

@@ -15,6 +15,7 @@ mod embedded;
 mod gate;
 mod permissions;
 mod retained;
+mod throttle;
 
 use std::net::SocketAddr;
 

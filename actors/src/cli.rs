@@ -1,5 +1,6 @@
 //! The command line of `ecod-node`.
 
+mod bench;
 #[cfg(feature = "camera")]
 mod calibrate;
 mod columns;
@@ -55,6 +56,8 @@ enum Command {
     /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
+    /// Measure a live cell under simulated vehicles: latency beside the bare broker, capacity, costs
+    Bench(bench::BenchArguments),
     /// Look whether a node can run here: camera, broker, ports, key, clock, disk; say what to fix
     Doctor(doctor::DoctorArguments),
     /// Join a cell as an observer and show it in this terminal
@@ -109,6 +112,7 @@ pub fn main() -> ExitCode {
         Some(Command::Testbed(arguments)) => testbed::run(&arguments),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
+        Some(Command::Bench(arguments)) => bench::run(&arguments),
         Some(Command::Doctor(arguments)) => doctor::run(&arguments),
         Some(Command::Top(arguments)) => top::run(&arguments),
         Some(Command::Record(arguments)) => record::run(&arguments),

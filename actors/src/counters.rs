@@ -1,9 +1,14 @@
 //! What went wrong or was left out, counted by reason: cheap enough for every packet.
 
+mod shed;
+
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use ecod::wire::RejectReason;
+
+use shed::Shedding;
+pub use shed::{Shed, ShedReason};
 
 /// Something that happens often enough to be counted rather than logged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -175,6 +180,7 @@ impl Event {
 pub struct Counters {
     events: [AtomicU64; Event::ALL.len()],
     rejects: [AtomicU64; RejectReason::ALL.len()],
+    shedding: Shedding,
 }
 
 impl Default for Counters {
@@ -182,6 +188,7 @@ impl Default for Counters {
         Self {
             events: [const { AtomicU64::new(0) }; Event::ALL.len()],
             rejects: [const { AtomicU64::new(0) }; RejectReason::ALL.len()],
+            shedding: Shedding::default(),
         }
     }
 }
@@ -200,6 +207,16 @@ impl Counters {
     /// Counts a payload that was not used.
     pub fn reject(&self, reason: RejectReason) {
         self.rejects[reason as usize].fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Counts something that was left out under overload, and warns of the first of a source.
+    pub fn shed(&self, reason: ShedReason, source: &str) {
+        self.shedding.count(reason, source);
+    }
+
+    /// What was left out so far, by reason and source.
+    pub fn all_shed(&self) -> Vec<Shed> {
+        self.shedding.snapshot()
     }
 
     /// How often an event happened.

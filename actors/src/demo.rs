@@ -8,7 +8,6 @@
 //! ```
 
 mod observer;
-mod process;
 mod reign;
 
 use std::collections::BTreeMap;
@@ -27,7 +26,6 @@ use ecod::wire::{GlobalMap, ReportKind, Role};
 
 pub use self::observer::ObservedReport;
 use self::observer::Observer;
-use self::process::NodeProcess;
 pub use self::reign::Reign;
 use self::reign::reigns;
 use crate::clock;
@@ -35,6 +33,7 @@ use crate::config::NodeConfig;
 use crate::follower::ReceivedMap;
 use crate::frame_source::SourceConfig;
 use crate::membership::MembershipConfig;
+use crate::node_process::NodeProcess;
 use crate::testbed::score::{SceneResult, Score};
 use crate::testbed::setup;
 
@@ -268,15 +267,6 @@ impl Demo<'_> {
     fn map_log(&self, cav: &Cav) -> PathBuf {
         self.directory.join(format!("{}.maps.jsonl", cav.name))
     }
-}
-
-/// A TCP address on which nothing listens now.
-///
-/// # Errors
-/// When loopback has no free port.
-pub fn free_address() -> anyhow::Result<SocketAddr> {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port on loopback")?;
-    Ok(listener.local_addr()?)
 }
 
 /// Addresses on which nothing listens now, no two the same.

@@ -1,10 +1,13 @@
 //! The actor that closes the rounds: reports in, maps and verdicts out while the node leads.
 //!
 //! ```text
-//! Gateway ── TakeReport, TakeMap ─> Fuser ── PublishMap, PublishVerdicts ──> Gateway
-//! LeaderElection ── Lead, … ─────> │ ▲ └─── Record ──> ReputationKeeper
+//! Gateway ── reports ──> Intake ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
+//! Gateway ── TakeReports, TakeMap ─> │ ▲
+//! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
 //! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
+
+mod intake;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,6 +24,8 @@ use ecod::wire::{GlobalMap, Reputation};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
+pub use intake::{Intake, Put};
+
 use crate::clock;
 use crate::counters::{Counters, Event};
 use crate::gateway::{Delivery, GatewayMessage, Incoming};
@@ -31,11 +36,8 @@ use crate::seat::Seat;
 /// What the fuser is asked to do.
 #[derive(Debug)]
 pub enum FuserMessage {
-    /// Fuse a vehicle's report.
-    TakeReport {
-        /// The report and when it came.
-        delivery: Delivery,
-    },
+    /// Fuse the reports that wait in the intake.
+    TakeReports,
     /// Keep another aggregator's map, to go on from when leading.
     TakeMap {
         /// The map.
@@ -74,6 +76,8 @@ pub enum FuserMessage {
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
+    /// Where vehicles' reports wait.
+    pub intake: Intake,
     /// Where the aggregator's inputs are recorded.
     pub recording: Recording,
     /// Where maps and verdicts are published.
@@ -94,6 +98,7 @@ pub struct Fuser;
 /// The aggregator and its alarm.
 pub struct FuserState {
     aggregator: Aggregator,
+    intake: Intake,
     recording: Recording,
     gateway: Seat<GatewayMessage>,
     keeper: Seat<ReputationKeeperMessage>,
@@ -114,9 +119,10 @@ impl Actor for Fuser {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let FuserArguments { aggregator, recording, gateway, keeper, counters } = arguments;
+        let FuserArguments { aggregator, intake, recording, gateway, keeper, counters } = arguments;
         let mut state = FuserState {
             aggregator,
+            intake,
             recording,
             gateway,
             keeper,
@@ -136,11 +142,13 @@ impl Actor for Fuser {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         match message {
-            FuserMessage::TakeReport { delivery } => state.take(&delivery),
+            FuserMessage::TakeReports => state.take_reports(),
             FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
+                // Also those of which only the run before this one was told.
+                state.take_reports();
                 state.tick();
             }
             FuserMessage::Lead { epoch, first_round, first } => state.lead(epoch, first_round, first),
@@ -161,6 +169,12 @@ impl Actor for Fuser {
 }
 
 impl FuserState {
+    fn take_reports(&mut self) {
+        for delivery in self.intake.take_all() {
+            self.take(&delivery);
+        }
+    }
+
     fn take(&mut self, delivery: &Delivery) {
         let Incoming::Report { kind, report } = &delivery.message else { return };
         let ignored_before = self.aggregator.ignored_votes();

@@ -199,10 +199,12 @@ impl Actor for Gateway {
             }
             GatewayMessage::PublishMap { map } => {
                 state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
+                links_first().await;
                 inbox.deliver_local(Incoming::Map(map));
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
                 state.publish(&Topic::GlobalVerdicts, &*verdicts, Handling::Stream);
+                links_first().await;
                 inbox.deliver_local(Incoming::Verdicts(verdicts));
             }
             GatewayMessage::PublishReputations { reputations } => {
@@ -233,6 +235,11 @@ impl Actor for Gateway {
     }
 }
 
+/// Lets the links' tasks send what was just published before this node's own parts work on it.
+async fn links_first() {
+    tokio::task::yield_now().await;
+}
+
 impl GatewayState {
     fn new(arguments: GatewayArguments) -> Self {
         let GatewayArguments { cell, part, status, mqtt, security, counters, subscriber, seed } = arguments;
@@ -247,7 +254,7 @@ impl GatewayState {
             (status.node.clone(), status.id),
             topics.clone(),
             (mqtt.limits(), security.signing.clone()),
-            mqtt.inbox,
+            (mqtt.inbox, mqtt.max_report_hz),
             Arc::clone(&counters),
             subscriber,
         );

@@ -39,6 +39,7 @@ pub mod lens;
 pub mod lines;
 pub mod membership;
 pub mod node;
+pub mod node_process;
 #[cfg(feature = "camera")]
 pub mod perception;
 pub mod pki;
@@ -53,4 +54,5 @@ pub mod service;
 pub mod state_file;
 #[cfg(feature = "camera")]
 pub mod testbed;
+mod throttles;
 pub mod top;

@@ -288,7 +288,8 @@ impl NodeState {
     fn log_health(&self) {
         let snapshot = self.assembly.counters().snapshot();
         let frames = self.assembly.frames().snapshot();
-        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?frames, "health");
+        let shed = self.assembly.counters().all_shed();
+        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?shed, ?frames, "health");
     }
 
     async fn start(&mut self, part: Part, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {

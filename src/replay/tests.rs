@@ -250,7 +250,8 @@ fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]
         output.extend(verdicts.map(FusedLine::Verdicts));
     };
     for (kind, report, received_at) in reports {
-        while cell.deadline() <= *received_at {
+        // A report at the very deadline is taken before the timer, as in a replay.
+        while cell.deadline() < *received_at {
             let deadline = cell.deadline();
             publish(cell.tick(deadline));
         }

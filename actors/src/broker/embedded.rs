@@ -1,7 +1,7 @@
 //! The embedded broker: rmqtt on a thread of its own, behind a gate where others than this machine's can reach it.
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 use std::{fmt, io};
@@ -18,6 +18,8 @@ use tokio::sync::oneshot;
 use super::BrokerHealth;
 use super::gate::{Gate, Guard};
 use super::retained::RetainedMessages;
+use super::throttle::ClientThrottle;
+use crate::counters::Counters;
 
 /// An MQTT broker that lives inside the process.
 pub trait Mqtt: Send + fmt::Debug {
@@ -97,6 +99,9 @@ pub struct BrokerConfig {
     pub connect_burst: u32,
     /// Connections per second that one address may make after that; default 10.
     pub connects_per_s: u32,
+    /// Most messages a second of one client, and at once after a second of silence; default 1000. What is beyond is
+    /// passed on to nobody and counted. A node sends some tens; more lets a flood take the others' time.
+    pub max_messages_hz: u32,
 }
 
 impl Default for BrokerConfig {
@@ -110,6 +115,7 @@ impl Default for BrokerConfig {
             handshake_timeout_ms: 5000,
             connect_burst: 64,
             connects_per_s: 10,
+            max_messages_hz: 1000,
         }
     }
 }
@@ -128,7 +134,8 @@ impl BrokerConfig {
         check_range("max_retained", self.max_retained as f64, 1.0, 1e6)?;
         check_range("handshake_timeout_ms", self.handshake_timeout_ms as f64, 100.0, 60_000.0)?;
         check_range("connect_burst", f64::from(self.connect_burst), 1.0, 1e6)?;
-        check_range("connects_per_s", f64::from(self.connects_per_s), 1.0, 1e4)
+        check_range("connects_per_s", f64::from(self.connects_per_s), 1.0, 1e4)?;
+        check_range("max_messages_hz", f64::from(self.max_messages_hz), 1.0, 1e6)
     }
 }
 
@@ -137,6 +144,7 @@ impl BrokerConfig {
 pub struct EmbeddedBroker {
     config: BrokerConfig,
     guard: Option<Guard>,
+    counters: Arc<Counters>,
     running: Option<Running>,
 }
 
@@ -156,12 +164,19 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 impl EmbeddedBroker {
     /// A broker that is not started.
     pub fn new(config: BrokerConfig) -> Self {
-        Self { config, guard: None, running: None }
+        Self { config, guard: None, counters: Arc::default(), running: None }
     }
 
     /// A broker behind a gate: clients show certificates, if the guard has any, and strangers are limited.
     pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
-        Self { config, guard: Some(guard), running: None }
+        let counters = Arc::clone(&guard.counters);
+        Self { config, guard: Some(guard), counters, running: None }
+    }
+
+    /// Counts what it does not pass on in `counters`.
+    pub fn counting(mut self, counters: Arc<Counters>) -> Self {
+        self.counters = counters;
+        self
     }
 
     fn listener(&self, address: SocketAddr) -> Builder {
@@ -186,8 +201,14 @@ impl Mqtt for EmbeddedBroker {
         let thread_error = |source| BrokerError::Thread { address, source };
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
-        let plan =
-            Plan { address, listener: self.listener(address), config: self.config.clone(), guard: self.guard.clone() };
+        let throttle = ClientThrottle::new(self.config.max_messages_hz, Arc::clone(&self.counters));
+        let plan = Plan {
+            address,
+            listener: self.listener(address),
+            config: self.config.clone(),
+            guard: self.guard.clone(),
+            throttle,
+        };
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
             .spawn(move || serve(plan, &ready, stopped))
@@ -241,6 +262,7 @@ struct Plan {
     listener: Builder,
     config: BrokerConfig,
     guard: Option<Guard>,
+    throttle: ClientThrottle,
 }
 
 /// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made here.
@@ -280,7 +302,7 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
 
 /// Opens the sockets: rmqtt's own is the public one, or behind the gate's.
 async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketAddr)> {
-    let Plan { address, listener, config, guard } = plan;
+    let Plan { address, listener, config, guard, throttle } = plan;
     let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let listener = match &guard {
         // Without anonymous clients, the hooks are asked about each.
@@ -292,6 +314,7 @@ async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketA
     // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
     let context = ServerContext::new().busy_check_enable(false).build().await;
     *context.extends.retain_mut().await = Box::new(RetainedMessages::new(config.max_retained));
+    throttle.install(&context).await;
     let (gate, bound) = match &guard {
         Some(guard) => {
             let public = TcpListener::bind(address).await?;

@@ -13,7 +13,8 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::testbed::{Results, check_writable, read, select};
 use super::{Failure, print, write_json};
-use crate::demo::{Demo, DemoResult, News, Reign, free_address};
+use crate::demo::{Demo, DemoResult, News, Reign};
+use crate::node_process::free_address;
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
 

@@ -16,7 +16,7 @@ use super::feed::kind_label;
 use super::history::MAX_VEHICLES;
 use super::observer::{Observer, age_s};
 use super::process;
-use crate::counters::Event;
+use crate::counters::{Event, Shed};
 use crate::gateway::LinkState;
 use crate::leader_election::Position;
 
@@ -138,6 +138,10 @@ fn traffic(registry: &mut Registry, observer: &Observer) {
     let rejected = counters(registry, "payloads_rejected", "Payloads that were not used, by reason");
     for (reason, number) in snapshot.rejects {
         add(&rejected, [("reason", reason.to_owned())], number);
+    }
+    let shed = counters(registry, "shed", "Messages left out under overload, by reason and source; bounded");
+    for Shed { reason, source, times } in sources.counters.all_shed() {
+        add(&shed, [("reason", reason.as_str().to_owned()), ("source", source)], times);
     }
     let events = counters(registry, "events", "What the node counts, by kind");
     for (event, number) in snapshot.events {

@@ -48,6 +48,9 @@ pub struct MqttConfig {
     pub send_queue: usize,
     /// Most decoded messages that receivers may be behind; default 1024. When full, new ones are dropped and counted.
     pub inbox: usize,
+    /// Most reports a second of one vehicle and kind, and at once after a second of silence; default 100. What is beyond is
+    /// not decoded and counted by vehicle. More lets one vehicle take the others' time.
+    pub max_report_hz: u32,
     /// Largest report or status in bytes that is decoded; default 262144.
     pub max_payload_bytes: usize,
     /// Largest map, verdicts or reputations in bytes that are sent and decoded; default 8388608, 512 bytes for each of
@@ -75,6 +78,7 @@ impl Default for MqttConfig {
             retry_max_ms: 2000,
             send_queue: 64,
             inbox: 1024,
+            max_report_hz: 100,
             max_payload_bytes: limits.payload_bytes,
             max_map_bytes: limits.map_bytes,
             max_objects: limits.objects,
@@ -98,6 +102,7 @@ impl MqttConfig {
         check_range("retry_min_ms", self.retry_min_ms as f64, 1.0, 60_000.0)?;
         check_range("retry_max_ms", self.retry_max_ms as f64, self.retry_min_ms as f64, 600_000.0)?;
         check_range("send_queue", self.send_queue as f64, 8.0, 65_536.0)?;
+        check_range("max_report_hz", f64::from(self.max_report_hz), 1.0, 1e5)?;
         check_range("inbox", self.inbox as f64, 1.0, 1e6)?;
         check_range("max_payload_bytes", self.max_payload_bytes as f64, 256.0, MAX_PAYLOAD_BYTES)?;
         check_range("max_map_bytes", self.max_map_bytes as f64, 1024.0, MAX_PAYLOAD_BYTES)?;

@@ -1,7 +1,7 @@
 //! From a packet to a decoded message in a receiver's hands; junk ends here as a count.
 
 use std::fmt;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
@@ -15,7 +15,8 @@ use uuid::Uuid;
 use super::address::BrokerAddress;
 use super::security::SigningKey;
 use crate::clock;
-use crate::counters::{Counters, Event};
+use crate::counters::{Counters, Event, ShedReason};
+use crate::throttles::Throttles;
 
 /// A checked message of the cell, or news about a link.
 ///
@@ -70,6 +71,13 @@ pub struct Delivery {
     _place: Option<OwnedSemaphorePermit>,
 }
 
+impl Delivery {
+    /// What the node itself publishes or observes; its own pace bounds it.
+    pub(crate) fn local(message: Incoming, at: Timestamp) -> Self {
+        Self { message, received_at: at, _place: None }
+    }
+}
+
 /// Takes messages to their receivers, typically by sending to actors; runs on the link's task and must not block.
 pub type Subscriber = Arc<dyn Fn(Delivery) + Send + Sync>;
 
@@ -83,6 +91,7 @@ pub(super) struct Inbox {
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
     places: Arc<Semaphore>,
+    reporters: [Mutex<Throttles<NodeName>>; ReportKind::COUNT],
 }
 
 /// What became of a packet, as far as the link has to act on it.
@@ -102,7 +111,7 @@ impl Inbox {
         (node, run): (NodeName, Uuid),
         topics: Topics,
         (limits, signing): (Limits, Option<SigningKey>),
-        places: usize,
+        (places, max_report_hz): (usize, u32),
         counters: Arc<Counters>,
         subscriber: Subscriber,
     ) -> Self {
@@ -115,6 +124,7 @@ impl Inbox {
             counters,
             subscriber: RwLock::new(subscriber),
             places: Arc::new(Semaphore::new(places)),
+            reporters: std::array::from_fn(|_| Mutex::new(Throttles::new(max_report_hz))),
         }
     }
 
@@ -134,7 +144,7 @@ impl Inbox {
                 self.counters.count(Event::Echo);
                 Outcome::Done
             }
-            Ok(Read::Cleared) => Outcome::Done,
+            Ok(Read::Cleared | Read::Shed) => Outcome::Done,
             Ok(Read::OwnDeath) => Outcome::DeclaredOffline,
             Ok(Read::OwnStatus) => {
                 self.counters.count(Event::Echo);
@@ -160,9 +170,9 @@ impl Inbox {
         }
     }
 
-    /// Hands over what this node itself publishes or observes; its own pace bounds it.
+    /// Hands over what this node itself publishes or observes.
     pub(super) fn deliver_local(&self, message: Incoming) {
-        self.hand_over(Delivery { message, received_at: clock::now(), _place: None });
+        self.hand_over(Delivery::local(message, clock::now()));
     }
 
     fn hand_over(&self, delivery: Delivery) {
@@ -178,8 +188,10 @@ impl Inbox {
             _ => payload,
         };
         let message = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
-            Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload),
-            Topic::VoteDetections(node) => return self.read_report(ReportKind::VoteDetections, &node, payload),
+            Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload, received_at),
+            Topic::VoteDetections(node) => {
+                return self.read_report(ReportKind::VoteDetections, &node, payload, received_at);
+            }
             Topic::Ledger(node) if node == self.node => return Ok(Read::Echo),
             Topic::Ledger(node) => Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?)),
             Topic::Nodes(node) => return self.read_status(&node, payload),
@@ -211,10 +223,22 @@ impl Inbox {
         Ok(Read::Message(message))
     }
 
-    fn read_report(&self, kind: ReportKind, node: &NodeName, payload: &[u8]) -> Result<Read, RejectReason> {
+    fn read_report(
+        &self,
+        kind: ReportKind,
+        node: &NodeName,
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> Result<Read, RejectReason> {
         if *node == self.node {
             return Ok(Read::Echo);
         }
+        let mut reporters = self.reporters[kind as usize].lock().unwrap_or_else(PoisonError::into_inner);
+        if !reporters.allow(node, received_at) {
+            self.counters.shed(ShedReason::ReportThrottled, node.as_str());
+            return Ok(Read::Shed);
+        }
+        drop(reporters);
         let report = Arc::new(decode_report(payload, node, &self.limits)?);
         Ok(Read::Message(Incoming::Report { kind, report }))
     }
@@ -239,6 +263,8 @@ impl Inbox {
 /// What a usable packet turned out to be.
 enum Read {
     Message(Incoming),
+    /// More of a vehicle than is taken.
+    Shed,
     /// Published by this node.
     Echo,
     /// A retained message was removed.
@@ -259,11 +285,12 @@ impl fmt::Debug for Inbox {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Mutex;
+    use std::collections::BTreeMap;
 
     use ecod::wire::{Encoding, encode};
 
     use super::*;
+    use crate::counters::Shed;
 
     #[test]
     fn a_full_inbox_drops_and_counts_until_a_receiver_catches_up() {
@@ -274,7 +301,7 @@ mod tests {
             (NodeName::new("edge").unwrap(), Uuid::nil()),
             Topics::new(&NodeName::new("lot").unwrap()),
             (Limits::default(), None),
-            2,
+            (2, 100),
             Arc::clone(&counters),
             Arc::new(move |delivery| receiver.lock().unwrap().push(delivery)),
         );
@@ -299,5 +326,41 @@ mod tests {
 
         accept_from("edge", 7);
         assert_eq!((counters.events(Event::Echo), counters.events(Event::InboxFull)), (1, 3));
+    }
+
+    #[test]
+    fn one_vehicle_that_floods_is_cut_down_and_counted_and_others_are_not() {
+        let counters = Arc::new(Counters::default());
+        let taken = Arc::new(Mutex::new(BTreeMap::<NodeName, u64>::new()));
+        let receiver = Arc::clone(&taken);
+        let inbox = Inbox::new(
+            (NodeName::new("edge").unwrap(), Uuid::nil()),
+            Topics::new(&NodeName::new("lot").unwrap()),
+            (Limits::default(), None),
+            (16, 30),
+            Arc::clone(&counters),
+            Arc::new(move |delivery| {
+                let Incoming::Report { report, .. } = delivery.message else { return };
+                *receiver.lock().unwrap().entry(report.node.clone()).or_default() += 1;
+            }),
+        );
+        for ms in 0..1000 {
+            let accept = |node: &str| {
+                let report = ObjectReport::new(NodeName::new(node).unwrap(), ms, Timestamp(ms));
+                let topic = format!("ecod/v1/lot/detections/{node}");
+                inbox.accept(topic.as_bytes(), &encode(&report, Encoding::Json), Timestamp(ms * 1000))
+            };
+            for _ in 0..10 {
+                accept("mallory");
+            }
+            if ms % 100 == 0 {
+                accept("euclid");
+            }
+        }
+        let [mallory, euclid] =
+            ["mallory", "euclid"].map(NodeName::from_static).map(|node| taken.lock().unwrap()[&node]);
+        assert_eq!((mallory, euclid), (59, 10), "a second's worth at once, then 30 a second");
+        let shed = Shed { reason: ShedReason::ReportThrottled, source: "mallory".into(), times: 10_000 - mallory };
+        assert_eq!(counters.all_shed(), [shed]);
     }
 }

@@ -60,6 +60,11 @@ impl Throttle {
         Self { left: burst, burst, interval, filled: now }
     }
 
+    /// Whether a whole burst would be allowed now.
+    pub(crate) fn is_rested(&self, now: Timestamp) -> bool {
+        now.since(self.filled) >= self.interval * self.burst.saturating_sub(self.left)
+    }
+
     /// Whether one more is allowed now.
     pub(crate) fn allow(&mut self, now: Timestamp) -> bool {
         let earned = now.since(self.filled).as_micros() / self.interval.as_micros().max(1);

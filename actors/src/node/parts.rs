@@ -22,7 +22,7 @@ use crate::config::NodeConfig;
 use crate::counters::Counters;
 use crate::dashboard::{Dashboard, Feed};
 use crate::follower::{Follower, Newest};
-use crate::fuser::Fuser;
+use crate::fuser::{Fuser, Intake};
 use crate::gateway::{Gateway, Security};
 use crate::leader_election::{LeaderElection, LeaderElectionMessage, Leadership};
 use crate::membership::{FrameCounters, Member, Membership, MembershipMessage};
@@ -49,6 +49,7 @@ pub(super) struct Assembly {
     newest: Newest,
     book: SharedBook,
     recording: Recording,
+    intake: Intake,
     broker_address: watch::Sender<Option<SocketAddr>>,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
@@ -80,6 +81,7 @@ impl Assembly {
             recording: Recording::new(Arc::clone(&counters)),
             counters,
             newest: Newest::default(),
+            intake: Intake::default(),
             book: SharedBook::new(by_evidence),
             broker_address: watch::Sender::new(None),
             gossip_address: watch::Sender::new(None),
@@ -258,7 +260,7 @@ impl Assembly {
         match (&credentials, listen.ip().is_loopback()) {
             (None, true) => {
                 tracing::info!("broker for this machine only: no certificates are configured");
-                return EmbeddedBroker::new(config);
+                return EmbeddedBroker::new(config).counting(self.counters());
             }
             (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
             (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),

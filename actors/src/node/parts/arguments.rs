@@ -13,6 +13,7 @@ use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
 use super::Assembly;
 use crate::clock;
+use crate::counters::ShedReason;
 use crate::dashboard::{DashboardArguments, LandmarkFacts, NodeFacts, Sources};
 use crate::follower::{FollowerArguments, FollowerMessage};
 use crate::fuser::{FuserArguments, FuserMessage};
@@ -83,6 +84,7 @@ impl Assembly {
         let Seats { fuser, follower, keeper, election, .. } = self.seats.clone();
         let (name, feed, leadership) = (self.name.clone(), Arc::clone(&self.feed), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
+        let (intake, counters) = (self.intake.clone(), self.counters());
         Arc::new(move |delivery| {
             let at = delivery.received_at;
             feed.note(&delivery.message, at);
@@ -97,7 +99,14 @@ impl Assembly {
                 {
                     true
                 }
-                Incoming::Report { .. } => fuser.send(FuserMessage::TakeReport { delivery }),
+                Incoming::Report { kind, report } => {
+                    let (node, kind) = (report.node.clone(), *kind);
+                    let put = intake.put(node.clone(), kind, delivery);
+                    if put.has_replaced {
+                        counters.shed(ShedReason::ReportReplaced, node.as_str());
+                    }
+                    !put.is_first || fuser.send(FuserMessage::TakeReports)
+                }
                 Incoming::Map(map) => {
                     fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at: delivery.received_at });
                     follower.send(FollowerMessage::TakeMap { delivery })
@@ -162,6 +171,7 @@ impl Assembly {
         FuserArguments {
             aggregator,
             recording: self.recording.clone(),
+            intake: self.intake.clone(),
             gateway: self.seats.gateway.clone(),
             keeper: self.seats.keeper.clone(),
             counters: self.counters(),

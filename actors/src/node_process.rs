@@ -1,6 +1,7 @@
 //! A node as a process of its own.
 
 use std::fs::{self, File};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
@@ -14,7 +15,7 @@ use crate::config::NodeConfig;
 
 /// A running `ecod-node`; killed when dropped.
 #[derive(Debug)]
-pub(super) struct NodeProcess {
+pub struct NodeProcess {
     name: String,
     program: PathBuf,
     file: PathBuf,
@@ -29,7 +30,10 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 
 impl NodeProcess {
     /// Writes the node's configuration to the directory and starts it; its log goes there too.
-    pub(super) fn start(program: &Path, config: &NodeConfig, directory: &Path) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    /// When a file cannot be written or the program cannot be run.
+    pub fn start(program: &Path, config: &NodeConfig, directory: &Path) -> anyhow::Result<Self> {
         let name = config.name.as_ref().map_or_else(|| "node".to_owned(), ToString::to_string);
         let (file, log) = (directory.join(format!("{name}.toml")), directory.join(format!("{name}.log")));
         let text = toml::to_string(config).context("the configuration cannot be written as TOML")?;
@@ -40,7 +44,10 @@ impl NodeProcess {
     }
 
     /// Starts the node again, with its configuration; the log goes on.
-    pub(super) fn restart(&mut self) -> anyhow::Result<()> {
+    ///
+    /// # Errors
+    /// When the program cannot be run.
+    pub fn restart(&mut self) -> anyhow::Result<()> {
         self.child = spawn(&self.program, &self.file, &self.log)?;
         self.starts += 1;
         self.killed = false;
@@ -48,22 +55,29 @@ impl NodeProcess {
     }
 
     /// SIGKILL: the node has no time for farewells.
-    pub(super) async fn kill(&mut self) -> anyhow::Result<()> {
+    ///
+    /// # Errors
+    /// When the operating system refuses.
+    pub async fn kill(&mut self) -> anyhow::Result<()> {
         self.killed = true;
         self.child.kill().await.with_context(|| format!("cannot kill node {}", self.name))
     }
 
-    pub(super) fn is_killed(&self) -> bool {
+    /// Whether it was killed and not started again.
+    pub fn is_killed(&self) -> bool {
         self.killed
     }
 
     /// How often the node was started.
-    pub(super) fn starts(&self) -> u32 {
+    pub fn starts(&self) -> u32 {
         self.starts
     }
 
-    /// An error when the process has ended by itself.
-    pub(super) fn check(&mut self) -> anyhow::Result<()> {
+    /// Looks whether it still runs.
+    ///
+    /// # Errors
+    /// When the process has ended by itself, with the last line of its log.
+    pub fn check(&mut self) -> anyhow::Result<()> {
         if !self.killed
             && let Some(status) = self.child.try_wait()?
         {
@@ -74,8 +88,13 @@ impl NodeProcess {
         Ok(())
     }
 
+    /// The process's number, while it runs.
+    pub fn pid(&self) -> Option<u32> {
+        self.child.id()
+    }
+
     /// Asks the node to stop, and makes it stop when it does not.
-    pub(super) async fn stop(&mut self) {
+    pub async fn stop(&mut self) {
         let pid = self.child.id().and_then(|pid| i32::try_from(pid).ok()).map(Pid::from_raw);
         if let Some(Err(error)) = pid.map(|pid| kill(pid, Signal::SIGTERM)) {
             tracing::warn!(node = self.name, %error, "node not asked to stop");
@@ -87,6 +106,15 @@ impl NodeProcess {
             }
         }
     }
+}
+
+/// A TCP address on which nothing listens now.
+///
+/// # Errors
+/// When loopback has no free port.
+pub fn free_address() -> anyhow::Result<SocketAddr> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port on loopback")?;
+    Ok(listener.local_addr()?)
 }
 
 fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {

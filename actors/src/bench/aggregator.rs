@@ -1,0 +1,78 @@
+//! An aggregator of the benchmark's own: a node in a process of its own, with its broker, on loopback.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::Context;
+use ecod::names::NodeName;
+use ecod::wire::Role;
+use tokio::net::TcpStream;
+
+use super::load::landmarks;
+use super::measurement::Target;
+use crate::config::NodeConfig;
+use crate::node_process::{NodeProcess, free_address};
+use crate::recorder::RecordConfig;
+
+/// A running aggregator; killed when dropped, though only [`OwnAggregator::stop`] removes its files.
+#[derive(Debug)]
+pub struct OwnAggregator {
+    process: NodeProcess,
+    directory: PathBuf,
+    target: Target,
+}
+
+impl OwnAggregator {
+    /// Starts `program` as an edge with a dashboard, recording if `records`, and waits until its broker serves.
+    ///
+    /// # Errors
+    /// When it cannot be started or ends.
+    pub async fn start(program: &Path, records: bool) -> anyhow::Result<Self> {
+        let directory = std::env::temp_dir().join(format!("ecod-bench-{}", std::process::id()));
+        fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+        let broker = free_address()?;
+        let mut config = NodeConfig {
+            name: Some(NodeName::from_static("edge")),
+            cell: NodeName::from_static("bench"),
+            role: Role::Edge,
+            listen: Some(broker),
+            landmarks: landmarks(),
+            record: records.then(|| RecordConfig::new(directory.join("log"))),
+            ..NodeConfig::default()
+        };
+        config.dashboard.listen = Some(free_address()?);
+        config.membership.bind = Some(([127, 0, 0, 1], 0).into());
+        config.membership.multicast.enabled = false;
+        let mut process = NodeProcess::start(program, &config, &directory)?;
+        while TcpStream::connect(broker).await.is_err() {
+            process.check()?;
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        let target = Target {
+            broker: broker.into(),
+            cell: config.cell,
+            landmarks: config.landmarks,
+            encoding: config.mqtt.encoding,
+            aggregator: process.pid(),
+        };
+        Ok(Self { process, directory, target })
+    }
+
+    /// What there is to measure.
+    ///
+    /// # Errors
+    /// When the process has ended.
+    pub fn target(&mut self) -> anyhow::Result<&Target> {
+        self.process.check()?;
+        Ok(&self.target)
+    }
+
+    /// Stops it and removes its files.
+    pub async fn stop(mut self) {
+        self.process.stop().await;
+        if let Err(error) = fs::remove_dir_all(&self.directory) {
+            tracing::warn!(directory = %self.directory.display(), %error, "directory stays");
+        }
+    }
+}

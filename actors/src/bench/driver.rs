@@ -1,0 +1,71 @@
+//! The thread that sends: it waits for the schedule and for nothing else.
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use ecod::wire::{Encoding, ObjectReport, encode};
+use rumqttc::{AsyncClient, QoS};
+
+use super::echo::stamped;
+use super::load::Load;
+use super::schedule::{Schedule, wait_until};
+
+/// What is sent for a vehicle.
+#[derive(Debug)]
+pub(super) struct Sender {
+    pub(super) client: AsyncClient,
+    pub(super) report: ObjectReport,
+    pub(super) topic: String,
+    pub(super) bare_topic: String,
+}
+
+/// What came of the sending.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Sent {
+    /// Most time by which a tick began late.
+    pub(super) latest: Duration,
+    /// Reports that a client's queue did not take.
+    pub(super) refused: u64,
+    /// Bytes of the last report.
+    pub(super) report_bytes: usize,
+}
+
+/// Sends everything on schedule.
+pub(super) fn drive(schedule: Schedule, load: Load, encoding: Encoding, mut senders: Vec<Sender>) -> Sent {
+    // Without it Linux lets a thread sleep 50 µs longer than asked; a kernel that refuses only costs that.
+    if let Err(error) = nix::sys::prctl::set_timerslack(1) {
+        tracing::debug!(%error, "timer slack stays");
+    }
+    let mut sent = Sent::default();
+    let last = u32::try_from(senders.len().saturating_sub(1)).unwrap_or(u32::MAX).max(1);
+    for tick in 0..load.ticks() {
+        let payloads: Vec<_> = senders
+            .iter_mut()
+            .map(|sender| {
+                (sender.report.seq, sender.report.captured_at_us) = (tick.into(), schedule.captured_at(tick));
+                encode(&sender.report, encoding)
+            })
+            .collect();
+        let mut send = |begin: Instant, bare: bool, payloads: Vec<Vec<u8>>| {
+            wait_until(begin);
+            sent.latest = sent.latest.max(begin.elapsed());
+            for ((index, sender), payload) in (0..).zip(&senders).zip(payloads) {
+                if !load.spread.is_zero() {
+                    wait_until(begin + load.spread * index / last);
+                }
+                let topic = if bare { &sender.bare_topic } else { &sender.topic };
+                let taken = sender.client.try_publish(topic, QoS::AtMostOnce, false, payload);
+                sent.refused += u64::from(taken.is_err());
+            }
+        };
+        let begin = schedule.begin(tick);
+        let bare = load.bare.then(|| payloads.iter().cloned().map(|bytes| stamped(tick, bytes)).collect());
+        sent.report_bytes = payloads.last().map_or(0, Vec::len);
+        send(begin, false, payloads);
+        if let Some(payloads) = bare {
+            send(begin + schedule.period() / 2, true, payloads);
+        }
+    }
+    thread::sleep(schedule.period());
+    sent
+}

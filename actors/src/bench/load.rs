@@ -1,0 +1,90 @@
+//! What the vehicles of a measurement send.
+
+use std::time::Duration;
+
+use ecod::landmark::LandmarkConfig;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{ObjectReport, PerceivedObject};
+
+/// A number of vehicles that all report once in a period.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Load {
+    /// Simulated vehicles, at least 1.
+    pub vehicles: usize,
+    /// Time from one report of a vehicle to its next.
+    pub period: Duration,
+    /// Time from the first vehicle's report to the last one's, evenly spaced; less than half a period.
+    pub spread: Duration,
+    /// How long reports are sent; the first tenth warms up and is not counted.
+    pub duration: Duration,
+    /// Whether the bare way is measured too.
+    pub bare: bool,
+}
+
+impl Load {
+    /// Reports of this many vehicles ten times a second, all at once, beside the bare way.
+    pub fn new(vehicles: usize, duration: Duration) -> Self {
+        Self { vehicles, period: Duration::from_millis(100), spread: Duration::ZERO, duration, bare: true }
+    }
+
+    /// How often every vehicle reports, at least twice.
+    pub(super) fn ticks(&self) -> u32 {
+        u32::try_from(self.duration.as_micros() / self.period.as_micros().max(1)).unwrap_or(u32::MAX).max(2)
+    }
+
+    /// Ticks that are not counted.
+    pub(super) fn warm_up(&self) -> u32 {
+        self.ticks().div_ceil(10)
+    }
+}
+
+/// Objects in a report.
+const OBJECTS: usize = 10;
+
+/// A lot of 32 spots, for a cell of the benchmark's own.
+pub fn landmarks() -> Vec<LandmarkConfig> {
+    (0..32).map(|index| LandmarkConfig::at(format!("slot-{index}"), 3.0 * f64::from(index), 0.0)).collect()
+}
+
+/// What one vehicle says of ten neighbouring locations: an object at each, and that all were in view.
+pub(super) fn report(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport {
+    let spots = landmarks.iter().cycle().skip(vehicle % landmarks.len().max(1)).take(OBJECTS.min(landmarks.len()));
+    let object = |spot: &LandmarkConfig| PerceivedObject {
+        covariance_m2: Some([0.01, 0.0012, 0.0104]),
+        ..PerceivedObject::new("ABCD123", 0.931, spot.x_m + 0.1037, spot.y_m - 0.0512)
+    };
+    ObjectReport {
+        objects: spots.clone().map(object).collect(),
+        seen: Some(spots.map(|spot| spot.id.clone()).collect()),
+        ..ObjectReport::new(name(vehicle), 0, Timestamp(0))
+    }
+}
+
+/// The vehicle's name.
+///
+/// # Panics
+/// Never: a number makes a name.
+fn name(vehicle: usize) -> NodeName {
+    NodeName::new(format!("cav-{vehicle}")).expect("a number makes a name")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn neighbours_see_the_same_spots_but_one() {
+        let lot = landmarks();
+        let spots = |vehicle| report(vehicle, &lot).seen.unwrap_or_default();
+        assert_eq!(spots(30).len(), OBJECTS);
+        assert_eq!(spots(30)[1..], spots(31)[..OBJECTS - 1]);
+        assert_eq!(report(5, &[]).objects.len(), 0);
+    }
+
+    #[test]
+    fn a_tenth_warms_up() {
+        let load = Load::new(4, Duration::from_secs(5));
+        assert_eq!((load.ticks(), load.warm_up()), (50, 5));
+    }
+}

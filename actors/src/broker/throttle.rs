@@ -1,0 +1,51 @@
+//! No client of the embedded broker takes more than its share.
+
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use async_trait::async_trait;
+use rmqtt::context::ServerContext;
+use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
+use rmqtt::types::{ClientId, PublishAclResult};
+
+use crate::clock;
+use crate::counters::{Counters, ShedReason};
+use crate::throttles::Throttles;
+
+/// Passes on at most so many messages a second of each client, before anything is done with them.
+pub(super) struct ClientThrottle {
+    clients: Mutex<Throttles<ClientId>>,
+    counters: Arc<Counters>,
+}
+
+impl ClientThrottle {
+    pub(super) fn new(per_second: u32, counters: Arc<Counters>) -> Self {
+        Self { clients: Mutex::new(Throttles::new(per_second)), counters }
+    }
+
+    /// Has rmqtt ask for every message, before anybody is asked for permission.
+    pub(super) async fn install(self, context: &ServerContext) {
+        let register = context.extends.hook_mgr().register();
+        register.add_priority(Type::MessagePublishCheckAcl, 1, Box::new(self)).await;
+        register.start().await;
+    }
+}
+
+#[async_trait]
+impl Handler for ClientThrottle {
+    async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
+        let Parameter::MessagePublishCheckAcl(session, _) = parameter else { return (true, before) };
+        let client = &session.id.client_id;
+        if self.clients.lock().unwrap_or_else(PoisonError::into_inner).allow(client, clock::now()) {
+            return (true, before);
+        }
+        self.counters.shed(ShedReason::BrokerThrottled, client);
+        (false, Some(HookResult::PublishAclResult(PublishAclResult::rejected(false, None))))
+    }
+}
+
+impl fmt::Debug for ClientThrottle {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ClientThrottle").finish_non_exhaustive()
+    }
+}

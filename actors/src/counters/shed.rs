@@ -1,0 +1,98 @@
+//! What is left out under overload, by reason and source.
+
+use std::collections::BTreeMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Why something that came in was left out though nothing is wrong with it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum ShedReason {
+    /// A client published more than `broker.max_messages_hz`; the embedded broker passed the message on to nobody.
+    BrokerThrottled,
+    /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
+    ReportThrottled,
+    /// A newer report of the same vehicle came before the fuser had taken this one.
+    ReportReplaced,
+}
+
+impl ShedReason {
+    /// The reason as a counter's label.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::BrokerThrottled => "broker_throttled",
+            Self::ReportThrottled => "report_throttled",
+            Self::ReportReplaced => "report_replaced",
+        }
+    }
+}
+
+/// How much of whose was left out for one reason.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Shed {
+    /// Why.
+    pub reason: ShedReason,
+    /// The vehicle, or the client of the broker.
+    pub source: String,
+    /// How many messages.
+    pub times: u64,
+}
+
+/// Counts by reason and source; a bounded number of sources is told apart.
+#[derive(Debug, Default)]
+pub(super) struct Shedding {
+    counts: Mutex<BTreeMap<(ShedReason, String), u64>>,
+}
+
+/// Most pairs of reason and source that are told apart; further sources are counted together.
+const MAX_SOURCES: usize = 64;
+
+/// The source of what further sources send.
+const OTHERS: &str = "others";
+
+impl Shedding {
+    /// Counts one message, and warns of the first of a source.
+    pub(super) fn count(&self, reason: ShedReason, source: &str) {
+        let mut counts = self.counts();
+        let key = (reason, source.to_owned());
+        if let Some(times) = counts.get_mut(&key) {
+            *times += 1;
+        } else if counts.len() < MAX_SOURCES {
+            counts.insert(key, 1);
+            tracing::warn!(source, reason = reason.as_str(), "more comes in than is taken, the rest is left out");
+        } else {
+            *counts.entry((reason, OTHERS.to_owned())).or_default() += 1;
+        }
+    }
+
+    pub(super) fn snapshot(&self) -> Vec<Shed> {
+        let shed = |((reason, source), times): (&(ShedReason, String), &u64)| Shed {
+            reason: *reason,
+            source: source.clone(),
+            times: *times,
+        };
+        self.counts().iter().map(shed).collect()
+    }
+
+    fn counts(&self) -> MutexGuard<'_, BTreeMap<(ShedReason, String), u64>> {
+        self.counts.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sources_are_told_apart_until_there_are_too_many() {
+        let shedding = Shedding::default();
+        for source in 0..2 * MAX_SOURCES {
+            for _ in 0..2 {
+                shedding.count(ShedReason::ReportThrottled, &format!("v{source:03}"));
+            }
+        }
+        let snapshot = shedding.snapshot();
+        assert_eq!(snapshot.len(), MAX_SOURCES + 1);
+        assert_eq!(snapshot.iter().map(|shed| shed.times).sum::<u64>(), 4 * MAX_SOURCES as u64);
+        let others = snapshot.iter().find(|shed| shed.source == OTHERS).unwrap();
+        assert_eq!(others.times, 2 * MAX_SOURCES as u64);
+    }
+}

@@ -1,0 +1,85 @@
+//! Reports on their way to the fuser: of each vehicle and kind the latest.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use ecod::names::NodeName;
+use ecod::wire::ReportKind;
+
+use crate::gateway::Delivery;
+
+/// Takes reports where they come in, on the links' tasks, and keeps them until the fuser is free. However many come, at
+/// most one of each vehicle and kind waits, so that no vehicle's reports wait behind a heap of another's.
+#[derive(Debug, Clone, Default)]
+pub struct Intake(Arc<Mutex<Waiting>>);
+
+#[derive(Debug, Default)]
+struct Waiting {
+    next: u64,
+    /// In the order of their coming.
+    reports: BTreeMap<u64, Delivery>,
+    places: BTreeMap<(NodeName, ReportKind), u64>,
+}
+
+/// What became of a report that was put in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Put {
+    /// Nothing waited before: the fuser has to be told.
+    pub is_first: bool,
+    /// An older report of the vehicle gave way.
+    pub has_replaced: bool,
+}
+
+impl Intake {
+    /// Takes a vehicle's report.
+    pub fn put(&self, node: NodeName, kind: ReportKind, delivery: Delivery) -> Put {
+        let mut waiting = self.waiting();
+        let is_first = waiting.reports.is_empty();
+        let place = waiting.next;
+        waiting.next += 1;
+        waiting.reports.insert(place, delivery);
+        let older = waiting.places.insert((node, kind), place);
+        let has_replaced = older.is_some_and(|older| waiting.reports.remove(&older).is_some());
+        Put { is_first, has_replaced }
+    }
+
+    /// All that wait, in the order of their coming.
+    pub fn take_all(&self) -> Vec<Delivery> {
+        let mut waiting = self.waiting();
+        waiting.places.clear();
+        std::mem::take(&mut waiting.reports).into_values().collect()
+    }
+
+    fn waiting(&self) -> MutexGuard<'_, Waiting> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::time::Timestamp;
+    use ecod::wire::ObjectReport;
+
+    use super::*;
+    use crate::gateway::Incoming;
+
+    #[test]
+    fn the_latest_of_each_vehicle_and_kind_waits() {
+        let intake = Intake::default();
+        let put = |node: &str, kind, seq| {
+            let node = NodeName::new(node).unwrap();
+            let report = Arc::new(ObjectReport::new(node.clone(), seq, Timestamp(seq)));
+            intake.put(node, kind, Delivery::local(Incoming::Report { kind, report }, Timestamp(seq)))
+        };
+        use ReportKind::{Detections, VoteDetections};
+        assert_eq!(put("mallory", Detections, 0), Put { is_first: true, has_replaced: false });
+        assert_eq!(put("euclid", Detections, 1), Put { is_first: false, has_replaced: false });
+        for seq in 2..1000 {
+            assert_eq!(put("mallory", Detections, seq), Put { is_first: false, has_replaced: true });
+        }
+        put("mallory", VoteDetections, 1000);
+        let taken: Vec<_> = intake.take_all().iter().map(|delivery| delivery.received_at.micros()).collect();
+        assert_eq!(taken, [1, 999, 1000]);
+        assert!(put("euclid", Detections, 1001).is_first);
+    }
+}
