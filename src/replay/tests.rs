@@ -239,7 +239,7 @@ fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
     (landmarks, reports)
 }
 
-/// What a live node does: reports as they come, timers at their deadlines.
+/// What a live node does until the round of the last report: reports as they come, timers at their deadlines.
 fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]) -> Vec<FusedLine> {
     let ReplayConfig { aggregator, fusion, landmarks, .. } = config.clone();
     let mut cell = Aggregator::new(aggregator, 1, fusion, landmarks, reports[0].2);
@@ -249,15 +249,19 @@ fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]
         output.extend(map.map(FusedLine::Map));
         output.extend(verdicts.map(FusedLine::Verdicts));
     };
+    let mut pending = false;
     for (kind, report, received_at) in reports {
-        // A report at the very deadline is taken before the timer, as in a replay.
-        while cell.deadline() < *received_at {
+        while cell.deadline() <= *received_at {
             let deadline = cell.deadline();
             publish(cell.tick(deadline));
         }
-        publish(cell.report(*kind, report, *received_at).unwrap());
+        let fused = cell.report(*kind, report, *received_at).unwrap();
+        pending = fused.is_none();
+        publish(fused);
     }
-    publish(cell.tick(cell.deadline()));
+    if pending {
+        publish(cell.tick(cell.deadline()));
+    }
     output
 }
 

@@ -20,6 +20,10 @@ const SILENCE: Duration = Duration::from_millis(250);
 /// How long one with a later epoch is believed while the election names another: the word may be under way.
 const CREDIT: Duration = Duration::from_millis(500);
 
+/// How many rounds the standby that takes over may be ahead of the elected's last. One that stands by since it was found
+/// leading on its own counts its own rounds, and is still to be told to follow.
+const CATCH_UP: u64 = 16;
+
 /// Why a message did not pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refusal {
@@ -91,9 +95,11 @@ impl Gate {
         standby: Option<&NodeName>,
     ) -> Result<(), Refusal> {
         if epoch > elected {
-            let heard = |(last, _, at): &(Epoch, u64, Timestamp)| last == elected && received_at.since(*at) < SILENCE;
-            let speaks = self.elected.as_ref().is_some_and(heard) && standby != Some(&epoch.leader);
-            if speaks || self.overruled.as_ref() == Some(elected) {
+            let heard = |(last, _, at): &&(Epoch, u64, Timestamp)| last == elected && received_at.since(*at) < SILENCE;
+            let spoken = self.elected.as_ref().filter(heard);
+            let goes_on = |last| standby == Some(&epoch.leader) && round > last && round - last <= CATCH_UP;
+            let usurps = spoken.is_some_and(|(_, last_round, _)| !goes_on(*last_round));
+            if usurps || self.overruled.as_ref() == Some(elected) {
                 return Err(Refusal::NotElected);
             }
         }
@@ -167,7 +173,7 @@ mod tests {
             if gate.admit(&elected, round, at(100 * round), &leadership).is_err() {
                 lost.push(round);
             }
-            gate.admit(&forged, round, at(100 * round + 50), &leadership).ok();
+            gate.admit(&forged, round + 1, at(100 * round + 50), &leadership).ok();
         }
         assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
     }
@@ -184,6 +190,18 @@ mod tests {
         let unknown = epoch(9, "gauss");
         assert_eq!(gate.admit(&unknown, 4, at(300), &after), Err(Refusal::NotElected));
         assert_eq!(gate.admit(&unknown, 5, at(500), &after), Ok(()), "the elected has fallen silent");
+    }
+
+    #[test]
+    fn a_standby_that_still_leads_on_its_own_is_not_taken_for_the_next_leader() {
+        let (elected, lone) = (epoch(2, "euclid"), epoch(3, "edge"));
+        let leadership = led_by(elected.clone(), Some("edge"));
+        let mut gate = Gate::new(0);
+        assert_eq!(gate.admit(&elected, 42, at(0), &leadership), Ok(()));
+        assert_eq!(gate.admit(&lone, 3, at(50), &leadership), Err(Refusal::NotElected), "it has just started");
+        assert_eq!(gate.admit(&lone, 9000, at(50), &leadership), Err(Refusal::NotElected), "it was alone for long");
+        assert_eq!(gate.admit(&elected, 43, at(100), &leadership), Ok(()));
+        assert_eq!(gate.admit(&epoch(5, "edge"), 44, at(200), &leadership), Ok(()), "it takes over");
     }
 
     #[test]

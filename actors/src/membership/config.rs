@@ -45,8 +45,9 @@ pub struct MembershipConfig {
     pub suspect_ms: u64,
     /// Time between two spreads of news, in ms. Default 50; nothing is sent when there is none.
     pub gossip_ms: u64,
-    /// Time between two greetings to all, in ms. Default 500 while alone; ten times that with company. Shorter heals
-    /// split cells sooner and costs packets.
+    /// Time between two greetings, in ms: to every seed that is not there, and to the multicast group, to that ten times as
+    /// rarely in company. Default 500, and at most half of the election's `join_ms`, for a seed that returns to hear of its
+    /// cell before it leads on its own. Shorter heals split cells sooner and costs packets.
     pub hello_ms: u64,
     /// Most nodes that are known at a time. Default 256.
     pub max_peers: usize,

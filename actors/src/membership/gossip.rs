@@ -30,8 +30,6 @@ pub(super) enum Rumour {
     Down(NodeName),
     /// A living node's identity changed.
     Changed(NodeId),
-    /// Nobody else is left.
-    Alone,
 }
 
 /// This node's part in the gossip.
@@ -208,8 +206,10 @@ impl Gossip {
                 let earliest = self.renewed.map_or(now, |renewed| renewed + RENEW_INTERVAL);
                 if earliest <= now { self.renew(now) } else { self.renew_at = Some(earliest) }
             }
-            OwnedNotification::Idle => self.rumours.push_back(Rumour::Alone),
-            OwnedNotification::Active | OwnedNotification::Defunct | OwnedNotification::Rejoin(_) => (),
+            OwnedNotification::Active
+            | OwnedNotification::Idle
+            | OwnedNotification::Defunct
+            | OwnedNotification::Rejoin(_) => (),
         }
     }
 }

@@ -230,10 +230,6 @@ impl Machine {
                     self.post(&to.name, to.gossip, Kind::Gossip, &body, at);
                     continue;
                 }
-                Rumour::Alone => {
-                    self.hello_at = self.hello_at.min(at + self.hello);
-                    continue;
-                }
                 Rumour::Alive(id) => {
                     if self.sessions.outdate(&id.name, id.run, at) {
                         self.greet(id.gossip, at);
@@ -273,23 +269,22 @@ impl Machine {
         }
     }
 
-    /// Greets the group and all seeds that do not belong to a living node; those less and less often while alone.
+    /// Greets all seeds that do not belong to a living node, so that one that returns hears of the cell before it takes
+    /// itself to be alone, and the group, which in company is greeted less often.
     fn greet_all(&mut self) {
         let frame = self.sessions.hello(self.gossip.own());
-        let alone = self.gossip.alive().is_empty();
-        if !alone || self.hellos < 8 || self.hellos.is_multiple_of(COMPANY_FACTOR) {
-            let known: Vec<_> = self.members().iter().map(|member| member.gossip).collect();
-            let unknown = self.seeds.iter().filter(|seed| !known.contains(seed));
-            self.outputs.extend(unknown.map(|seed| Output::Send { to: *seed, frame: frame.clone() }));
+        let known: Vec<_> = self.members().iter().map(|member| member.gossip).collect();
+        let missing = self.seeds.iter().filter(|seed| !known.contains(seed));
+        self.outputs.extend(missing.map(|seed| Output::Send { to: *seed, frame: frame.clone() }));
+        if self.gossip.alive().is_empty() || self.hellos.is_multiple_of(COMPANY_FACTOR) {
+            self.outputs.push_back(Output::Multicast { frame });
         }
-        self.outputs.push_back(Output::Multicast { frame });
         self.hellos += 1;
     }
 
     fn schedule_hello(&mut self, at: Timestamp) {
-        let factor = if self.gossip.alive().is_empty() { 1 } else { COMPANY_FACTOR };
         let percent = self.rng.random_range(75..=125);
-        self.hello_at = at + self.hello * u32::try_from(factor).unwrap_or(1) * percent / 100;
+        self.hello_at = at + self.hello * percent / 100;
     }
 
     fn report_taken(&mut self, name: NodeName, at: Timestamp) {
@@ -324,7 +319,7 @@ const PATIENCE: Duration = Duration::from_millis(200);
 const MAX_WAITING: usize = 64;
 const MAX_WAITING_FRAMES: usize = 4;
 
-/// How much rarer greetings are in company.
+/// How much rarer greetings to the group are in company.
 const COMPANY_FACTOR: u64 = 10;
 
 /// How often the same name is reported as taken.

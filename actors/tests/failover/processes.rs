@@ -25,6 +25,20 @@ impl Drop for Process {
     }
 }
 
+/// The nodes' logs, printed when a test fails.
+struct Logs<'a>(&'a Path);
+
+impl Drop for Logs<'_> {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            for name in ["edge", "euclid", "gauss"] {
+                let log = std::fs::read_to_string(self.0.join(format!("{name}.log")));
+                eprintln!("{name}:\n{}", log.unwrap_or_default());
+            }
+        }
+    }
+}
+
 fn start(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Process {
     let bind = (role == Role::Edge).then_some(seed);
     let file = directory.join(format!("{name}.toml"));
@@ -70,19 +84,14 @@ fn vehicles_with_certificates_go_on_when_the_process_of_the_edge_is_killed() {
 }
 
 fn edge_is_killed(directory: &TempDir) {
+    let _logs = Logs(directory.path());
     let seed = free_address();
     let vehicles = ["euclid", "gauss"];
     let record = |name: &str| Record::read(&directory.path().join(format!("{name}.maps")));
     let until = |what: &str, holds: &dyn Fn(&Record) -> bool| {
         let deadline = Instant::now() + PATIENCE;
         while !vehicles.iter().all(|name| holds(&record(name))) {
-            if Instant::now() > deadline {
-                for name in ["edge", "euclid", "gauss"] {
-                    let log = std::fs::read_to_string(directory.path().join(format!("{name}.log")));
-                    eprintln!("{name}:\n{}", log.unwrap_or_default());
-                }
-                panic!("not within {PATIENCE:?}: {what}");
-            }
+            assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
             std::thread::sleep(Duration::from_millis(20));
         }
     };

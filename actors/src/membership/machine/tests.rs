@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::Ipv4Addr;
 
+use ecod::election::ElectionConfig;
 use ecod::wire::Role;
 use proptest::prelude::*;
 
@@ -190,6 +191,24 @@ fn nodes_find_each_other_by_one_seed_whoever_starts_first() {
     cell.start(1, "node-1");
     cell.run(6000);
     cell.assert_complete();
+}
+
+#[test]
+fn a_seed_that_returns_hears_of_its_cell_before_it_leads_on_its_own() {
+    for seed in 0..20 {
+        let mut cell = Cell::seeded(false, seed);
+        (1..=4).for_each(|node| cell.start(node, &name(node)));
+        for node in 2..=4 {
+            cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(1)]);
+        }
+        cell.run(3000);
+        cell.assert_complete();
+        cell.nodes.remove(&1);
+        cell.run(2000 + 97 * seed);
+        cell.start(1, "node-1");
+        cell.run(ElectionConfig::default().join_ms * 3 / 4);
+        cell.assert_complete();
+    }
 }
 
 #[test]
