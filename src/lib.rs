@@ -9,12 +9,14 @@
 pub mod aggregator;
 pub mod camera;
 pub mod config;
+pub mod delay;
 pub mod detection;
 pub mod election;
 pub mod epoch;
 pub mod eval;
 pub mod geometry;
 pub mod landmark;
+pub mod motion;
 pub mod names;
 pub mod pace;
 pub mod projection;

@@ -13,6 +13,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
+use crate::delay::MinimumDelay;
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::{ObjectReport, RejectReason};
@@ -137,7 +138,7 @@ impl VehicleClock {
     /// Whether the estimate rests on one report alone, whose clock was ahead, and this one's is not.
     fn is_contradicted(&self, captured: Timestamp, delay_us: i64, tolerance_us: i64, slack_us: i64) -> bool {
         let least = self.delay.least();
-        self.delay.reports == 1
+        self.delay.observed() == 1
             && captured != self.last_captured
             && least < -tolerance_us
             && delay_us.saturating_sub(least) > slack_us
@@ -158,47 +159,6 @@ impl VehicleClock {
 
 /// How long a silent vehicle's clock is remembered when room is short.
 const RETENTION: Duration = Duration::from_secs(10);
-
-/// Least delay from capture to receipt over the last one to two spans.
-///
-/// The least delay of a one-way stream is the clock offset plus the shortest transit, so later arrivals stand out by
-/// their queueing alone (Moon, Skelly, Towsley, "Estimation and removal of clock skew", INFOCOM 1999).
-#[derive(Debug, Clone)]
-struct MinimumDelay {
-    span_start: Timestamp,
-    current_us: i64,
-    previous_us: i64,
-    /// Reports that the estimate rests on.
-    reports: u64,
-}
-
-impl MinimumDelay {
-    const SPAN: Duration = Duration::from_secs(10);
-
-    fn new(now: Timestamp) -> Self {
-        Self { span_start: now, current_us: i64::MAX, previous_us: i64::MAX, reports: 0 }
-    }
-
-    fn observe(&mut self, delay_us: i64, now: Timestamp) {
-        if now.since(self.span_start) >= Self::SPAN {
-            self.previous_us = self.current_us;
-            self.current_us = i64::MAX;
-            self.span_start = now;
-        }
-        self.current_us = self.current_us.min(delay_us);
-        self.reports += 1;
-    }
-
-    /// The least delay in microseconds; `i64::MAX` without any.
-    fn least(&self) -> i64 {
-        self.current_us.min(self.previous_us)
-    }
-
-    fn clock_offset(&self, tolerance_us: i64) -> i64 {
-        let least = self.least();
-        if least == i64::MAX || least.abs() <= tolerance_us { 0 } else { least }
-    }
-}
 
 fn seconds(s: f64) -> i64 {
     (s * 1e6) as i64

@@ -5,12 +5,14 @@
 //!                                            └── NoteRound ──> LeaderElection
 //! ```
 
+mod age;
 mod gate;
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
@@ -25,6 +27,7 @@ use crate::gateway::{Delivery, Incoming};
 use crate::leader_election::{LeaderElectionMessage, Leadership};
 use crate::recorder::Recording;
 use crate::seat::Seat;
+use age::Age;
 use gate::{Gate, MEMORY, Refusal};
 
 /// What the follower is asked to do.
@@ -113,6 +116,8 @@ pub struct FollowerState {
     maps: Gate,
     verdicts: Gate,
     reputations: Gate,
+    map_age: Age,
+    verdicts_age: Age,
     log: Option<BufWriter<File>>,
     recording: Recording,
     leadership: watch::Receiver<Leadership>,
@@ -153,6 +158,7 @@ impl Actor for Follower {
             Ok(()) => {}
             Err(Refusal::Repeated) => state.counters.count(Event::Repeated),
             Err(Refusal::Superseded) => state.counters.reject(RejectReason::Superseded),
+            Err(Refusal::Stale) => state.counters.reject(RejectReason::Stale),
             Err(Refusal::NotElected) => state.counters.reject(RejectReason::NotElected),
         }
         Ok(())
@@ -163,11 +169,25 @@ impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
         let FollowerArguments { newest, recording, least_term, leadership, election, counters, .. } = arguments;
         let [maps, verdicts, reputations] = [(); 3].map(|()| Gate::new(least_term));
-        Self { newest, maps, verdicts, reputations, log, recording, leadership, election, counters }
+        let (map_age, verdicts_age) = (Age::default(), Age::default());
+        Self {
+            newest,
+            maps,
+            verdicts,
+            reputations,
+            map_age,
+            verdicts_age,
+            log,
+            recording,
+            leadership,
+            election,
+            counters,
+        }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
+        check_age(self.map_age.of(&epoch, map.fused_at_us, received_at))?;
         self.maps.admit(&epoch, map.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::MapAccepted);
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
@@ -180,6 +200,7 @@ impl FollowerState {
 
     fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
+        check_age(self.verdicts_age.of(&epoch, verdicts.fused_at_us, received_at))?;
         self.verdicts.admit(&epoch, verdicts.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::VerdictsAccepted);
         self.recording.verdicts(verdicts, received_at);
@@ -210,6 +231,13 @@ impl FollowerState {
     }
 }
 
+/// What a driver was to be told longer ago than this is not told any more.
+const MAX_AGE: Duration = Duration::from_secs(1);
+
+fn check_age(age: Duration) -> Result<(), Refusal> {
+    if age <= MAX_AGE { Ok(()) } else { Err(Refusal::Stale) }
+}
+
 /// The aggregator of reputations that name none; it sorts before all others.
 const UNNAMED: NodeName = NodeName::from_static("-");
 
@@ -238,13 +266,13 @@ mod tests {
         FollowerState::new(arguments, None)
     }
 
-    fn map(epoch: u64, round: u64) -> Arc<GlobalMap> {
+    fn map(epoch: u64, round: u64, fused_at: Timestamp) -> Arc<GlobalMap> {
         Arc::new(GlobalMap {
             schema: SCHEMA_VERSION,
             aggregator: NodeName::from_static("edge"),
             epoch,
             round,
-            fused_at_us: Timestamp(0),
+            fused_at_us: fused_at,
             oldest_capture_us: None,
             landmarks: Vec::new(),
             objects: Vec::new(),
@@ -257,12 +285,26 @@ mod tests {
         let mut follower = follower(Leadership::default());
         let second = |n: u64| Timestamp(n * 1_000_000);
         let accepted = |follower: &FollowerState| follower.newest.map.borrow().as_ref().map(|newest| newest.map.epoch);
-        assert_eq!(follower.take_map(&map(u64::MAX, 1), second(0)), Ok(()));
-        assert_eq!(follower.take_map(&map(7, 1), second(1)), Err(Refusal::Superseded));
+        assert_eq!(follower.take_map(&map(u64::MAX, 1, second(0)), second(0)), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 1, second(1)), second(1)), Err(Refusal::Superseded));
         assert_eq!(accepted(&follower), Some(u64::MAX));
-        assert_eq!(follower.take_map(&map(7, 2), second(4)), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 2, second(4)), second(4)), Ok(()));
         assert_eq!(accepted(&follower), Some(7));
-        assert_eq!(follower.take_map(&map(7, 2), second(5)), Err(Refusal::Repeated), "not taken twice");
+        assert_eq!(follower.take_map(&map(7, 2, second(5)), second(5)), Err(Refusal::Repeated), "not taken twice");
+    }
+
+    #[test]
+    fn rounds_that_waited_while_the_node_was_stopped_are_not_taken() {
+        let mut follower = follower(Leadership::default());
+        let at = |round: u64| Timestamp(round * 100_000);
+        for round in 0..10 {
+            assert_eq!(follower.take_map(&map(7, round, at(round)), at(round)), Ok(()));
+        }
+        let resumed = at(40);
+        for round in 10..30 {
+            assert_eq!(follower.take_map(&map(7, round, at(round)), resumed), Err(Refusal::Stale), "round {round}");
+        }
+        assert_eq!(follower.take_map(&map(7, 30, at(30)), resumed), Ok(()));
     }
 
     #[test]
@@ -273,7 +315,7 @@ mod tests {
             Arc::new(Reputations { schema: SCHEMA_VERSION, aggregator, epoch, round, reputations: Default::default() })
         };
         let now = Timestamp(1);
-        assert_eq!(follower.take_map(&map(7, 9), now), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 9, now), now), Ok(()));
         assert_eq!(follower.take_reputations(&reputations(7, 1, None), now), Ok(()));
         assert_eq!(follower.take_reputations(&reputations(7, 1, Some("edge")), now), Ok(()));
         let late = follower.take_reputations(&reputations(7, 2, None), now);
@@ -286,7 +328,10 @@ mod tests {
     fn a_deposed_leader_is_refused_even_when_nobody_else_is_heard() {
         let epoch = Some(Epoch::new(8, NodeName::from_static("euclid")));
         let mut follower = follower(Leadership { position: Position::Following, epoch, standby: None });
-        assert_eq!(follower.take_map(&map(8, 1), Timestamp(0)), Ok(()));
-        assert_eq!(follower.take_map(&map(7, 99), Timestamp(9_000_000)), Err(Refusal::Superseded));
+        assert_eq!(follower.take_map(&map(8, 1, Timestamp(0)), Timestamp(0)), Ok(()));
+        assert_eq!(
+            follower.take_map(&map(7, 99, Timestamp(9_000_000)), Timestamp(9_000_000)),
+            Err(Refusal::Superseded)
+        );
     }
 }

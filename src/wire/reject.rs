@@ -25,7 +25,7 @@ pub enum RejectReason {
     InvalidLabel,
     /// Captured or fused further in the future than clocks may differ.
     FromTheFuture,
-    /// Captured too long ago.
+    /// Captured too long ago, or a round that was under way for too long.
     Stale,
     /// Not newer than a report already taken from this node.
     OutOfOrder,

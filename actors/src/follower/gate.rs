@@ -33,6 +33,8 @@ pub(super) enum Refusal {
     Superseded,
     /// The election names another leader.
     NotElected,
+    /// It was under way for too long.
+    Stale,
 }
 
 /// Admits messages in the order of epoch, aggregator and round, of those that may lead.
