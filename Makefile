@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -65,6 +65,10 @@ sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of S
 trials: PACKAGES += iproute2 mosquitto nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
 	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact trials --nocapture
+
+soak: PACKAGES += iproute2 nftables
+soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
+	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact soak::soak --nocapture
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check

@@ -16,6 +16,14 @@ pub(crate) struct Accepted {
     pub(crate) at: Timestamp,
     pub(crate) epoch: Epoch,
     pub(crate) round: u64,
+    pub(crate) fused_at: Timestamp,
+}
+
+impl Accepted {
+    /// Time from the aggregator's fusion to the node's taking it; all of them have one clock.
+    pub(crate) fn age(&self) -> Duration {
+        self.at.since(self.fused_at)
+    }
 }
 
 /// Everything that one run of a node's process accepted, in the order of its log.
@@ -70,7 +78,7 @@ pub(crate) fn judge(runs: &[NodeRun], phases: &[Phase]) -> Verdict {
         phases.first().map(|first| epochs(runs, Timestamp::default(), first.from)).unwrap_or_default();
     for phase in phases {
         for run in runs.iter().filter(|run| phase.measured.contains(&run.node)) {
-            verdict.gap = verdict.gap.max(longest_wait(run, phase));
+            verdict.gap = verdict.gap.max(longest_wait(run, phase.from, phase.until));
             verdict.missed_rounds += missed(run, phase);
         }
         verdict.unrecovered |= phase.components.iter().flatten().any(|node| !served(runs, node, phase.until));
@@ -90,7 +98,8 @@ pub(crate) fn percentile(sorted: &[Duration], percent: usize) -> Option<Duration
     sorted.get(rank - 1).copied()
 }
 
-fn stale(run: &NodeRun) -> u64 {
+/// How many maps a process took although it had taken a later one.
+pub(crate) fn stale(run: &NodeRun) -> u64 {
     let mut latest: Option<(&Epoch, u64)> = None;
     let mut stale = 0;
     for map in &run.accepted {
@@ -101,14 +110,15 @@ fn stale(run: &NodeRun) -> u64 {
     stale
 }
 
-/// Pairs of maps taken one after the other, the second within the phase.
-fn pairs<'a>(run: &'a NodeRun, phase: &'a Phase) -> impl Iterator<Item = (&'a Accepted, &'a Accepted)> {
-    let within = |map: &Accepted| phase.from <= map.at && map.at <= phase.until;
+/// Pairs of maps taken one after the other, the second within the time.
+fn pairs(run: &NodeRun, from: Timestamp, until: Timestamp) -> impl Iterator<Item = (&Accepted, &Accepted)> {
+    let within = move |map: &Accepted| from <= map.at && map.at <= until;
     run.accepted.windows(2).map(|pair| (&pair[0], &pair[1])).filter(move |(_, second)| within(second))
 }
 
-fn longest_wait(run: &NodeRun, phase: &Phase) -> Option<Duration> {
-    pairs(run, phase).map(|(first, second)| second.at.since(first.at)).max()
+/// The longest time between two maps that a process took, the second between these times.
+pub(crate) fn longest_wait(run: &NodeRun, from: Timestamp, until: Timestamp) -> Option<Duration> {
+    pairs(run, from, until).map(|(first, second)| second.at.since(first.at)).max()
 }
 
 fn missed(run: &NodeRun, phase: &Phase) -> u64 {
@@ -116,7 +126,7 @@ fn missed(run: &NodeRun, phase: &Phase) -> u64 {
         Some(step) if step > 0 => step - 1,
         _ => u64::from(second.epoch != first.epoch),
     };
-    pairs(run, phase).map(between).sum()
+    pairs(run, phase.from, phase.until).map(between).sum()
 }
 
 fn served(runs: &[NodeRun], node: &NodeName, until: Timestamp) -> bool {
@@ -152,7 +162,10 @@ mod tests {
     /// Rounds of one leader every 100 ms from `at_ms` on.
     fn maps(leader: &str, term: u64, first_round: u64, at_ms: u64, count: u64) -> Vec<Accepted> {
         let epoch = Epoch::new(term, name(leader));
-        let map = |n| Accepted { at: ms(at_ms + 100 * n), epoch: epoch.clone(), round: first_round + n };
+        let map = |n| {
+            let at = ms(at_ms + 100 * n);
+            Accepted { at, epoch: epoch.clone(), round: first_round + n, fused_at: at }
+        };
         (0..count).map(map).collect()
     }
 

@@ -16,7 +16,7 @@ use crate::analysis::{Accepted, NodeRun};
 use crate::logs;
 use crate::network::{self, Bridged};
 use crate::process::{Process, command};
-use crate::settings::{DETECTIONS, Ports, configuration, frame};
+use crate::settings::{Addresses, DETECTIONS, Ports, configuration, frame};
 
 /// The program under test.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_ecod-node");
@@ -46,6 +46,8 @@ pub(crate) struct Plan {
     pub(crate) fallback: bool,
     /// Whether every node has a network namespace.
     pub(crate) bridged: bool,
+    /// Whether the vehicles vote on what they see.
+    pub(crate) votes: bool,
 }
 
 /// Running nodes with their files; all end with it.
@@ -64,7 +66,7 @@ pub(crate) struct Cell {
 #[derive(Debug)]
 struct Node {
     name: NodeName,
-    broker: SocketAddr,
+    address: Addresses,
     directory: PathBuf,
     namespace: Option<String>,
     process: Option<Process>,
@@ -107,7 +109,7 @@ impl Cell {
             fs::write(home.join("node.toml"), text)?;
             cell.nodes.push(Node {
                 name: NodeName::new(name)?,
-                broker: address.broker,
+                address: *address,
                 directory: home,
                 namespace: plan.bridged.then(|| network::namespace(index)),
                 process: None,
@@ -123,6 +125,11 @@ impl Cell {
 
     /// Waits until all follow one leader, the edge if it runs, and have done so for a while.
     pub(crate) async fn settle(&mut self) -> anyhow::Result<()> {
+        self.settle_within(START_TIMEOUT).await
+    }
+
+    /// The same, for no longer than this.
+    pub(crate) async fn settle_within(&mut self, limit: Duration) -> anyhow::Result<()> {
         let started = Instant::now();
         let mut well_since: Option<Instant> = None;
         loop {
@@ -131,7 +138,7 @@ impl Cell {
                 None => well_since = well_since.or(Some(Instant::now())),
                 Some(why) => {
                     well_since = None;
-                    ensure!(started.elapsed() < START_TIMEOUT, "the cell does not settle: {why}");
+                    ensure!(started.elapsed() < limit, "the cell does not settle: {why}");
                 }
             }
             tokio::time::sleep(Duration::from_millis(100)).await;
@@ -216,6 +223,11 @@ impl Cell {
         self.index(&newest.epoch.leader)
     }
 
+    /// Its name.
+    pub(crate) fn leader_name(&self) -> anyhow::Result<String> {
+        Ok(self.nodes[self.leader()?].name.to_string())
+    }
+
     /// Whom the leader has named to follow it.
     pub(crate) fn standby(&self) -> anyhow::Result<usize> {
         let leader = &self.nodes[self.leader()?];
@@ -248,7 +260,23 @@ impl Cell {
 
     /// Where the nodes' brokers listen.
     pub(crate) fn brokers(&self) -> Vec<SocketAddr> {
-        self.nodes.iter().map(|node| node.broker).collect()
+        self.nodes.iter().map(|node| node.address.broker).collect()
+    }
+
+    /// Where the nodes gossip.
+    pub(crate) fn gossips(&self) -> Vec<SocketAddr> {
+        self.nodes.iter().map(|node| node.address.gossip).collect()
+    }
+
+    /// How many nodes there are, running or not.
+    pub(crate) fn nodes(&self) -> usize {
+        self.nodes.len()
+    }
+
+    /// The running processes: node and run, and number.
+    pub(crate) fn processes(&self) -> Vec<(String, u32)> {
+        let process = |node: &Node| Some((format!("{}, run {}", node.name, node.runs), node.process.as_ref()?.id()));
+        self.nodes.iter().filter_map(process).collect()
     }
 
     /// What every run of every process accepted.

@@ -24,6 +24,7 @@ struct Map {
     epoch: u64,
     aggregator: NodeName,
     round: u64,
+    fused_at_us: Timestamp,
 }
 
 /// All maps of a log; a line that a killed process left unfinished is none.
@@ -55,7 +56,8 @@ pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
 
 fn parse(line: &str) -> serde_json::Result<Accepted> {
     let Line { received_at_us, map } = serde_json::from_str(line)?;
-    Ok(Accepted { at: received_at_us, epoch: Epoch::new(map.epoch, map.aggregator), round: map.round })
+    let Map { epoch, aggregator, round, fused_at_us: fused_at } = map;
+    Ok(Accepted { at: received_at_us, epoch: Epoch::new(epoch, aggregator), round, fused_at })
 }
 
 fn tail(path: &Path) -> anyhow::Result<Option<String>> {

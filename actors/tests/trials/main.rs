@@ -1,6 +1,6 @@
 //! Failover as vehicles see it: cells of real processes, killed, stopped, cut off and starved, again and again.
 //!
-//! `make trials` runs it; `TRIALS=n` is the number of trials of each scenario and cell size (default 20),
+//! Here are two harnesses. `make soak` runs the one in `soak`. `make trials` runs the other; `TRIALS=n` is the number of trials of each scenario and cell size (default 20),
 //! `SCENARIOS=a,b` and `NODES=2,5` run those only. What cannot be run on this machine is skipped and said to be. The
 //! results are printed and written to `target/trials.json`; the files of a trial that went wrong are kept.
 
@@ -12,6 +12,7 @@ mod process;
 mod report;
 mod scenario;
 mod settings;
+mod soak;
 mod voters;
 
 use std::path::{Path, PathBuf};
@@ -32,12 +33,18 @@ const NODES: [usize; 4] = [2, 5, 16, 32];
 #[test]
 #[ignore = "takes minutes to hours: make trials"]
 fn trials() {
+    end_with_the_harness(run_all());
+}
+
+/// Runs to the end, or until the harness is told to end.
+#[track_caller]
+fn end_with_the_harness(work: impl Future<Output = anyhow::Result<()>>) {
     // Processes end with the thread that started them: all are started by this one.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let outcome = runtime.block_on(async {
         let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
         tokio::select! {
-            outcome = run_all() => outcome,
+            outcome = work => outcome,
             _ = interrupt.recv() => bail!("interrupted"),
             _ = terminate.recv() => bail!("terminated"),
         }
@@ -88,6 +95,7 @@ async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> 
         external_broker: matches!(scenario.needs, Needs::Mosquitto | Needs::MosquittoAndFallback),
         fallback: scenario.needs == Needs::MosquittoAndFallback,
         bridged: matches!(scenario.needs, Needs::Namespaces | Needs::PacketFilter),
+        votes: false,
     };
     let mut cell = Cell::start(&plan)?;
     let outcome = perform(scenario, &mut cell).await;
@@ -184,9 +192,13 @@ fn filter(key: &str) -> Option<Vec<String>> {
 }
 
 fn write(outcomes: &[Outcome]) -> anyhow::Result<()> {
-    let target = std::env::var_os("CARGO_TARGET_DIR").map(PathBuf::from);
-    let target = target.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../target"));
-    let file = target.join("trials.json");
+    let file = target_file("trials.json");
     let text = serde_json::to_string_pretty(outcomes)? + "\n";
     std::fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))
+}
+
+/// Where a file of results belongs.
+fn target_file(name: &str) -> PathBuf {
+    let target = std::env::var_os("CARGO_TARGET_DIR").map(PathBuf::from);
+    target.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../target")).join(name)
 }

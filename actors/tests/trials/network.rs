@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! node 0: eth0 ── veth ──┐            one bridge, or two while the network is split
-//! node 1: eth0 ── veth ──┴── bridge
+//! node 1: eth0 ── veth ──┴── bridge   (the harness has an address on the first)
 //! ```
 
 use std::io::Write;
@@ -10,6 +10,9 @@ use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
+
+/// Where the harness itself is on the first bridge.
+const HARNESS: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 254);
 
 /// Namespaces and bridges; removed when dropped.
 #[derive(Debug)]
@@ -39,6 +42,7 @@ impl Bridged {
             ip(&["link", "add", &bridge(side), "type", "bridge", "mcast_snooping", "0"])?;
             ip(&["link", "set", &bridge(side), "up"])?;
         }
+        ip(&["address", "add", &format!("{HARNESS}/24"), "dev", &bridge('a')])?;
         for node in 0..nodes {
             let (space, port) = (namespace(node), port(node));
             ip(&["netns", "add", &space])?;

@@ -36,6 +36,11 @@ impl Process {
         Ok(Self { child })
     }
 
+    /// Its number.
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// SIGKILL, and waits for the end.
     pub(crate) fn kill(mut self) -> anyhow::Result<()> {
         self.child.kill()?;

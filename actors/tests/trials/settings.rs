@@ -96,9 +96,10 @@ pub(crate) fn configuration(
         let (frames, detections) = (shared.join("frames"), shared.join("detections.jsonl"));
         let _ = write!(
             text,
-            "\n[camera.source]\nkind = \"images\"\npath = {frames:?}\nlooping = true\n\n\
+            "\n[camera]\nvotes = {}\n\n[camera.source]\nkind = \"images\"\npath = {frames:?}\nlooping = true\n\n\
              [camera.detector]\nkind = \"recorded\"\npath = {detections:?}\nlooping = true\n\n\
-             [camera.projection.sizes.default]\nwidth_m = 0.5\nheight_m = 0.5\n"
+             [camera.projection.sizes.default]\nwidth_m = 0.5\nheight_m = 0.5\n",
+            plan.votes
         );
     }
     text + &format!("\n[[landmarks]]\nid = \"{LANDMARK}\"\nx_m = 6.0\ny_m = 0.0\n")
