@@ -88,6 +88,7 @@ async fn main() -> anyhow::Result<()> {
             ..Default::default()
         },
         view: Default::default(),
+        votes: true,
     };
     let mut config = NodeConfig { name: Some(NodeName::new("euclid")?), role: Role::Cav, camera: Some(camera), ..cell };
     config.mqtt.broker = edge.broker_address().map(Into::into);

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
+use ecod::aggregator::Algorithms;
 use ecod::camera::{Intrinsics, Mount};
 use ecod::config::{ConfigError, check_range};
 use ecod::landmark::LandmarkIndex;
@@ -49,6 +50,13 @@ pub struct CameraConfig {
     /// What it takes to have a location in view.
     #[serde(default)]
     pub view: ViewConfig,
+    /// Whether what stands at known locations is also put to the vote, where the cell runs VOTE. Default true.
+    #[serde(default = "yes")]
+    pub votes: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 /// Image size and field of view, or a calibration file.
@@ -150,12 +158,21 @@ pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
     let gate = config.fusion.pace.gate();
     let vantage = Vantage {
         node: config.name.clone().unwrap_or(ecod::names::NodeName::from_static("node")),
-        pose: config.pose(),
+        pose: config.pose.pose(),
         mount: camera.mount.into(),
         lens: camera.optics.lens().context("key `camera.optics.calibration`")?,
         landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),
     };
     Ok(Perception::new(vantage, camera.projection.clone(), camera.view.clone(), gate))
+}
+
+/// The algorithms that the camera's reports are for. Without known locations there is nothing to vote on.
+pub fn algorithms(config: &NodeConfig) -> Algorithms {
+    let votes = config.camera.as_ref().is_some_and(|camera| camera.votes) && !config.landmarks.is_empty();
+    match config.fusion.algorithms {
+        Algorithms::Both if !votes => Algorithms::Pace,
+        algorithms => algorithms,
+    }
 }
 
 /// The way from frames to detections, as configured.

@@ -6,9 +6,8 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use ecod::aggregator::FusionConfig;
-use ecod::config::{ConfigError, check_range};
+use ecod::config::ConfigError;
 use ecod::election::ElectionConfig;
-use ecod::geometry::Pose;
 use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::names::NodeName;
 use ecod::wire::Role;
@@ -26,6 +25,7 @@ use crate::membership::MembershipConfig;
 use crate::pki::TlsConfig;
 use crate::recorder::RecordConfig;
 use crate::reputation_keeper::ReputationKeeperConfig;
+use crate::vehicle_pose::PoseConfig;
 
 /// Everything that a node can be told.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -47,7 +47,7 @@ pub struct NodeConfig {
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line. Default none.
     pub map_log: Option<PathBuf>,
-    /// Pose of the vehicle. Default the origin, looking east.
+    /// Where the vehicle is. Default at the origin, looking east.
     pub pose: PoseConfig,
     /// How the nodes of the cell find and watch each other.
     pub membership: MembershipConfig,
@@ -74,18 +74,6 @@ pub struct NodeConfig {
     pub record: Option<RecordConfig>,
     /// The cell's known locations, the same on every node. Default none.
     pub landmarks: Vec<LandmarkConfig>,
-}
-
-/// Where a vehicle stands.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct PoseConfig {
-    /// East in metres. Default 0.
-    pub x_m: f64,
-    /// North in metres. Default 0.
-    pub y_m: f64,
-    /// Heading in degrees, counter-clockwise from east. Default 0.
-    pub heading_deg: f64,
 }
 
 impl Default for NodeConfig {
@@ -178,9 +166,7 @@ impl NodeConfig {
         if self.name.is_none() {
             return Err(ConfigError::new("name", "nothing", "the node's name, unique in its cell"));
         }
-        check_range("pose.x_m", self.pose.x_m, -1e8, 1e8)?;
-        check_range("pose.y_m", self.pose.y_m, -1e8, 1e8)?;
-        check_range("pose.heading_deg", self.pose.heading_deg, -360.0, 360.0)?;
+        self.pose.validate().map_err(|error| error.within("pose"))?;
         self.membership.validate().map_err(|error| error.within("membership"))?;
         self.election.validate().map_err(|error| error.within("election"))?;
         self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
@@ -277,11 +263,6 @@ impl NodeConfig {
         let external = self.mqtt.broker.clone();
         let embedded = external.is_none() || self.mqtt.fallback_to_embedded;
         DataPlane { external, embedded }
-    }
-
-    /// The vehicle's pose.
-    pub fn pose(&self) -> Pose {
-        Pose::new(self.pose.x_m, self.pose.y_m, self.pose.heading_deg.to_radians())
     }
 
     /// The cell's known locations.

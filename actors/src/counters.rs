@@ -73,6 +73,10 @@ pub enum Event {
     DashboardNotBound,
     /// A detection could not be placed in the world and was left out of its report.
     DetectionUnplaced,
+    /// A pose that a moving vehicle was told is none, or is not later than the one before.
+    PoseRejected,
+    /// A frame of a moving vehicle was not reported: no pose is known near its time.
+    FrameWithoutPose,
     /// A client of the embedded broker was not let in: its address made too many connections lately, or too many wait.
     ClientThrottled,
     /// A client of the embedded broker did not log in within the time.
@@ -91,7 +95,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 37] = [
+    pub const ALL: [Self; 39] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -122,6 +126,8 @@ impl Event {
         Self::BrowserThrottled,
         Self::DashboardNotBound,
         Self::DetectionUnplaced,
+        Self::PoseRejected,
+        Self::FrameWithoutPose,
         Self::ClientThrottled,
         Self::ClientTimedOut,
         Self::ClientUntrusted,
@@ -164,6 +170,8 @@ impl Event {
             Self::BrowserThrottled => "browser_throttled",
             Self::DashboardNotBound => "dashboard_not_bound",
             Self::DetectionUnplaced => "detection_unplaced",
+            Self::PoseRejected => "pose_rejected",
+            Self::FrameWithoutPose => "frame_without_pose",
             Self::ClientThrottled => "client_throttled",
             Self::ClientTimedOut => "client_timed_out",
             Self::ClientUntrusted => "client_untrusted",

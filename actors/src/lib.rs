@@ -56,3 +56,4 @@ pub mod state_file;
 pub mod testbed;
 mod throttles;
 pub mod top;
+pub mod vehicle_pose;

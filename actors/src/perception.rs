@@ -70,6 +70,12 @@ impl Perception {
         Self { vantage, camera, projection, view, gate, seq: 0, left_out: LeftOut::default() }
     }
 
+    /// Tells where the vehicle is from now on.
+    pub fn set_pose(&mut self, pose: Pose) {
+        self.vantage.pose = pose;
+        self.camera = self.vantage.mount.camera_pose(&pose);
+    }
+
     /// The report of one frame. A detection that has no position is left out and counted.
     pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
         detections.retain(|detection| match self.projection.check_whole(detection) {

@@ -193,6 +193,8 @@ impl Assembly {
             Part::Projector => {
                 let arguments = ProjectorArguments {
                     perception: camera::perception(&self.config).map_err(in_full)?,
+                    poses: self.config.pose.listen,
+                    algorithms: camera::algorithms(&self.config),
                     gateway: self.seats.gateway.clone(),
                     counters: self.counters(),
                 };

@@ -19,7 +19,7 @@ const PARTS: usize = 700;
 const MOST_CURVES: usize = 12;
 
 /// Counted events that mean that something was lost.
-const LOSSES: [Event; 8] = [
+const LOSSES: [Event; 10] = [
     Event::PublishRefused,
     Event::PublishTooLarge,
     Event::InboxFull,
@@ -27,6 +27,8 @@ const LOSSES: [Event; 8] = [
     Event::FrameFailed,
     Event::FrameSkipped,
     Event::DetectionUnplaced,
+    Event::PoseRejected,
+    Event::FrameWithoutPose,
     Event::ReputationsNotSaved,
 ];
 

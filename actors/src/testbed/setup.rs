@@ -15,7 +15,7 @@ use ecod::view::ViewConfig;
 use ecod::wire::Role;
 
 use crate::camera::{CameraConfig, MountConfig, OpticsConfig};
-use crate::config::{NodeConfig, PoseConfig};
+use crate::config::NodeConfig;
 use crate::detect::DetectorConfig;
 use crate::detect::placard::PlacardConfig;
 use crate::frame_source::SourceConfig;
@@ -23,6 +23,7 @@ use crate::frame_source::capture::CaptureConfig;
 use crate::lens::Lens;
 use crate::membership::{MembershipConfig, MulticastConfig};
 use crate::perception::{Perception, Vantage};
+use crate::vehicle_pose::PoseConfig;
 
 /// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
 const GATE_M: f64 = 0.032;
@@ -58,6 +59,7 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
         detector: DetectorConfig::Placard(PlacardConfig::default()),
         projection: projection(placard),
         view: view(placard),
+        votes: false,
     };
     NodeConfig {
         name: Some(cav.name.clone()),
@@ -66,6 +68,7 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
             x_m: cav.pose.position.x,
             y_m: cav.pose.position.y,
             heading_deg: cav.pose.heading_rad.to_degrees(),
+            listen: None,
         },
         camera: Some(camera),
         ..cell(testbed, scene)

@@ -109,7 +109,7 @@ const DROPS = {
   publish_refused: "not sent: link down or full", publish_too_large: "not sent: too large", inbox_full: "dropped: node too far behind",
   name_conflict: "another node has this name", disconnected: "link lost", connect_failed: "link not established", broker_refused: "refused by a broker",
   vote_ignored: "vote for nothing", reputations_not_saved: "reputations not saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped",
-  detection_unplaced: "detection not placed", browser_refused: "browser refused", browser_throttled: "browser slowed down", dashboard_not_bound: "page's address not free",
+  detection_unplaced: "detection not placed", pose_rejected: "pose not taken", frame_without_pose: "frame without a pose", browser_refused: "browser refused", browser_throttled: "browser slowed down", dashboard_not_bound: "page's address not free",
 };
 
 const earlier = new Map();
