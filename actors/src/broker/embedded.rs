@@ -88,6 +88,9 @@ pub struct BrokerConfig {
     pub max_waiting: usize,
     /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
     pub max_retained: usize,
+    /// Most bytes of all retained messages together; default 67108864. A status has some hundred, reputations some hundred
+    /// for each vehicle. What is beyond is passed on and not kept.
+    pub max_retained_bytes: usize,
     /// Whether the broker may listen on others than loopback addresses without `[tls]`; default false. Whoever reaches it
     /// then reads everything and may say anything in anybody's name.
     pub allow_plaintext: bool,
@@ -111,6 +114,7 @@ impl Default for BrokerConfig {
             max_clients: 2048,
             max_waiting: 256,
             max_retained: 8192,
+            max_retained_bytes: 64 * 1024 * 1024,
             allow_plaintext: false,
             handshake_timeout_ms: 5000,
             connect_burst: 64,
@@ -132,6 +136,7 @@ impl BrokerConfig {
         check_range("max_clients", self.max_clients as f64, 1.0, 1e6)?;
         check_range("max_waiting", self.max_waiting as f64, 1.0, 1e6)?;
         check_range("max_retained", self.max_retained as f64, 1.0, 1e6)?;
+        check_range("max_retained_bytes", self.max_retained_bytes as f64, 1024.0, 1e12)?;
         check_range("handshake_timeout_ms", self.handshake_timeout_ms as f64, 100.0, 60_000.0)?;
         check_range("connect_burst", f64::from(self.connect_burst), 1.0, 1e6)?;
         check_range("connects_per_s", f64::from(self.connects_per_s), 1.0, 1e4)?;
@@ -313,7 +318,7 @@ async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketA
     let own = listener.local_addr()?;
     // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
     let context = ServerContext::new().busy_check_enable(false).build().await;
-    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(config.max_retained));
+    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(&config));
     throttle.install(&context).await;
     let (gate, bound) = match &guard {
         Some(guard) => {

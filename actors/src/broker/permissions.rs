@@ -2,11 +2,13 @@
 //!
 //! | topic | who |
 //! |---|---|
-//! | `detections/N`, `vote_detections/N`, `ledger/N`, `nodes/N` | whoever has the certificate of `N` |
+//! | `detections/N`, `vote_detections/N`, `ledger/N` | whoever has the certificate of `N` |
+//! | `nodes/N`, `nodes/N--…` | whoever has the certificate of `N`; observers share it |
 //! | `global_detections`, `global_verdicts`, `reputations` | who is elected; while nobody is, who may lead |
 //! | anything else | nobody |
 //!
-//! Everyone with a certificate of the cell may read everything.
+//! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a certificate
+//! of the cell may read everything.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -83,24 +85,26 @@ impl Permissions {
         match self.passes.holder(info.id().remote_addr) {
             // Past the gate: another process of this machine found the port behind it.
             None => false,
-            Some(None) => true,
-            Some(Some(identity)) => {
+            Some(holder) => {
                 let will = info.last_will().map(|will| match will {
-                    LastWill::V3(will) => will.topic.clone(),
-                    LastWill::V5(will) => will.topic.clone(),
+                    LastWill::V3(will) => (will.topic.clone(), will.retain),
+                    LastWill::V5(will) => (will.topic.clone(), will.retain),
                 });
-                may_be_called(&identity, info.client_id())
-                    && will.is_none_or(|topic| may_publish(&identity, &self.topics, &topic, &self.elected))
+                holder.as_ref().is_none_or(|identity| may_be_called(identity, info.client_id()))
+                    && will.is_none_or(|(topic, retain)| self.allows(holder.as_deref(), &topic, retain))
             }
         }
     }
 
-    fn permits(&self, address: Option<SocketAddr>, topic: &str) -> bool {
-        match self.passes.holder(address) {
-            None => false,
-            Some(None) => true,
-            Some(Some(identity)) => may_publish(&identity, &self.topics, topic, &self.elected),
-        }
+    fn permits(&self, address: Option<SocketAddr>, topic: &str, retain: bool) -> bool {
+        self.passes.holder(address).is_some_and(|holder| self.allows(holder.as_deref(), topic, retain))
+    }
+
+    /// Whether the holder may say something on a topic; without a certificate anybody may, but what is not to be retained.
+    fn allows(&self, holder: Option<&Identity>, topic: &str, retain: bool) -> bool {
+        let topic = self.topics.parse(topic);
+        (!retain || topic.as_ref().is_some_and(is_state))
+            && holder.is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
     }
 }
 
@@ -116,7 +120,7 @@ impl Handler for Permissions {
                 AuthResult::NotAuthorized
             }),
             Parameter::MessagePublishCheckAcl(session, publish) => {
-                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, &publish.topic) {
+                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, &publish.topic, publish.retain) {
                     PublishAclResult::allow()
                 } else {
                     self.counters.count(Event::ClientDenied);
@@ -130,15 +134,18 @@ impl Handler for Permissions {
     }
 }
 
-fn may_publish(identity: &Identity, topics: &Topics, topic: &str, elected: &Elected) -> bool {
-    match topics.parse(topic) {
-        Some(Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Ledger(node) | Topic::Nodes(node)) => {
-            identity.speaks_for(node.as_str())
-        }
-        Some(Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations) => {
+/// Whether the topic's last message is kept for latecomers.
+fn is_state(topic: &Topic) -> bool {
+    matches!(topic, Topic::Nodes(_) | Topic::Reputations)
+}
+
+fn may_publish(identity: &Identity, topic: &Topic, elected: &Elected) -> bool {
+    match topic {
+        Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Ledger(node) => identity.name() == node,
+        Topic::Nodes(node) => identity.speaks_for(node.as_str()),
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => {
             identity.serves() && elected(identity.name())
         }
-        None => false,
     }
 }
 
@@ -168,12 +175,20 @@ mod tests {
         Identity::of(&x509_parser::pem::parse_x509_pem(&pem).unwrap().1.contents).unwrap()
     }
 
+    fn permissions() -> Permissions {
+        Permissions {
+            passes: Passes::default(),
+            topics: Topics::new(&NodeName::from_static("lot")),
+            elected: Arc::new(|name| name.as_str() == "edge"),
+            counters: Arc::default(),
+        }
+    }
+
     #[test]
     fn everyone_speaks_for_itself_and_the_elected_for_all() {
-        let topics = Topics::new(&NodeName::from_static("lot"));
-        let elected: Elected = Arc::new(|name| name.as_str() == "edge");
+        let permissions = permissions();
         let allows = |identity: &Identity, topic: &str| {
-            may_publish(identity, &topics, &format!("ecod/v1/lot/{topic}"), &elected)
+            permissions.allows(Some(identity), &format!("ecod/v1/lot/{topic}"), false)
         };
         let (edge, euclid) = (identity("edge", Role::Edge), identity("euclid", Role::Auto));
         for topic in
@@ -181,13 +196,33 @@ mod tests {
         {
             assert!(allows(&euclid, topic) && !allows(&edge, topic), "{topic}");
         }
+        for topic in ["detections/euclid--2", "vote_detections/euclid--2", "ledger/euclid--2"] {
+            assert!(!allows(&euclid, topic), "one certificate is one vehicle: {topic}");
+        }
         for topic in ["global_detections", "global_verdicts", "reputations"] {
             assert!(allows(&edge, topic) && !allows(&euclid, topic), "{topic}");
             assert!(!allows(&identity("edge", Role::Cav), topic), "a vehicle that cannot lead");
         }
         assert!(!allows(&euclid, "nodes/euclid-2") && !allows(&euclid, "nodes/euclid/x"));
-        assert!(!may_publish(&euclid, &topics, "ecod/v1/lot-2/detections/euclid", &elected));
-        assert!(!may_publish(&euclid, &topics, "$SYS/x", &elected));
+        assert!(!permissions.allows(Some(&euclid), "ecod/v1/lot-2/detections/euclid", false));
+        assert!(!permissions.allows(Some(&euclid), "$SYS/x", false));
+    }
+
+    #[test]
+    fn only_statuses_and_reputations_are_retained_whoever_asks() {
+        let permissions = permissions();
+        let edge = identity("edge", Role::Edge);
+        let streams =
+            ["detections/edge", "vote_detections/edge", "ledger/edge", "global_detections", "global_verdicts"];
+        for holder in [Some(&edge), None] {
+            let allows = |topic: &str, retain| permissions.allows(holder, &format!("ecod/v1/lot/{topic}"), retain);
+            for topic in streams {
+                assert!(allows(topic, false) && !allows(topic, true), "{topic}");
+            }
+            assert!(allows("nodes/edge", true) && allows("reputations", true));
+            assert!(!permissions.allows(holder, "elsewhere", true));
+        }
+        assert!(permissions.allows(None, "elsewhere", false), "without certificates anybody may say anything");
     }
 
     #[test]

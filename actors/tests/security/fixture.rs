@@ -164,8 +164,8 @@ impl Client {
     }
 
     /// Publishes and waits until the broker has dealt with it, permitted or not.
-    pub(crate) async fn publish_and_wait(&mut self, topic: &str) -> Result<(), String> {
-        self.client.try_publish(topic, QoS::AtLeastOnce, true, "forged").unwrap();
+    pub(crate) async fn publish_and_wait(&mut self, topic: &str, retain: bool) -> Result<(), String> {
+        self.client.try_publish(topic, QoS::AtLeastOnce, retain, "forged").unwrap();
         let acknowledged = async {
             loop {
                 match self.events.poll().await {
