@@ -2,7 +2,8 @@
 //!
 //! | topic | who |
 //! |---|---|
-//! | `detections/N`, `vote_detections/N`, `ledger/N` | whoever has the certificate of `N` |
+//! | `detections/N`, `vote_detections/N` | whoever has the certificate of `N` |
+//! | `ledger/N` | the same, if `N` may lead |
 //! | `nodes/N`, `nodes/N--…` | whoever has the certificate of `N`; observers share it |
 //! | `global_detections`, `global_verdicts`, `reputations` | who is elected; while nobody is, who may lead |
 //! | anything else | nobody |
@@ -141,7 +142,8 @@ fn is_state(topic: &Topic) -> bool {
 
 fn may_publish(identity: &Identity, topic: &Topic, elected: &Elected) -> bool {
     match topic {
-        Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Ledger(node) => identity.name() == node,
+        Topic::Detections(node) | Topic::VoteDetections(node) => identity.name() == node,
+        Topic::Ledger(node) => identity.serves() && identity.name() == node,
         Topic::Nodes(node) => identity.speaks_for(node.as_str()),
         Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => {
             identity.serves() && elected(identity.name())
@@ -199,6 +201,11 @@ mod tests {
         for topic in ["detections/euclid--2", "vote_detections/euclid--2", "ledger/euclid--2"] {
             assert!(!allows(&euclid, topic), "one certificate is one vehicle: {topic}");
         }
+        let vehicle = identity("euclid", Role::Cav);
+        assert!(
+            allows(&vehicle, "vote_detections/euclid") && !allows(&vehicle, "ledger/euclid"),
+            "it never counts votes"
+        );
         for topic in ["global_detections", "global_verdicts", "reputations"] {
             assert!(allows(&edge, topic) && !allows(&euclid, topic), "{topic}");
             assert!(!allows(&identity("edge", Role::Cav), topic), "a vehicle that cannot lead");

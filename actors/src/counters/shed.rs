@@ -10,6 +10,8 @@ pub enum ShedReason {
     BrokerThrottled,
     /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
     ReportThrottled,
+    /// A candidate shared evidence more often than `mqtt.max_report_hz`; the share was not decoded.
+    LedgerThrottled,
     /// A newer report of the same vehicle came before the fuser had taken this one.
     ReportReplaced,
 }
@@ -20,6 +22,7 @@ impl ShedReason {
         match self {
             Self::BrokerThrottled => "broker_throttled",
             Self::ReportThrottled => "report_throttled",
+            Self::LedgerThrottled => "ledger_throttled",
             Self::ReportReplaced => "report_replaced",
         }
     }

@@ -55,6 +55,8 @@ pub(super) struct Assembly {
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
+    /// The highest term that the election knows.
+    term: watch::Sender<u64>,
     feed: Arc<Feed>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
@@ -88,6 +90,7 @@ impl Assembly {
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
+            term: watch::Sender::default(),
             feed: Arc::default(),
             dashboard_address: watch::Sender::new(None),
             failed,

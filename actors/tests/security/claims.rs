@@ -38,6 +38,17 @@ async fn one_certificate_is_one_vehicle() {
 }
 
 #[tokio::test]
+async fn a_vehicle_that_never_leads_has_no_evidence_to_share() {
+    let mut cell = Cell::start().await;
+    let files = cell.pki.issue("gauss", Role::Cav, DAY);
+    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
+    gauss.log_in().await.unwrap();
+    gauss.publish_and_wait("ecod/v1/lot/ledger/gauss", false).await.unwrap();
+    assert_eq!(cell.counters.events(Event::ClientDenied), 1);
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
 async fn a_report_is_not_kept_for_latecomers() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);

@@ -155,6 +155,9 @@ impl Assembly {
             book: self.book.clone(),
             file: self.state_file("reputations"),
             newest: self.newest.reputations.subscribe(),
+            members: self.members(),
+            leadership: self.leadership(),
+            term: self.term.subscribe(),
             gateway: self.seats.gateway.clone(),
             fuser: self.seats.fuser.clone(),
             counters: self.counters(),
@@ -190,6 +193,7 @@ impl Assembly {
             members: self.members(),
             parts: Parts { membership, gateway, fuser, keeper, broker },
             leadership: self.leadership.clone(),
+            term: self.term.clone(),
             counters: self.counters(),
         }
     }
