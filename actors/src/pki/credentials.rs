@@ -16,7 +16,7 @@ use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::version::TLS13;
 use rustls::{ClientConfig, DigitallySignedStruct, RootCertStore, ServerConfig, SignatureScheme};
 
-use super::{BROKER_NAME, Identity, TlsConfig};
+use super::{BROKER_NAME, BrokerTrust, Identity, TlsConfig};
 
 /// The certificates of a node, read again when their files change.
 #[derive(Debug)]
@@ -45,6 +45,8 @@ pub struct Current {
     pub client: Arc<ClientConfig>,
     /// Checks certificates of clients.
     pub clients: Arc<dyn ClientCertVerifier>,
+    /// Checks certificates of brokers of the cell.
+    pub brokers: Arc<dyn ServerCertVerifier>,
     certificates: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
 }
@@ -127,6 +129,15 @@ pub fn external_client(ca: &Path, own: Option<&Current>) -> Result<ClientConfig,
     }
 }
 
+/// How a node goes on trusting a broker that is none of the cell's: as [`external_client`] says.
+///
+/// # Errors
+/// [`CredentialsError`] naming the file.
+pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, CredentialsError> {
+    let verifier = server_verifier(Arc::new(roots("mqtt.ca", ca)?), Vec::new())?;
+    Ok(BrokerTrust::new(&external_client(ca, own)?, verifier))
+}
+
 fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError> {
     let roots = Arc::new(roots("tls.ca", &files.ca)?);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
@@ -149,15 +160,16 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
         .map_err(unusable)?;
     server.session_storage = Arc::new(NoServerSessionStorage {});
     server.send_tls13_tickets = 0;
+    let brokers: Arc<dyn ServerCertVerifier> = Arc::new(CellBroker(server_verifier(roots, lists)?));
     let mut client = ClientConfig::builder_with_provider(crypto())
         .with_protocol_versions(&[&TLS13])
         .map_err(unusable)?
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(CellBroker(server_verifier(roots, lists)?)))
+        .with_custom_certificate_verifier(Arc::clone(&brokers))
         .with_client_auth_cert(certificates.clone(), key.clone_key())
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
-    Ok(Current { identity, server: Arc::new(server), client: Arc::new(client), clients, certificates, key })
+    Ok(Current { identity, server: Arc::new(server), client: Arc::new(client), clients, brokers, certificates, key })
 }
 
 fn client_verifier(
