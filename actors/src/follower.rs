@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watches of the newest of each; maps also to an optional log file
-//!                                            └── NoteRound ──> LeaderElection
+//!                                            ├── NoteRound ──> LeaderElection
+//!                                            └── TakeMap ──> Fuser
 //! ```
 
 mod gate;
@@ -21,6 +22,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 use crate::counters::{Counters, Event};
+use crate::fuser::FuserMessage;
 use crate::gateway::{Delivery, Incoming};
 use crate::leader_election::{LeaderElectionMessage, Leadership};
 use crate::recorder::Recording;
@@ -99,6 +101,8 @@ pub struct FollowerArguments {
     pub leadership: watch::Receiver<Leadership>,
     /// Is told of the rounds taken.
     pub election: Seat<LeaderElectionMessage>,
+    /// Goes on from the maps taken, when the node leads.
+    pub fuser: Seat<FuserMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -117,6 +121,7 @@ pub struct FollowerState {
     recording: Recording,
     leadership: watch::Receiver<Leadership>,
     election: Seat<LeaderElectionMessage>,
+    fuser: Seat<FuserMessage>,
     counters: Arc<Counters>,
 }
 
@@ -161,15 +166,16 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, recording, least_term, leadership, election, counters, .. } = arguments;
+        let FollowerArguments { newest, recording, least_term, leadership, election, fuser, counters, .. } = arguments;
         let [maps, verdicts, reputations] = [(); 3].map(|()| Gate::new(least_term));
-        Self { newest, maps, verdicts, reputations, log, recording, leadership, election, counters }
+        Self { newest, maps, verdicts, reputations, log, recording, leadership, election, fuser, counters }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         self.maps.admit(&epoch, map.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::MapAccepted);
+        self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         self.write(&received);
@@ -233,6 +239,7 @@ mod tests {
             least_term: 0,
             leadership: watch::channel(leadership).1,
             election: Seat::default(),
+            fuser: Seat::default(),
             counters: Arc::default(),
         };
         FollowerState::new(arguments, None)

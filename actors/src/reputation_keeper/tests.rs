@@ -7,35 +7,7 @@ use tokio::sync::mpsc;
 
 use super::*;
 use crate::leader_election::Position;
-
-/// Notes the shares that a keeper publishes.
-struct Wire;
-
-impl Actor for Wire {
-    type Msg = GatewayMessage;
-    type State = mpsc::UnboundedSender<LedgerShare>;
-    type Arguments = Self::State;
-
-    async fn pre_start(
-        &self,
-        _myself: ActorRef<Self::Msg>,
-        shares: Self::Arguments,
-    ) -> Result<Self::State, ActorProcessingErr> {
-        Ok(shares)
-    }
-
-    async fn handle(
-        &self,
-        _myself: ActorRef<Self::Msg>,
-        message: Self::Msg,
-        shares: &mut Self::State,
-    ) -> Result<(), ActorProcessingErr> {
-        if let GatewayMessage::PublishShare { share } = message {
-            shares.send(share)?;
-        }
-        Ok(())
-    }
-}
+use crate::seat::listening;
 
 fn name(name: &str) -> NodeName {
     NodeName::new(name).unwrap()
@@ -45,14 +17,12 @@ fn name(name: &str) -> NodeName {
 struct Scene {
     keeper: ReputationKeeperState,
     counters: Arc<Counters>,
-    shares: mpsc::UnboundedReceiver<LedgerShare>,
+    published: mpsc::UnboundedReceiver<GatewayMessage>,
 }
 
 impl Scene {
     async fn new() -> Self {
-        let (sender, shares) = mpsc::unbounded_channel();
-        let gateway = Seat::default();
-        gateway.take(Actor::spawn(None, Wire, sender).await.unwrap().0);
+        let (gateway, published) = listening::seat().await;
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 1));
         let member = |(node, role)| Member { name: name(node), run: 1, gossip: address, broker: None, role };
         let members = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)].map(member).to_vec();
@@ -76,7 +46,7 @@ impl Scene {
         });
         let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
         keeper.arguments.book.open().ledger.record(3, &name("euclid"), &own);
-        Self { keeper, counters, shares }
+        Self { keeper, counters, published }
     }
 
     fn hear(&mut self, from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>, at_ms: u64) {
@@ -126,7 +96,11 @@ async fn leaders_that_change_with_every_share_are_not_answered_each_time() {
     scene.hear("edge", Some(7), Vec::new(), 6000);
     scene.hear("edge", Some(7), Vec::new(), 20_000);
     scene.keeper.arguments.gateway.holder().unwrap().drain_and_wait(None).await.unwrap();
-    let sent = std::iter::from_fn(|| scene.shares.try_recv().ok()).collect::<Vec<_>>();
+    let share = |message| match message {
+        GatewayMessage::PublishShare { share } => Some(share),
+        _ => None,
+    };
+    let sent: Vec<_> = std::iter::from_fn(|| scene.published.try_recv().ok()).filter_map(share).collect();
     assert_eq!(sent.len(), 2, "at once, and when some time has passed");
-    assert!(sent.iter().all(|share| share.entries.iter().all(|entry| entry.aggregator == name("euclid"))));
+    assert!(sent.iter().flat_map(|share| &share.entries).all(|entry| entry.aggregator == name("euclid")));
 }
