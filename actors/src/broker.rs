@@ -13,6 +13,7 @@
 mod admission;
 mod embedded;
 mod gate;
+mod holder;
 mod permissions;
 mod retained;
 mod throttle;

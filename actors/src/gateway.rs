@@ -44,7 +44,7 @@ pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
 pub use part::Part;
 pub use probe::probe;
-pub use security::{Security, SecurityError};
+pub use security::{ENVELOPE_BYTES, Security, SecurityError};
 
 use crate::counters::{Counters, Event};
 use connection::{Handling, LastWill, last_will};

@@ -11,57 +11,31 @@
 //! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a certificate
 //! of the cell may read everything.
 
-use std::collections::HashMap;
 use std::fmt;
 use std::net::SocketAddr;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::Arc;
 
 use async_trait::async_trait;
 use ecod::names::NodeName;
-use ecod::wire::{Topic, Topics};
+use ecod::wire::{Limits, Topic, Topics};
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
-use rmqtt::types::{AuthResult, ConnectInfo, LastWill, PublishAclResult};
+use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult};
 
+use super::holder::{Holder, Passes};
 use crate::counters::{Counters, Event};
+use crate::gateway::ENVELOPE_BYTES;
 use crate::pki::Identity;
 
 /// Tells whether a node may speak for all: whether it is the elected one.
 pub type Elected = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
-
-/// The connections that the gate has let in, by the address from which it passes them on, and whose they are. Without
-/// certificates they are nobody's.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Passes(Arc<RwLock<HashMap<SocketAddr, Option<Arc<Identity>>>>>);
-
-/// A connection that may talk to rmqtt; not any more when dropped.
-pub(super) struct Pass {
-    passes: Passes,
-    address: SocketAddr,
-}
-
-impl Passes {
-    pub(super) fn issue(&self, address: SocketAddr, holder: Option<Arc<Identity>>) -> Pass {
-        self.0.write().unwrap_or_else(PoisonError::into_inner).insert(address, holder);
-        Pass { passes: self.clone(), address }
-    }
-
-    fn holder(&self, address: Option<SocketAddr>) -> Option<Option<Arc<Identity>>> {
-        self.0.read().unwrap_or_else(PoisonError::into_inner).get(&address?).cloned()
-    }
-}
-
-impl Drop for Pass {
-    fn drop(&mut self) {
-        self.passes.0.write().unwrap_or_else(PoisonError::into_inner).remove(&self.address);
-    }
-}
 
 /// What the hooks need to know.
 #[derive(Clone)]
 pub(super) struct Permissions {
     pub(super) passes: Passes,
     pub(super) topics: Topics,
+    pub(super) limits: Limits,
     pub(super) elected: Elected,
     pub(super) counters: Arc<Counters>,
 }
@@ -83,29 +57,35 @@ impl Permissions {
 
     /// Whether the connection may log in under this client id with this last will.
     fn admits(&self, info: &ConnectInfo) -> bool {
-        match self.passes.holder(info.id().remote_addr) {
-            // Past the gate: another process of this machine found the port behind it.
-            None => false,
-            Some(holder) => {
-                let will = info.last_will().map(|will| match will {
-                    LastWill::V3(will) => (will.topic.clone(), will.retain),
-                    LastWill::V5(will) => (will.topic.clone(), will.retain),
-                });
-                holder.as_ref().is_none_or(|identity| may_be_called(identity, info.client_id()))
-                    && will.is_none_or(|(topic, retain)| self.allows(holder.as_deref(), &topic, retain))
-            }
-        }
+        // Without a pass it went past the gate: another process of this machine found the port behind it.
+        let Some(holder) = self.passes.holder(info.id().remote_addr) else { return false };
+        let may_say = |will: LastWill<'_>| {
+            let (topic, retain, bytes) = match will {
+                LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
+                LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
+            };
+            self.allows(&holder, topic, retain, bytes)
+        };
+        holder.identity.as_ref().is_none_or(|identity| may_be_called(identity, info.client_id()))
+            && info.last_will().is_none_or(may_say)
     }
 
-    fn permits(&self, address: Option<SocketAddr>, topic: &str, retain: bool) -> bool {
-        self.passes.holder(address).is_some_and(|holder| self.allows(holder.as_deref(), topic, retain))
+    fn permits(&self, address: Option<SocketAddr>, publish: &Publish) -> bool {
+        let allows = |holder: Holder| self.allows(&holder, &publish.topic, publish.retain, publish.payload.len());
+        self.passes.holder(address).is_some_and(allows)
     }
 
-    /// Whether the holder may say something on a topic; without a certificate anybody may, but what is not to be retained.
-    fn allows(&self, holder: Option<&Identity>, topic: &str, retain: bool) -> bool {
+    /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more than
+    /// the topic's receivers take, nor what is not to be retained.
+    fn allows(&self, holder: &Holder, topic: &str, retain: bool, bytes: usize) -> bool {
         let topic = self.topics.parse(topic);
-        (!retain || topic.as_ref().is_some_and(is_state))
-            && holder.is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
+        let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));
+        bytes <= most + ENVELOPE_BYTES
+            && (!retain || topic.as_ref().is_some_and(is_state))
+            && holder
+                .identity
+                .as_ref()
+                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
     }
 }
 
@@ -121,7 +101,7 @@ impl Handler for Permissions {
                 AuthResult::NotAuthorized
             }),
             Parameter::MessagePublishCheckAcl(session, publish) => {
-                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, &publish.topic, publish.retain) {
+                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, publish) {
                     PublishAclResult::allow()
                 } else {
                     self.counters.count(Event::ClientDenied);
@@ -132,6 +112,14 @@ impl Handler for Permissions {
             _ => return (true, None),
         };
         (false, Some(answer))
+    }
+}
+
+/// What receivers take of the topic: nobody but the elected has maps to send.
+fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
+    match topic {
+        Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) | Topic::Nodes(_) => limits.payload_bytes,
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
     }
 }
 
@@ -177,10 +165,19 @@ mod tests {
         Identity::of(&x509_parser::pem::parse_x509_pem(&pem).unwrap().1.contents).unwrap()
     }
 
+    fn anyone() -> Holder {
+        Holder::new(None, [10, 0, 0, 1].into())
+    }
+
+    fn with(identity: &Identity) -> Holder {
+        Holder::new(Some(identity.clone()), [10, 0, 0, 1].into())
+    }
+
     fn permissions() -> Permissions {
         Permissions {
             passes: Passes::default(),
             topics: Topics::new(&NodeName::from_static("lot")),
+            limits: Limits { payload_bytes: 1000, map_bytes: 5000, ..Limits::default() },
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::default(),
         }
@@ -190,7 +187,7 @@ mod tests {
     fn everyone_speaks_for_itself_and_the_elected_for_all() {
         let permissions = permissions();
         let allows = |identity: &Identity, topic: &str| {
-            permissions.allows(Some(identity), &format!("ecod/v1/lot/{topic}"), false)
+            permissions.allows(&with(identity), &format!("ecod/v1/lot/{topic}"), false, 0)
         };
         let (edge, euclid) = (identity("edge", Role::Edge), identity("euclid", Role::Auto));
         for topic in
@@ -211,25 +208,42 @@ mod tests {
             assert!(!allows(&identity("edge", Role::Cav), topic), "a vehicle that cannot lead");
         }
         assert!(!allows(&euclid, "nodes/euclid-2") && !allows(&euclid, "nodes/euclid/x"));
-        assert!(!permissions.allows(Some(&euclid), "ecod/v1/lot-2/detections/euclid", false));
-        assert!(!permissions.allows(Some(&euclid), "$SYS/x", false));
+        assert!(!permissions.allows(&with(&euclid), "ecod/v1/lot-2/detections/euclid", false, 0));
+        assert!(!permissions.allows(&with(&euclid), "$SYS/x", false, 0));
     }
 
     #[test]
     fn only_statuses_and_reputations_are_retained_whoever_asks() {
         let permissions = permissions();
-        let edge = identity("edge", Role::Edge);
+        let edge = with(&identity("edge", Role::Edge));
         let streams =
             ["detections/edge", "vote_detections/edge", "ledger/edge", "global_detections", "global_verdicts"];
-        for holder in [Some(&edge), None] {
-            let allows = |topic: &str, retain| permissions.allows(holder, &format!("ecod/v1/lot/{topic}"), retain);
+        for holder in [edge, anyone()] {
+            let allows = |topic: &str, retain| permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), retain, 0);
             for topic in streams {
                 assert!(allows(topic, false) && !allows(topic, true), "{topic}");
             }
             assert!(allows("nodes/edge", true) && allows("reputations", true));
-            assert!(!permissions.allows(holder, "elsewhere", true));
+            assert!(!permissions.allows(&holder, "elsewhere", true, 0));
         }
-        assert!(permissions.allows(None, "elsewhere", false), "without certificates anybody may say anything");
+        assert!(permissions.allows(&anyone(), "elsewhere", false, 0), "without certificates anybody may say anything");
+    }
+
+    #[test]
+    fn a_report_is_not_as_large_as_a_map() {
+        let permissions = permissions();
+        for holder in [with(&identity("edge", Role::Edge)), anyone()] {
+            let allows = |topic: &str, bytes| {
+                permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), false, bytes + ENVELOPE_BYTES)
+            };
+            for topic in ["detections/edge", "vote_detections/edge", "ledger/edge", "nodes/edge"] {
+                assert!(allows(topic, 1000) && !allows(topic, 1001), "{topic}");
+            }
+            for topic in ["global_detections", "global_verdicts", "reputations"] {
+                assert!(allows(topic, 5000) && !allows(topic, 5001), "{topic}");
+            }
+        }
+        assert!(!permissions.allows(&anyone(), "elsewhere", false, 5000));
     }
 
     #[test]

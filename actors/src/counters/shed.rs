@@ -6,7 +6,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// Why something that came in was left out though nothing is wrong with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ShedReason {
-    /// A client published more than `broker.max_messages_hz`; the embedded broker passed the message on to nobody.
+    /// A node, an address or a client of this machine published more than `broker.max_messages_hz`; the embedded broker passed the message on to nobody.
     BrokerThrottled,
     /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
     ReportThrottled,

@@ -84,6 +84,9 @@ pub(super) struct SigningKey(hmac::Key);
 const MARK: u8 = 0xec;
 const TAG_BYTES: usize = 32;
 
+/// What a signature adds to a payload.
+pub const ENVELOPE_BYTES: usize = 1 + TAG_BYTES;
+
 impl SigningKey {
     /// The payload in its envelope.
     pub(super) fn seal(&self, topic: &str, payload: &[u8]) -> Vec<u8> {

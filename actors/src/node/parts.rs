@@ -269,7 +269,8 @@ impl Assembly {
             (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
         }
         let (topics, elected) = (Topics::new(&self.config.cell), elected::rule(self.leadership()));
-        EmbeddedBroker::guarded(config, Guard { credentials, topics, elected, counters: self.counters() })
+        let (limits, counters) = (self.config.mqtt.limits(), self.counters());
+        EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
     }
 
     async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
