@@ -14,6 +14,7 @@ mod admission;
 mod embedded;
 mod gate;
 mod holder;
+mod login;
 mod permissions;
 mod retained;
 mod throttle;

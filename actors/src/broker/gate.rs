@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use ecod::wire::{Limits, Topics};
 use rustls::pki_types::{CertificateDer, UnixTime};
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::{Semaphore, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout, timeout_at};
@@ -26,6 +26,7 @@ use tokio_rustls::TlsAcceptor;
 use super::BrokerConfig;
 use super::admission::{Admission, Rate, Ticket};
 use super::holder::{Holder, Passes, Shares};
+use super::login;
 use super::permissions::{Elected, Permissions};
 use crate::clock;
 use crate::counters::{Counters, Event};
@@ -72,9 +73,6 @@ const RECHECK: Duration = Duration::from_secs(30);
 
 /// Pause after the system gave no connection, such as for lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-
-/// Largest CONNECT packet: client id, last will, user name and password.
-const MAX_CONNECT_BYTES: usize = 16 * 1024;
 
 /// How long a client may not read at all before it is cut off.
 const WRITE_PATIENCE: Duration = Duration::from_secs(15);
@@ -161,7 +159,7 @@ impl Gate {
 
 /// Why a client was not let in, or not any longer.
 #[derive(Debug, thiserror::Error)]
-enum TurnedAway {
+pub(super) enum TurnedAway {
     #[error("no login in time")]
     TimedOut,
     #[error("not trusted: {0}")]
@@ -216,14 +214,14 @@ impl Shared {
                 }
                 None => (stream as Stream, Vec::new()),
             };
-            let connect = read_connect(&mut stream).await?;
+            let connect = login::read(&mut stream).await?;
             Ok((stream, certificates, connect))
         };
         let login = timeout_at(Instant::now() + self.patience, login).await;
         let (stream, certificates, connect) = login.unwrap_or(Err(TurnedAway::TimedOut))?;
         let identity = certificates.first().map(|certificate| Identity::of(certificate)).transpose();
         let identity = identity.map_err(|error| TurnedAway::Untrusted(error.to_string()))?;
-        let holder = Holder::new(identity, from.ip());
+        let holder = Holder::new(identity, from.ip(), connect.is_nameless);
         let _part = self.shares.take(&holder).ok_or(TurnedAway::Crowded)?;
         let _place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| TurnedAway::Full)?;
 
@@ -233,7 +231,7 @@ impl Shared {
         let _pass = self.passes.issue(socket.local_addr()?, holder);
         let mut behind = socket.connect(self.behind).await?;
         behind.set_nodelay(true)?;
-        behind.write_all(&connect).await?;
+        behind.write_all(&connect.packet).await?;
         drop(ticket);
         tokio::select! {
             () = relay(stream, behind) => Ok(()),
@@ -253,32 +251,6 @@ async fn secure(
     let certificates = certificates.ok_or_else(|| TurnedAway::Untrusted("no certificate".into()))?;
     Ok((Box::pin(stream), certificates))
 }
-
-/// The first packet, which must be CONNECT; rmqtt itself would wait for its first bytes for good.
-async fn read_connect(stream: &mut Stream) -> Result<Vec<u8>, TurnedAway> {
-    let mut packet = vec![stream.read_u8().await?];
-    if packet[0] != CONNECT {
-        return Err(TurnedAway::Malformed);
-    }
-    let mut length = 0;
-    for shift in [0, 7, 14] {
-        let byte = stream.read_u8().await?;
-        packet.push(byte);
-        length |= usize::from(byte & 0x7f) << shift;
-        if byte & 0x80 == 0 {
-            break;
-        }
-    }
-    if packet.last().is_some_and(|byte| byte & 0x80 != 0) || length > MAX_CONNECT_BYTES {
-        return Err(TurnedAway::Malformed);
-    }
-    let head = packet.len();
-    packet.resize(head + length, 0);
-    stream.read_exact(&mut packet[head..]).await?;
-    Ok(packet)
-}
-
-const CONNECT: u8 = 0x10;
 
 /// Passes bytes on until either side ends; what was under way to a client that left is given a moment.
 async fn relay(client: Stream, broker: TcpStream) {

@@ -16,16 +16,18 @@ pub(super) struct Holder {
     pub(super) identity: Option<Arc<Identity>>,
     /// By what its connections count together; absent for this machine's without certificates, where a whole cell may run.
     share: Option<Arc<str>>,
+    /// Whether it left it to the broker to draw its client id.
+    pub(super) is_nameless: bool,
 }
 
 impl Holder {
-    pub(super) fn new(identity: Option<Identity>, from: IpAddr) -> Self {
+    pub(super) fn new(identity: Option<Identity>, from: IpAddr, is_nameless: bool) -> Self {
         let share = match &identity {
             Some(identity) => Some(identity.name().as_str().into()),
             None if from.to_canonical().is_loopback() => None,
             None => Some(source(from).to_string().into()),
         };
-        Self { identity: identity.map(Arc::new), share }
+        Self { identity: identity.map(Arc::new), share, is_nameless }
     }
 }
 
@@ -133,7 +135,7 @@ mod tests {
     use super::*;
 
     fn at(address: &str) -> Holder {
-        Holder::new(None, address.parse().unwrap())
+        Holder::new(None, address.parse().unwrap(), false)
     }
 
     #[test]

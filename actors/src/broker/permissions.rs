@@ -66,8 +66,8 @@ impl Permissions {
             };
             self.allows(&holder, topic, retain, bytes)
         };
-        holder.identity.as_ref().is_none_or(|identity| may_be_called(identity, info.client_id()))
-            && info.last_will().is_none_or(may_say)
+        let is_own = |identity: &Arc<Identity>| holder.is_nameless || may_be_called(identity, info.client_id());
+        holder.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
     }
 
     fn permits(&self, address: Option<SocketAddr>, publish: &Publish) -> bool {
@@ -139,12 +139,10 @@ fn may_publish(identity: &Identity, topic: &Topic, elected: &Elected) -> bool {
     }
 }
 
-/// A second connection of one client id ends the first: nobody may take another's. A node's is its name and its run; one
-/// that the broker drew is 32 hexadecimal digits.
+/// A second connection of one client id ends the first: nobody may take another's. A node's is its name and its run.
 fn may_be_called(identity: &Identity, client_id: &str) -> bool {
     let is_run = |text: &str| text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
-    let named = client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.speaks_for(name));
-    named || is_run(client_id)
+    client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.speaks_for(name))
 }
 
 #[cfg(test)]
@@ -166,11 +164,11 @@ mod tests {
     }
 
     fn anyone() -> Holder {
-        Holder::new(None, [10, 0, 0, 1].into())
+        Holder::new(None, [10, 0, 0, 1].into(), false)
     }
 
     fn with(identity: &Identity) -> Holder {
-        Holder::new(Some(identity.clone()), [10, 0, 0, 1].into())
+        Holder::new(Some(identity.clone()), [10, 0, 0, 1].into(), false)
     }
 
     fn permissions() -> Permissions {
@@ -250,10 +248,11 @@ mod tests {
     fn nobody_takes_the_client_id_of_another() {
         let euclid = identity("euclid", Role::Auto);
         let run = "0123456789abcdef0123456789abcdef";
-        for good in [run.to_owned(), format!("euclid-{run}"), format!("euclid--top-7-{run}")] {
+        for good in [format!("euclid-{run}"), format!("euclid--top-7-{run}")] {
             assert!(may_be_called(&euclid, &good), "{good}");
         }
-        for bad in [format!("edge-{run}"), format!("euclid-2-{run}"), "euclid".into(), "edge".into(), String::new()] {
+        let others = [format!("edge-{run}"), format!("euclid-2-{run}"), "euclid".into(), "edge".into(), String::new()];
+        for bad in others.into_iter().chain([run.to_owned()]) {
             assert!(!may_be_called(&euclid, &bad), "{bad}");
         }
     }

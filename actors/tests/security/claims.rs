@@ -75,12 +75,15 @@ async fn nobody_logs_in_as_another_or_leaves_its_last_will() {
     let run = Uuid::now_v7().simple();
     let posing = Client::with_id(cell.address, &format!("euclid-{run}"), &tls, |_| ()).log_in().await;
     assert!(posing.is_err(), "a login under the name of another would end the other's");
+    let drawn = Client::with_id(cell.address, &run.to_string(), &tls, |_| ()).log_in().await;
+    assert!(drawn.is_err(), "it may be what the broker drew for another");
     let will = LastWill::new("ecod/v1/lot/nodes/euclid", "offline", QoS::AtLeastOnce, true);
     let leaving = Client::with_id(cell.address, &format!("gauss-{run}"), &tls, |options| {
         options.set_last_will(will);
     });
     let refused = { leaving }.log_in().await;
     assert!(refused.is_err(), "{refused:?}");
-    cell.counted(Event::ClientDenied, 2).await;
+    cell.counted(Event::ClientDenied, 3).await;
+    Client::with_id(cell.address, "", &tls, |_| ()).log_in().await.unwrap();
     cell.honest_traffic_goes_on().await;
 }
