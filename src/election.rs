@@ -188,6 +188,11 @@ impl Election {
         }
     }
 
+    /// The highest term that anyone is known to have used.
+    pub fn term(&self) -> u64 {
+        self.terms.seen
+    }
+
     /// The lowest term that a gate should admit after a restart: the highest term known when the node stopped.
     pub fn floor(&self) -> u64 {
         self.terms.found.saturating_sub(1)

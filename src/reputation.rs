@@ -105,17 +105,21 @@ impl From<Snapshot> for ReputationLedger {
 }
 
 impl ReputationLedger {
-    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. It is not counted
-    /// where the bounds leave no room, see [`Self::merge_entries`].
+    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Any other lane gives way
+    /// to it, see [`Self::merge_entries`]; the vote is not counted where it takes all the room itself.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
-        let Some(counts) = self.counts_mut(epoch, aggregator, &evidence.node, &evidence.label) else { return };
+        let Some(counts) =
+            self.counts_mut((epoch, aggregator), &evidence.node, &evidence.label, Some((epoch, aggregator)))
+        else {
+            return;
+        };
         let count = if evidence.correct { &mut counts.correct } else { &mut counts.incorrect };
         *count = count.saturating_add(1);
     }
 
     /// Takes in all that `other` knows, within the same bounds.
     pub fn merge(&mut self, other: &Self) {
-        self.merge_entries(other.entries());
+        self.merge_entries(other.entries(), None);
     }
 
     fn counts(&self) -> impl Iterator<Item = (u64, &NodeName, &Label, Counts)> {

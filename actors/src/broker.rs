@@ -13,6 +13,8 @@
 mod admission;
 mod embedded;
 mod gate;
+mod holder;
+mod login;
 mod permissions;
 mod retained;
 mod throttle;

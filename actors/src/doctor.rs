@@ -109,6 +109,22 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_revocation_list_without_a_list_is_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let (mut config, now) = (config(), crate::clock::now());
+        let name = NodeName::from_static("edge");
+        let mut authority = crate::pki::Authority::init(directory.path(), &config.cell, now).unwrap();
+        authority.issue(&name, Role::Edge, std::time::Duration::from_secs(86_400), now).unwrap();
+        let ((certificate, key), list) = (authority.files_of(&name), authority.revocation_list());
+        std::fs::write(&list, "").unwrap();
+        let (ca, revocation_list) = (authority.ca(), Some(list));
+        config.tls = Some(crate::pki::TlsConfig { ca, certificate, key, revocation_list });
+        let finding = finding(&config, "certificates").await;
+        assert_eq!(finding.verdict, Verdict::Broken);
+        assert!(finding.seen.contains("revoked.pem") && finding.fix.unwrap().contains("revoked.pem"));
+    }
+
+    #[tokio::test]
     async fn ports_in_use_are_named() {
         let (tcp, udp) = (TcpListener::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
         let mut config = config();

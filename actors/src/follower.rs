@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watches of the newest of each; maps also to an optional log file
-//!                                            └── NoteRound ──> LeaderElection
+//!                                            ├── NoteRound ──> LeaderElection
+//!                                            └── TakeMap ──> Fuser
 //! ```
 
 mod age;
@@ -23,6 +24,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 use crate::counters::{Counters, Event};
+use crate::fuser::FuserMessage;
 use crate::gateway::{Delivery, Incoming};
 use crate::leader_election::{LeaderElectionMessage, Leadership};
 use crate::recorder::Recording;
@@ -102,6 +104,8 @@ pub struct FollowerArguments {
     pub leadership: watch::Receiver<Leadership>,
     /// Is told of the rounds taken.
     pub election: Seat<LeaderElectionMessage>,
+    /// Goes on from the maps taken, when the node leads.
+    pub fuser: Seat<FuserMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -122,6 +126,7 @@ pub struct FollowerState {
     recording: Recording,
     leadership: watch::Receiver<Leadership>,
     election: Seat<LeaderElectionMessage>,
+    fuser: Seat<FuserMessage>,
     counters: Arc<Counters>,
 }
 
@@ -167,7 +172,7 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, recording, least_term, leadership, election, counters, .. } = arguments;
+        let FollowerArguments { newest, recording, least_term, leadership, election, fuser, counters, .. } = arguments;
         let [maps, verdicts, reputations] = [(); 3].map(|()| Gate::new(least_term));
         let (map_age, verdicts_age) = (Age::default(), Age::default());
         Self {
@@ -181,6 +186,7 @@ impl FollowerState {
             recording,
             leadership,
             election,
+            fuser,
             counters,
         }
     }
@@ -190,6 +196,7 @@ impl FollowerState {
         check_age(self.map_age.of(&epoch, map.fused_at_us, received_at))?;
         self.maps.admit(&epoch, map.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::MapAccepted);
+        self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         self.write(&received);
@@ -261,6 +268,7 @@ mod tests {
             least_term: 0,
             leadership: watch::channel(leadership).1,
             election: Seat::default(),
+            fuser: Seat::default(),
             counters: Arc::default(),
         };
         FollowerState::new(arguments, None)

@@ -2,12 +2,15 @@
 //!
 //! ```text
 //! Gateway ── reports ──> Intake ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
-//! Gateway ── TakeReports, TakeMap ─> │ ▲
+//! Gateway ── TakeReports ──────────> │ ▲
+//! Follower ── TakeMap ─────────────> │ │
 //! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
 //! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
 
 mod intake;
+#[cfg(test)]
+mod tests;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,6 +25,7 @@ use ecod::round::FirstRound;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputation};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 pub use intake::{Intake, Put};
@@ -38,7 +42,7 @@ use crate::seat::Seat;
 pub enum FuserMessage {
     /// Fuse the reports that wait in the intake.
     TakeReports,
-    /// Keep another aggregator's map, to go on from when leading.
+    /// Keep another aggregator's map, which the follower's gate admitted, to go on from when leading.
     TakeMap {
         /// The map.
         map: Arc<GlobalMap>,
@@ -76,6 +80,8 @@ pub enum FuserMessage {
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
+    /// The highest term that the election knows.
+    pub term: watch::Receiver<u64>,
     /// Where vehicles' reports wait.
     pub intake: Intake,
     /// Where the aggregator's inputs are recorded.
@@ -98,6 +104,7 @@ pub struct Fuser;
 /// The aggregator and its alarm.
 pub struct FuserState {
     aggregator: Aggregator,
+    term: watch::Receiver<u64>,
     intake: Intake,
     recording: Recording,
     gateway: Seat<GatewayMessage>,
@@ -119,18 +126,7 @@ impl Actor for Fuser {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let FuserArguments { aggregator, intake, recording, gateway, keeper, counters } = arguments;
-        let mut state = FuserState {
-            aggregator,
-            intake,
-            recording,
-            gateway,
-            keeper,
-            counters,
-            last_map: None,
-            alarm: Timestamp(u64::MAX),
-            timer: None,
-        };
+        let mut state = FuserState::new(arguments);
         state.set_alarm(&myself);
         Ok(state)
     }
@@ -169,6 +165,22 @@ impl Actor for Fuser {
 }
 
 impl FuserState {
+    fn new(arguments: FuserArguments) -> Self {
+        let FuserArguments { aggregator, term, intake, recording, gateway, keeper, counters } = arguments;
+        Self {
+            aggregator,
+            term,
+            intake,
+            recording,
+            gateway,
+            keeper,
+            counters,
+            last_map: None,
+            alarm: Timestamp(u64::MAX),
+            timer: None,
+        }
+    }
+
     fn take_reports(&mut self) {
         for delivery in self.intake.take_all() {
             self.take(&delivery);
@@ -190,10 +202,10 @@ impl FuserState {
         }
     }
 
+    /// Keeps the map that was admitted last. While nobody is known to lead, the gate admits any epoch: one that the election
+    /// does not know is nobody's to go on from.
     fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
-        let order = |map: &GlobalMap| (Epoch::new(map.epoch, map.aggregator.clone()), map.round);
-        if self.aggregator.leads().is_none() && self.last_map.as_ref().is_none_or(|(last, _)| order(last) < order(&map))
-        {
+        if self.aggregator.leads().is_none() && map.epoch <= *self.term.borrow() {
             self.last_map = Some((map, received_at));
         }
     }
@@ -203,7 +215,6 @@ impl FuserState {
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
         if let Some((map, received_at)) = self.last_map.take()
             && clock::now().since(received_at) < FRESH_MAP
-            && map.epoch <= epoch.term
         {
             self.command(Command::AdoptMap { map, received_at });
         }

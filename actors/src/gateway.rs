@@ -44,7 +44,7 @@ pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;
 pub use part::Part;
 pub use probe::probe;
-pub use security::{Security, SecurityError};
+pub use security::{ENVELOPE_BYTES, Security, SecurityError};
 
 use crate::counters::{Counters, Event};
 use connection::{Handling, LastWill, last_will};
@@ -369,7 +369,11 @@ impl GatewayState {
     }
 
     fn link_changed(&mut self, LinkEvent { link: id, news }: LinkEvent) {
-        let Some(filters) = self.links.get(&id).map(|link| self.filters(&link.broker)) else { return };
+        // Computed for the one event that needs them.
+        let filters = match &news {
+            LinkNews::Accepted(_) => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
+            _ => Vec::new(),
+        };
         let Some(link) = self.links.get_mut(&id) else { return };
         let state = match news {
             LinkNews::Accepted(client) => {

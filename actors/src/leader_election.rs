@@ -129,6 +129,8 @@ pub struct LeaderElectionArguments {
     pub parts: Parts,
     /// Gets the leadership whenever it changes.
     pub leadership: watch::Sender<Leadership>,
+    /// Gets the highest term known whenever it changes.
+    pub term: watch::Sender<u64>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }

@@ -4,6 +4,7 @@
 //! Authority   a directory with the cell's CA: makes node certificates and the revocation list
 //! Credentials what one node holds of it: checks others, shows itself, notices changed files
 //! Identity    what a certificate says of its holder
+//! BrokerTrust whether a broker's certificate is good, for as long as a connection lasts
 //! ```
 //!
 //! A cell has a CA of its own, so that a certificate of another cell is worth nothing here. A certificate's common name
@@ -11,13 +12,15 @@
 //! that never leads cannot pose as a broker, and addresses may change.
 
 mod authority;
+mod broker_trust;
 mod config;
 mod credentials;
 mod identity;
 
 pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
+pub use broker_trust::BrokerTrust;
 pub use config::TlsConfig;
-pub use credentials::{Credentials, CredentialsError, Current, external_client};
+pub use credentials::{Credentials, CredentialsError, Current, external_broker, external_client};
 pub use identity::{Identity, InvalidCertificate};
 
 /// The DNS name in the certificate of every node that may lead, below a domain that is reserved for private use.

@@ -13,9 +13,12 @@
 //!   its state directory.
 //! - Whoever has led sends its own lanes to a leader that it hears for the first time: when a split heals, the evidence
 //!   of both sides is kept.
+//! - Evidence is taken of members that may lead, and of terms that the election knows; the present leader's always has room.
 
 mod book;
 mod config;
+#[cfg(test)]
+mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -24,7 +27,10 @@ use std::time::Duration;
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::reputation::{EntryKey, Evidence, ReputationConfig};
-use ecod::wire::{LedgerEntry, LedgerShare, MAX_SHARE_ENTRIES, Reputation, Reputations, SCHEMA_VERSION};
+use ecod::time::Timestamp;
+use ecod::wire::{
+    LedgerEntry, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION,
+};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -32,10 +38,13 @@ use tokio::task::JoinHandle;
 pub use book::{Book, SharedBook};
 pub use config::ReputationKeeperConfig;
 
+use crate::clock;
 use crate::counters::{Counters, Event};
 use crate::follower::Received;
 use crate::fuser::FuserMessage;
 use crate::gateway::{Delivery, GatewayMessage, Incoming};
+use crate::leader_election::Leadership;
+use crate::membership::Member;
 use crate::seat::Seat;
 use crate::state_file::StateFile;
 use book::Saved;
@@ -93,6 +102,12 @@ pub struct ReputationKeeperArguments {
     pub file: Option<StateFile>,
     /// The newest reputations of the cell.
     pub newest: watch::Receiver<Option<Received<Reputations>>>,
+    /// The other nodes.
+    pub members: watch::Receiver<Vec<Member>>,
+    /// Who leads.
+    pub leadership: watch::Receiver<Leadership>,
+    /// The highest term that the election knows.
+    pub term: watch::Receiver<u64>,
     /// Where reputations and shares are published.
     pub gateway: Seat<GatewayMessage>,
     /// Starts from evidence of others.
@@ -113,12 +128,19 @@ pub struct ReputationKeeperState {
     published: Option<(Epoch, u64)>,
     /// The leader whose shares came last.
     heard: Option<Epoch>,
+    /// Whether it has yet to be told the node's own lanes.
+    owes_lanes: bool,
+    lanes_sent: Option<Timestamp>,
     unsaved: bool,
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
     disk_failed: bool,
     ticks: u32,
 }
+
+/// Least time between two times that the node's own lanes are sent to a leader that is new: leaders may come and go fast,
+/// or only seem to.
+const LANES_PAUSE: Duration = Duration::from_secs(5);
 
 /// How long a disk may take before reputations are published unsaved.
 const WRITE_PATIENCE: Duration = Duration::from_secs(1);
@@ -135,19 +157,7 @@ impl Actor for ReputationKeeper {
     ) -> Result<Self::State, ActorProcessingErr> {
         book::restore(&arguments);
         myself.send_interval(arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
-        Ok(ReputationKeeperState {
-            arguments,
-            leads: None,
-            last_round: 0,
-            published: None,
-            heard: None,
-            // A run before may have left something.
-            unsaved: true,
-            unadopted: false,
-            writing: None,
-            disk_failed: false,
-            ticks: 0,
-        })
+        Ok(ReputationKeeperState::new(arguments))
     }
 
     async fn handle(
@@ -184,6 +194,24 @@ impl Actor for ReputationKeeper {
 }
 
 impl ReputationKeeperState {
+    fn new(arguments: ReputationKeeperArguments) -> Self {
+        Self {
+            arguments,
+            leads: None,
+            last_round: 0,
+            published: None,
+            heard: None,
+            owes_lanes: false,
+            lanes_sent: None,
+            // A run before may have left something.
+            unsaved: true,
+            unadopted: false,
+            writing: None,
+            disk_failed: false,
+            ticks: 0,
+        }
+    }
+
     fn lead(&mut self, epoch: Epoch, last_round: u64) {
         let newest = self.arguments.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.message));
         let mut book = self.arguments.book.open();
@@ -224,20 +252,41 @@ impl ReputationKeeperState {
 
     fn merge(&mut self, delivery: &Delivery) {
         let Incoming::Ledger(share) = &delivery.message else { return };
+        let may_lead = |member: &Member| member.name == share.node && member.role != Role::Cav;
+        if !self.arguments.members.borrow().iter().any(may_lead) {
+            tracing::debug!(node = %share.node, "evidence of a node that is no candidate");
+            return self.arguments.counters.reject(RejectReason::NotCandidate);
+        }
+        let term = *self.arguments.term.borrow();
         let own = |entry: &LedgerEntry| {
             self.leads.as_ref().is_some_and(|own| own.term == entry.epoch && own.leader == entry.aggregator)
         };
-        let news: Vec<_> = share.entries.iter().filter(|entry| !own(entry)).cloned().collect();
-        if self.arguments.book.open().ledger.merge_entries(news) {
+        let known = |entry: &&LedgerEntry| entry.epoch <= term && !own(entry);
+        let news: Vec<_> = share.entries.iter().filter(known).cloned().collect();
+        if share.entries.iter().any(|entry| entry.epoch > term) {
+            tracing::debug!(node = %share.node, term, "evidence of a later term");
+            self.arguments.counters.reject(RejectReason::UnknownTerm);
+        }
+        let present = self.leads.clone().or_else(|| self.arguments.leadership.borrow().epoch.clone());
+        if self.arguments.book.open().ledger.merge_entries(news, present.as_ref()) {
             self.arguments.counters.count(Event::LedgerMerged);
             self.unsaved = true;
             self.unadopted = true;
         }
-        let leader = share.epoch.map(|term| Epoch::new(term, share.node.clone()));
+        let leader = share.epoch.filter(|claimed| *claimed <= term).map(|term| Epoch::new(term, share.node.clone()));
         if leader.is_some() && leader != self.heard {
             self.heard = leader;
-            let own: Vec<_> =
-                self.entries().into_iter().filter(|entry| entry.aggregator == self.arguments.name).collect();
+            self.owes_lanes = true;
+        }
+        self.send_own_lanes(delivery.received_at);
+    }
+
+    /// Sends the node's own lanes to a leader that does not have them, not too often.
+    fn send_own_lanes(&mut self, now: Timestamp) {
+        if self.owes_lanes && self.lanes_sent.is_none_or(|at| now.since(at) >= LANES_PAUSE) {
+            (self.owes_lanes, self.lanes_sent) = (false, Some(now));
+            let mut own = self.entries();
+            own.retain(|entry| entry.aggregator == self.arguments.name);
             self.share(&own);
         }
     }
@@ -245,6 +294,7 @@ impl ReputationKeeperState {
     async fn tick(&mut self) {
         self.save().await;
         self.publish();
+        self.send_own_lanes(clock::now());
         if std::mem::take(&mut self.unadopted) {
             let ledger = Arc::new(self.arguments.book.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });

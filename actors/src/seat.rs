@@ -45,3 +45,48 @@ impl<M> fmt::Debug for Seat<M> {
         f.debug_struct("Seat").finish_non_exhaustive()
     }
 }
+
+#[cfg(test)]
+pub(crate) mod listening {
+    //! A seat whose messages a test reads.
+
+    use std::marker::PhantomData;
+
+    use ractor::{Actor, ActorProcessingErr};
+    use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
+
+    use super::*;
+
+    struct Listener<M>(PhantomData<fn() -> M>);
+
+    impl<M: Message> Actor for Listener<M> {
+        type Msg = M;
+        type State = UnboundedSender<M>;
+        type Arguments = Self::State;
+
+        async fn pre_start(
+            &self,
+            _myself: ActorRef<M>,
+            sender: Self::Arguments,
+        ) -> Result<Self::State, ActorProcessingErr> {
+            Ok(sender)
+        }
+
+        async fn handle(
+            &self,
+            _myself: ActorRef<M>,
+            message: M,
+            sender: &mut Self::State,
+        ) -> Result<(), ActorProcessingErr> {
+            sender.send(message).map_err(|_| "nobody reads".into())
+        }
+    }
+
+    /// The seat, and what is sent to it.
+    pub(crate) async fn seat<M: Message>() -> (Seat<M>, UnboundedReceiver<M>) {
+        let (sender, receiver) = unbounded_channel();
+        let seat = Seat::default();
+        seat.take(Actor::spawn(None, Listener(PhantomData), sender).await.unwrap().0);
+        (seat, receiver)
+    }
+}

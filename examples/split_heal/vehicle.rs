@@ -76,7 +76,7 @@ impl Vehicle {
             Payload::Report(kind, bytes) => self.fuse(*kind, &decode_report(bytes, from, &limits)?, now)?,
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),
             Payload::Evidence(bytes) => {
-                if self.ledger.merge_entries(decode_share(bytes, from, &limits)?.entries) {
+                if self.ledger.merge_entries(decode_share(bytes, from, &limits)?.entries, self.election.epoch()) {
                     self.aggregator.adopt(&self.ledger);
                 }
             }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::{Counts, ReputationLedger};
+use super::{Counts, ReputationLedger, Vehicles};
 use crate::epoch::Epoch;
 use crate::names::{Label, NodeName};
 use crate::wire::LedgerEntry;
@@ -11,7 +11,7 @@ use crate::wire::LedgerEntry;
 pub const MAX_LANES: usize = 64;
 
 /// Most entries that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its own and
-/// later ones are left.
+/// later ones are left, unless it is of the present leader's lane, to which later ones give way too.
 pub const MAX_ENTRIES: usize = 65_536;
 
 /// Which count: what an entry is about, without the numbers.
@@ -24,6 +24,9 @@ pub struct EntryKey {
     /// What for.
     pub label: Label,
 }
+
+/// A lane: its term and who writes it.
+pub(super) type Lane<'a> = (u64, &'a NodeName);
 
 impl ReputationLedger {
     /// Every count, lane by lane.
@@ -47,11 +50,13 @@ impl ReputationLedger {
     }
 
     /// Takes the larger of every count; true when that changed anything. What is beyond [`MAX_LANES`] and
-    /// [`MAX_ENTRIES`] is forgotten, the oldest lanes first, so that all who merge the same forget the same.
-    pub fn merge_entries(&mut self, entries: impl IntoIterator<Item = LedgerEntry>) -> bool {
+    /// [`MAX_ENTRIES`] is forgotten, the oldest lanes first, so that all who merge the same forget the same. The lane of the
+    /// `present` leader always has room and is never forgotten.
+    pub fn merge_entries(&mut self, entries: impl IntoIterator<Item = LedgerEntry>, present: Option<&Epoch>) -> bool {
+        let present = present.map(|epoch| (epoch.term, &epoch.leader));
         let mut changed = false;
         for LedgerEntry { epoch, aggregator, node, label, correct, incorrect } in entries {
-            let Some(counts) = self.counts_mut(epoch, &aggregator, &node, &label) else { continue };
+            let Some(counts) = self.counts_mut((epoch, &aggregator), &node, &label, present) else { continue };
             let before = *counts;
             counts.merge(Counts { correct, incorrect });
             changed |= *counts != before;
@@ -64,49 +69,50 @@ impl ReputationLedger {
         self.lanes.values().map(|aggregators| aggregators.len()).sum()
     }
 
-    /// The counts of a vehicle and label, new ones where there is room or older lanes make some; `None` elsewhere.
+    /// The counts of a vehicle and label, new ones where there is room or other lanes make some; `None` elsewhere.
     pub(super) fn counts_mut(
         &mut self,
-        epoch: u64,
-        aggregator: &NodeName,
+        lane: Lane<'_>,
         node: &NodeName,
         label: &Label,
+        present: Option<Lane<'_>>,
     ) -> Option<&mut Counts> {
-        let lane = self.lanes.get(&epoch).and_then(|aggregators| aggregators.get(aggregator));
-        let is_new = !lane.is_some_and(|lane| lane.get(node).is_some_and(|labels| labels.contains_key(label)));
+        let known = self.lane(lane);
+        let is_new = !known.is_some_and(|known| known.get(node).is_some_and(|labels| labels.contains_key(label)));
         if is_new {
             let is_full = |ledger: &Self| {
-                ledger.entries >= MAX_ENTRIES || (lane_is_new(ledger, epoch, aggregator) && ledger.lanes() >= MAX_LANES)
+                ledger.entries >= MAX_ENTRIES || (ledger.lane(lane).is_none() && ledger.lanes() >= MAX_LANES)
             };
             while is_full(self) {
-                if !self.forget_lane_before(epoch, aggregator) {
+                if !self.forget_oldest(lane, present) {
                     return None;
                 }
             }
             self.entries += 1;
         }
+        let (epoch, aggregator) = lane;
         let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
         Some(lane.entry(node.clone()).or_default().entry(label.clone()).or_default())
     }
 
-    /// Forgets the oldest lane if it is older than that of `epoch` and `aggregator`.
-    fn forget_lane_before(&mut self, epoch: u64, aggregator: &NodeName) -> bool {
-        let Some(mut oldest) = self.lanes.first_entry() else { return false };
-        let term = *oldest.key();
-        if oldest.get().keys().next().is_none_or(|leader| (term, leader) >= (epoch, aggregator)) {
-            return false;
+    fn lane(&self, (epoch, aggregator): Lane<'_>) -> Option<&Vehicles> {
+        self.lanes.get(&epoch)?.get(aggregator)
+    }
+
+    /// Forgets the oldest lane but the present one: one that is older than `lane`, or any if that is the present one.
+    fn forget_oldest(&mut self, lane: Lane<'_>, present: Option<Lane<'_>>) -> bool {
+        let lanes = self.lanes.iter().flat_map(|(epoch, aggregators)| aggregators.keys().map(|name| (*epoch, name)));
+        let oldest = lanes.into_iter().find(|other| *other != lane && Some(*other) != present);
+        let Some((epoch, name)) = oldest.filter(|oldest| *oldest < lane || present == Some(lane)) else { return false };
+        let name = name.clone();
+        let Some(aggregators) = self.lanes.get_mut(&epoch) else { return false };
+        let forgotten = aggregators.remove(&name);
+        if aggregators.is_empty() {
+            self.lanes.remove(&epoch);
         }
-        let forgotten = oldest.get_mut().pop_first();
-        if oldest.get().is_empty() {
-            oldest.remove();
-        }
-        self.entries -= forgotten.iter().flat_map(|(_, lane)| lane.values()).map(|labels| labels.len()).sum::<usize>();
+        self.entries -= forgotten.iter().flat_map(|lane| lane.values()).map(|labels| labels.len()).sum::<usize>();
         true
     }
-}
-
-fn lane_is_new(ledger: &ReputationLedger, epoch: u64, aggregator: &NodeName) -> bool {
-    !ledger.lanes.get(&epoch).is_some_and(|aggregators| aggregators.contains_key(aggregator))
 }
 
 fn entry(epoch: u64, aggregator: &NodeName, node: &NodeName, label: &Label, counts: Counts) -> LedgerEntry {
@@ -143,15 +149,15 @@ mod tests {
         entries.reverse();
         let mut copy = ReputationLedger::default();
         for share in entries.chunks(2) {
-            assert!(copy.merge_entries(share.to_vec()));
-            assert!(!copy.merge_entries(share.to_vec()), "the same again changes nothing");
+            assert!(copy.merge_entries(share.to_vec(), None));
+            assert!(!copy.merge_entries(share.to_vec(), None), "the same again changes nothing");
         }
         assert_eq!(copy, ledger);
 
         let lane = Epoch::new(3, name("edge"));
         ledger.record(3, &name("edge"), &vote(false));
         let changed = [EntryKey { lane, node: name("euclid"), label: "cup".into() }].into();
-        copy.merge_entries(ledger.entries_of(&changed));
+        copy.merge_entries(ledger.entries_of(&changed), None);
         assert_eq!(copy, ledger);
     }
 
@@ -161,14 +167,39 @@ mod tests {
         for epoch in 0..(2 * MAX_LANES as u64) {
             let entry =
                 entry(epoch, &name("edge"), &name("euclid"), &"cup".into(), Counts { correct: 1, incorrect: 0 });
-            ledger.merge_entries([entry]);
+            ledger.merge_entries([entry], None);
         }
         assert_eq!(ledger.lanes(), MAX_LANES);
         let oldest = ledger.entries().next().unwrap();
         assert_eq!(oldest.epoch, MAX_LANES as u64);
         let forgotten = LedgerEntry { epoch: 0, ..oldest };
-        assert!(!ledger.merge_entries([forgotten]), "an old lane does not come back");
+        assert!(!ledger.merge_entries([forgotten], None), "an old lane does not come back");
     }
+
+    #[test]
+    fn the_present_leaders_lane_has_room_whatever_others_claim() {
+        let counted = Counts { correct: 1, incorrect: 0 };
+        let flood = |epoch: u64| {
+            (0..2 * MAX_LANES)
+                .map(move |n| entry(epoch, &name(&format!("forger{n:03}")), &name("liar"), &"cup".into(), counted))
+        };
+        let present = Epoch::new(7, name("edge"));
+        let vote_of = |ledger: &ReputationLedger| ledger.totals().get(&name("euclid")).copied();
+
+        let mut own = ReputationLedger::default();
+        own.merge_entries(flood(7).chain(flood(8)), None);
+        own.record(7, &name("edge"), &vote(true));
+        assert_eq!((vote_of(&own), own.lanes()), (Some((1, 0)), MAX_LANES), "later lanes give way");
+        own.merge_entries(flood(9), Some(&present));
+        assert_eq!((vote_of(&own), own.lanes()), (Some((1, 0)), MAX_LANES), "and none displaces it");
+
+        let mut copy = ReputationLedger::default();
+        copy.merge_entries(flood(8), None);
+        let told = entry(7, &name("edge"), &name("euclid"), &"cup".into(), counted);
+        assert!(!copy.merge_entries([told.clone()], None));
+        assert!(copy.merge_entries([told], Some(&present)), "nor does it at whoever follows");
+    }
+
     #[test]
     fn names_used_up_in_one_lane_displace_older_lanes_and_nothing_else() {
         let mut ledger = ReputationLedger::default();

@@ -41,11 +41,15 @@ pub enum RejectReason {
     NotFused,
     /// A payload without a signature of the cell, where every payload must have one.
     BadSignature,
+    /// Evidence of a node that is not known to be one that may lead.
+    NotCandidate,
+    /// Evidence of a term that the election does not know yet.
+    UnknownTerm,
 }
 
 impl RejectReason {
     /// All reasons, for counters.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 20] = [
         Self::TooLarge,
         Self::Malformed,
         Self::UnknownSchema,
@@ -64,6 +68,8 @@ impl RejectReason {
         Self::NotElected,
         Self::NotFused,
         Self::BadSignature,
+        Self::NotCandidate,
+        Self::UnknownTerm,
     ];
 
     /// The reason as a counter's label.
@@ -87,6 +93,8 @@ impl RejectReason {
             Self::NotElected => "not_elected",
             Self::NotFused => "not_fused",
             Self::BadSignature => "bad_signature",
+            Self::NotCandidate => "not_candidate",
+            Self::UnknownTerm => "unknown_term",
         }
     }
 }

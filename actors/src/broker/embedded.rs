@@ -83,11 +83,18 @@ pub struct BrokerConfig {
     pub max_packet_bytes: Option<u32>,
     /// Most clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
     pub max_clients: usize,
+    /// Most clients at a time of one certificate or, without certificates, of one address other than this machine's; default
+    /// 32. A node has one or two, and one for each observer beside it; a cell behind address translation needs as many for
+    /// each node.
+    pub max_clients_each: usize,
     /// Most messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
     /// then gets is old. Each of them may be as large as the largest packet.
     pub max_waiting: usize,
     /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
     pub max_retained: usize,
+    /// Most bytes of all retained messages together; default 67108864. A status has some hundred, reputations some hundred
+    /// for each vehicle. What is beyond is passed on and not kept.
+    pub max_retained_bytes: usize,
     /// Whether the broker may listen on others than loopback addresses without `[tls]`; default false. Whoever reaches it
     /// then reads everything and may say anything in anybody's name.
     pub allow_plaintext: bool,
@@ -99,8 +106,9 @@ pub struct BrokerConfig {
     pub connect_burst: u32,
     /// Connections per second that one address may make after that; default 10.
     pub connects_per_s: u32,
-    /// Most messages a second of one client, and at once after a second of silence; default 1000. What is beyond is
-    /// passed on to nobody and counted. A node sends some tens; more lets a flood take the others' time.
+    /// Most messages a second of one certificate or, without certificates, of one address, or of one client of this
+    /// machine, and at once after a second of silence; default 1000. What is beyond is passed on to nobody and counted. A
+    /// node sends some tens; more lets a flood take the others' time.
     pub max_messages_hz: u32,
 }
 
@@ -109,8 +117,10 @@ impl Default for BrokerConfig {
         Self {
             max_packet_bytes: None,
             max_clients: 2048,
+            max_clients_each: 32,
             max_waiting: 256,
             max_retained: 8192,
+            max_retained_bytes: 64 * 1024 * 1024,
             allow_plaintext: false,
             handshake_timeout_ms: 5000,
             connect_burst: 64,
@@ -130,8 +140,10 @@ impl BrokerConfig {
             check_range("max_packet_bytes", f64::from(bytes), 1024.0, 268_435_455.0)?;
         }
         check_range("max_clients", self.max_clients as f64, 1.0, 1e6)?;
+        check_range("max_clients_each", self.max_clients_each as f64, 1.0, 1e6)?;
         check_range("max_waiting", self.max_waiting as f64, 1.0, 1e6)?;
         check_range("max_retained", self.max_retained as f64, 1.0, 1e6)?;
+        check_range("max_retained_bytes", self.max_retained_bytes as f64, 1024.0, 1e12)?;
         check_range("handshake_timeout_ms", self.handshake_timeout_ms as f64, 100.0, 60_000.0)?;
         check_range("connect_burst", f64::from(self.connect_burst), 1.0, 1e6)?;
         check_range("connects_per_s", f64::from(self.connects_per_s), 1.0, 1e4)?;
@@ -201,13 +213,12 @@ impl Mqtt for EmbeddedBroker {
         let thread_error = |source| BrokerError::Thread { address, source };
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
-        let throttle = ClientThrottle::new(self.config.max_messages_hz, Arc::clone(&self.counters));
         let plan = Plan {
             address,
             listener: self.listener(address),
             config: self.config.clone(),
             guard: self.guard.clone(),
-            throttle,
+            counters: Arc::clone(&self.counters),
         };
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
@@ -262,7 +273,7 @@ struct Plan {
     listener: Builder,
     config: BrokerConfig,
     guard: Option<Guard>,
-    throttle: ClientThrottle,
+    counters: Arc<Counters>,
 }
 
 /// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made here.
@@ -302,7 +313,7 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
 
 /// Opens the sockets: rmqtt's own is the public one, or behind the gate's.
 async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketAddr)> {
-    let Plan { address, listener, config, guard, throttle } = plan;
+    let Plan { address, listener, config, guard, counters } = plan;
     let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let listener = match &guard {
         // Without anonymous clients, the hooks are asked about each.
@@ -313,8 +324,7 @@ async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketA
     let own = listener.local_addr()?;
     // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
     let context = ServerContext::new().busy_check_enable(false).build().await;
-    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(config.max_retained));
-    throttle.install(&context).await;
+    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(&config));
     let (gate, bound) = match &guard {
         Some(guard) => {
             let public = TcpListener::bind(address).await?;
@@ -325,5 +335,7 @@ async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketA
         }
         None => (None, own),
     };
+    let passes = gate.as_ref().map(Gate::passes).unwrap_or_default();
+    ClientThrottle::new(config.max_messages_hz, passes, counters).install(&context).await;
     Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), gate, bound))
 }

@@ -14,9 +14,9 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::wire::Topics;
+use ecod::wire::{Limits, Topics};
 use rustls::pki_types::{CertificateDer, UnixTime};
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::{Semaphore, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout, timeout_at};
@@ -25,7 +25,9 @@ use tokio_rustls::TlsAcceptor;
 
 use super::BrokerConfig;
 use super::admission::{Admission, Rate, Ticket};
-use super::permissions::{Elected, Passes, Permissions};
+use super::holder::{Holder, Passes, Shares};
+use super::login;
+use super::permissions::{Elected, Permissions};
 use crate::clock;
 use crate::counters::{Counters, Event};
 use crate::pki::{Credentials, Current, Identity};
@@ -37,6 +39,8 @@ pub struct Guard {
     pub credentials: Option<Arc<Credentials>>,
     /// The cell's topics.
     pub topics: Topics,
+    /// The largest payloads that the cell's nodes take.
+    pub limits: Limits,
     /// Tells who may speak for all.
     pub elected: Elected,
     /// The node's counters.
@@ -56,6 +60,7 @@ struct Shared {
     passes: Passes,
     behind: SocketAddr,
     places: Arc<Semaphore>,
+    shares: Shares,
     patience: Duration,
     counters: Arc<Counters>,
 }
@@ -68,9 +73,6 @@ const RECHECK: Duration = Duration::from_secs(30);
 
 /// Pause after the system gave no connection, such as for lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-
-/// Largest CONNECT packet: client id, last will, user name and password.
-const MAX_CONNECT_BYTES: usize = 16 * 1024;
 
 /// How long a client may not read at all before it is cut off.
 const WRITE_PATIENCE: Duration = Duration::from_secs(15);
@@ -88,6 +90,7 @@ impl Gate {
             passes: Passes::default(),
             behind,
             places: Arc::new(Semaphore::new(config.max_clients)),
+            shares: Shares::new(config.max_clients_each),
             patience: Duration::from_millis(config.handshake_timeout_ms),
             counters: Arc::clone(&guard.counters),
         };
@@ -96,8 +99,18 @@ impl Gate {
 
     /// What rmqtt has to ask about those who come through this gate.
     pub(super) fn permissions(&self, guard: &Guard) -> Permissions {
-        let (topics, elected) = (guard.topics.clone(), Arc::clone(&guard.elected));
-        Permissions { passes: self.shared.passes.clone(), topics, elected, counters: Arc::clone(&guard.counters) }
+        Permissions {
+            passes: self.passes(),
+            topics: guard.topics.clone(),
+            limits: guard.limits,
+            elected: Arc::clone(&guard.elected),
+            counters: Arc::clone(&guard.counters),
+        }
+    }
+
+    /// Whose the connections are that come through this gate.
+    pub(super) fn passes(&self) -> Passes {
+        self.shared.passes.clone()
     }
 
     /// Lets clients in; never ends.
@@ -126,7 +139,7 @@ impl Gate {
         };
         let (shared, current) = (Arc::clone(&self.shared), self.current.as_ref().map(watch::Sender::subscribe));
         tokio::spawn(async move {
-            if let Err(turned_away) = shared.serve(stream, current, ticket).await {
+            if let Err(turned_away) = shared.serve(stream, from, current, ticket).await {
                 shared.counters.count(turned_away.event());
                 tracing::debug!(%from, %turned_away, "client turned away");
             }
@@ -146,7 +159,7 @@ impl Gate {
 
 /// Why a client was not let in, or not any longer.
 #[derive(Debug, thiserror::Error)]
-enum TurnedAway {
+pub(super) enum TurnedAway {
     #[error("no login in time")]
     TimedOut,
     #[error("not trusted: {0}")]
@@ -155,6 +168,8 @@ enum TurnedAway {
     Malformed,
     #[error("most clients are connected")]
     Full,
+    #[error("as many clients of this certificate or address are connected as may be")]
+    Crowded,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),
     #[error("certificate no longer valid: {0}")]
@@ -167,7 +182,7 @@ impl TurnedAway {
             Self::TimedOut => Event::ClientTimedOut,
             Self::Untrusted(_) => Event::ClientUntrusted,
             Self::Malformed | Self::Lost(_) => Event::ClientMalformed,
-            Self::Full => Event::ClientsFull,
+            Self::Full | Self::Crowded => Event::ClientsFull,
             Self::Expelled(_) => Event::ClientExpelled,
         }
     }
@@ -184,6 +199,7 @@ impl Shared {
     async fn serve(
         &self,
         stream: TcpStream,
+        from: SocketAddr,
         current: Option<watch::Receiver<Arc<Current>>>,
         ticket: Ticket,
     ) -> Result<(), TurnedAway> {
@@ -198,22 +214,24 @@ impl Shared {
                 }
                 None => (stream as Stream, Vec::new()),
             };
-            let connect = read_connect(&mut stream).await?;
+            let connect = login::read(&mut stream).await?;
             Ok((stream, certificates, connect))
         };
         let login = timeout_at(Instant::now() + self.patience, login).await;
         let (stream, certificates, connect) = login.unwrap_or(Err(TurnedAway::TimedOut))?;
         let identity = certificates.first().map(|certificate| Identity::of(certificate)).transpose();
-        let identity = identity.map_err(|error| TurnedAway::Untrusted(error.to_string()))?.map(Arc::new);
+        let identity = identity.map_err(|error| TurnedAway::Untrusted(error.to_string()))?;
+        let holder = Holder::new(identity, from.ip(), connect.is_nameless);
+        let _part = self.shares.take(&holder).ok_or(TurnedAway::Crowded)?;
         let _place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| TurnedAway::Full)?;
 
         let socket = TcpSocket::new_v4()?;
         socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
         // Before rmqtt can ask for it, and until the port may be somebody else's.
-        let _pass = self.passes.issue(socket.local_addr()?, identity);
+        let _pass = self.passes.issue(socket.local_addr()?, holder);
         let mut behind = socket.connect(self.behind).await?;
         behind.set_nodelay(true)?;
-        behind.write_all(&connect).await?;
+        behind.write_all(&connect.packet).await?;
         drop(ticket);
         tokio::select! {
             () = relay(stream, behind) => Ok(()),
@@ -233,32 +251,6 @@ async fn secure(
     let certificates = certificates.ok_or_else(|| TurnedAway::Untrusted("no certificate".into()))?;
     Ok((Box::pin(stream), certificates))
 }
-
-/// The first packet, which must be CONNECT; rmqtt itself would wait for its first bytes for good.
-async fn read_connect(stream: &mut Stream) -> Result<Vec<u8>, TurnedAway> {
-    let mut packet = vec![stream.read_u8().await?];
-    if packet[0] != CONNECT {
-        return Err(TurnedAway::Malformed);
-    }
-    let mut length = 0;
-    for shift in [0, 7, 14] {
-        let byte = stream.read_u8().await?;
-        packet.push(byte);
-        length |= usize::from(byte & 0x7f) << shift;
-        if byte & 0x80 == 0 {
-            break;
-        }
-    }
-    if packet.last().is_some_and(|byte| byte & 0x80 != 0) || length > MAX_CONNECT_BYTES {
-        return Err(TurnedAway::Malformed);
-    }
-    let head = packet.len();
-    packet.resize(head + length, 0);
-    stream.read_exact(&mut packet[head..]).await?;
-    Ok(packet)
-}
-
-const CONNECT: u8 = 0x10;
 
 /// Passes bytes on until either side ends; what was under way to a client that left is given a moment.
 async fn relay(client: Stream, broker: TcpStream) {

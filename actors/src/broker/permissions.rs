@@ -2,63 +2,40 @@
 //!
 //! | topic | who |
 //! |---|---|
-//! | `detections/N`, `vote_detections/N`, `ledger/N`, `nodes/N` | whoever has the certificate of `N` |
+//! | `detections/N`, `vote_detections/N` | whoever has the certificate of `N` |
+//! | `ledger/N` | the same, if `N` may lead |
+//! | `nodes/N`, `nodes/N--…` | whoever has the certificate of `N`; observers share it |
 //! | `global_detections`, `global_verdicts`, `reputations` | who is elected; while nobody is, who may lead |
 //! | anything else | nobody |
 //!
-//! Everyone with a certificate of the cell may read everything.
+//! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a certificate
+//! of the cell may read everything.
 
-use std::collections::HashMap;
 use std::fmt;
 use std::net::SocketAddr;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::Arc;
 
 use async_trait::async_trait;
 use ecod::names::NodeName;
-use ecod::wire::{Topic, Topics};
+use ecod::wire::{Limits, Topic, Topics};
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
-use rmqtt::types::{AuthResult, ConnectInfo, LastWill, PublishAclResult};
+use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult};
 
+use super::holder::{Holder, Passes};
 use crate::counters::{Counters, Event};
+use crate::gateway::ENVELOPE_BYTES;
 use crate::pki::Identity;
 
 /// Tells whether a node may speak for all: whether it is the elected one.
 pub type Elected = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
-
-/// The connections that the gate has let in, by the address from which it passes them on, and whose they are. Without
-/// certificates they are nobody's.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Passes(Arc<RwLock<HashMap<SocketAddr, Option<Arc<Identity>>>>>);
-
-/// A connection that may talk to rmqtt; not any more when dropped.
-pub(super) struct Pass {
-    passes: Passes,
-    address: SocketAddr,
-}
-
-impl Passes {
-    pub(super) fn issue(&self, address: SocketAddr, holder: Option<Arc<Identity>>) -> Pass {
-        self.0.write().unwrap_or_else(PoisonError::into_inner).insert(address, holder);
-        Pass { passes: self.clone(), address }
-    }
-
-    fn holder(&self, address: Option<SocketAddr>) -> Option<Option<Arc<Identity>>> {
-        self.0.read().unwrap_or_else(PoisonError::into_inner).get(&address?).cloned()
-    }
-}
-
-impl Drop for Pass {
-    fn drop(&mut self) {
-        self.passes.0.write().unwrap_or_else(PoisonError::into_inner).remove(&self.address);
-    }
-}
 
 /// What the hooks need to know.
 #[derive(Clone)]
 pub(super) struct Permissions {
     pub(super) passes: Passes,
     pub(super) topics: Topics,
+    pub(super) limits: Limits,
     pub(super) elected: Elected,
     pub(super) counters: Arc<Counters>,
 }
@@ -80,27 +57,35 @@ impl Permissions {
 
     /// Whether the connection may log in under this client id with this last will.
     fn admits(&self, info: &ConnectInfo) -> bool {
-        match self.passes.holder(info.id().remote_addr) {
-            // Past the gate: another process of this machine found the port behind it.
-            None => false,
-            Some(None) => true,
-            Some(Some(identity)) => {
-                let will = info.last_will().map(|will| match will {
-                    LastWill::V3(will) => will.topic.clone(),
-                    LastWill::V5(will) => will.topic.clone(),
-                });
-                may_be_called(&identity, info.client_id())
-                    && will.is_none_or(|topic| may_publish(&identity, &self.topics, &topic, &self.elected))
-            }
-        }
+        // Without a pass it went past the gate: another process of this machine found the port behind it.
+        let Some(holder) = self.passes.holder(info.id().remote_addr) else { return false };
+        let may_say = |will: LastWill<'_>| {
+            let (topic, retain, bytes) = match will {
+                LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
+                LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
+            };
+            self.allows(&holder, topic, retain, bytes)
+        };
+        let is_own = |identity: &Arc<Identity>| holder.is_nameless || may_be_called(identity, info.client_id());
+        holder.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
     }
 
-    fn permits(&self, address: Option<SocketAddr>, topic: &str) -> bool {
-        match self.passes.holder(address) {
-            None => false,
-            Some(None) => true,
-            Some(Some(identity)) => may_publish(&identity, &self.topics, topic, &self.elected),
-        }
+    fn permits(&self, address: Option<SocketAddr>, publish: &Publish) -> bool {
+        let allows = |holder: Holder| self.allows(&holder, &publish.topic, publish.retain, publish.payload.len());
+        self.passes.holder(address).is_some_and(allows)
+    }
+
+    /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more than
+    /// the topic's receivers take, nor what is not to be retained.
+    fn allows(&self, holder: &Holder, topic: &str, retain: bool, bytes: usize) -> bool {
+        let topic = self.topics.parse(topic);
+        let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));
+        bytes <= most + ENVELOPE_BYTES
+            && (!retain || topic.as_ref().is_some_and(is_state))
+            && holder
+                .identity
+                .as_ref()
+                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
     }
 }
 
@@ -116,7 +101,7 @@ impl Handler for Permissions {
                 AuthResult::NotAuthorized
             }),
             Parameter::MessagePublishCheckAcl(session, publish) => {
-                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, &publish.topic) {
+                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, publish) {
                     PublishAclResult::allow()
                 } else {
                     self.counters.count(Event::ClientDenied);
@@ -130,24 +115,34 @@ impl Handler for Permissions {
     }
 }
 
-fn may_publish(identity: &Identity, topics: &Topics, topic: &str, elected: &Elected) -> bool {
-    match topics.parse(topic) {
-        Some(Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Ledger(node) | Topic::Nodes(node)) => {
-            identity.speaks_for(node.as_str())
-        }
-        Some(Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations) => {
-            identity.serves() && elected(identity.name())
-        }
-        None => false,
+/// What receivers take of the topic: nobody but the elected has maps to send.
+fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
+    match topic {
+        Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) | Topic::Nodes(_) => limits.payload_bytes,
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
     }
 }
 
-/// A second connection of one client id ends the first: nobody may take another's. A node's is its name and its run; one
-/// that the broker drew is 32 hexadecimal digits.
+/// Whether the topic's last message is kept for latecomers.
+fn is_state(topic: &Topic) -> bool {
+    matches!(topic, Topic::Nodes(_) | Topic::Reputations)
+}
+
+fn may_publish(identity: &Identity, topic: &Topic, elected: &Elected) -> bool {
+    match topic {
+        Topic::Detections(node) | Topic::VoteDetections(node) => identity.name() == node,
+        Topic::Ledger(node) => identity.serves() && identity.name() == node,
+        Topic::Nodes(node) => identity.speaks_for(node.as_str()),
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => {
+            identity.serves() && elected(identity.name())
+        }
+    }
+}
+
+/// A second connection of one client id ends the first: nobody may take another's. A node's is its name and its run.
 fn may_be_called(identity: &Identity, client_id: &str) -> bool {
     let is_run = |text: &str| text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
-    let named = client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.speaks_for(name));
-    named || is_run(client_id)
+    client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.speaks_for(name))
 }
 
 #[cfg(test)]
@@ -168,12 +163,29 @@ mod tests {
         Identity::of(&x509_parser::pem::parse_x509_pem(&pem).unwrap().1.contents).unwrap()
     }
 
+    fn anyone() -> Holder {
+        Holder::new(None, [10, 0, 0, 1].into(), false)
+    }
+
+    fn with(identity: &Identity) -> Holder {
+        Holder::new(Some(identity.clone()), [10, 0, 0, 1].into(), false)
+    }
+
+    fn permissions() -> Permissions {
+        Permissions {
+            passes: Passes::default(),
+            topics: Topics::new(&NodeName::from_static("lot")),
+            limits: Limits { payload_bytes: 1000, map_bytes: 5000, ..Limits::default() },
+            elected: Arc::new(|name| name.as_str() == "edge"),
+            counters: Arc::default(),
+        }
+    }
+
     #[test]
     fn everyone_speaks_for_itself_and_the_elected_for_all() {
-        let topics = Topics::new(&NodeName::from_static("lot"));
-        let elected: Elected = Arc::new(|name| name.as_str() == "edge");
+        let permissions = permissions();
         let allows = |identity: &Identity, topic: &str| {
-            may_publish(identity, &topics, &format!("ecod/v1/lot/{topic}"), &elected)
+            permissions.allows(&with(identity), &format!("ecod/v1/lot/{topic}"), false, 0)
         };
         let (edge, euclid) = (identity("edge", Role::Edge), identity("euclid", Role::Auto));
         for topic in
@@ -181,23 +193,66 @@ mod tests {
         {
             assert!(allows(&euclid, topic) && !allows(&edge, topic), "{topic}");
         }
+        for topic in ["detections/euclid--2", "vote_detections/euclid--2", "ledger/euclid--2"] {
+            assert!(!allows(&euclid, topic), "one certificate is one vehicle: {topic}");
+        }
+        let vehicle = identity("euclid", Role::Cav);
+        assert!(
+            allows(&vehicle, "vote_detections/euclid") && !allows(&vehicle, "ledger/euclid"),
+            "it never counts votes"
+        );
         for topic in ["global_detections", "global_verdicts", "reputations"] {
             assert!(allows(&edge, topic) && !allows(&euclid, topic), "{topic}");
             assert!(!allows(&identity("edge", Role::Cav), topic), "a vehicle that cannot lead");
         }
         assert!(!allows(&euclid, "nodes/euclid-2") && !allows(&euclid, "nodes/euclid/x"));
-        assert!(!may_publish(&euclid, &topics, "ecod/v1/lot-2/detections/euclid", &elected));
-        assert!(!may_publish(&euclid, &topics, "$SYS/x", &elected));
+        assert!(!permissions.allows(&with(&euclid), "ecod/v1/lot-2/detections/euclid", false, 0));
+        assert!(!permissions.allows(&with(&euclid), "$SYS/x", false, 0));
+    }
+
+    #[test]
+    fn only_statuses_and_reputations_are_retained_whoever_asks() {
+        let permissions = permissions();
+        let edge = with(&identity("edge", Role::Edge));
+        let streams =
+            ["detections/edge", "vote_detections/edge", "ledger/edge", "global_detections", "global_verdicts"];
+        for holder in [edge, anyone()] {
+            let allows = |topic: &str, retain| permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), retain, 0);
+            for topic in streams {
+                assert!(allows(topic, false) && !allows(topic, true), "{topic}");
+            }
+            assert!(allows("nodes/edge", true) && allows("reputations", true));
+            assert!(!permissions.allows(&holder, "elsewhere", true, 0));
+        }
+        assert!(permissions.allows(&anyone(), "elsewhere", false, 0), "without certificates anybody may say anything");
+    }
+
+    #[test]
+    fn a_report_is_not_as_large_as_a_map() {
+        let permissions = permissions();
+        for holder in [with(&identity("edge", Role::Edge)), anyone()] {
+            let allows = |topic: &str, bytes| {
+                permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), false, bytes + ENVELOPE_BYTES)
+            };
+            for topic in ["detections/edge", "vote_detections/edge", "ledger/edge", "nodes/edge"] {
+                assert!(allows(topic, 1000) && !allows(topic, 1001), "{topic}");
+            }
+            for topic in ["global_detections", "global_verdicts", "reputations"] {
+                assert!(allows(topic, 5000) && !allows(topic, 5001), "{topic}");
+            }
+        }
+        assert!(!permissions.allows(&anyone(), "elsewhere", false, 5000));
     }
 
     #[test]
     fn nobody_takes_the_client_id_of_another() {
         let euclid = identity("euclid", Role::Auto);
         let run = "0123456789abcdef0123456789abcdef";
-        for good in [run.to_owned(), format!("euclid-{run}"), format!("euclid--top-7-{run}")] {
+        for good in [format!("euclid-{run}"), format!("euclid--top-7-{run}")] {
             assert!(may_be_called(&euclid, &good), "{good}");
         }
-        for bad in [format!("edge-{run}"), format!("euclid-2-{run}"), "euclid".into(), "edge".into(), String::new()] {
+        let others = [format!("edge-{run}"), format!("euclid-2-{run}"), "euclid".into(), "edge".into(), String::new()];
+        for bad in others.into_iter().chain([run.to_owned()]) {
             assert!(!may_be_called(&euclid, &bad), "{bad}");
         }
     }

@@ -1,4 +1,4 @@
-//! No client of the embedded broker takes more than its share.
+//! Nobody takes more than a share of the embedded broker, under however many names.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -6,21 +6,23 @@ use std::sync::{Arc, Mutex, PoisonError};
 use async_trait::async_trait;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
-use rmqtt::types::{ClientId, PublishAclResult};
+use rmqtt::types::PublishAclResult;
 
+use super::holder::{Passes, Source};
 use crate::clock;
 use crate::counters::{Counters, ShedReason};
 use crate::throttles::Throttles;
 
-/// Passes on at most so many messages a second of each client, before anything is done with them.
+/// Passes on at most so many messages a second of each node, address or client, before anything is done with them.
 pub(super) struct ClientThrottle {
-    clients: Mutex<Throttles<ClientId>>,
+    sources: Mutex<Throttles<Source>>,
+    passes: Passes,
     counters: Arc<Counters>,
 }
 
 impl ClientThrottle {
-    pub(super) fn new(per_second: u32, counters: Arc<Counters>) -> Self {
-        Self { clients: Mutex::new(Throttles::new(per_second)), counters }
+    pub(super) fn new(per_second: u32, passes: Passes, counters: Arc<Counters>) -> Self {
+        Self { sources: Mutex::new(Throttles::new(per_second)), passes, counters }
     }
 
     /// Has rmqtt ask for every message, before anybody is asked for permission.
@@ -35,11 +37,11 @@ impl ClientThrottle {
 impl Handler for ClientThrottle {
     async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
         let Parameter::MessagePublishCheckAcl(session, _) = parameter else { return (true, before) };
-        let client = &session.id.client_id;
-        if self.clients.lock().unwrap_or_else(PoisonError::into_inner).allow(client, clock::now()) {
+        let source = self.passes.source(session.id.remote_addr, &session.id.client_id);
+        if self.sources.lock().unwrap_or_else(PoisonError::into_inner).allow(&source, clock::now()) {
             return (true, before);
         }
-        self.counters.shed(ShedReason::BrokerThrottled, client);
+        self.counters.shed(ShedReason::BrokerThrottled, source.as_str());
         (false, Some(HookResult::PublishAclResult(PublishAclResult::rejected(false, None))))
     }
 }

@@ -6,10 +6,12 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// Why something that came in was left out though nothing is wrong with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ShedReason {
-    /// A client published more than `broker.max_messages_hz`; the embedded broker passed the message on to nobody.
+    /// A node, an address or a client of this machine published more than `broker.max_messages_hz`; the embedded broker passed the message on to nobody.
     BrokerThrottled,
     /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
     ReportThrottled,
+    /// A candidate shared evidence more often than `mqtt.max_report_hz`; the share was not decoded.
+    LedgerThrottled,
     /// A newer report of the same vehicle came before the fuser had taken this one.
     ReportReplaced,
 }
@@ -20,6 +22,7 @@ impl ShedReason {
         match self {
             Self::BrokerThrottled => "broker_throttled",
             Self::ReportThrottled => "report_throttled",
+            Self::LedgerThrottled => "ledger_throttled",
             Self::ReportReplaced => "report_replaced",
         }
     }

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::Finding;
 use crate::clock;
 use crate::config::NodeConfig;
-use crate::pki::{Credentials, Identity};
+use crate::pki::{Credentials, CredentialsError, Identity};
 
 /// Time before its end from which on a certificate should be replaced.
 const SOON: Duration = Duration::from_secs(30 * 86_400);
@@ -30,7 +30,12 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
     let current = match Credentials::load(files, name) {
         Ok(credentials) => credentials.current(),
         Err(error) => {
-            let fix = format!("`ecod-node pki issue {name}` makes them anew");
+            let fix = match &error {
+                CredentialsError::File { key: "tls.revocation_list", .. } => {
+                    "copy `revoked.pem` of the CA again".into()
+                }
+                _ => format!("`ecod-node pki issue {name}` makes them anew"),
+            };
             return Some(Finding::broken(check, error.to_string(), fix));
         }
     };

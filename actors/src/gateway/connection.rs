@@ -60,6 +60,8 @@ pub(super) enum ConnectionError {
     V5(Box<v5::ConnectionError>),
     #[error("nothing within {0:?}")]
     Silent(Duration),
+    #[error("the broker's certificate is no longer valid: {0}")]
+    Distrusted(rustls::Error),
     #[error(transparent)]
     Credentials(#[from] Box<CredentialsError>),
 }
@@ -71,7 +73,7 @@ impl ConnectionError {
         match self {
             Self::V311(error) => matches!(&**error, rumqttc::ConnectionError::Io(io) if refused(io)),
             Self::V5(error) => matches!(&**error, v5::ConnectionError::Io(io) if refused(io)),
-            Self::Silent(_) | Self::Credentials(_) => false,
+            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
         }
     }
 
@@ -89,7 +91,7 @@ impl ConnectionError {
                 v5::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
                 _ => None,
             },
-            Self::Silent(_) | Self::Credentials(_) => None,
+            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => None,
         }
     }
 
@@ -98,6 +100,7 @@ impl ConnectionError {
         let mut next: Option<&(dyn Error + 'static)> = match self {
             Self::V311(error) => Some(&**error),
             Self::V5(error) => Some(&**error),
+            Self::Distrusted(error) => return Some(error.to_string()),
             Self::Silent(_) | Self::Credentials(_) => None,
         };
         while let Some(error) = next {
@@ -128,7 +131,7 @@ impl ConnectionError {
                         | v5::StateError::IncomingPacketTooLarge { .. }
                 )
             ),
-            Self::Silent(_) | Self::Credentials(_) => false,
+            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
         }
     }
 }

@@ -92,6 +92,7 @@ pub(super) struct Inbox {
     subscriber: RwLock<Subscriber>,
     places: Arc<Semaphore>,
     reporters: [Mutex<Throttles<NodeName>>; ReportKind::COUNT],
+    sharers: Mutex<Throttles<NodeName>>,
 }
 
 /// What became of a packet, as far as the link has to act on it.
@@ -125,6 +126,7 @@ impl Inbox {
             subscriber: RwLock::new(subscriber),
             places: Arc::new(Semaphore::new(places)),
             reporters: std::array::from_fn(|_| Mutex::new(Throttles::new(max_report_hz))),
+            sharers: Mutex::new(Throttles::new(max_report_hz)),
         }
     }
 
@@ -193,7 +195,13 @@ impl Inbox {
                 return self.read_report(ReportKind::VoteDetections, &node, payload, received_at);
             }
             Topic::Ledger(node) if node == self.node => return Ok(Read::Echo),
-            Topic::Ledger(node) => Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?)),
+            Topic::Ledger(node) => {
+                if !self.sharers.lock().unwrap_or_else(PoisonError::into_inner).allow(&node, received_at) {
+                    self.counters.shed(ShedReason::LedgerThrottled, node.as_str());
+                    return Ok(Read::Shed);
+                }
+                Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?))
+            }
             Topic::Nodes(node) => return self.read_status(&node, payload),
             Topic::GlobalDetections => {
                 let map: GlobalMap = decode(payload, &self.limits)?;
@@ -263,7 +271,7 @@ impl Inbox {
 /// What a usable packet turned out to be.
 enum Read {
     Message(Incoming),
-    /// More of a vehicle than is taken.
+    /// More of a node than is taken.
     Shed,
     /// Published by this node.
     Echo,

@@ -7,6 +7,7 @@ use ecod::wire::RejectReason;
 use ractor::ActorRef;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rustls::ClientConfig;
 use tokio::task::{AbortHandle, JoinHandle};
 use uuid::Uuid;
 
@@ -123,7 +124,7 @@ impl Task {
         let mut checks = BREAK_CHECKS.iter();
         loop {
             let begun = Instant::now();
-            let error = match self.session().await {
+            let error = match self.attempt().await {
                 Ok(()) => return,
                 Err(error) => error,
             };
@@ -154,12 +155,25 @@ impl Task {
         }
     }
 
+    /// One connection for as long as the broker's certificate is good.
+    async fn attempt(&mut self) -> Result<(), ConnectionError> {
+        let Some(trust) = self.setup.security.tls(&self.broker).map_err(Box::new)? else {
+            return self.session(None).await;
+        };
+        tokio::select! {
+            ended = self.session(Some(trust.client())) => ended,
+            error = trust.lost() => {
+                self.setup.counters.count(Event::Disconnected);
+                Err(ConnectionError::Distrusted(error))
+            }
+        }
+    }
+
     /// One connection from beginning to end; `Ok` after a farewell.
-    async fn session(&mut self) -> Result<(), ConnectionError> {
+    async fn session(&mut self, tls: Option<Arc<ClientConfig>>) -> Result<(), ConnectionError> {
         let setup = Arc::clone(&self.setup);
         let LinkSetup { client_id, will, config, inbox, counters, .. } = &*setup;
         let will = will.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let tls = setup.security.tls(&self.broker).map_err(Box::new)?;
         let (client, mut connection) = connection::open(&self.broker, client_id, Some(&will), config, tls);
         // The protocol's own timeouts are whole seconds.
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;

@@ -4,12 +4,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use ring::hmac;
-use rustls::ClientConfig;
 
 use super::address::BrokerAddress;
 use crate::config::NodeConfig;
 use crate::membership::{KeyError, payload_key};
-use crate::pki::{Credentials, CredentialsError, external_client};
+use crate::pki::{BrokerTrust, Credentials, CredentialsError, external_broker};
 
 /// How links and payloads are protected; the default is not at all.
 #[derive(Debug, Clone, Default)]
@@ -58,13 +57,15 @@ impl Security {
         Ok(security)
     }
 
-    /// How to speak TLS to a broker; none where it is spoken to in plaintext.
-    pub(super) fn tls(&self, broker: &BrokerAddress) -> Result<Option<Arc<ClientConfig>>, CredentialsError> {
-        let current = self.credentials.as_ref().map(|credentials| credentials.current());
+    /// How to speak TLS to a broker, for one connection; none where it is spoken to in plaintext.
+    pub(super) fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self.external.as_ref().filter(|external| external.address == *broker) {
-            Some(External { ca: Some(ca), .. }) => external_client(ca, current.as_deref()).map(Arc::new).map(Some),
+            Some(External { ca: Some(ca), .. }) => {
+                let current = self.credentials.as_ref().map(|credentials| credentials.current());
+                external_broker(ca, current.as_deref()).map(Some)
+            }
             Some(External { ca: None, .. }) => Ok(None),
-            None => Ok(current.map(|current| Arc::clone(&current.client))),
+            None => Ok(self.credentials.as_ref().map(BrokerTrust::of_cell)),
         }
     }
 }
@@ -82,6 +83,9 @@ pub(super) struct SigningKey(hmac::Key);
 
 const MARK: u8 = 0xec;
 const TAG_BYTES: usize = 32;
+
+/// What a signature adds to a payload.
+pub const ENVELOPE_BYTES: usize = 1 + TAG_BYTES;
 
 impl SigningKey {
     /// The payload in its envelope.

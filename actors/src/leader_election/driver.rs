@@ -50,6 +50,8 @@ pub struct ElectionDriver {
     preparing: Option<Preparing>,
     parts: Parts,
     leadership: watch::Sender<Leadership>,
+    /// The highest term known.
+    term: watch::Sender<u64>,
     counters: Arc<Counters>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
@@ -83,7 +85,8 @@ const DRAIN_TIME: Duration = Duration::from_millis(10);
 
 impl ElectionDriver {
     pub(super) fn new(arguments: LeaderElectionArguments, myself: ActorRef<LeaderElectionMessage>) -> Self {
-        let LeaderElectionArguments { config, status, term_file, plane, parts, leadership, counters, .. } = arguments;
+        let LeaderElectionArguments { config, status, term_file, plane, parts, leadership, term, counters, .. } =
+            arguments;
         let (name, role) = (status.node.clone(), config.role);
         Self {
             election: Election::new(config, name.clone(), saved_term(term_file.as_ref()), clock::now()),
@@ -104,6 +107,7 @@ impl ElectionDriver {
             preparing: None,
             parts,
             leadership,
+            term,
             counters,
             alarm: Timestamp(u64::MAX),
             timer: None,
@@ -271,6 +275,8 @@ impl ElectionDriver {
             tracing::info!(?position, epoch, standby, "leadership");
             self.leadership.send_replace(leadership.clone());
         }
+        let term = self.election.term();
+        self.term.send_if_modified(|known| std::mem::replace(known, term) != term);
         self.reflect_links(&leadership);
         self.reflect_status(&leadership);
         let due = self.election.next_deadline();

@@ -55,6 +55,8 @@ pub(super) struct Assembly {
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
+    /// The highest term that the election knows.
+    term: watch::Sender<u64>,
     feed: Arc<Feed>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
@@ -88,6 +90,7 @@ impl Assembly {
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
+            term: watch::Sender::default(),
             feed: Arc::default(),
             dashboard_address: watch::Sender::new(None),
             failed,
@@ -268,7 +271,8 @@ impl Assembly {
             (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
         }
         let (topics, elected) = (Topics::new(&self.config.cell), elected::rule(self.leadership()));
-        EmbeddedBroker::guarded(config, Guard { credentials, topics, elected, counters: self.counters() })
+        let (limits, counters) = (self.config.mqtt.limits(), self.counters());
+        EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
     }
 
     async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {

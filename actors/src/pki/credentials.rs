@@ -16,7 +16,7 @@ use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::version::TLS13;
 use rustls::{ClientConfig, DigitallySignedStruct, RootCertStore, ServerConfig, SignatureScheme};
 
-use super::{BROKER_NAME, Identity, TlsConfig};
+use super::{BROKER_NAME, BrokerTrust, Identity, TlsConfig};
 
 /// The certificates of a node, read again when their files change.
 #[derive(Debug)]
@@ -45,6 +45,8 @@ pub struct Current {
     pub client: Arc<ClientConfig>,
     /// Checks certificates of clients.
     pub clients: Arc<dyn ClientCertVerifier>,
+    /// Checks certificates of brokers of the cell.
+    pub brokers: Arc<dyn ServerCertVerifier>,
     certificates: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
 }
@@ -127,15 +129,21 @@ pub fn external_client(ca: &Path, own: Option<&Current>) -> Result<ClientConfig,
     }
 }
 
+/// How a node goes on trusting a broker that is none of the cell's: as [`external_client`] says.
+///
+/// # Errors
+/// [`CredentialsError`] naming the file.
+pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, CredentialsError> {
+    let verifier = server_verifier(Arc::new(roots("mqtt.ca", ca)?), Vec::new())?;
+    Ok(BrokerTrust::new(&external_client(ca, own)?, verifier))
+}
+
 fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError> {
     let roots = Arc::new(roots("tls.ca", &files.ca)?);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
     let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
     let key = key.map_err(|error| file_error("tls.key", &files.key, &error))?;
-    let lists: Vec<CertificateRevocationListDer<'static>> = match &files.revocation_list {
-        Some(path) => pem("tls.revocation_list", path)?,
-        None => Vec::new(),
-    };
+    let lists = files.revocation_list.as_deref().map(lists).transpose()?.unwrap_or_default();
     let own =
         certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
     let identity = Identity::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
@@ -152,15 +160,16 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
         .map_err(unusable)?;
     server.session_storage = Arc::new(NoServerSessionStorage {});
     server.send_tls13_tickets = 0;
+    let brokers: Arc<dyn ServerCertVerifier> = Arc::new(CellBroker(server_verifier(roots, lists)?));
     let mut client = ClientConfig::builder_with_provider(crypto())
         .with_protocol_versions(&[&TLS13])
         .map_err(unusable)?
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(CellBroker(server_verifier(roots, lists)?)))
+        .with_custom_certificate_verifier(Arc::clone(&brokers))
         .with_client_auth_cert(certificates.clone(), key.clone_key())
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
-    Ok(Current { identity, server: Arc::new(server), client: Arc::new(client), clients, certificates, key })
+    Ok(Current { identity, server: Arc::new(server), client: Arc::new(client), clients, brokers, certificates, key })
 }
 
 fn client_verifier(
@@ -240,6 +249,13 @@ fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsErr
     Ok(roots)
 }
 
+/// A file without a list in it, such as one half copied, is not a list of nobody.
+fn lists(path: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
+    let key = "tls.revocation_list";
+    let lists = pem(key, path)?;
+    if lists.is_empty() { Err(file_error(key, path, "no revocation list")) } else { Ok(lists) }
+}
+
 fn pem<T: PemObject>(key: &'static str, path: &Path) -> Result<Vec<T>, CredentialsError> {
     let items: Result<Vec<T>, _> = T::pem_slice_iter(&bytes(key, path)?).collect();
     items.map_err(|error| file_error(key, path, &error))
@@ -266,4 +282,35 @@ fn stamps(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
     };
     let paths = [&files.ca, &files.certificate, &files.key];
     paths.into_iter().chain(&files.revocation_list).map(stamp).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::wire::Role;
+
+    use super::*;
+    use crate::clock;
+    use crate::pki::Authority;
+
+    #[test]
+    fn a_revocation_list_without_a_list_is_refused_and_the_one_before_stays_in_use() {
+        let (directory, edge) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
+        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        authority.issue(&edge, Role::Edge, Duration::from_secs(60), clock::now()).unwrap();
+        let ((certificate, key), list) = (authority.files_of(&edge), directory.path().join("copied.pem"));
+        fs::copy(authority.revocation_list(), &list).unwrap();
+        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list.clone()) };
+        let credentials = Credentials::load(&files, &edge).unwrap();
+        let before = credentials.current();
+        for text in ["", "# revoked\n", "-----BEGIN X509 CRL-----\nMIIB"] {
+            fs::write(&list, text).unwrap();
+            let error = Credentials::load(&files, &edge).unwrap_err().to_string();
+            assert!(error.starts_with("key `tls.revocation_list`: ") && error.contains("copied.pem"), "{error}");
+        }
+        std::thread::sleep(LOOK);
+        assert!(Arc::ptr_eq(&credentials.current(), &before), "still checked against the list before");
+        fs::copy(authority.revocation_list(), &list).unwrap();
+        std::thread::sleep(LOOK);
+        assert!(!Arc::ptr_eq(&credentials.current(), &before), "and against the next");
+    }
 }

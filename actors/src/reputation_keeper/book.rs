@@ -83,7 +83,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments) {
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
         tracing::info!(path = %file.path().display(), entries = saved.entries.len(), "reputations restored");
-        book.ledger.merge_entries(saved.entries);
+        book.ledger.merge_entries(saved.entries, None);
         book.standing = saved.standing;
     }
 }

@@ -88,8 +88,8 @@ async fn who_is_revoked_is_cut_off_and_stays_out_and_the_broker_runs_on() {
 /// A vehicle that never leads cannot pose as a broker: its own kind does not trust it.
 #[tokio::test]
 async fn a_client_trusts_no_broker_with_the_certificate_of_a_mere_vehicle() {
-    let mut pki = Pki::new();
-    let (cav, gauss) = (pki.issue("euclid", Role::Cav, DAY), pki.issue("gauss", Role::Auto, DAY));
+    let mut cell = Cell::start().await;
+    let (cav, gauss) = (cell.pki.issue("euclid", Role::Cav, DAY), cell.pki.issue("gauss", Role::Auto, DAY));
     let posing = ecod_actors::pki::Credentials::load(&cav, &crate::fixture::node("euclid")).unwrap();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
@@ -100,4 +100,6 @@ async fn a_client_trusts_no_broker_with_the_certificate_of_a_mere_vehicle() {
     });
     let refused = Client::new(address, "gauss", &client_config("gauss", &gauss)).log_in().await;
     assert!(refused.is_err() && serving.await.unwrap().is_err());
+    Client::new(cell.address, "gauss", &client_config("gauss", &gauss)).log_in().await.unwrap();
+    cell.honest_traffic_goes_on().await;
 }

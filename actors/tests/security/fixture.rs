@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::names::NodeName;
-use ecod::wire::{Role, Topics};
+use ecod::wire::{Limits, Role, Topics};
 use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
 use ecod_actors::clock;
 use ecod_actors::counters::{Counters, Event};
@@ -23,6 +23,12 @@ pub(crate) const SOON: Duration = Duration::from_secs(20);
 
 /// Largest packet of the broker.
 pub(crate) const MAX_PACKET: usize = 64 * 1024;
+
+/// Largest report.
+pub(crate) const MAX_REPORT: usize = 16 * 1024;
+
+/// Most clients of one certificate.
+pub(crate) const MAX_EACH: usize = 4;
 
 /// How long a client has to log in.
 pub(crate) const LOGIN: Duration = Duration::from_millis(700);
@@ -78,6 +84,7 @@ impl Cell {
         let guard = Guard {
             credentials: Some(Arc::new(Credentials::load(&edge, &node("edge")).unwrap())),
             topics: Topics::new(&node("lot")),
+            limits: Limits { payload_bytes: MAX_REPORT, ..Limits::default() },
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::clone(&counters),
         };
@@ -85,6 +92,7 @@ impl Cell {
             max_packet_bytes: Some(MAX_PACKET as u32),
             handshake_timeout_ms: LOGIN.as_millis() as u64,
             connects_per_s: 1,
+            max_clients_each: MAX_EACH,
             ..BrokerConfig::default()
         };
         let mut broker = EmbeddedBroker::guarded(config, guard);
@@ -164,8 +172,18 @@ impl Client {
     }
 
     /// Publishes and waits until the broker has dealt with it, permitted or not.
-    pub(crate) async fn publish_and_wait(&mut self, topic: &str) -> Result<(), String> {
-        self.client.try_publish(topic, QoS::AtLeastOnce, true, "forged").unwrap();
+    pub(crate) async fn publish_and_wait(&mut self, topic: &str, retain: bool) -> Result<(), String> {
+        self.publish_all_and_wait(topic, retain, b"forged").await
+    }
+
+    /// The same with a payload of one's own.
+    pub(crate) async fn publish_all_and_wait(
+        &mut self,
+        topic: &str,
+        retain: bool,
+        payload: &[u8],
+    ) -> Result<(), String> {
+        self.client.try_publish(topic, QoS::AtLeastOnce, retain, payload).unwrap();
         let acknowledged = async {
             loop {
                 match self.events.poll().await {

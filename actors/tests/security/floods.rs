@@ -16,7 +16,7 @@ use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
-use crate::fixture::{Cell, Client, DAY, MAX_PACKET, SOON, client_config};
+use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config};
 
 /// Another host than the honest ones, as far as a broker can see.
 const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
@@ -111,6 +111,41 @@ async fn a_packet_that_is_too_large_ends_its_own_connection_only() {
     cell.honest_traffic_goes_on().await;
 }
 
+#[tokio::test]
+async fn a_report_as_large_as_a_map_is_refused() {
+    let mut cell = Cell::start().await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
+    gauss.log_in().await.unwrap();
+    let large = vec![b'x'; 2 * MAX_REPORT];
+    gauss.publish_all_and_wait("ecod/v1/lot/detections/gauss", false, &large).await.unwrap();
+    assert_eq!(cell.counters.events(Event::ClientDenied), 1);
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn one_certificate_does_not_take_the_places_of_others() {
+    let mut cell = Cell::start().await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let tls = client_config("gauss", &files);
+    let mut held = Vec::new();
+    for _ in 0..MAX_EACH {
+        let mut client = Client::new(cell.address, "gauss", &tls);
+        client.log_in().await.unwrap();
+        held.push(client);
+    }
+    assert!(Client::new(cell.address, "gauss", &tls).log_in().await.is_err());
+    cell.counted(Event::ClientsFull, 1).await;
+    cell.honest_traffic_goes_on().await;
+    held.pop();
+    let returned = async {
+        while Client::new(cell.address, "gauss", &tls).log_in().await.is_err() {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    };
+    timeout(SOON, returned).await.expect("who leaves makes room");
+}
+
 /// A broker that is not behind TLS but open to others has the same limits.
 #[tokio::test]
 async fn limits_hold_without_certificates_too() {
@@ -122,6 +157,7 @@ async fn limits_hold_without_certificates_too() {
     let guard = Guard {
         credentials: None,
         topics: Topics::new(&crate::fixture::node("lot")),
+        limits: Default::default(),
         elected: Arc::new(|_| true),
         counters: Arc::clone(&counters),
     };
@@ -130,7 +166,13 @@ async fn limits_hold_without_certificates_too() {
     let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
     let mut silent = knock(address).await;
     closed(&mut silent).await;
-    assert_eq!(counters.events(Event::ClientTimedOut), 1);
+    // Counted a moment after the connection is closed.
+    let counted = async {
+        while counters.events(Event::ClientTimedOut) < 1 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    timeout(SOON, counted).await.expect("not counted");
     let mut options = rumqttc::MqttOptions::new("anyone", "127.0.0.1", address.port());
     options.set_keep_alive(Duration::from_secs(5));
     let (_client, mut events) = rumqttc::AsyncClient::new(options, 8);

@@ -1,5 +1,6 @@
 //! Attacks on a cell; every one of them asserts that honest traffic goes on.
 
+mod brokers;
 mod certificates;
 mod claims;
 mod fixture;

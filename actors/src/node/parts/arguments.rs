@@ -107,10 +107,7 @@ impl Assembly {
                     }
                     !put.is_first || fuser.send(FuserMessage::TakeReports)
                 }
-                Incoming::Map(map) => {
-                    fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at: delivery.received_at });
-                    follower.send(FollowerMessage::TakeMap { delivery })
-                }
+                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
                 Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
                 Incoming::Ledger(share) if !fuses => {
@@ -142,6 +139,7 @@ impl Assembly {
             least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
             leadership: self.leadership(),
             election: self.seats.election.clone(),
+            fuser: self.seats.fuser.clone(),
             counters: self.counters(),
         }
     }
@@ -155,6 +153,9 @@ impl Assembly {
             book: self.book.clone(),
             file: self.state_file("reputations"),
             newest: self.newest.reputations.subscribe(),
+            members: self.members(),
+            leadership: self.leadership(),
+            term: self.term.subscribe(),
             gateway: self.seats.gateway.clone(),
             fuser: self.seats.fuser.clone(),
             counters: self.counters(),
@@ -170,6 +171,7 @@ impl Assembly {
         self.recording.journal(now, JournalEvent::Start { ledger });
         FuserArguments {
             aggregator,
+            term: self.term.subscribe(),
             recording: self.recording.clone(),
             intake: self.intake.clone(),
             gateway: self.seats.gateway.clone(),
@@ -190,6 +192,7 @@ impl Assembly {
             members: self.members(),
             parts: Parts { membership, gateway, fuser, keeper, broker },
             leadership: self.leadership.clone(),
+            term: self.term.clone(),
             counters: self.counters(),
         }
     }

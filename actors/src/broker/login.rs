@@ -1,0 +1,98 @@
+//! The first packet of a client.
+
+use tokio::io::{AsyncRead, AsyncReadExt};
+
+use super::gate::TurnedAway;
+
+/// A CONNECT packet as it came.
+#[derive(Debug)]
+pub(super) struct Login {
+    pub(super) packet: Vec<u8>,
+    /// Whether the client leaves it to the broker to draw its id.
+    pub(super) is_nameless: bool,
+}
+
+/// Largest CONNECT packet: client id, last will, user name and password.
+const MAX_BYTES: usize = 16 * 1024;
+
+const CONNECT: u8 = 0x10;
+
+/// The protocol level of MQTT 5, in which properties come before the client id.
+const MQTT_5: u8 = 5;
+
+/// Reads the first packet, which must be CONNECT; rmqtt itself would wait for its first bytes for good.
+pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Login, TurnedAway> {
+    let mut packet = vec![stream.read_u8().await?];
+    if packet[0] != CONNECT {
+        return Err(TurnedAway::Malformed);
+    }
+    let mut length = 0;
+    for shift in [0, 7, 14] {
+        let byte = stream.read_u8().await?;
+        packet.push(byte);
+        length |= usize::from(byte & 0x7f) << shift;
+        if byte & 0x80 == 0 {
+            break;
+        }
+    }
+    if packet.last().is_some_and(|byte| byte & 0x80 != 0) || length > MAX_BYTES {
+        return Err(TurnedAway::Malformed);
+    }
+    let head = packet.len();
+    packet.resize(head + length, 0);
+    stream.read_exact(&mut packet[head..]).await?;
+    let is_nameless = client_id(&packet[head..]).is_some_and(<[u8]>::is_empty);
+    Ok(Login { packet, is_nameless })
+}
+
+/// The client id in a CONNECT packet without its head; none where rmqtt will find the packet malformed.
+fn client_id(body: &[u8]) -> Option<&[u8]> {
+    let (_protocol, rest) = text(body)?;
+    // Level, flags and the keep-alive.
+    let (fixed, mut rest) = rest.split_at_checked(4)?;
+    if fixed[0] == MQTT_5 {
+        let mut length = 0;
+        for shift in [0, 7, 14, 21] {
+            let (byte, after) = rest.split_first()?;
+            rest = after;
+            length |= usize::from(byte & 0x7f) << shift;
+            if byte & 0x80 == 0 {
+                break;
+            }
+        }
+        rest = rest.get(length..)?;
+    }
+    text(rest).map(|(id, _)| id)
+}
+
+/// Bytes after their length, and the rest.
+fn text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+    let (length, rest) = bytes.split_first_chunk::<2>()?;
+    rest.split_at_checked(u16::from_be_bytes(*length).into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn clients_that_name_themselves_are_told_from_those_that_do_not() {
+        let v4 = |id: &str| [&b"\0\x04MQTT\x04\x02\0\x3c\0"[..], &[id.len() as u8], id.as_bytes()].concat();
+        // With a session expiry of an hour.
+        let v5 = |id: &str| {
+            [&b"\0\x04MQTT\x05\x02\0\x3c\x05\x11\0\0\x0e\x10\0"[..], &[id.len() as u8], id.as_bytes()].concat()
+        };
+        let drawn = "0123456789abcdef0123456789abcdef";
+        for (body, is_nameless) in
+            [(v4(""), true), (v5(""), true), (v4("euclid"), false), (v5("euclid"), false), (v4(drawn), false)]
+        {
+            let packet = [&[CONNECT, body.len() as u8], &body[..]].concat();
+            let login = read(&mut &packet[..]).await.unwrap();
+            assert_eq!((login.packet, login.is_nameless), (packet, is_nameless));
+        }
+        for body in [&b""[..], b"\0\x04MQ", b"\0\x04MQTT\x05\x02\0\x3c\xff\xff\xff\xff", b"\0\x04MQTT\x04\x02\0\x3c\0"]
+        {
+            assert_eq!(client_id(body), None);
+        }
+    }
+}

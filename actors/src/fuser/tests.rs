@@ -1,0 +1,71 @@
+//! What a new leader goes on from.
+
+use ecod::aggregator::FusionConfig;
+use ecod::wire::SCHEMA_VERSION;
+
+use super::*;
+use crate::follower::{Follower, FollowerArguments, FollowerMessage, Newest};
+use crate::leader_election::{Leadership, Position};
+use crate::seat::listening;
+
+fn epoch(term: u64, leader: &'static str) -> Epoch {
+    Epoch::new(term, NodeName::from_static(leader))
+}
+
+fn map(Epoch { term, leader }: Epoch, round: u64) -> FollowerMessage {
+    let map = GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: leader,
+        epoch: term,
+        round,
+        fused_at_us: Timestamp(0),
+        oldest_capture_us: None,
+        landmarks: Vec::new(),
+        objects: Vec::new(),
+        pose_corrections: BTreeMap::new(),
+    };
+    FollowerMessage::TakeMap { delivery: Delivery::local(Incoming::Map(Arc::new(map)), Timestamp(round)) }
+}
+
+#[tokio::test]
+async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
+    let elected = Leadership { position: Position::Following, epoch: Some(epoch(7, "edge")), standby: None };
+    // The gate refuses it where a leader is known; where none is, the gate is taken in and the fuser is not.
+    for (leadership, honest, admitted) in [(elected, 3, 3), (Leadership::default(), 1, 2)] {
+        let (fuser, mut told) = listening::seat().await;
+        let arguments = FollowerArguments {
+            newest: Newest::default(),
+            log: None,
+            recording: Recording::default(),
+            least_term: 0,
+            leadership: watch::channel(leadership.clone()).1,
+            election: Seat::default(),
+            fuser: fuser.clone(),
+            counters: Arc::default(),
+        };
+        let (follower, _) = Actor::spawn(None, Follower, arguments).await.unwrap();
+        for round in 1..=honest {
+            follower.cast(map(epoch(7, "edge"), round)).unwrap();
+            follower.cast(map(epoch(u64::MAX, "gauss"), round)).unwrap();
+        }
+        follower.drain_and_wait(None).await.unwrap();
+        fuser.holder().unwrap().drain_and_wait(None).await.unwrap();
+
+        let mut fuser = FuserState::new(FuserArguments {
+            aggregator: Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
+            term: watch::channel(7).1,
+            intake: Intake::default(),
+            recording: Recording::default(),
+            gateway: Seat::default(),
+            keeper: Seat::default(),
+            counters: Arc::default(),
+        });
+        let mut maps = 0;
+        while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {
+            fuser.take_map(map, received_at);
+            maps += 1;
+        }
+        let kept = fuser.last_map.map(|(map, _)| (map.epoch, map.round));
+        assert_eq!((kept, maps), (Some((7, honest)), admitted), "{leadership:?}");
+    }
+}
