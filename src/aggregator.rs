@@ -31,7 +31,7 @@ use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
 use crate::tracks::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
-use crate::window::ReportWindow;
+use crate::window::{Admitted, ReportWindow};
 use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
 
 /// What a round came to.
@@ -62,6 +62,8 @@ pub struct Aggregator {
     tracks: Option<Tracker>,
     /// Whether tracking ends with the first known location.
     tracks_open_cell: bool,
+    /// Reports of which only tracking made use, because later ones of their vehicles came before.
+    overtaken: u64,
     vote: Option<Vote>,
     by_packets: bool,
     /// Whether anyone has voted: a cell that runs both algorithms spares its network verdicts about nothing until then.
@@ -91,6 +93,7 @@ impl Aggregator {
             pace,
             tracks,
             tracks_open_cell,
+            overtaken: 0,
             vote,
             by_packets,
             voted: false,
@@ -126,7 +129,8 @@ impl Aggregator {
         self.leads.as_ref()
     }
 
-    /// Takes a report received at `now`; returns what came of the round if it closes with it.
+    /// Takes a report received at `now`; returns what came of the round if it closes with it. One that a later report of
+    /// its vehicle overtook is of use to tracking only.
     ///
     /// # Errors
     /// The reason for which the report was not used; nothing is fused of it, at most the estimate of its vehicle's
@@ -141,15 +145,26 @@ impl Aggregator {
         match kind {
             ReportKind::Detections => {
                 let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
-                let captured_at = window.admit(report, now)?;
-                pace.observe(report, captured_at);
-                if let Some(tracks) = &mut self.tracks {
-                    tracks.observe_only(report, captured_at, |object| !pace.is_at_landmark(object));
+                let admitted = window.admit(report, now)?;
+                let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
+                let tracks = self.tracks.as_mut();
+                let is_tracked = tracks.is_some_and(|tracks| {
+                    tracks.observe_only(report, captured_at, |object| !pace.is_at_landmark(object))
+                });
+                match admitted {
+                    Admitted::InOrder(_) => pace.observe(report, captured_at),
+                    Admitted::OutOfOrder(_) if is_tracked => {
+                        self.overtaken += 1;
+                        return Ok(None);
+                    }
+                    Admitted::OutOfOrder(_) => return Err(RejectReason::OutOfOrder),
                 }
             }
             ReportKind::VoteDetections => {
                 let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
-                window.admit(report, now)?;
+                if let Admitted::OutOfOrder(_) = window.admit(report, now)? {
+                    return Err(RejectReason::OutOfOrder);
+                }
                 vote.observe(report, now)?;
                 self.voted = true;
             }
@@ -220,6 +235,11 @@ impl Aggregator {
     /// What tracking could not use so far.
     pub fn tracks_losses(&self) -> TracksLosses {
         self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
+    }
+
+    /// Reports so far that tracking used and PACE did not: later ones of their vehicles came before.
+    pub fn overtaken(&self) -> u64 {
+        self.overtaken
     }
 
     /// Goes on, in VOTE's `paper` mode, from reputations that were published.

@@ -106,9 +106,9 @@ impl Tracker {
         }
     }
 
-    /// Takes one admitted report, captured at `captured_at` on the aggregator's clock.
-    pub fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
-        self.observe_only(report, captured_at, |_| true);
+    /// Takes one admitted report, captured at `captured_at` on the aggregator's clock; false if it came too late.
+    pub fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) -> bool {
+        self.observe_only(report, captured_at, |_| true)
     }
 
     /// The same with only some of the report's objects: those that are at no known place.
@@ -117,10 +117,10 @@ impl Tracker {
         report: &ObjectReport,
         captured_at: Timestamp,
         wanted: impl Fn(&PerceivedObject) -> bool,
-    ) {
+    ) -> bool {
         if self.fused_until.since(captured_at).as_secs_f64() > self.config.max_lag_s {
             self.late += 1;
-            return;
+            return false;
         }
         let objects = report.objects.iter().filter(|object| wanted(object)).cloned().collect();
         let (pose, view) = (report.pose, report.view);
@@ -131,6 +131,7 @@ impl Tracker {
             ..ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us)
         };
         self.pending.push((captured_at, report));
+        true
     }
 
     /// Starts from what a ledger knows of the vehicles.

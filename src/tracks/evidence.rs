@@ -94,10 +94,14 @@ impl Witness {
         }
         self.score += nats;
         self.weight += 1.0;
-        self.was_hit = true;
-        self.last_hit = Some(at);
-        self.position = position;
         self.unsettled.1 += 1;
+        if at >= self.last_look {
+            self.was_hit = true;
+        }
+        if self.last_hit.is_none_or(|last| at >= last) {
+            self.last_hit = Some(at);
+            self.position = position;
+        }
     }
 
     /// The object was in view and not detected.
