@@ -20,6 +20,7 @@ use ecod::replay::JournalEvent;
 use ecod::reputation::ReputationLedger;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
+use ecod::tracks::TracksLosses;
 use ecod::wire::{GlobalMap, Reputation};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
@@ -107,6 +108,8 @@ pub struct FuserState {
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
+    /// What the aggregator has left out so far and is counted already.
+    losses: [u64; 4],
 }
 
 impl Actor for Fuser {
@@ -130,6 +133,7 @@ impl Actor for Fuser {
             last_map: None,
             alarm: Timestamp(u64::MAX),
             timer: None,
+            losses: [0; 4],
         };
         state.set_alarm(&myself);
         Ok(state)
@@ -163,6 +167,7 @@ impl Actor for Fuser {
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
         }
+        state.count_losses();
         state.set_alarm(&myself);
         Ok(())
     }
@@ -177,10 +182,8 @@ impl FuserState {
 
     fn take(&mut self, delivery: &Delivery) {
         let Incoming::Report { kind, report } = &delivery.message else { return };
-        let ignored_before = self.aggregator.ignored_votes();
         self.recording.report(*kind, report, delivery.received_at);
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
-        self.counters.add(Event::VoteIgnored, self.aggregator.ignored_votes() - ignored_before);
         match taken {
             Ok(fused) => self.publish(fused),
             Err(reason) => {
@@ -222,6 +225,21 @@ impl FuserState {
             let fused = self.aggregator.command(&command, now);
             self.recording.journal(now, JournalEvent::Command(command));
             self.publish(fused);
+        }
+    }
+
+    /// Counts what the aggregator has left out since it was last asked.
+    fn count_losses(&mut self) {
+        let TracksLosses { late, refused } = self.aggregator.tracks_losses();
+        let now = [
+            (Event::VoteIgnored, self.aggregator.ignored_votes()),
+            (Event::ReportOvertaken, self.aggregator.overtaken()),
+            (Event::ReportLate, late),
+            (Event::ObjectRefused, refused),
+        ];
+        for ((event, total), counted) in now.into_iter().zip(&mut self.losses) {
+            self.counters.add(event, total.saturating_sub(*counted));
+            *counted = total;
         }
     }
 
