@@ -142,7 +142,8 @@ impl Assembly {
         parts.extend((leads && self.config.data_plane().embedded).then_some(Part::Broker));
         parts.extend([Part::Membership, Part::Gateway, Part::Follower]);
         if leads {
-            parts.extend(self.config.fusion.algorithms.vote().then_some(Part::ReputationKeeper));
+            let rates = self.config.fusion.rates_vehicles(!self.config.landmarks().is_empty());
+            parts.extend(rates.then_some(Part::ReputationKeeper));
             parts.push(Part::Fuser);
         }
         parts.push(Part::LeaderElection);
