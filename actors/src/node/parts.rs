@@ -69,7 +69,7 @@ const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl Assembly {
     pub(super) fn new(config: NodeConfig, security: Security, failed: watch::Sender<Option<String>>) -> Self {
-        let by_evidence = config.fusion.vote.mode != VoteMode::Paper;
+        let by_evidence = config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote();
         let counters = Arc::<Counters>::default();
         Self {
             name: config.name.clone().unwrap_or(NodeName::from_static("node")),
