@@ -31,7 +31,7 @@ use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
 use crate::tracks::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
-use crate::window::ReportWindow;
+use crate::window::{Admitted, ReportWindow};
 use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
 
 /// What a round came to.
@@ -62,6 +62,8 @@ pub struct Aggregator {
     tracks: Option<Tracker>,
     /// Whether tracking ends with the first known location.
     tracks_open_cell: bool,
+    /// Reports of which only tracking made use, because later ones of their vehicles came before.
+    overtaken: u64,
     vote: Option<Vote>,
     by_packets: bool,
     /// Whether anyone has voted: a cell that runs both algorithms spares its network verdicts about nothing until then.
@@ -71,16 +73,12 @@ pub struct Aggregator {
 impl Aggregator {
     /// An aggregator without evidence that does not lead; `config` is taken as valid.
     pub fn standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation: _ } = config;
+        let is_tracking = config.tracks_objects(!landmarks.is_empty());
+        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
         let by_packets = vote.mode == VoteMode::Paper;
         let vote = algorithms.vote().then(|| Vote::new(vote, landmarks.clone()));
         let tracks_open_cell = tracks.mode == TracksMode::Auto;
-        let is_tracking = match tracks.mode {
-            TracksMode::Auto => landmarks.is_empty(),
-            TracksMode::On => true,
-            TracksMode::Off => false,
-        };
-        let tracks = (algorithms.pace() && is_tracking).then(|| Tracker::new(tracks));
+        let tracks = is_tracking.then(|| Tracker::new(tracks, reputation));
         let gate_m = pace.gate_m;
         let pace = algorithms.pace().then(|| Pace::new(pace, Arc::new(LandmarkIndex::new(landmarks, gate_m))));
         Self {
@@ -91,6 +89,7 @@ impl Aggregator {
             pace,
             tracks,
             tracks_open_cell,
+            overtaken: 0,
             vote,
             by_packets,
             voted: false,
@@ -126,7 +125,8 @@ impl Aggregator {
         self.leads.as_ref()
     }
 
-    /// Takes a report received at `now`; returns what came of the round if it closes with it.
+    /// Takes a report received at `now`; returns what came of the round if it closes with it. One that a later report of
+    /// its vehicle overtook is of use to tracking only.
     ///
     /// # Errors
     /// The reason for which the report was not used; nothing is fused of it, at most the estimate of its vehicle's
@@ -141,15 +141,26 @@ impl Aggregator {
         match kind {
             ReportKind::Detections => {
                 let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
-                let captured_at = window.admit(report, now)?;
-                pace.observe(report, captured_at);
-                if let Some(tracks) = &mut self.tracks {
-                    tracks.observe_only(report, captured_at, |object| !pace.is_at_landmark(object));
+                let admitted = window.admit(report, now)?;
+                let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
+                let tracks = self.tracks.as_mut();
+                let is_tracked = tracks.is_some_and(|tracks| {
+                    tracks.observe_only(report, captured_at, |object| !pace.is_at_landmark(object))
+                });
+                match admitted {
+                    Admitted::InOrder(_) => pace.observe(report, captured_at),
+                    Admitted::OutOfOrder(_) if is_tracked => {
+                        self.overtaken += 1;
+                        return Ok(None);
+                    }
+                    Admitted::OutOfOrder(_) => return Err(RejectReason::OutOfOrder),
                 }
             }
             ReportKind::VoteDetections => {
                 let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
-                window.admit(report, now)?;
+                if let Admitted::OutOfOrder(_) = window.admit(report, now)? {
+                    return Err(RejectReason::OutOfOrder);
+                }
                 vote.observe(report, now)?;
                 self.voted = true;
             }
@@ -222,6 +233,11 @@ impl Aggregator {
         self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
     }
 
+    /// Reports so far that tracking used and PACE did not: later ones of their vehicles came before.
+    pub fn overtaken(&self) -> u64 {
+        self.overtaken
+    }
+
     /// Goes on, in VOTE's `paper` mode, from reputations that were published.
     pub fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
         if let Some(vote) = &mut self.vote {
@@ -241,6 +257,9 @@ impl Aggregator {
         let wanted = self.voted || pace.is_none();
         let is_due = |vote: &&mut Vote| if by_packets { vote.is_packet_complete() } else { wanted };
         let vote = self.vote.as_mut().filter(is_due).map(|vote| vote.close(now));
+        if let (Some(tracks), Some(vote)) = (&mut self.tracks, &vote) {
+            tracks.learn(&vote.evidence);
+        }
         let epoch = self.leads.clone()?;
         if pace.is_none() && vote.is_none() {
             return None;

@@ -25,6 +25,7 @@ use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
 use crate::landmark::Landmark;
 use crate::names::{LandmarkId, NodeName};
 use crate::time::Timestamp;
+use crate::tracks::TracksLosses;
 use crate::wire::{Limits, ObjectReport, RejectReason, ReportKind};
 use clock::VirtualClock;
 use line::Line;
@@ -86,6 +87,10 @@ pub struct Summary {
     pub late: u64,
     /// Objects of used lines that voted for nothing; see [`crate::vote`].
     pub ignored_votes: u64,
+    /// Used lines of which only tracking made use, because later ones of their vehicles came before.
+    pub overtaken: u64,
+    /// Reports and objects that tracking left out.
+    pub tracks: TracksLosses,
     /// Maps and sets of verdicts made.
     pub written: u64,
 }
@@ -188,7 +193,11 @@ impl Replay {
             output.extend(cell.refine(passes, self.clock.now()).map(FusedLine::Verdicts));
             self.summary.written += output.len() as u64;
         }
-        self.summary.ignored_votes = self.cell.as_ref().map_or(0, Aggregator::ignored_votes);
+        if let Some(cell) = &self.cell {
+            self.summary.ignored_votes = cell.ignored_votes();
+            self.summary.overtaken = cell.overtaken();
+            self.summary.tracks = cell.tracks_losses();
+        }
         (output, self.summary)
     }
 

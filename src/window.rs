@@ -1,12 +1,13 @@
 //! The gate for reports: freshest per vehicle, on the aggregator's clock.
 //!
 //! Call [`ReportWindow::admit`] with every decoded report; what it returns may be fused once. A rejected report
-//! changes nothing but the vehicle's clock estimate.
+//! changes nothing but the vehicle's clock estimate. A report that was overtaken by a later one of its vehicle is
+//! admitted as such, once: for whoever can go back in time.
 //!
 //! One wrong stamp does not silence its vehicle: a report that claims to be more than half of `max_age_s` further ahead
 //! than all before is rejected unless the next one agrees, and a first report that the second contradicts is forgotten.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use schemars::JsonSchema;
@@ -52,7 +53,16 @@ impl WindowConfig {
     }
 }
 
-/// Admits each vehicle's reports once, in order of capture, and puts them on the aggregator's clock.
+/// A report that may be used once, with its capture time on the aggregator's clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Admitted {
+    /// The vehicle's latest so far.
+    InOrder(Timestamp),
+    /// A later one of the vehicle was admitted before.
+    OutOfOrder(Timestamp),
+}
+
+/// Admits each vehicle's reports once and puts them on the aggregator's clock.
 #[derive(Debug, Clone)]
 pub struct ReportWindow {
     config: WindowConfig,
@@ -63,6 +73,8 @@ pub struct ReportWindow {
 struct VehicleClock {
     last_captured: Timestamp,
     last_seq: Option<u64>,
+    /// Capture time and number of the latest reports that were admitted, in order, at most [`REMEMBERED`].
+    recent: VecDeque<(Timestamp, u64)>,
     last_received: Timestamp,
     delay: MinimumDelay,
     /// Capture time of the last report, if it was rejected for a stamp too far ahead of all before.
@@ -78,9 +90,9 @@ impl ReportWindow {
     /// Admits a report and returns its capture time on the aggregator's clock.
     ///
     /// # Errors
-    /// [`RejectReason::FromTheFuture`] (also for a stamp that no other report agrees with), [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] (also for duplicates) or
-    /// [`RejectReason::TooManyVehicles`].
-    pub fn admit(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<Timestamp, RejectReason> {
+    /// [`RejectReason::FromTheFuture`] (also for a stamp that no other report agrees with), [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] for
+    /// duplicates and what may be one, or [`RejectReason::TooManyVehicles`].
+    pub fn admit(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<Admitted, RejectReason> {
         let delay = received_at.micros_from(report.captured_at_us);
         let reach = seconds(self.config.max_clock_offset_s) + seconds(self.config.max_age_s);
         if delay < -seconds(self.config.max_clock_offset_s) {
@@ -95,6 +107,7 @@ impl ReportWindow {
         let vehicle = self.vehicles.entry(report.node.clone()).or_insert_with(|| VehicleClock {
             last_captured: Timestamp(0),
             last_seq: None,
+            recent: VecDeque::new(),
             last_received: received_at,
             delay: MinimumDelay::new(received_at),
             suspect: None,
@@ -104,8 +117,14 @@ impl ReportWindow {
         let stepped_back = vehicle.last_captured.micros_from(report.captured_at_us) > reach;
         if stepped_back || vehicle.is_contradicted(report.captured_at_us, delay, tolerance, slack) {
             vehicle.delay = MinimumDelay::new(received_at);
+            vehicle.recent.clear();
         } else if (report.captured_at_us, Some(report.seq)) <= (vehicle.last_captured, vehicle.last_seq) {
-            return Err(RejectReason::OutOfOrder);
+            let offset = vehicle.delay.clock_offset(tolerance);
+            if delay - offset > seconds(self.config.max_age_s) {
+                return Err(RejectReason::Stale);
+            }
+            vehicle.remember(report)?;
+            return Ok(Admitted::OutOfOrder(report.captured_at_us.shifted(offset)));
         } else if vehicle.is_suspect(report.captured_at_us, delay, slack) {
             return Err(RejectReason::FromTheFuture);
         }
@@ -114,10 +133,11 @@ impl ReportWindow {
         if delay - offset > seconds(self.config.max_age_s) {
             return Err(RejectReason::Stale);
         }
+        vehicle.remember(report)?;
         vehicle.last_captured = report.captured_at_us;
         vehicle.last_seq = Some(report.seq);
         vehicle.last_received = received_at;
-        Ok(report.captured_at_us.shifted(offset))
+        Ok(Admitted::InOrder(report.captured_at_us.shifted(offset)))
     }
 
     /// Estimated microseconds to add to a vehicle's clock to get the aggregator's; `None` for an unknown vehicle.
@@ -135,6 +155,21 @@ impl ReportWindow {
 }
 
 impl VehicleClock {
+    /// Takes note of a report that was not admitted before; of those older than all that are remembered nobody knows.
+    fn remember(&mut self, report: &ObjectReport) -> Result<(), RejectReason> {
+        let entry = (report.captured_at_us, report.seq);
+        let place = self.recent.partition_point(|known| *known < entry);
+        let is_full = self.recent.len() >= REMEMBERED;
+        if self.recent.get(place) == Some(&entry) || is_full && place == 0 {
+            return Err(RejectReason::OutOfOrder);
+        }
+        self.recent.insert(place, entry);
+        if is_full {
+            self.recent.pop_front();
+        }
+        Ok(())
+    }
+
     /// Whether the estimate rests on one report alone, whose clock was ahead, and this one's is not.
     fn is_contradicted(&self, captured: Timestamp, delay_us: i64, tolerance_us: i64, slack_us: i64) -> bool {
         let least = self.delay.least();
@@ -160,12 +195,16 @@ impl VehicleClock {
 /// How long a silent vehicle's clock is remembered when room is short.
 const RETENTION: Duration = Duration::from_secs(10);
 
+/// Latest reports of a vehicle by which duplicates are told.
+const REMEMBERED: usize = 32;
+
 fn seconds(s: f64) -> i64 {
     (s * 1e6) as i64
 }
 
 #[cfg(test)]
 mod tests {
+    use super::Admitted::{InOrder, OutOfOrder};
     use super::*;
 
     const NOON: u64 = 1_732_154_400_000_000;
@@ -182,10 +221,28 @@ mod tests {
     fn takes_each_report_once_and_in_order() {
         let mut window = window();
         let now = Timestamp(NOON + 10_000);
-        assert_eq!(window.admit(&report("a", NOON), now), Ok(Timestamp(NOON)));
+        assert_eq!(window.admit(&report("a", NOON), now), Ok(InOrder(Timestamp(NOON))));
         assert_eq!(window.admit(&report("a", NOON), now), Err(RejectReason::OutOfOrder));
+        assert_eq!(window.admit(&report("a", NOON - 1), now), Ok(OutOfOrder(Timestamp(NOON - 1))));
         assert_eq!(window.admit(&report("a", NOON - 1), now), Err(RejectReason::OutOfOrder));
-        assert_eq!(window.admit(&report("b", NOON - 1), now), Ok(Timestamp(NOON - 1)));
+        assert_eq!(window.admit(&report("b", NOON - 1), now), Ok(InOrder(Timestamp(NOON - 1))));
+    }
+
+    #[test]
+    fn an_overtaken_report_is_told_from_a_duplicate_as_long_as_it_is_remembered() {
+        let mut window = window();
+        let now = Timestamp(NOON + 810_000);
+        for n in 1..=40 {
+            assert!(matches!(window.admit(&report("a", NOON + n * 20_000), now), Ok(InOrder(_))));
+        }
+        let admitted = |window: &mut ReportWindow, n: u64| window.admit(&report("a", NOON + n * 10_000), now);
+        assert_eq!(admitted(&mut window, 79), Ok(OutOfOrder(Timestamp(NOON + 790_000))));
+        assert_eq!(admitted(&mut window, 79), Err(RejectReason::OutOfOrder));
+        assert_eq!(admitted(&mut window, 31), Ok(OutOfOrder(Timestamp(NOON + 310_000))));
+        for n in [1, 2, 12] {
+            assert_eq!(admitted(&mut window, n), Err(RejectReason::OutOfOrder), "nobody knows whether {n} came before");
+        }
+        assert_eq!(window.admit(&report("a", NOON), Timestamp(NOON + 1_100_000)), Err(RejectReason::Stale));
     }
 
     #[test]
@@ -204,20 +261,21 @@ mod tests {
         for step in 0..20 {
             let sent = NOON + step * 100_000;
             let admitted = window.admit(&report("fast", sent + 1_500_000), Timestamp(sent + 2_000)).unwrap();
-            assert_eq!(admitted, Timestamp(sent + 2_000), "the fastest transit counts as none");
+            assert_eq!(admitted, InOrder(Timestamp(sent + 2_000)), "the fastest transit counts as none");
         }
         let late = NOON + 2_000_000;
         let admitted = window.admit(&report("fast", late + 1_500_000), Timestamp(late + 302_000)).unwrap();
-        assert_eq!(admitted, Timestamp(late + 2_000), "queueing does not move the capture time");
+        assert_eq!(admitted, InOrder(Timestamp(late + 2_000)), "queueing does not move the capture time");
     }
 
     /// Reports every 100 ms with 2 ms of transit; the numbered one is stamped `ahead_us` ahead. Returns which of them
-    /// are admitted.
+    /// are admitted in order.
     fn admitted_around_a_wrong_stamp(wrong: u64, ahead_us: u64) -> Vec<bool> {
         let mut window = window();
         let admit = |n: u64| {
             let stamp = NOON + n * 100_000 + if n == wrong { ahead_us } else { 0 };
-            window.admit(&report("a", stamp), Timestamp(NOON + n * 100_000 + 2_000)).is_ok()
+            let admitted = window.admit(&report("a", stamp), Timestamp(NOON + n * 100_000 + 2_000));
+            matches!(admitted, Ok(InOrder(_)))
         };
         (0..200).map(admit).collect()
     }
@@ -247,7 +305,7 @@ mod tests {
         }
         for n in 11..20 {
             let received = Timestamp(sent(n) + 2_000);
-            assert_eq!(window.admit(&report("a", sent(n) + 1_500_000), received), Ok(received));
+            assert_eq!(window.admit(&report("a", sent(n) + 1_500_000), received), Ok(InOrder(received)));
         }
     }
 

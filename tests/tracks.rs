@@ -10,7 +10,7 @@ use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
 use ecod::tracks::{TracksConfig, TracksMode};
-use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, ReportKind, encode};
+use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, RejectReason, ReportKind, encode};
 use nalgebra::Point2;
 
 const START: u64 = 1_732_154_400_000_000;
@@ -118,4 +118,36 @@ fn a_standby_leads_on_with_the_same_identities() {
     let next = standby.tick(now).unwrap().map.unwrap();
     let ids = |map: &GlobalMap| map.objects.iter().map(|object| object.id).collect::<Vec<_>>();
     assert_eq!(ids(&next), ids(&map.unwrap()));
+}
+
+/// What `euclid` saw in the frames that were overtaken by the next is in the map too, once each; what comes later than
+/// the bound is not, and is counted.
+#[test]
+fn overtaken_reports_count_for_tracks_within_the_bound_and_not_for_known_locations() {
+    let tracks = TracksConfig { mode: TracksMode::On, ..TracksConfig::default() };
+    let config = FusionConfig { tracks, ..FusionConfig::default() };
+    let mut cell = Aggregator::new(NodeName::from_static("edge"), 1, config, vec![landmark()], Timestamp(START));
+    let time = |frame: u64| Timestamp(START + frame * 100_000);
+    let mut last = None;
+    for frame in (2..40).step_by(2) {
+        let now = time(frame) + Duration::from_millis(20);
+        let in_time = report("euclid", frame, time(frame), vec![PerceivedObject::new("car", 0.8, 10.0, 8.0)]);
+        let moving = PerceivedObject::new("car", 0.9, 0.8 * (frame - 1) as f64, 0.0);
+        let truck = PerceivedObject::new("truck", 0.99, 10.0, 8.0);
+        let overtaken = report("euclid", frame - 1, time(frame - 1), vec![moving, truck]);
+        last = cell.report(ReportKind::Detections, &in_time, now).unwrap().or(last);
+        assert_eq!(cell.report(ReportKind::Detections, &overtaken, now), Ok(None));
+        for again in [&in_time, &overtaken] {
+            assert_eq!(cell.report(ReportKind::Detections, again, now), Err(RejectReason::OutOfOrder));
+        }
+        last = cell.tick(time(frame + 2)).or(last);
+    }
+    let map = last.unwrap().map.unwrap();
+    let moving = map.objects.iter().find(|object| object.y_m.abs() < 1.0).unwrap_or_else(|| panic!("{map:?}"));
+    assert!((moving.x_m - 0.8 * 40.0).abs() < 0.5, "{moving:?}");
+    assert_eq!(map.landmarks[0].label.as_deref(), Some("car"), "known locations go by the latest report");
+    assert_eq!((cell.overtaken(), cell.tracks_losses().late), (19, 0));
+    let late = report("euclid", 32, Timestamp(START + 3_250_000), cars(32));
+    assert_eq!(cell.report(ReportKind::Detections, &late, time(40)), Err(RejectReason::OutOfOrder));
+    assert_eq!((cell.overtaken(), cell.tracks_losses().late), (19, 1));
 }

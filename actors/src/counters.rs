@@ -41,6 +41,12 @@ pub enum Event {
     Repeated,
     /// An object voted for nothing, such as at an unknown landmark.
     VoteIgnored,
+    /// A report was used for tracking alone: a later one of its vehicle came before.
+    ReportOvertaken,
+    /// A report came too late for tracking.
+    ReportLate,
+    /// A new object was not tracked: there are too many, or too many near it.
+    ObjectRefused,
     /// Verdicts newer than all before were taken.
     VerdictsAccepted,
     /// Reputations newer than all before were taken.
@@ -97,7 +103,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 39] = [
+    pub const ALL: [Self; 42] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -112,6 +118,9 @@ impl Event {
         Self::MapAccepted,
         Self::Repeated,
         Self::VoteIgnored,
+        Self::ReportOvertaken,
+        Self::ReportLate,
+        Self::ObjectRefused,
         Self::VerdictsAccepted,
         Self::ReputationsAccepted,
         Self::LedgerMerged,
@@ -156,6 +165,9 @@ impl Event {
             Self::MapAccepted => "map_accepted",
             Self::Repeated => "repeated",
             Self::VoteIgnored => "vote_ignored",
+            Self::ReportOvertaken => "report_overtaken",
+            Self::ReportLate => "report_late",
+            Self::ObjectRefused => "object_refused",
             Self::VerdictsAccepted => "verdicts_accepted",
             Self::ReputationsAccepted => "reputations_accepted",
             Self::LedgerMerged => "ledger_merged",

@@ -23,6 +23,7 @@ use ecod::replay::JournalEvent;
 use ecod::reputation::ReputationLedger;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
+use ecod::tracks::TracksLosses;
 use ecod::wire::{GlobalMap, Reputation};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
@@ -84,6 +85,8 @@ pub struct FuserArguments {
     pub term: watch::Receiver<u64>,
     /// Where vehicles' reports wait.
     pub intake: Intake,
+    /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
+    pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
     /// Where the aggregator's inputs are recorded.
     pub recording: Recording,
     /// Where maps and verdicts are published.
@@ -110,10 +113,12 @@ pub struct FuserState {
     gateway: Seat<GatewayMessage>,
     keeper: Seat<ReputationKeeperMessage>,
     counters: Arc<Counters>,
-    /// The newest map of another aggregator, and when it came.
+    /// The newest map of another aggregator or an earlier run, and when it came.
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
+    /// What the aggregator has left out so far and is counted already.
+    losses: [u64; 4],
 }
 
 impl Actor for Fuser {
@@ -159,6 +164,7 @@ impl Actor for Fuser {
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
         }
+        state.count_losses();
         state.set_alarm(&myself);
         Ok(())
     }
@@ -166,7 +172,7 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
-        let FuserArguments { aggregator, term, intake, recording, gateway, keeper, counters } = arguments;
+        let FuserArguments { aggregator, term, intake, newest, recording, gateway, keeper, counters } = arguments;
         Self {
             aggregator,
             term,
@@ -175,9 +181,10 @@ impl FuserState {
             gateway,
             keeper,
             counters,
-            last_map: None,
+            last_map: newest,
             alarm: Timestamp(u64::MAX),
             timer: None,
+            losses: [0; 4],
         }
     }
 
@@ -189,10 +196,8 @@ impl FuserState {
 
     fn take(&mut self, delivery: &Delivery) {
         let Incoming::Report { kind, report } = &delivery.message else { return };
-        let ignored_before = self.aggregator.ignored_votes();
         self.recording.report(*kind, report, delivery.received_at);
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
-        self.counters.add(Event::VoteIgnored, self.aggregator.ignored_votes() - ignored_before);
         match taken {
             Ok(fused) => self.publish(fused),
             Err(reason) => {
@@ -233,6 +238,21 @@ impl FuserState {
             let fused = self.aggregator.command(&command, now);
             self.recording.journal(now, JournalEvent::Command(command));
             self.publish(fused);
+        }
+    }
+
+    /// Counts what the aggregator has left out since it was last asked.
+    fn count_losses(&mut self) {
+        let TracksLosses { late, refused } = self.aggregator.tracks_losses();
+        let now = [
+            (Event::VoteIgnored, self.aggregator.ignored_votes()),
+            (Event::ReportOvertaken, self.aggregator.overtaken()),
+            (Event::ReportLate, late),
+            (Event::ObjectRefused, refused),
+        ];
+        for ((event, total), counted) in now.into_iter().zip(&mut self.losses) {
+            self.counters.add(event, total.saturating_sub(*counted));
+            *counted = total;
         }
     }
 

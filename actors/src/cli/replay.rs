@@ -155,15 +155,20 @@ fn flush(sink: &mut dyn Write) -> io::Result<()> {
 }
 
 fn report(summary: &Summary) {
-    let Summary { lines, rejected, late, ignored_votes, written } = summary;
+    let Summary { lines, rejected, late, ignored_votes, overtaken, tracks, written } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
     for (reason, Rejections { lines, first_line }) in rejected {
         eprintln!("rejected {reason} {lines}, the first in line {first_line}");
     }
-    if *late > 0 {
-        eprintln!("used although earlier than a line before {late}");
-    }
-    if *ignored_votes > 0 {
-        eprintln!("objects that voted for nothing {ignored_votes}");
+    for (what, number) in [
+        ("used although earlier than a line before", *late),
+        ("objects that voted for nothing", *ignored_votes),
+        ("used for tracks alone, overtaken by a later report of the vehicle", *overtaken),
+        ("reports too late for tracks", tracks.late),
+        ("new objects refused by tracks", tracks.refused),
+    ] {
+        if number > 0 {
+            eprintln!("{what} {number}");
+        }
     }
 }

@@ -55,6 +55,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             aggregator: Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
             term: watch::channel(7).1,
             intake: Intake::default(),
+            newest: None,
             recording: Recording::default(),
             gateway: Seat::default(),
             keeper: Seat::default(),

@@ -162,7 +162,7 @@ impl Assembly {
         }
     }
 
-    /// A fuser starts with the evidence that the keeper has.
+    /// A fuser starts with the evidence that the keeper has, and goes on with the objects of the newest map.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
         let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
@@ -174,6 +174,7 @@ impl Assembly {
             term: self.term.subscribe(),
             recording: self.recording.clone(),
             intake: self.intake.clone(),
+            newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
             gateway: self.seats.gateway.clone(),
             keeper: self.seats.keeper.clone(),
             counters: self.counters(),
@@ -271,6 +272,25 @@ mod tests {
     use crate::config::NodeConfig;
     use crate::follower::ReceivedMap;
     use crate::gateway::Security;
+
+    #[test]
+    fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
+        use ecod::aggregator::Algorithms::{Both, Pace};
+        use ecod::tracks::TracksMode::{Auto, Off, On};
+        let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
+        for (algorithms, mode, landmarks, expected) in [
+            (Both, Off, vec![], true),
+            (Pace, Auto, vec![], true),
+            (Pace, On, vec![spot], true),
+            (Pace, Off, vec![], false),
+        ] {
+            let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
+            (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
+            let assembly = Assembly::new(config, Security::default(), watch::Sender::new(None));
+            let keeps = assembly.parts().contains(&crate::node::seats::Part::ReputationKeeper);
+            assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
+        }
+    }
 
     #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
