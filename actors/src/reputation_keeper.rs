@@ -11,8 +11,8 @@
 //!   Receivers take the larger count: shares may come late, twice, or in any order.
 //! - What is published was saved before. What an actor knew outlives it in its [`Book`]; what a node knew outlives it in
 //!   its state directory.
-//! - Whoever has led sends its own lanes to a leader that it hears for the first time: when a split heals, the evidence
-//!   of both sides is kept.
+//! - Whoever has led sends all it knows to a leader that it hears for the first time: when a split heals, the evidence
+//!   of both sides is kept, that of leaders who are gone too. So a leader shares even that it has none.
 
 mod book;
 mod config;
@@ -109,6 +109,7 @@ pub struct ReputationKeeper;
 pub struct ReputationKeeperState {
     arguments: ReputationKeeperArguments,
     leads: Option<Epoch>,
+    has_led: bool,
     last_round: u64,
     published: Option<(Epoch, u64)>,
     /// The leader whose shares came last.
@@ -135,19 +136,7 @@ impl Actor for ReputationKeeper {
     ) -> Result<Self::State, ActorProcessingErr> {
         book::restore(&arguments);
         myself.send_interval(arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
-        Ok(ReputationKeeperState {
-            arguments,
-            leads: None,
-            last_round: 0,
-            published: None,
-            heard: None,
-            // A run before may have left something.
-            unsaved: true,
-            unadopted: false,
-            writing: None,
-            disk_failed: false,
-            ticks: 0,
-        })
+        Ok(ReputationKeeperState::new(arguments))
     }
 
     async fn handle(
@@ -161,7 +150,7 @@ impl Actor for ReputationKeeper {
                 state.lead(epoch, last_round);
                 state.save().await;
                 state.publish();
-                state.share_all();
+                state.send_snapshot();
             }
             ReputationKeeperMessage::Record { epoch, round, evidence, reputations } => {
                 state.record(epoch, round, &evidence, reputations);
@@ -184,6 +173,23 @@ impl Actor for ReputationKeeper {
 }
 
 impl ReputationKeeperState {
+    fn new(arguments: ReputationKeeperArguments) -> Self {
+        Self {
+            arguments,
+            leads: None,
+            has_led: false,
+            last_round: 0,
+            published: None,
+            heard: None,
+            // A run before may have left something.
+            unsaved: true,
+            unadopted: false,
+            writing: None,
+            disk_failed: false,
+            ticks: 0,
+        }
+    }
+
     fn lead(&mut self, epoch: Epoch, last_round: u64) {
         let newest = self.arguments.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.message));
         let mut book = self.arguments.book.open();
@@ -192,6 +198,7 @@ impl ReputationKeeperState {
         }
         self.arguments.fuser.send(FuserMessage::Resume { reputations: book.standing.clone() });
         self.leads = Some(epoch);
+        self.has_led = true;
         self.last_round = last_round;
     }
 
@@ -236,9 +243,10 @@ impl ReputationKeeperState {
         let leader = share.epoch.map(|term| Epoch::new(term, share.node.clone()));
         if leader.is_some() && leader != self.heard {
             self.heard = leader;
-            let own: Vec<_> =
-                self.entries().into_iter().filter(|entry| entry.aggregator == self.arguments.name).collect();
-            self.share(&own);
+            let entries = self.entries();
+            if self.has_led || entries.iter().any(|entry| entry.aggregator == self.arguments.name) {
+                self.share(&entries);
+            }
         }
     }
 
@@ -253,7 +261,7 @@ impl ReputationKeeperState {
         if self.ticks >= self.arguments.config.ticks_per_snapshot() {
             self.ticks = 0;
             if self.leads.is_some() {
-                self.share_all();
+                self.send_snapshot();
             }
         }
     }
@@ -280,11 +288,7 @@ impl ReputationKeeperState {
         self.arguments.book.open().ledger.entries().collect()
     }
 
-    fn share_all(&self) {
-        self.share(&self.entries());
-    }
-
-    /// Shares all evidence, and that there is none: whoever takes over waits for it.
+    /// Shares all evidence, and that there is none: whoever takes over waits for it, and whoever has some gives it.
     fn send_snapshot(&self) {
         let entries = self.entries();
         if entries.is_empty() {
@@ -336,3 +340,6 @@ impl ReputationKeeperState {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
