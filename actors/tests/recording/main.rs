@@ -5,6 +5,7 @@ mod disk;
 mod files;
 #[cfg(feature = "foxglove")]
 mod live;
+mod python;
 
 use std::collections::BTreeMap;
 use std::process::Command;
