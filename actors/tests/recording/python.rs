@@ -11,7 +11,6 @@ use crate::disk::{edge, maps, wait_until};
 /// Prints schema and topic of every message; a log that was not finished is read as far as it goes.
 const SCRIPT: &str = "
 import json, sys
-from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 file = open(sys.argv[1], 'rb')
 is_finished = sys.argv[2] == 'finished'
@@ -20,8 +19,9 @@ try:
     for schema, channel, message in messages:
         json.loads(message.data)
         print(schema.name, channel.topic)
-except EndOfFile:
-    assert not is_finished
+except Exception:
+    # The last record may be cut anywhere.
+    if is_finished: raise
 ";
 
 /// The maps that Python finds in a log.
