@@ -87,6 +87,7 @@ core-only: ## prove that the core needs no runtime: it depends on a list of crat
 replay-check: setup ## prove that replays are byte-equal from run to run and from debug to release
 	packaging/check-replay
 
+recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
 	python3 -m venv $(BUILD)/recording-venv
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap

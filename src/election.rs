@@ -146,7 +146,7 @@ impl Election {
             Input::Health { health } => self.set_health(health, now),
             Input::Round { epoch, round } => self.note_round(&epoch, round, now),
             Input::Prepared => self.prepared(now),
-            Input::Leave => self.resign(now),
+            Input::Leave => self.leave(now),
         }
         self.run_timers(now);
         self.finish()
@@ -211,6 +211,7 @@ impl Election {
     }
 
     fn run_timers(&mut self, now: Timestamp) {
+        self.peers.forget_silent(now);
         if let State::Following(_) = self.state {
             self.follow_timers(now);
         }
@@ -287,6 +288,12 @@ impl Election {
             }
             State::Seeking(_) => {}
         }
+    }
+
+    /// Says at once what others would have to find out: that this node leads no more, nor could.
+    fn leave(&mut self, now: Timestamp) {
+        let Health { load_percent, .. } = self.health;
+        self.set_health(Health { load_percent, ..Health::default() }, now);
     }
 
     fn standing(&self) -> Standing {

@@ -169,6 +169,11 @@ impl NodeConfig {
         self.pose.validate().map_err(|error| error.within("pose"))?;
         self.membership.validate().map_err(|error| error.within("membership"))?;
         self.election.validate().map_err(|error| error.within("election"))?;
+        let (hello, join) = (self.membership.hello_ms, self.election.join_ms);
+        if hello.saturating_mul(2) > join {
+            let allowed = format!("at most half of `election.join_ms`, {join}: a leader that is there must be found");
+            return Err(ConfigError::new("membership.hello_ms", hello, allowed));
+        }
         self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
         if self.mqtt.sign && !self.membership.has_key() {
             return Err(ConfigError::new(
@@ -405,6 +410,7 @@ mod tests {
                 "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",
                 ["`broker.max_packet_bytes`", "1048576", "8392704"],
             ),
+            ("[election]\njoin_ms = 700", ["`membership.hello_ms`", "500", "half of `election.join_ms`, 700"]),
             ("[election]\nbeat_ms = 1", ["`election.beat_ms`", "1", "5 to"]),
             (
                 "role = \"edge\"\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 1\ny_m = 0",

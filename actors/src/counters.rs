@@ -256,6 +256,7 @@ impl Counters {
         CounterSnapshot {
             events: Event::ALL.map(|event| (event.as_str(), self.events(event))).into(),
             rejects: RejectReason::ALL.map(|reason| (reason.as_str(), self.rejects(reason))).into(),
+            shed: self.shedding.sums(),
         }
     }
 }
@@ -267,6 +268,8 @@ pub struct CounterSnapshot {
     pub events: BTreeMap<&'static str, u64>,
     /// Payloads that were not used, by [`RejectReason`].
     pub rejects: BTreeMap<&'static str, u64>,
+    /// What was left out under overload, by [`ShedReason`].
+    pub shed: BTreeMap<&'static str, u64>,
 }
 
 #[cfg(test)]

@@ -61,6 +61,7 @@ pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
     findings.extend(camera::examine(config).await);
     findings.extend(network::broker(config).await);
     findings.extend(network::gossip(config));
+    findings.extend(network::pages(config));
     findings.extend(network::multicast(config));
     findings.push(storage::key(config));
     findings.extend(certificates::examine(config));
@@ -130,14 +131,27 @@ mod tests {
         let mut config = config();
         config.listen = tcp.local_addr().ok();
         config.membership.bind = udp.local_addr().ok();
+        let page = TcpListener::bind("127.0.0.1:0").unwrap();
+        config.dashboard.listen = page.local_addr().ok();
         for (check, port, key) in [
             ("broker port", tcp.local_addr().unwrap().port(), "`listen`"),
             ("gossip port", udp.local_addr().unwrap().port(), "`membership.bind`"),
+            ("dashboard", page.local_addr().unwrap().port(), "`dashboard.listen`"),
         ] {
             let finding = finding(&config, check).await;
             assert_eq!(finding.verdict, Verdict::Broken);
             assert!(finding.seen.contains(&port.to_string()) && finding.fix.unwrap().contains(key));
         }
+    }
+
+    #[cfg(feature = "foxglove")]
+    #[tokio::test]
+    async fn a_live_port_in_use_is_named() {
+        let (live, directory) = (TcpListener::bind("127.0.0.1:0").unwrap(), tempfile::tempdir().unwrap());
+        let live_port = Some(live.local_addr().unwrap().port());
+        let record = Some(RecordConfig { live_port, ..RecordConfig::new(directory.path()) });
+        let finding = finding(&NodeConfig { record, ..config() }, "live port").await;
+        assert!(finding.verdict == Verdict::Broken && finding.fix.unwrap().contains("`record.live_port`"));
     }
 
     #[tokio::test]

@@ -298,15 +298,18 @@ impl GatewayState {
     }
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
-        let reports = self.watches_reports || self.part == Part::Observer || self.takes_reports_of(broker);
+        let reports = self.watches_reports || self.takes_reports_of(broker);
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
         self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
 
-    /// Whether a candidate needs the reports that go to this broker.
+    /// Whether this node needs the reports that go to this broker, whoever else watches them.
     fn takes_reports_of(&self, broker: &BrokerAddress) -> bool {
-        let among = |brokers: &Vec<BrokerAddress>| brokers.contains(broker);
-        self.part == Part::Candidate && self.report_brokers.as_ref().is_none_or(among)
+        match self.part {
+            Part::Candidate => self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker)),
+            Part::Observer => true,
+            Part::Follower => false,
+        }
     }
 
     fn watch_reports(&mut self, wanted: bool) {

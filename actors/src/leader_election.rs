@@ -39,7 +39,7 @@ pub use terms::saved_term;
 use crate::broker::BrokerMessage;
 use crate::counters::Counters;
 use crate::fuser::FuserMessage;
-use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
+use crate::gateway::{BrokerAddress, Delivery, GatewayMessage, Incoming, LinkState};
 use crate::membership::{Member, MembershipEvent, MembershipMessage};
 use crate::reputation_keeper::ReputationKeeperMessage;
 use crate::seat::Seat;
@@ -62,8 +62,8 @@ pub enum LeaderElectionMessage {
     },
     /// A broker told how another node is.
     TakeStatus {
-        /// The other node's word, or its last will.
-        status: Arc<NodeStatus>,
+        /// The other node's word, or its last will, and its place among what waits.
+        delivery: Delivery,
     },
     /// A round was published by this node or accepted by its gate.
     NoteRound {
@@ -170,7 +170,11 @@ impl Actor for LeaderElection {
         match message {
             LeaderElectionMessage::Membership { event } => driver.take_event(event).await?,
             LeaderElectionMessage::LinkChanged { broker, state } => driver.take_link(&broker, state).await?,
-            LeaderElectionMessage::TakeStatus { status } => driver.take_status(&status).await?,
+            LeaderElectionMessage::TakeStatus { delivery } => {
+                if let Incoming::Status(status) = &delivery.message {
+                    driver.take_status(status).await?;
+                }
+            }
             LeaderElectionMessage::NoteRound { epoch, round } => driver.note_round(epoch, round).await?,
             LeaderElectionMessage::NoteState { from } => driver.note_state(&from),
             LeaderElectionMessage::NoteFuserRestart => driver.note_fuser_restart().await?,

@@ -38,6 +38,7 @@ pub use counters::{FrameCounters, FrameEvent};
 pub(crate) use key::payload_key;
 pub use key::{KeyError, check_key};
 pub use socket::BindError;
+pub(crate) use socket::is_of_this_machine;
 pub(crate) use throttle::Throttle;
 
 use crate::clock;
@@ -195,6 +196,9 @@ impl Actor for Membership {
         let handled = Arc::new(Notify::new());
         let mut tasks = JoinSet::new();
         tasks.spawn(watch_socket(Arc::clone(&socket), deadlines, Arc::clone(&handled), myself.clone()));
+        if !join_group(&socket, &config.multicast) {
+            tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
+        }
         if !config.seeds.is_empty() {
             tasks.spawn(seeds::resolve(config.seeds, address.is_ipv4(), myself));
         }
@@ -292,6 +296,30 @@ async fn watch_socket(
             return;
         }
         handled.notified().await;
+    }
+}
+
+/// Time between two attempts to join the multicast group.
+const REJOIN_PERIOD: Duration = Duration::from_secs(5);
+
+/// Joins the multicast group, if there is to be one; false when that does not work here, or not yet.
+fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
+    match socket.join(config) {
+        Ok(()) => true,
+        Err(error) => {
+            tracing::warn!(%error, group = %config.group, "no discovery by multicast, tried again");
+            false
+        }
+    }
+}
+
+/// A machine that starts may have its network later than its node.
+async fn join_later(socket: Arc<GossipSocket>, config: MulticastConfig) {
+    loop {
+        tokio::time::sleep(REJOIN_PERIOD).await;
+        if socket.join(&config).is_ok() {
+            return tracing::info!(group = %config.group, "discovery by multicast works");
+        }
     }
 }
 

@@ -11,14 +11,12 @@
 //!   Receivers take the larger count: shares may come late, twice, or in any order.
 //! - What is published was saved before. What an actor knew outlives it in its [`Book`]; what a node knew outlives it in
 //!   its state directory.
-//! - Whoever has led sends its own lanes to a leader that it hears for the first time: when a split heals, the evidence
-//!   of both sides is kept.
+//! - Whoever has led sends all it knows to a leader that it hears for the first time: when a split heals, the evidence
+//!   of both sides is kept, that of leaders who are gone too. So a leader shares even that it has none.
 //! - Evidence is taken of members that may lead, and of terms that the election knows; the present leader's always has room.
 
 mod book;
 mod config;
-#[cfg(test)]
-mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -124,13 +122,14 @@ pub struct ReputationKeeper;
 pub struct ReputationKeeperState {
     arguments: ReputationKeeperArguments,
     leads: Option<Epoch>,
+    has_led: bool,
     last_round: u64,
     published: Option<(Epoch, u64)>,
     /// The leader whose shares came last.
     heard: Option<Epoch>,
     /// Whether it has yet to be told the node's own lanes.
-    owes_lanes: bool,
-    lanes_sent: Option<Timestamp>,
+    owes_all: bool,
+    all_sent: Option<Timestamp>,
     unsaved: bool,
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
@@ -140,7 +139,7 @@ pub struct ReputationKeeperState {
 
 /// Least time between two times that the node's own lanes are sent to a leader that is new: leaders may come and go fast,
 /// or only seem to.
-const LANES_PAUSE: Duration = Duration::from_secs(5);
+const ALL_PAUSE: Duration = Duration::from_secs(5);
 
 /// How long a disk may take before reputations are published unsaved.
 const WRITE_PATIENCE: Duration = Duration::from_secs(1);
@@ -171,7 +170,7 @@ impl Actor for ReputationKeeper {
                 state.lead(epoch, last_round);
                 state.save().await;
                 state.publish();
-                state.share_all();
+                state.send_snapshot();
             }
             ReputationKeeperMessage::Record { epoch, round, evidence, reputations } => {
                 state.record(epoch, round, &evidence, reputations);
@@ -198,11 +197,12 @@ impl ReputationKeeperState {
         Self {
             arguments,
             leads: None,
+            has_led: false,
             last_round: 0,
             published: None,
             heard: None,
-            owes_lanes: false,
-            lanes_sent: None,
+            owes_all: false,
+            all_sent: None,
             // A run before may have left something.
             unsaved: true,
             unadopted: false,
@@ -220,6 +220,7 @@ impl ReputationKeeperState {
         }
         self.arguments.fuser.send(FuserMessage::Resume { reputations: book.standing.clone() });
         self.leads = Some(epoch);
+        self.has_led = true;
         self.last_round = last_round;
     }
 
@@ -276,25 +277,24 @@ impl ReputationKeeperState {
         let leader = share.epoch.filter(|claimed| *claimed <= term).map(|term| Epoch::new(term, share.node.clone()));
         if leader.is_some() && leader != self.heard {
             self.heard = leader;
-            self.owes_lanes = true;
+            let has_own = |entries: &[LedgerEntry]| entries.iter().any(|entry| entry.aggregator == self.arguments.name);
+            self.owes_all = self.has_led || has_own(&self.entries());
         }
-        self.send_own_lanes(delivery.received_at);
+        self.send_all(delivery.received_at);
     }
 
-    /// Sends the node's own lanes to a leader that does not have them, not too often.
-    fn send_own_lanes(&mut self, now: Timestamp) {
-        if self.owes_lanes && self.lanes_sent.is_none_or(|at| now.since(at) >= LANES_PAUSE) {
-            (self.owes_lanes, self.lanes_sent) = (false, Some(now));
-            let mut own = self.entries();
-            own.retain(|entry| entry.aggregator == self.arguments.name);
-            self.share(&own);
+    /// Sends everything to a leader that may not have it, not too often.
+    fn send_all(&mut self, now: Timestamp) {
+        if self.owes_all && self.all_sent.is_none_or(|at| now.since(at) >= ALL_PAUSE) {
+            (self.owes_all, self.all_sent) = (false, Some(now));
+            self.share(&self.entries());
         }
     }
 
     async fn tick(&mut self) {
         self.save().await;
         self.publish();
-        self.send_own_lanes(clock::now());
+        self.send_all(clock::now());
         if std::mem::take(&mut self.unadopted) {
             let ledger = Arc::new(self.arguments.book.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });
@@ -303,7 +303,7 @@ impl ReputationKeeperState {
         if self.ticks >= self.arguments.config.ticks_per_snapshot() {
             self.ticks = 0;
             if self.leads.is_some() {
-                self.share_all();
+                self.send_snapshot();
             }
         }
     }
@@ -330,11 +330,7 @@ impl ReputationKeeperState {
         self.arguments.book.open().ledger.entries().collect()
     }
 
-    fn share_all(&self) {
-        self.share(&self.entries());
-    }
-
-    /// Shares all evidence, and that there is none: whoever takes over waits for it.
+    /// Shares all evidence, and that there is none: whoever takes over waits for it, and whoever has some gives it.
     fn send_snapshot(&self) {
         let entries = self.entries();
         if entries.is_empty() {
@@ -386,3 +382,6 @@ impl ReputationKeeperState {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

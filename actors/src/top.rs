@@ -196,7 +196,7 @@ fn vehicles(view: &View) -> Table<'_> {
 fn counted(view: &View) -> Table<'_> {
     const SHOWN: [&str; 5] = ["inbox_full", "publish_refused", "disconnected", "connect_failed", "record_dropped"];
     let events = view.counters.events.iter().filter(|(name, _)| SHOWN.contains(name));
-    let counts = events.chain(&view.counters.rejects).filter(|(_, times)| **times > 0);
+    let counts = events.chain(&view.counters.rejects).chain(&view.counters.shed).filter(|(_, times)| **times > 0);
     let rows: Vec<_> = counts.map(|(name, times)| Row::new([name.replace('_', " "), times.to_string()])).collect();
     let title = if rows.is_empty() { " nothing lost here " } else { " lost here " };
     Table::new(rows, [Constraint::Fill(1), Constraint::Length(10)]).block(Block::bordered().title(title))
@@ -223,7 +223,7 @@ mod tests {
     use ratatui::backend::TestBackend;
 
     use super::*;
-    use crate::counters::Counters;
+    use crate::counters::{Counters, ShedReason};
     use crate::leader_election::Position;
 
     fn name(text: &str) -> NodeName {
@@ -310,6 +310,16 @@ mod tests {
         let alone = View { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
         let text = shown(&alone, 100, 30);
         assert!(text.contains("nobody leads") && text.contains("no map yet"), "{text}");
+    }
+
+    #[test]
+    fn what_is_left_out_under_overload_is_counted_among_the_losses() {
+        let counters = Counters::default();
+        for vehicle in ["euclid", "gauss"] {
+            counters.shed(ShedReason::ReportReplaced, vehicle);
+        }
+        let text = shown(&View { counters: counters.snapshot(), ..view(Timestamp(7_200_000)) }, 100, 30);
+        assert!(text.contains(" lost here ") && text.contains("report replaced"), "{text}");
     }
 
     #[test]

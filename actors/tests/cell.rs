@@ -9,7 +9,9 @@ use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, Role};
 use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::gateway::{GatewayMessage, ReportKind};
+use ecod_actors::leader_election::Position;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::recorder::RecordConfig;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -113,12 +115,18 @@ async fn rounds_go_on_in_order_and_old_ones_are_refused() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_cell_goes_on_when_any_part_is_killed() {
-    let edge = edge().await;
+    let log = tempfile::tempdir().unwrap();
+    let record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(log.path()) });
+    let edge = node::start(NodeConfig { record, ..config("edge", Role::Edge) }).await.unwrap();
+    let gossip = edge.gossip_address();
     let euclid = cav("euclid", &edge).await;
     let sees = |name: &'static str| move || report("euclid", name, 2);
     reported(&euclid, &euclid, sees("before"), |map| label(map, 2) == Some("before")).await;
 
-    let kills: [(&str, &dyn Fn()); 6] = [
+    let kills: [(&str, &dyn Fn()); 9] = [
+        ("election", &|| edge.seats().election.holder().unwrap().kill()),
+        ("membership", &|| edge.seats().membership.holder().unwrap().kill()),
+        ("recorder", &|| edge.seats().recorder.holder().unwrap().kill()),
         ("fuser", &|| edge.seats().fuser.holder().unwrap().kill()),
         ("edge-gateway", &|| edge.seats().gateway.holder().unwrap().kill()),
         ("edge-follower", &|| edge.seats().follower.holder().unwrap().kill()),
@@ -127,12 +135,42 @@ async fn the_cell_goes_on_when_any_part_is_killed() {
         ("follower", &|| euclid.seats().follower.holder().unwrap().kill()),
     ];
     for (part, kill) in kills {
+        let term = edge.leadership().borrow().epoch.clone().unwrap().term;
         kill();
         eprintln!("killed {part}");
-        reported(&euclid, &euclid, sees(part), |map| label(map, 2) == Some(part)).await;
+        // An election that starts anew has no state directory to tell it that the term is used.
+        let is_fresh = |map: &GlobalMap| part != "election" || map.epoch > term;
+        reported(&euclid, &euclid, sees(part), |map| label(map, 2) == Some(part) && is_fresh(map)).await;
     }
+    assert_eq!(edge.gossip_address(), gossip, "others find the membership where it was");
     euclid.stop().await;
     edge.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_cell_goes_on_under_another_candidate_when_a_supervisor_is_killed() {
+    let edge = edge().await;
+    let seeds = vec![edge.gossip_address().unwrap().to_string()];
+    let mut others = Vec::new();
+    for (name, role) in [("gauss", Role::Auto), ("euclid", Role::Cav)] {
+        let mut config = config(name, role);
+        config.membership.seeds = seeds.clone();
+        others.push(node::start(config).await.unwrap());
+    }
+    let [gauss, euclid] = &others[..] else { unreachable!("two were started") };
+    let led_by =
+        |name: &'static str| move |map: &GlobalMap| map.aggregator.as_str() == name && label(map, 0) == Some("x");
+    reported(euclid, euclid, || report("euclid", "x", 0), led_by("edge")).await;
+    let standby = async {
+        let mut leadership = gauss.leadership();
+        leadership.wait_for(|leadership| leadership.position == Position::StandingBy).await.map(drop)
+    };
+    timeout(PATIENCE, standby).await.expect("gauss stands by").unwrap();
+    edge.seats().fuser.holder().unwrap().try_get_supervisor().unwrap().kill();
+    reported(euclid, euclid, || report("euclid", "x", 0), led_by("gauss")).await;
+    for node in others {
+        node.stop().await;
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -357,6 +357,7 @@ impl Election {
             self.ask_all(now);
         }
         self.peers.down(peer, now);
+        self.name_successors(now);
     }
 
     pub(super) fn peer_gone(&mut self, peer: &NodeName, now: Timestamp) {
@@ -366,8 +367,7 @@ impl Election {
                 self.close(following.epoch.clone());
                 self.lose_leader(now);
             }
-            State::Leading(_) => self.name_successors(now),
-            State::Seeking(_) | State::Following(_) => {}
+            State::Seeking(_) | State::Following(_) | State::Leading(_) => self.name_successors(now),
         }
     }
 

@@ -38,6 +38,8 @@ pub(super) struct Peer {
     fit_since: Option<Timestamp>,
     /// Until when it counts as gone although messages of its may still be on their way.
     gone_until: Option<Timestamp>,
+    /// When the membership gave it up, if it was not heard since.
+    given_up_at: Option<Timestamp>,
 }
 
 /// All other nodes that were ever heard of and not given up.
@@ -46,13 +48,15 @@ pub(super) struct Peers {
     table: BTreeMap<NodeName, Peer>,
     contact: Duration,
     patience: Duration,
+    /// When to look for peers that were given up and not heard since.
+    forget_at: Option<Timestamp>,
 }
 
 impl Peers {
     /// `contact` is how long a peer may be silent and still count as heard, `patience` how long one that the membership
     /// gave up.
     pub(super) fn new(contact: Duration, patience: Duration) -> Self {
-        Self { table: BTreeMap::new(), contact, patience }
+        Self { table: BTreeMap::new(), contact, patience, forget_at: None }
     }
 
     pub(super) fn add(&mut self, name: &NodeName) {
@@ -93,6 +97,7 @@ impl Peers {
         peer.run = message.run;
         peer.seq = message.seq;
         peer.heard_at = Some(now);
+        peer.given_up_at = None;
         peer.standing = Some(message.standing);
         peer.epoch = message.epoch.clone();
         true
@@ -107,12 +112,25 @@ impl Peers {
         }
     }
 
-    /// Forgets a peer that the membership gave up, unless it was heard lately.
+    /// Forgets a peer that the membership gave up: at once if it has been silent, else if it stays so.
     pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
-        let heard_at = self.table.get(name).and_then(|peer| peer.heard_at);
-        if heard_at.is_none_or(|at| now.since(at) > self.patience / 2) {
+        let Some(peer) = self.table.get_mut(name) else { return };
+        if peer.heard_at.is_none_or(|at| now.since(at) > self.patience / 2) {
             self.table.remove(name);
+        } else {
+            peer.given_up_at = Some(now);
+            self.forget_at.get_or_insert(now + self.patience / 2);
         }
+    }
+
+    /// Forgets who was given up and not heard since.
+    pub(super) fn forget_silent(&mut self, now: Timestamp) {
+        if self.forget_at.is_none_or(|at| now < at) {
+            return;
+        }
+        let wait = self.patience / 2;
+        self.table.retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
+        self.forget_at = self.table.values().filter_map(|peer| peer.given_up_at).min().map(|at| at + wait);
     }
 
     /// Lets a peer prove itself anew before it is handed the lead.
@@ -160,9 +178,14 @@ impl Peers {
             .filter_map(|(name, peer)| Some((name, peer.standing?)))
     }
 
-    /// The leader's successors: heard lately and fit, the best first.
+    /// The leader's successors: heard lately and fit, the best first. Who was given up has to have been heard within the
+    /// beats that a standby may miss: the membership may hear less than the election does.
     pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
-        let mut fit: Vec<_> = self.candidates(now).filter(|(name, _)| self.hears(name, now)).collect();
+        let silence = self.patience / 4;
+        let given_up =
+            |name: &NodeName| self.table[name].given_up_at.is_some() && !self.heard_since(name, now - silence);
+        let mut fit: Vec<_> =
+            self.candidates(now).filter(|(name, _)| self.hears(name, now) && !given_up(name)).collect();
         fit.sort_by_key(|&(name, standing)| (standing.class(), standing.load, name.clone()));
         fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
     }

@@ -47,7 +47,7 @@ pub enum Input {
     },
     /// What [`Effect::Prepare`] asked for is done.
     Prepared,
-    /// The node is about to stop: a leader resigns.
+    /// The node is about to stop: a leader resigns, a follower tells its leader that it is no candidate any more.
     Leave,
 }
 

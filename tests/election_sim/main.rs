@@ -182,6 +182,40 @@ fn a_leader_without_broker_abdicates() {
     });
 }
 
+/// Whoever is named standby and leaves, or is killed, is not named for long, and no message goes to it for ever.
+#[test]
+fn a_standby_that_is_gone_is_not_named() {
+    for_seeds(seeds() / 10, |seed| {
+        for (fault, patience) in [(Fault::Leave as fn(usize) -> Fault, 60 * MS), (unseen_kill, 950 * MS)] {
+            let mut world = cell(seed);
+            world.nodes[1].config.role = Role::Auto;
+            start_all(&mut world);
+            check(&mut world, seed, |world| {
+                world.run_for(9 * SECOND);
+                let leader = world.leaders()[0];
+                let standby = |world: &World, of: usize| {
+                    let named = world.nodes[of].election.as_ref()?.standby()?.clone();
+                    world.nodes.iter().position(|node| node.name == named)
+                };
+                let Some(gone) = standby(world, leader) else { return Ok(()) };
+                world.plan(0, fault(gone));
+                world.run_for(patience);
+                for (index, node) in world.alive() {
+                    ensure(standby(world, index) != Some(gone), &format!("{} still names it", node.name))?;
+                }
+                world.run_for(SECOND);
+                let sent = world.packets_to(gone);
+                world.run_for(6 * SECOND);
+                ensure(world.packets_to(gone) == sent, "it is still spoken to")
+            });
+        }
+    });
+}
+
+fn unseen_kill(node: usize) -> Fault {
+    Fault::Kill { node, seen: false }
+}
+
 fn keeps_its_leader(lateness: u64, loss_percent: u64) {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);

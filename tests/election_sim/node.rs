@@ -13,6 +13,8 @@ pub(crate) enum Fault {
     Start(usize),
     /// The process ends; others see broken connections and a refusing port when told so, else only silence.
     Kill { node: usize, seen: bool },
+    /// The process is stopped in good order; its own word is the first that others hear of it.
+    Leave(usize),
     /// The process does nothing for so many µs.
     Pause { node: usize, micros: u64 },
     /// The node's clock is set by so many µs.
@@ -71,6 +73,7 @@ pub(crate) struct Node {
     pub(crate) publishing: Option<(Epoch, u64)>,
     pub(crate) gate: EpochGate,
     pub(crate) known: BTreeSet<usize>,
+    pub(crate) packets: u64,
 }
 
 impl Node {
@@ -90,6 +93,7 @@ impl Node {
             publishing: None,
             gate: EpochGate::default(),
             known: BTreeSet::new(),
+            packets: 0,
         }
     }
 

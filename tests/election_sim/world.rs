@@ -165,6 +165,10 @@ impl World {
         match *fault {
             Fault::Start(index) => self.start(index),
             Fault::Kill { node, seen } => self.kill(node, seen),
+            Fault::Leave(node) => {
+                self.handle(node, Input::Leave);
+                self.kill(node, false);
+            }
             Fault::Pause { node, micros } => {
                 self.nodes[node].paused_until = self.now + micros;
                 self.push(micros, Event::Resume { to: node });
@@ -241,6 +245,11 @@ impl World {
         self.push(100 * MS, Event::Gossip);
     }
 
+    /// How many packets were sent to a node, there or not.
+    pub(crate) fn packets_to(&self, index: usize) -> u64 {
+        self.nodes[index].packets
+    }
+
     /// Whether a connection between two nodes works, which needs both directions.
     pub(crate) fn linked(&self, a: usize, b: usize) -> bool {
         !self.cuts.contains(&(a, b)) && !self.cuts.contains(&(b, a))
@@ -300,6 +309,7 @@ impl World {
     fn send(&mut self, from: usize, to: &NodeName, message: &ElectionMessage) {
         self.packets += 1;
         let Some(to) = self.nodes.iter().position(|node| node.name == *to) else { return };
+        self.nodes[to].packets += 1;
         if self.cuts.contains(&(from, to)) || self.random.chance(self.loss_percent) {
             return;
         }

@@ -221,6 +221,7 @@ impl ObserverArguments {
             config.camera = None;
         }
         (config.membership.advertise, config.state_dir, config.map_log) = (None, None, None);
+        config.dashboard.listen = None;
         Ok(config)
     }
 }
@@ -236,5 +237,25 @@ async fn input_ended() {
     });
     if end.await.is_err() {
         std::future::pending::<()>().await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_observer_leaves_the_addresses_in_the_file_to_the_node_they_are_for() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("node.toml");
+        let text =
+            "name = \"euclid\"\n[dashboard]\nlisten = \"127.0.0.1:8080\"\n[membership]\nbind = \"127.0.0.1:17884\"\n";
+        std::fs::write(&path, text).unwrap();
+        let arguments =
+            ObserverArguments { config: Some(path), name: None, cell: None, broker: None, seeds: Vec::new() };
+        let Ok(config) = arguments.load("recorder") else { panic!("the configuration is valid") };
+        assert_eq!(config.dashboard.listen, None);
+        assert_eq!(config.membership.bind.map(|bind| bind.port()), Some(0));
+        assert!(config.name.unwrap().as_str().starts_with("recorder-"));
     }
 }

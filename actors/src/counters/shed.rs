@@ -17,6 +17,9 @@ pub enum ShedReason {
 }
 
 impl ShedReason {
+    /// All reasons.
+    pub const ALL: [Self; 3] = [Self::BrokerThrottled, Self::ReportThrottled, Self::ReportReplaced];
+
     /// The reason as a counter's label.
     pub fn as_str(self) -> &'static str {
         match self {
@@ -66,6 +69,15 @@ impl Shedding {
         }
     }
 
+    /// How much was left out for each reason, whoever sent it; zeros are left in.
+    pub(super) fn sums(&self) -> BTreeMap<&'static str, u64> {
+        let mut sums: BTreeMap<_, _> = ShedReason::ALL.map(|reason| (reason.as_str(), 0)).into();
+        for ((reason, _), times) in &*self.counts() {
+            *sums.entry(reason.as_str()).or_default() += times;
+        }
+        sums
+    }
+
     pub(super) fn snapshot(&self) -> Vec<Shed> {
         let shed = |((reason, source), times): (&(ShedReason, String), &u64)| Shed {
             reason: *reason,
@@ -97,5 +109,7 @@ mod tests {
         assert_eq!(snapshot.iter().map(|shed| shed.times).sum::<u64>(), 4 * MAX_SOURCES as u64);
         let others = snapshot.iter().find(|shed| shed.source == OTHERS).unwrap();
         assert_eq!(others.times, 2 * MAX_SOURCES as u64);
+        let sums = shedding.sums();
+        assert_eq!((sums["report_throttled"], sums["report_replaced"]), (4 * MAX_SOURCES as u64, 0));
     }
 }

@@ -4,10 +4,11 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{NodeStatus, ObjectReport, ReportKind};
+use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind};
 use serde::Serialize;
 
 use crate::gateway::Incoming;
@@ -24,7 +25,7 @@ pub struct Feed {
 #[derive(Debug, Default)]
 struct Held {
     sightings: BTreeMap<(NodeName, ReportKind), Sighting>,
-    statuses: BTreeMap<NodeName, Arc<NodeStatus>>,
+    statuses: BTreeMap<NodeName, (Timestamp, Arc<NodeStatus>)>,
 }
 
 /// A vehicle's latest report of a kind.
@@ -39,8 +40,12 @@ pub struct Sighting {
     pub report: Arc<ObjectReport>,
 }
 
-/// Most vehicles and most nodes that are kept; further ones are not shown.
+/// Most vehicles and most nodes that are kept. Further ones are shown in place of vehicles that have been silent, and of
+/// nodes that are offline or, if none is, spoke longest ago.
 pub const MAX_SHOWN: usize = 256;
+
+/// From when on a vehicle that does not report gives way to another.
+const SILENCE: Duration = Duration::from_secs(10);
 
 impl Feed {
     /// Notes what came in or was published by this node.
@@ -49,9 +54,18 @@ impl Feed {
             Incoming::Report { kind, report } => {
                 self.reports[*kind as usize].fetch_add(1, Relaxed);
                 let sighting = Sighting { kind: *kind, received_at, report: Arc::clone(report) };
-                put(&mut self.held().sightings, (report.node.clone(), *kind), sighting);
+                put(&mut self.held().sightings, (report.node.clone(), *kind), sighting, |held| {
+                    let (key, oldest) = held.iter().min_by_key(|(_, old)| old.received_at)?;
+                    (received_at.since(oldest.received_at) > SILENCE).then(|| key.clone())
+                });
             }
-            Incoming::Status(status) => put(&mut self.held().statuses, status.node.clone(), Arc::clone(status)),
+            Incoming::Status(status) => {
+                let told = (received_at, Arc::clone(status));
+                put(&mut self.held().statuses, status.node.clone(), told, |held| {
+                    let rank = |(at, status): &(Timestamp, Arc<NodeStatus>)| (status.state != NodeState::Offline, *at);
+                    held.iter().min_by_key(|(_, told)| rank(told)).map(|(name, _)| name.clone())
+                });
+            }
             _ => {}
         }
     }
@@ -79,7 +93,7 @@ impl Feed {
 
     /// What nodes said of themselves last.
     pub(super) fn statuses(&self) -> BTreeMap<NodeName, Arc<NodeStatus>> {
-        self.held().statuses.clone()
+        self.held().statuses.iter().map(|(name, (_, status))| (name.clone(), Arc::clone(status))).collect()
     }
 
     fn held(&self) -> MutexGuard<'_, Held> {
@@ -87,7 +101,14 @@ impl Feed {
     }
 }
 
-fn put<K: Ord, T>(held: &mut BTreeMap<K, T>, key: K, value: T) {
+/// Keeps a value; where there is no room, in place of the one that `gives_way` names.
+fn put<K: Ord, T>(held: &mut BTreeMap<K, T>, key: K, value: T, gives_way: impl FnOnce(&BTreeMap<K, T>) -> Option<K>) {
+    if held.len() >= MAX_SHOWN
+        && !held.contains_key(&key)
+        && let Some(oldest) = gives_way(held)
+    {
+        held.remove(&oldest);
+    }
     if held.len() < MAX_SHOWN || held.contains_key(&key) {
         held.insert(key, value);
     }
@@ -103,6 +124,9 @@ pub(super) fn kind_label(kind: ReportKind) -> &'static str {
 
 #[cfg(test)]
 mod tests {
+    use ecod::wire::Role;
+    use uuid::Uuid;
+
     use super::*;
 
     fn report(node: &str, seq: u64) -> Incoming {
@@ -126,5 +150,26 @@ mod tests {
         assert_eq!(feed.reports(ReportKind::Detections), 4 + 2 * MAX_SHOWN as u64);
         feed.note(&report("gauss", 1), Timestamp(5));
         assert_eq!(feed.sightings_since(Timestamp(5)).len(), 1, "there is room when old ones are forgotten");
+    }
+
+    #[test]
+    fn nodes_that_left_and_vehicles_that_fell_silent_give_way() {
+        let feed = Feed::default();
+        let status = |node: String, state| {
+            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
+            Incoming::Status(Arc::new(NodeStatus { state, ..starting }))
+        };
+        for n in 0..MAX_SHOWN {
+            let state = if n % 2 == 0 { NodeState::Following } else { NodeState::Offline };
+            feed.note(&status(format!("node-{n}"), state), Timestamp(n as u64));
+            feed.note(&report(&format!("node-{n}"), 1), Timestamp(n as u64));
+        }
+        let later = Timestamp(0) + SILENCE * 2;
+        feed.note(&status("late".into(), NodeState::Following), later);
+        feed.note(&report("late", 1), later);
+        let statuses = feed.statuses();
+        let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
+        assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
+        assert_eq!((statuses.len(), feed.sightings_since(later).len()), (MAX_SHOWN, 1));
     }
 }

@@ -60,6 +60,21 @@ pub(super) fn gossip(config: &NodeConfig) -> Option<Finding> {
     })
 }
 
+/// The addresses of the dashboard and of the log's live server, where they are wanted.
+pub(super) fn pages(config: &NodeConfig) -> Vec<Finding> {
+    #[cfg(feature = "foxglove")]
+    let live = config.record.as_ref().and_then(|record| record.live_port);
+    #[cfg(not(feature = "foxglove"))]
+    let live: Option<u16> = None;
+    let live = live.map(|port| ("live port", SocketAddr::from(([127, 0, 0, 1], port)), "record.live_port"));
+    let page = config.dashboard.listen.map(|address| ("dashboard", address, "dashboard.listen"));
+    let look = |(check, address, key)| match TcpListener::bind(address) {
+        Ok(_) => Finding::fine(check, format!("{address} is free")),
+        Err(error) => not_bound(check, address, &error, key),
+    };
+    page.into_iter().chain(live).map(look).collect()
+}
+
 fn not_bound(check: &'static str, address: SocketAddr, error: &io::Error, key: &str) -> Finding {
     let fix = match error.kind() {
         io::ErrorKind::AddrNotAvailable => format!("set `{key}` to an address of this machine, or 0.0.0.0 for all"),

@@ -1,8 +1,9 @@
 //! From what happens in a node to the election's inputs, and from its effects to the node's parts.
 
 mod effects;
+mod members;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -35,7 +36,13 @@ pub struct ElectionDriver {
     terms: TermWriter,
     round_period: Duration,
     members: BTreeMap<NodeName, Member>,
+    /// Members on other machines, which do not reach a broker on this one's loopback.
+    elsewhere: BTreeSet<NodeName>,
+    /// Nodes that the membership gave up a moment ago, their brokers, and until when those may prove them gone.
+    departed: BTreeMap<NodeName, (BrokerAddress, Timestamp)>,
     all_members: watch::Receiver<Vec<Member>>,
+    /// Since when the membership does not know of a member: it was started anew.
+    missing_since: Option<Timestamp>,
     own_broker: watch::Receiver<Option<SocketAddr>>,
     monitor: HealthMonitor,
     health: Health,
@@ -43,6 +50,7 @@ pub struct ElectionDriver {
     /// The last living run of each node, as brokers tell it.
     runs: HashMap<NodeName, Uuid>,
     status: NodeStatus,
+    told_out_of_reach: bool,
     /// Whether the gateway knows the status.
     status_told: bool,
     /// The epoch of the last round, which a node without word from the election says it follows.
@@ -88,14 +96,20 @@ impl ElectionDriver {
         let LeaderElectionArguments { config, status, term_file, plane, parts, leadership, term, counters, .. } =
             arguments;
         let (name, role) = (status.node.clone(), config.role);
+        // A run of this actor before may have led in the term of the watch, and there may be no disk that tells.
+        let told = leadership.borrow().epoch.as_ref().map_or(0, |epoch| epoch.term.saturating_add(1));
+        let least_term = saved_term(term_file.as_ref()).max(told);
         Self {
-            election: Election::new(config, name.clone(), saved_term(term_file.as_ref()), clock::now()),
+            election: Election::new(config, name.clone(), least_term, clock::now()),
             name,
             role,
             terms: TermWriter::new(term_file),
             round_period: arguments.round_period,
             members: BTreeMap::new(),
+            elsewhere: BTreeSet::new(),
+            departed: BTreeMap::new(),
             all_members: arguments.members,
+            missing_since: None,
             own_broker: arguments.own_broker,
             monitor: HealthMonitor::default(),
             health: Health::default(),
@@ -103,6 +117,7 @@ impl ElectionDriver {
             runs: HashMap::new(),
             taken: status.aggregator.clone().map(|aggregator| Epoch::new(status.epoch, aggregator)),
             status,
+            told_out_of_reach: false,
             status_told: false,
             preparing: None,
             parts,
@@ -120,12 +135,12 @@ impl ElectionDriver {
         match event {
             MembershipEvent::Alive { member } => self.meet(member).await,
             MembershipEvent::Changed { member } => {
-                self.members.insert(member.name.clone(), member);
-                Ok(())
+                self.place(member);
+                self.update_health().await
             }
             MembershipEvent::Suspected { name } => self.feed(Input::PeerSuspected { peer: name }).await,
             MembershipEvent::Down { name } => {
-                self.members.remove(&name);
+                self.part_with(&name);
                 self.feed(Input::PeerDown { peer: name }).await
             }
             MembershipEvent::Received { from, payload, .. } => match ElectionMessage::decode(&payload) {
@@ -156,8 +171,7 @@ impl ElectionDriver {
         self.update_health().await?;
         // A broker that belongs to no node says nothing about any.
         if gone && self.routes.plane().external.as_ref() != Some(broker) {
-            let at = |member: &&Member| member.broker.map(BrokerAddress::from).as_ref() == Some(broker);
-            for peer in self.members.values().filter(at).map(|member| member.name.clone()).collect::<Vec<_>>() {
+            for peer in self.nodes_at(broker) {
                 tracing::info!(%peer, %broker, "process is gone");
                 self.feed(Input::PeerGone { peer }).await?;
             }
@@ -223,8 +237,12 @@ impl ElectionDriver {
             health::probe(&self.parts, self.myself.clone());
             self.update_health().await?;
         }
-        // Events from before this actor's start went nowhere.
+        // Events from before this actor's start went nowhere, nor does a membership started anew tell of whom it lost.
         let members = self.all_members.borrow().clone();
+        for peer in self.long_missing(&members) {
+            self.part_with(&peer);
+            self.feed(Input::PeerDown { peer }).await?;
+        }
         for member in members {
             if self.members.get(&member.name).is_none_or(|known| known.run != member.run) {
                 self.meet(member).await?;
@@ -268,15 +286,7 @@ impl ElectionDriver {
 
     /// Makes links, status, watch and timer what the election says now.
     pub(super) fn reflect(&mut self) {
-        let leadership = Leadership::of(&self.election, &self.name);
-        if *self.leadership.borrow() != leadership {
-            let Leadership { position, epoch, standby } = &leadership;
-            let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
-            tracing::info!(?position, epoch, standby, "leadership");
-            self.leadership.send_replace(leadership.clone());
-        }
-        let term = self.election.term();
-        self.term.send_if_modified(|known| std::mem::replace(known, term) != term);
+        let leadership = self.tell_leadership();
         self.reflect_links(&leadership);
         self.reflect_status(&leadership);
         let due = self.election.next_deadline();
@@ -284,6 +294,20 @@ impl ElectionDriver {
             self.alarm = due;
             self.set_timer(due.since(clock::now()));
         }
+    }
+
+    /// Makes the watch what the election says now.
+    fn tell_leadership(&self) -> Leadership {
+        let term = self.election.term();
+        self.term.send_if_modified(|known| std::mem::replace(known, term) != term);
+        let leadership = Leadership::of(&self.election, &self.name);
+        if *self.leadership.borrow() != leadership {
+            let Leadership { position, epoch, standby } = &leadership;
+            let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
+            tracing::info!(?position, epoch, standby, "leadership");
+            self.leadership.send_replace(leadership.clone());
+        }
+        leadership
     }
 
     fn reflect_links(&mut self, leadership: &Leadership) {
@@ -323,14 +347,16 @@ impl ElectionDriver {
 
     async fn meet(&mut self, member: Member) -> Result<(), ActorProcessingErr> {
         let peer = member.name.clone();
-        self.members.insert(peer.clone(), member);
-        self.feed(Input::PeerAlive { peer }).await
+        self.place(member);
+        self.feed(Input::PeerAlive { peer }).await?;
+        self.update_health().await
     }
 
     async fn update_health(&mut self) -> Result<(), ActorProcessingErr> {
         let (plane, brokers) = (self.routes.plane(), self.routes.brokers());
         let health = self.monitor.health(plane, brokers, self.round_period, clock::now());
-        self.set_health(health).await
+        let is_reached = self.is_reached();
+        self.set_health(Health { broker: health.broker && is_reached, ..health }).await
     }
 
     async fn set_health(&mut self, health: Health) -> Result<(), ActorProcessingErr> {

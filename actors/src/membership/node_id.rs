@@ -7,6 +7,7 @@ use ecod::wire::Role;
 use serde::{Deserialize, Serialize};
 
 use super::Member;
+use super::socket::is_of_this_machine;
 
 /// A node at one time of its life. Of two with one name, the one with the later `life` is believed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -23,11 +24,14 @@ pub(super) struct NodeId {
 }
 
 impl NodeId {
-    /// The node as others are told, where it is seen at `address`.
+    /// The node as others are told, where it is seen at `address`. A broker on another machine's loopback is none: there,
+    /// this machine would find its own.
     pub(super) fn member(&self, address: Option<SocketAddr>) -> Member {
         let gossip = address.unwrap_or(self.gossip);
         let reached = |ip: IpAddr| if ip.is_unspecified() { gossip.ip() } else { ip };
-        let broker = self.broker.map(|broker| SocketAddr::new(reached(broker.ip()), broker.port()));
+        let is_near = |broker: &SocketAddr| !broker.ip().is_loopback() || is_of_this_machine(gossip.ip());
+        let broker = self.broker.filter(is_near);
+        let broker = broker.map(|broker| SocketAddr::new(reached(broker.ip()), broker.port()));
         Member { name: self.name.clone(), run: self.run, gossip, broker, role: self.role }
     }
 }
@@ -46,5 +50,27 @@ impl foca::Identity for NodeId {
 
     fn win_addr_conflict(&self, adversary: &Self) -> bool {
         self.life > adversary.life
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_broker_on_the_loopback_of_another_machine_is_none() {
+        let id = |gossip: &str| NodeId {
+            name: NodeName::from_static("euclid"),
+            run: 1,
+            life: 1,
+            role: Role::Auto,
+            gossip: gossip.parse().unwrap(),
+            broker: Some("127.0.0.1:1883".parse().unwrap()),
+        };
+        // An address of nobody: reserved for documentation.
+        assert_eq!(id("192.0.2.7:17884").member(None).broker, None);
+        assert_eq!(id("127.0.0.1:17884").member(None).broker, id("127.0.0.1:17884").broker, "this machine's");
+        let open = NodeId { broker: Some("0.0.0.0:1883".parse().unwrap()), ..id("192.0.2.7:17884") };
+        assert_eq!(open.member(None).broker, Some("192.0.2.7:1883".parse().unwrap()));
     }
 }

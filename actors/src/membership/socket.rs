@@ -2,6 +2,7 @@
 
 use std::io::{self, ErrorKind};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::sync::OnceLock;
 
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::net::UdpSocket;
@@ -11,7 +12,7 @@ use super::config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
 /// The node's end of the gossip.
 pub(super) struct GossipSocket {
     own: UdpSocket,
-    group: Option<(UdpSocket, SocketAddr)>,
+    group: OnceLock<(UdpSocket, SocketAddr)>,
     address: SocketAddr,
 }
 
@@ -24,7 +25,7 @@ pub struct BindError {
 }
 
 impl GossipSocket {
-    /// Opens the sockets. Without multicast, should it not be possible here, seeds have to do.
+    /// Opens the node's own socket.
     pub(super) fn bind(config: &MembershipConfig) -> Result<Self, BindError> {
         let own = match config.bind {
             Some(address) => open(address),
@@ -32,11 +33,16 @@ impl GossipSocket {
         }?;
         let failed = |source| BindError { address: config.bind.unwrap_or(UNKNOWN), source };
         let address = own.local_addr().map_err(failed)?;
-        let group = join(&config.multicast, &own, address).unwrap_or_else(|error| {
-            tracing::warn!(%error, group = %config.multicast.group, "no discovery by multicast");
-            None
-        });
-        Ok(Self { own: UdpSocket::from_std(own).map_err(failed)?, group, address })
+        Ok(Self { own: UdpSocket::from_std(own).map_err(failed)?, group: OnceLock::new(), address })
+    }
+
+    /// Joins the multicast group, if there is to be one. Without it, seeds have to do.
+    pub(super) fn join(&self, config: &MulticastConfig) -> io::Result<()> {
+        if let Some(group) = join(config, &self.own, self.address)? {
+            // It is joined once.
+            let _ = self.group.set(group);
+        }
+        Ok(())
     }
 
     /// Where the node gossips; the address may be unspecified.
@@ -46,7 +52,7 @@ impl GossipSocket {
 
     /// Waits until a datagram can be taken.
     pub(super) async fn readable(&self) -> io::Result<()> {
-        match &self.group {
+        match self.group.get() {
             None => self.own.readable().await,
             Some((group, _)) => tokio::select! {
                 ready = self.own.readable() => ready,
@@ -57,7 +63,7 @@ impl GossipSocket {
 
     /// Takes a datagram that waits.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Option<(usize, SocketAddr)> {
-        let sockets = [Some(&self.own), self.group.as_ref().map(|(group, _)| group)];
+        let sockets = [Some(&self.own), self.group.get().map(|(group, _)| group)];
         sockets.into_iter().flatten().find_map(|socket| socket.try_recv_from(buffer).ok())
     }
 
@@ -68,8 +74,13 @@ impl GossipSocket {
 
     /// Sends a datagram to the group, if there is one.
     pub(super) fn multicast(&self, frame: &[u8]) -> Option<io::Result<()>> {
-        self.group.as_ref().map(|(_, group)| self.send(frame, *group))
+        self.group.get().map(|(_, group)| self.send(frame, *group))
     }
+}
+
+/// Whether an address is this machine's own: one can listen there.
+pub(crate) fn is_of_this_machine(ip: IpAddr) -> bool {
+    ip.is_loopback() || ip.is_unspecified() || std::net::UdpSocket::bind((ip, 0)).is_ok()
 }
 
 /// Room for what comes in while the node is held up.
@@ -96,11 +107,7 @@ fn open(address: SocketAddr) -> Result<std::net::UdpSocket, BindError> {
     open().map_err(|source| BindError { address, source })
 }
 
-fn join(
-    config: &MulticastConfig,
-    own: &std::net::UdpSocket,
-    address: SocketAddr,
-) -> io::Result<Option<(UdpSocket, SocketAddr)>> {
+fn join(config: &MulticastConfig, own: &UdpSocket, address: SocketAddr) -> io::Result<Option<(UdpSocket, SocketAddr)>> {
     let IpAddr::V4(ip) = address.ip() else { return Ok(None) };
     if !config.enabled {
         return Ok(None);
@@ -119,4 +126,21 @@ fn join(
     socket.bind(&group.into())?;
     socket.join_multicast_v4(&config.group, &interface)?;
     Ok(Some((UdpSocket::from_std(socket.into())?, group)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_group_that_could_not_be_joined_is_joined_later() {
+        let bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+        let socket = GossipSocket::bind(&MembershipConfig { bind, ..MembershipConfig::default() }).unwrap();
+        // An interface of nobody: reserved for documentation.
+        let absent = MulticastConfig { interface: Some(Ipv4Addr::new(192, 0, 2, 7)), ..MulticastConfig::default() };
+        assert!(socket.join(&absent).is_err());
+        assert!(socket.multicast(b"hello").is_none());
+        socket.join(&MulticastConfig::default()).unwrap();
+        assert!(socket.multicast(b"hello").is_some());
+    }
 }

@@ -25,7 +25,7 @@ use crate::follower::{Follower, Newest};
 use crate::fuser::{Fuser, Intake};
 use crate::gateway::{Gateway, Security};
 use crate::leader_election::{LeaderElection, LeaderElectionMessage, Leadership};
-use crate::membership::{FrameCounters, Member, Membership, MembershipMessage};
+use crate::membership::{BindError, FrameCounters, Member, Membership, MembershipMessage};
 use crate::recorder::{Recorder, Recording};
 use crate::reputation_keeper::{ReputationKeeper, SharedBook};
 use crate::seat::Seat;
@@ -65,7 +65,7 @@ pub(super) struct Assembly {
 /// How long a part may take to stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// How often, and how far apart, a broker started anew tries to get its address back.
+/// How often, and how far apart, a broker or membership started anew tries to get its address back.
 const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
@@ -276,9 +276,18 @@ impl Assembly {
         EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
     }
 
+    /// The membership comes back at the address it had, as the broker does.
     async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let (actor, _) =
-            Actor::spawn_linked(None, Membership, self.membership_arguments(), supervisor).await.map_err(cause)?;
+        let mut attempts = if self.gossip_address.borrow().is_some() { REBIND_ATTEMPTS } else { 1 };
+        let actor = loop {
+            attempts -= 1;
+            let arguments = self.membership_arguments();
+            match Actor::spawn_linked(None, Membership, arguments, supervisor.clone()).await.map_err(cause) {
+                Ok((actor, _)) => break actor,
+                Err(error) if attempts > 0 && error.is::<BindError>() => tokio::time::sleep(REBIND_WAIT).await,
+                Err(error) => return Err(error),
+            }
+        };
         let address = ractor::call!(actor, |reply| MembershipMessage::Address { reply })?;
         self.gossip_address.send_replace(Some(address));
         let id = actor.get_id();

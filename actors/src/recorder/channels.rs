@@ -159,6 +159,9 @@ pub struct CounterReading {
     pub events: BTreeMap<String, u64>,
     /// Payloads that were not used, by reason.
     pub rejects: BTreeMap<String, u64>,
+    /// What was left out under overload, by reason; none in logs of earlier versions.
+    #[serde(default)]
+    pub shed: BTreeMap<String, u64>,
 }
 
 #[cfg(test)]

@@ -22,11 +22,7 @@ const NAMES_A_SECOND: u32 = 1000;
 /// What the operating system said, and when there is less room than `min_free` bytes.
 pub(super) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) -> io::Result<(PathBuf, File)> {
     fs::create_dir_all(dir)?;
-    let free = free_bytes(dir)?;
-    if free < min_free {
-        let message = format!("{} MB are free and `record.min_free_mb` is {}", free / 1_000_000, min_free / 1_000_000);
-        return Err(io::Error::new(io::ErrorKind::StorageFull, message));
-    }
+    check_room(dir, min_free)?;
     let seconds = i64::try_from(at.micros() / 1_000_000).unwrap_or_default();
     let time = DateTime::from_timestamp(seconds, 0).unwrap_or_default().format("%Y%m%dT%H%M%SZ");
     for number in 0..NAMES_A_SECOND {
@@ -37,6 +33,19 @@ pub(super) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) 
         }
     }
     Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{NAMES_A_SECOND} files began in the same second")))
+}
+
+/// Whether there is room for a log.
+///
+/// # Errors
+/// What the operating system said, and when there is less room than `min_free` bytes.
+pub(super) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
+    let free = free_bytes(dir)?;
+    if free < min_free {
+        let message = format!("{} MB are free and `record.min_free_mb` is {}", free / 1_000_000, min_free / 1_000_000);
+        return Err(io::Error::new(io::ErrorKind::StorageFull, message));
+    }
+    Ok(())
 }
 
 /// Bytes that programs without privileges may still write where `dir` is.

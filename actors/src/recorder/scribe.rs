@@ -89,7 +89,8 @@ impl Scribe {
             Item::Counters(snapshot) => {
                 let named = |counts: &BTreeMap<&str, u64>| counts.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect();
                 let (events, rejects) = (named(&snapshot.events), named(&snapshot.rejects));
-                let reading = CounterReading { node: self.node.clone(), at_us: at, events, rejects };
+                let shed = named(&snapshot.shed);
+                let reading = CounterReading { node: self.node.clone(), at_us: at, events, rejects, shed };
                 self.put(SchemaName::Counters, "node/counters", at, at, &reading, to)
             }
             Item::Picture(jpeg) => self.picture(jpeg, at, to),

@@ -144,6 +144,11 @@ impl LogWriter {
             Ok(bytes) => bytes >= self.config.max_file_bytes() || file.opened().elapsed() >= self.config.max_file_age(),
             Err(error) => return self.failed(&error),
         };
+        if let Err(error) = disk::check_room(&self.config.dir, self.config.min_free_bytes()) {
+            // All that was taken is in the file: it only has to end.
+            let ended = self.file.take().map_or(Ok(()), LogFile::finish);
+            return self.failed(&ended.err().unwrap_or(error.into()));
+        }
         if is_full && let Some(Err(error)) = self.file.take().map(LogFile::finish) {
             self.failed(&error);
         }
@@ -169,5 +174,40 @@ impl LogWriter {
             };
             tracing::warn!(%directory, error, "not recording, the node goes on; tried again every {RETRY_AFTER:?}");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ecod::names::NodeName;
+    use ecod::time::Timestamp;
+    use uuid::Uuid;
+
+    use super::*;
+    use crate::config::NodeConfig;
+    use crate::counters::Counters;
+    use crate::recorder::{LogReader, files};
+
+    #[test]
+    fn a_disk_that_fills_up_while_a_file_is_written_ends_the_file_in_order() {
+        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let config = RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path()) };
+        let identity = Identity::of(&NodeConfig::default(), &NodeName::from_static("cav"), Uuid::nil());
+        let mut writer = LogWriter::new(config, identity, Recording::new(Arc::clone(&counters)));
+        let entry = |ms: u64| Entry { at: Timestamp(ms * 1000), item: Item::Counters(counters.snapshot()) };
+        writer.take(&entry(1));
+        writer.flush();
+        assert_eq!(counters.events(Event::RecordFailed), 0);
+        writer.config.min_free_mb = 1_000_000_000;
+        writer.take(&entry(2));
+        writer.flush();
+        writer.take(&entry(3));
+        let [recorded, failed, dropped] = [Event::Recorded, Event::RecordFailed, Event::RecordDropped];
+        assert_eq!([recorded, failed, dropped].map(|event| counters.events(event)), [2, 1, 1]);
+        let path = &files(directory.path()).unwrap()[0];
+        let read = LogReader::open(path).unwrap().collect::<Result<Vec<_>, _>>().unwrap();
+        assert!(read.len() >= 2, "what came before is there, and the file is whole: {}", read.len());
     }
 }

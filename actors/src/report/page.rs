@@ -37,7 +37,7 @@ pub(super) fn losses(reading: &CounterReading) -> impl Iterator<Item = (&str, u6
     let is_loss = |name: &str| LOSSES.iter().any(|event| event.as_str() == name);
     let events = reading.events.iter().filter(move |(name, _)| is_loss(name));
     let rejects = reading.rejects.iter().filter(|(name, _)| *name != "out_of_order");
-    events.chain(rejects).map(|(name, times)| (name.as_str(), *times))
+    events.chain(rejects).chain(&reading.shed).map(|(name, times)| (name.as_str(), *times))
 }
 
 /// Writes the page.

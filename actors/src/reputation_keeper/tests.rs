@@ -1,5 +1,7 @@
 //! Evidence of others: whose is taken, and what it costs.
 
+mod healing;
+
 use std::net::{Ipv4Addr, SocketAddr};
 
 use ecod::reputation::MAX_LANES;
@@ -13,6 +15,10 @@ fn name(name: &str) -> NodeName {
     NodeName::new(name).unwrap()
 }
 
+fn member(node: &str, role: Role) -> Member {
+    Member { name: name(node), run: 1, gossip: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)), broker: None, role }
+}
+
 /// The keeper of `euclid`, which follows `edge` in term 7 and has led before.
 struct Scene {
     keeper: ReputationKeeperState,
@@ -23,9 +29,8 @@ struct Scene {
 impl Scene {
     async fn new() -> Self {
         let (gateway, published) = listening::seat().await;
-        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, 1));
-        let member = |(node, role)| Member { name: name(node), run: 1, gossip: address, broker: None, role };
-        let members = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)].map(member).to_vec();
+        let roles = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)];
+        let members = roles.map(|(node, role)| member(node, role)).to_vec();
         let epoch = Some(Epoch::new(7, name("edge")));
         let leadership = Leadership { position: Position::Following, epoch, standby: None };
         let counters = Arc::<Counters>::default();

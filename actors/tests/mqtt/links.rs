@@ -162,3 +162,20 @@ async fn a_restarted_embedded_broker_is_found_again() {
         assert_eq!(edge.next_report().await, (name("euclid"), seq));
     }
 }
+
+#[tokio::test]
+async fn an_observer_takes_reports_whoever_stops_looking_at_them() {
+    let (_broker, address) = embedded();
+    let mut observer = Node::join("recorder", Part::Observer, MqttConfig::default(), &[&address]).await;
+    let euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    settle(&mut observer, &euclid).await;
+    for wanted in [true, false] {
+        observer.send(GatewayMessage::WatchReports { wanted });
+    }
+    // What was unsubscribed would be so before a message that is sent on the same connection later returns.
+    let before = observer.counters.events(Event::Echo);
+    observer.send(GatewayMessage::PublishStatus { status: observer.status.clone() });
+    until("the status returns", || observer.counters.events(Event::Echo) > before).await;
+    euclid.report(5);
+    assert_eq!(observer.next_report().await, (name("euclid"), 5));
+}

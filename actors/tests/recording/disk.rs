@@ -32,7 +32,7 @@ impl Drop for Process {
 }
 
 /// An edge that records, started by a shell after `prelude`.
-fn edge(directory: &Path, prelude: &str) -> Process {
+pub(crate) fn edge(directory: &Path, prelude: &str) -> Process {
     let address = free_address();
     let file = directory.join("edge.toml");
     let config = config("edge", Role::Edge, Some(address), address, directory);
@@ -42,7 +42,7 @@ fn edge(directory: &Path, prelude: &str) -> Process {
     Process(Command::new("sh").args(["-c", &script]).stdout(Stdio::null()).stderr(log).spawn().unwrap())
 }
 
-fn wait_until(what: &str, directory: &Path, holds: impl Fn() -> bool) {
+pub(crate) fn wait_until(what: &str, directory: &Path, holds: impl Fn() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(30);
     while !holds() {
         let log = || std::fs::read_to_string(directory.join("edge.log")).unwrap_or_default();
@@ -51,7 +51,7 @@ fn wait_until(what: &str, directory: &Path, holds: impl Fn() -> bool) {
     }
 }
 
-fn maps(directory: &Path) -> usize {
+pub(crate) fn maps(directory: &Path) -> usize {
     if directory.exists() { Log::read(directory).count(SchemaName::GlobalMap) } else { 0 }
 }
 

@@ -106,28 +106,6 @@ fn what_is_no_log_is_refused_by_name() {
     assert!(code == 2 && said.contains("no log in"), "{said}");
 }
 
-/// The Python reader that everybody has agrees on what is in a log.
-#[test]
-fn the_python_reader_reads_a_log() {
-    let python = std::env::var("MCAP_PYTHON").unwrap_or("python3".into());
-    if !Command::new(&python).args(["-c", "import mcap"]).output().is_ok_and(|output| output.status.success()) {
-        eprintln!(
-            "SKIPPED: {python} has no package mcap; `make recording-check` installs it in a directory of its own"
-        );
-        return;
-    }
-    let folder = TempDir::new().unwrap();
-    let log = file(&folder, "log.mcap", &log(1));
-    let script = "import json, sys; from mcap.reader import make_reader\n\
-        for schema, channel, message in make_reader(open(sys.argv[1], 'rb')).iter_messages():\n \
-        print(schema.name, channel.topic, message.log_time, json.loads(message.data)['seq'])";
-    let run = Command::new(python).args(["-c", script]).arg(log).output().unwrap();
-    let said = String::from_utf8_lossy(&run.stdout).into_owned() + &String::from_utf8_lossy(&run.stderr);
-    let lines: Vec<_> = said.lines().collect();
-    assert_eq!(lines.len(), 3, "{said}");
-    assert_eq!(lines[0], "ecod.ObjectReport detections/a 1732154401000000000 1");
-}
-
 #[test]
 fn a_report_is_one_page_with_everything_in_it() {
     let folder = TempDir::new().unwrap();

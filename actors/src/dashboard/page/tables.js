@@ -116,8 +116,9 @@ const earlier = new Map();
 
 export function drops({ counters, now_us }) {
   const rejected = Object.entries(counters.rejects).map(([reason, count]) => [`rejected: ${reason.replaceAll("_", " ")}`, count]);
+  const shed = Object.entries(counters.shed).map(([reason, count]) => [`overload: ${reason.replaceAll("_", " ")}`, count]);
   const events = Object.entries(DROPS).map(([event, words]) => [words, counters.events[event] ?? 0]);
-  const all = [...rejected, ...events].filter(([, count]) => count > 0);
+  const all = [...rejected, ...shed, ...events].filter(([, count]) => count > 0);
   fill("drops", all, ([reason]) => reason, ([reason, count]) => {
     const lately = recent(reason, count, now_us);
     return [reason, n(count), { text: lately ? `+${lately}` : "–", class: lately ? "n warn" : "n dim" }];

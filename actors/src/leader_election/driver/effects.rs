@@ -28,6 +28,8 @@ impl ElectionDriver {
                     self.terms.settle(epoch.term).await;
                     tracing::info!(%epoch, first_round, ?first, "leading");
                     self.preparing = None;
+                    // The node's broker admits the first round only if it knows who leads.
+                    self.tell_leadership();
                     self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, first });
                 }
                 Effect::StopPublishing { epoch } => {

@@ -19,7 +19,7 @@ use crate::follower::{FollowerArguments, FollowerMessage};
 use crate::fuser::{FuserArguments, FuserMessage};
 use crate::gateway::{self, GatewayArguments, Incoming, Subscriber};
 use crate::leader_election::{LeaderElectionArguments, LeaderElectionMessage, Parts, Position, saved_term};
-use crate::membership::{EventSink, MembershipArguments};
+use crate::membership::{EventSink, MembershipArguments, MembershipConfig};
 use crate::node::Seats;
 use crate::readiness::{Vitals, patience};
 use crate::recorder::{Identity, RecorderArguments};
@@ -32,13 +32,15 @@ impl Assembly {
         let events: EventSink = Arc::new(move |event| {
             election.send(LeaderElectionMessage::Membership { event });
         });
+        let membership = &self.config.membership;
         MembershipArguments {
             name: self.name.clone(),
             cell: self.config.cell.clone(),
             run: clock::now().micros(),
             role: self.config.role,
             broker: *self.broker_address.borrow(),
-            config: self.config.membership.clone(),
+            // Others look for it where it was.
+            config: MembershipConfig { bind: self.gossip_address.borrow().or(membership.bind), ..membership.clone() },
             events,
             members: self.members.clone(),
             counters: self.frames(),
@@ -125,7 +127,7 @@ impl Assembly {
                 }
                 Incoming::Status(status) => {
                     recording.status(status, at);
-                    election.send(LeaderElectionMessage::TakeStatus { status: Arc::clone(status) })
+                    election.send(LeaderElectionMessage::TakeStatus { delivery })
                 }
             };
         })
