@@ -5,6 +5,7 @@ mod figures;
 use std::time::{Duration, Instant};
 
 use ecod::names::NodeName;
+use ecod::reputation::ReputationConfig;
 use ecod::time::Timestamp;
 use ecod::tracks::{Tracker, TracksConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
@@ -31,7 +32,7 @@ fn main() {
 
 /// Prints, takes and returns the least time of a round in milliseconds; the area grows with the observers.
 fn round(figures: &mut Figures, observers: u32) -> f64 {
-    let mut tracker = Tracker::new(TracksConfig::default());
+    let mut tracker = Tracker::new(TracksConfig::default(), ReputationConfig::default());
     let mut frame = 0;
     let mut times: Vec<Duration> = (0..40)
         .map(|_| {

@@ -73,16 +73,12 @@ pub struct Aggregator {
 impl Aggregator {
     /// An aggregator without evidence that does not lead; `config` is taken as valid.
     pub fn standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation: _ } = config;
+        let is_tracking = config.tracks_objects(!landmarks.is_empty());
+        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
         let by_packets = vote.mode == VoteMode::Paper;
         let vote = algorithms.vote().then(|| Vote::new(vote, landmarks.clone()));
         let tracks_open_cell = tracks.mode == TracksMode::Auto;
-        let is_tracking = match tracks.mode {
-            TracksMode::Auto => landmarks.is_empty(),
-            TracksMode::On => true,
-            TracksMode::Off => false,
-        };
-        let tracks = (algorithms.pace() && is_tracking).then(|| Tracker::new(tracks));
+        let tracks = is_tracking.then(|| Tracker::new(tracks, reputation));
         let gate_m = pace.gate_m;
         let pace = algorithms.pace().then(|| Pace::new(pace, Arc::new(LandmarkIndex::new(landmarks, gate_m))));
         Self {
@@ -261,6 +257,9 @@ impl Aggregator {
         let wanted = self.voted || pace.is_none();
         let is_due = |vote: &&mut Vote| if by_packets { vote.is_packet_complete() } else { wanted };
         let vote = self.vote.as_mut().filter(is_due).map(|vote| vote.close(now));
+        if let (Some(tracks), Some(vote)) = (&mut self.tracks, &vote) {
+            tracks.learn(&vote.evidence);
+        }
         let epoch = self.leads.clone()?;
         if pace.is_none() && vote.is_none() {
             return None;

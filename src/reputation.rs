@@ -74,6 +74,11 @@ impl ReputationConfig {
         check_range("initial_votes", self.initial_votes, 1e-3, 1e6)?;
         check_range("memory_votes", self.memory_votes, 1.0, 1e9)
     }
+
+    /// The reputation of a vehicle with so many right and wrong votes: the mean of a Beta distribution (Jøsang, Ismail 2002).
+    pub fn mean(&self, correct: f64, incorrect: f64) -> f64 {
+        (correct + self.initial * self.initial_votes) / (correct + incorrect + self.initial_votes)
+    }
 }
 
 type Vehicles = BTreeMap<NodeName, BTreeMap<Label, Counts>>;
@@ -161,8 +166,7 @@ impl ReputationLedger {
         }
         let score = |node: &NodeName| {
             let (correct, incorrect) = remembered.get(node).copied().unwrap_or_default();
-            let mean = (correct + config.initial * config.initial_votes) / (correct + incorrect + config.initial_votes);
-            mean.clamp(0.30, 1.00)
+            config.mean(correct, incorrect).clamp(0.30, 1.00)
         };
         self.totals()
             .into_iter()

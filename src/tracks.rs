@@ -29,7 +29,7 @@ use hashbrown::HashMap;
 pub use config::{TracksConfig, TracksMode};
 
 use crate::names::NodeName;
-use crate::reputation::{Evidence, ReputationLedger};
+use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{FusedObject, ObjectReport, PerceivedObject, PoseCorrection};
 use align::{Alignment, Spread};
@@ -37,7 +37,7 @@ use grid::Grid;
 use source::Source;
 use taking::Taking;
 use track::Track;
-use trust::{Fleet, Standing};
+use trust::{Fleet, Standing, Standings};
 
 /// What a round came to.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -65,11 +65,11 @@ pub struct TracksLosses {
 #[derive(Debug, Clone)]
 pub struct Tracker {
     config: TracksConfig,
+    reputation: ReputationConfig,
     /// By number; numbers of forgotten vehicles are given anew.
     sources: Vec<Option<Source>>,
     numbers: HashMap<NodeName, u32>,
-    /// What was known of vehicles before they were heard.
-    standings: BTreeMap<NodeName, Standing>,
+    standings: Standings,
     fleet: Fleet,
     /// The oldest first.
     tracks: Vec<Track>,
@@ -87,15 +87,16 @@ pub struct Tracker {
 const WIDE_M: f64 = 16.0;
 
 impl Tracker {
-    /// Knows nothing yet; `config` is taken as valid.
-    pub fn new(config: TracksConfig) -> Self {
+    /// Knows nothing yet; both are taken as valid.
+    pub fn new(config: TracksConfig, reputation: ReputationConfig) -> Self {
         Self {
+            reputation,
             near: Grid::new(config.gate_m),
             wide: Grid::new(WIDE_M.max(config.gate_m)),
             config,
             sources: Vec::new(),
             numbers: HashMap::new(),
-            standings: BTreeMap::new(),
+            standings: Standings::default(),
             fleet: Fleet::default(),
             tracks: Vec::new(),
             pending: Vec::new(),
@@ -136,13 +137,30 @@ impl Tracker {
 
     /// Starts from what a ledger knows of the vehicles.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
+        let mut known = Vec::new();
         for (node, (correct, incorrect)) in ledger.totals() {
-            let standing = Standing::new(correct, incorrect);
-            if let Some(source) = self.numbers.get(&node).and_then(|number| self.sources[*number as usize].as_mut()) {
-                source.standing = standing;
+            let standing = Standing::new(correct, incorrect, &self.reputation);
+            match self.heard(&node) {
+                Some(source) => source.standing = standing,
+                None => known.push((node, standing)),
             }
-            self.standings.insert(node, standing);
         }
+        self.standings.keep(known);
+    }
+
+    /// Takes in what VOTE has settled about vehicles that are heard.
+    pub fn learn(&mut self, evidence: &[Evidence]) {
+        let config = self.reputation.clone();
+        for Evidence { node, correct, .. } in evidence {
+            if let Some(source) = self.heard(node) {
+                source.standing.count(*correct, &config);
+            }
+        }
+    }
+
+    fn heard(&mut self, node: &NodeName) -> Option<&mut Source> {
+        let number = *self.numbers.get(node)?;
+        self.sources.get_mut(number as usize)?.as_mut()
     }
 
     /// What could not be used so far.
@@ -194,7 +212,7 @@ impl Tracker {
         if let Some(number) = self.numbers.get(node) {
             return *number;
         }
-        let standing = self.standings.get(node).copied().unwrap_or_default();
+        let standing = self.standings.of(node);
         let source = Source::new(node.clone(), at, Alignment::new(at, &self.spread()), standing, &self.config);
         let number = self.sources.iter().position(Option::is_none).unwrap_or(self.sources.len());
         if number == self.sources.len() {
@@ -207,7 +225,7 @@ impl Tracker {
 
     fn objects(&self, now: Timestamp) -> Vec<FusedObject> {
         let source = |number: u32| self.sources.get(number as usize).and_then(Option::as_ref);
-        let trust = |number: u32| source(number).map_or(0.0, Source::trust);
+        let trust = |number: u32| source(number).map_or(0.0, |source| source.trust(&self.reputation));
         let name = |number: u32| source(number).map(|source| source.node.clone());
         let objects = self.tracks.iter().map(|track| track.fused(now, &self.config, trust, name));
         objects.filter(|object| object.confidence >= self.config.min_confidence).collect()

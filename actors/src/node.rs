@@ -7,7 +7,7 @@
 //! ├─ Membership        who is there, datagrams            always
 //! ├─ Gateway           the only owner of MQTT clients     always
 //! ├─ Follower          takes maps, verdicts, reputations  always
-//! ├─ ReputationKeeper  publishes and keeps reputations    may lead, in a cell that runs VOTE
+//! ├─ ReputationKeeper  publishes and keeps reputations    may lead, in a cell that votes or tracks
 //! ├─ Fuser             closes rounds: maps and verdicts   may lead; publishes only while leading
 //! ├─ LeaderElection    who leads, and what follows        always
 //! ├─ Dashboard         page, metrics and health           if it has an address

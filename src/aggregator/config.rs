@@ -6,7 +6,7 @@ use crate::config::ConfigError;
 use crate::pace::PaceConfig;
 use crate::reputation::ReputationConfig;
 use crate::round::RoundConfig;
-use crate::tracks::TracksConfig;
+use crate::tracks::{TracksConfig, TracksMode};
 use crate::vote::VoteConfig;
 use crate::window::WindowConfig;
 
@@ -57,6 +57,21 @@ pub struct FusionConfig {
 }
 
 impl FusionConfig {
+    /// Whether objects are tracked in a cell that has known locations, or in one that has none.
+    pub fn tracks_objects(&self, has_landmarks: bool) -> bool {
+        let is_wanted = match self.tracks.mode {
+            TracksMode::Auto => !has_landmarks,
+            TracksMode::On => true,
+            TracksMode::Off => false,
+        };
+        self.algorithms.pace() && is_wanted
+    }
+
+    /// Whether rounds say anything about vehicles, in a cell that has known locations or in one that has none.
+    pub fn rates_vehicles(&self, has_landmarks: bool) -> bool {
+        self.algorithms.vote() || self.tracks_objects(has_landmarks)
+    }
+
     /// Checks all values.
     ///
     /// # Errors

@@ -11,9 +11,6 @@ use nalgebra::Vector2;
 use super::trust::SETTLED_AFTER;
 use crate::time::Timestamp;
 
-/// Log-odds of a detection of average confidence.
-pub(super) const BASE_NATS: f64 = 0.0;
-
 /// Time in seconds over which evidence fades.
 const MEMORY_S: f64 = 2.0;
 
@@ -143,7 +140,7 @@ impl Witness {
     pub(super) fn nats(&self) -> f64 {
         let confidence = if self.weight > 1e-3 {
             let worth = self.weight / (1.0 + CORRELATION * (self.weight - 1.0).max(0.0));
-            (self.score / self.weight - BASE_NATS) * worth
+            self.score / self.weight * worth
         } else {
             0.0
         };

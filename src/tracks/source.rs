@@ -11,6 +11,7 @@ use super::evidence::Rates;
 use super::trust::Standing;
 use crate::geometry::{Covariance, Pose, wrap_angle};
 use crate::names::NodeName;
+use crate::reputation::ReputationConfig;
 use crate::time::Timestamp;
 use crate::wire::{FieldOfView, ObjectReport, PerceivedObject};
 
@@ -46,8 +47,8 @@ impl Source {
     }
 
     /// Weight of its word, 0 to 1.
-    pub(super) fn trust(&self) -> f64 {
-        self.standing.trust()
+    pub(super) fn trust(&self, config: &ReputationConfig) -> f64 {
+        self.standing.trust(config)
     }
 }
 

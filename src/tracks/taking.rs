@@ -247,7 +247,8 @@ impl Tracker {
         let track = &mut self.tracks[track];
         let Some(witness) = track.witnesses.iter().position(|witness| witness.source == number) else { return };
         let Some((hits, looks)) = track.witnesses[witness].settled(at) else { return };
-        let trust = |other: u32| self.sources.get(other as usize).and_then(Option::as_ref).map_or(0.0, Source::trust);
+        let source = |number: u32| self.sources.get(number as usize).and_then(Option::as_ref);
+        let trust = |other: u32| source(other).map_or(0.0, |source| source.trust(&self.reputation));
         let others = Others::of(&track.witnesses, number, at, trust);
         let Some(word) = judge(hits, looks, &others) else { return };
         let distance_m = taking.source.view.centre().map_or(0.0, |centre| (reported - centre).norm());
@@ -258,7 +259,7 @@ impl Tracker {
             return;
         }
         let correct = word == Word::True;
-        taking.source.standing.count(correct);
+        taking.source.standing.count(correct, &self.reputation);
         self.evidence.push(Evidence { node: taking.source.node.clone(), label: track.label(), correct });
     }
 

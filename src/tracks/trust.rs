@@ -5,9 +5,12 @@
 //! along is wrong if most vehicles detect what is so far away. Where at least two of them look and agree that nothing is
 //! there, to have detected it is wrong. One word against another settles nothing.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::evidence::{BASE_NATS, Witness};
+use super::evidence::Witness;
+use crate::names::NodeName;
+use crate::reputation::ReputationConfig;
 use crate::time::Timestamp;
 
 /// Time in view after which a vehicle's word about an object is judged, and judged again.
@@ -50,7 +53,7 @@ pub(super) struct Others {
 impl Others {
     /// All but the vehicle `source`; `trust` weighs their words.
     pub(super) fn of(witnesses: &[Witness], source: u32, at: Timestamp, trust: impl Fn(u32) -> f64) -> Self {
-        let mut others = Self { nats: BASE_NATS, ..Self::default() };
+        let mut others = Self::default();
         for witness in witnesses.iter().filter(|witness| witness.source != source) {
             if at.since(witness.last_look) > SETTLED_AFTER {
                 continue;
@@ -86,35 +89,63 @@ pub(super) struct Standing {
     incorrect: f64,
 }
 
-impl Standing {
-    /// Words that are remembered.
-    const MEMORY: f64 = 200.0;
-    /// Right and wrong words that a newcomer starts with.
-    const PRIOR: f64 = 5.0;
+/// Part of a newcomer's reputation at and below which a word weighs nothing.
+const WORTHLESS: f64 = 0.6;
 
+impl Standing {
     /// So many right and wrong ones.
-    pub(super) fn new(correct: u64, incorrect: u64) -> Self {
+    pub(super) fn new(correct: u64, incorrect: u64, config: &ReputationConfig) -> Self {
         let mut standing = Self { correct: correct as f64, incorrect: incorrect as f64 };
-        standing.fade();
+        standing.fade(config);
         standing
     }
 
     /// One more.
-    pub(super) fn count(&mut self, correct: bool) {
+    pub(super) fn count(&mut self, correct: bool, config: &ReputationConfig) {
         *(if correct { &mut self.correct } else { &mut self.incorrect }) += 1.0;
-        self.fade();
+        self.fade(config);
     }
 
-    fn fade(&mut self) {
-        let kept = (Self::MEMORY / (self.correct + self.incorrect)).min(1.0);
+    fn fade(&mut self, config: &ReputationConfig) {
+        let kept = (config.memory_votes / self.words()).min(1.0);
         self.correct *= kept;
         self.incorrect *= kept;
     }
 
+    /// How much is known of the vehicle.
+    fn words(&self) -> f64 {
+        self.correct + self.incorrect
+    }
+
     /// Weight of the vehicle's word, 0 to 1: whole from the reputation of a newcomer up, none at that of a proven liar.
-    pub(super) fn trust(&self) -> f64 {
-        let reputation = (self.correct + Self::PRIOR) / (self.correct + self.incorrect + 2.0 * Self::PRIOR);
-        ((reputation - 0.3) / 0.2).clamp(0.0, 1.0)
+    pub(super) fn trust(&self, config: &ReputationConfig) -> f64 {
+        let reputation = config.mean(self.correct, self.incorrect);
+        ((reputation / config.initial - WORTHLESS) / (1.0 - WORTHLESS)).clamp(0.0, 1.0)
+    }
+}
+
+/// What is known of vehicles that are not heard at present.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Standings(BTreeMap<NodeName, Standing>);
+
+impl Standings {
+    /// Most vehicles that are remembered.
+    pub(super) const MOST: usize = 4096;
+
+    /// What is known of a vehicle.
+    pub(super) fn of(&self, node: &NodeName) -> Standing {
+        self.0.get(node).copied().unwrap_or_default()
+    }
+
+    /// Remembers vehicles; those of whom least is known make room.
+    pub(super) fn keep(&mut self, vehicles: impl IntoIterator<Item = (NodeName, Standing)>) {
+        self.0.extend(vehicles.into_iter().filter(|(_, standing)| standing.words() > 0.0));
+        let excess = self.0.len().saturating_sub(Self::MOST);
+        if excess > 0 {
+            let mut words: Vec<_> = self.0.iter().map(|(node, standing)| (standing.words(), node.clone())).collect();
+            words.sort_by(|a, b| a.0.total_cmp(&b.0).then_with(|| a.1.cmp(&b.1)));
+            words.iter().take(excess).for_each(|(_, node)| drop(self.0.remove(node)));
+        }
     }
 }
 

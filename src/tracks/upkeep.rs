@@ -86,7 +86,8 @@ impl Tracker {
         offset.norm_squared() < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
     }
 
-    /// Forgets objects that are gone, and vehicles that have been silent for longer than any object lives.
+    /// Forgets objects that are gone, and vehicles that have been silent for longer than any object lives,
+    /// save what their word is worth.
     pub(super) fn forget(&mut self, now: Timestamp) {
         let life = Duration::from_secs_f64(self.config.life_s);
         self.tracks.retain(|track| now.since(track.last_seen) <= life && track.presence(now) > LEAST_PRESENCE);
@@ -95,11 +96,14 @@ impl Tracker {
         if !self.sources.iter().any(silent) {
             return;
         }
+        let mut forgotten = Vec::new();
         for slot in self.sources.iter_mut().filter(|slot| silent(slot)) {
             if let Some(source) = slot.take() {
                 self.numbers.remove(&source.node);
+                forgotten.push((source.node, source.standing));
             }
         }
+        self.standings.keep(forgotten);
         for track in &mut self.tracks {
             track.witnesses.retain(|witness| self.sources[witness.source as usize].is_some());
             track.vehicle = track.vehicle.filter(|number| self.sources[*number as usize].is_some());

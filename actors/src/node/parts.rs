@@ -69,7 +69,7 @@ const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl Assembly {
     pub(super) fn new(config: NodeConfig, security: Security, failed: watch::Sender<Option<String>>) -> Self {
-        let by_evidence = config.fusion.vote.mode != VoteMode::Paper;
+        let by_evidence = config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote();
         let counters = Arc::<Counters>::default();
         Self {
             name: config.name.clone().unwrap_or(NodeName::from_static("node")),
@@ -142,7 +142,8 @@ impl Assembly {
         parts.extend((leads && self.config.data_plane().embedded).then_some(Part::Broker));
         parts.extend([Part::Membership, Part::Gateway, Part::Follower]);
         if leads {
-            parts.extend(self.config.fusion.algorithms.vote().then_some(Part::ReputationKeeper));
+            let rates = self.config.fusion.rates_vehicles(!self.config.landmarks().is_empty());
+            parts.extend(rates.then_some(Part::ReputationKeeper));
             parts.push(Part::Fuser);
         }
         parts.push(Part::LeaderElection);

@@ -1,0 +1,93 @@
+//! Vehicles that invent or hide objects.
+
+use super::*;
+use crate::tracks::trust::{Standing, Standings};
+
+#[test]
+fn whoever_invents_or_hides_objects_loses_its_standing() {
+    let mut tracker = tracker();
+    let counts = liars(&mut tracker);
+    for honest in ["a", "b", "c", "d"] {
+        let (right, wrong) = counts[&name(honest)];
+        assert!(right > 20 && wrong == 0, "{honest} {right} {wrong}");
+    }
+    for false_one in ["hider", "liar"] {
+        let (right, wrong) = counts[&name(false_one)];
+        assert!(wrong > 10 && wrong > 2 * right, "{false_one} {right} {wrong}");
+    }
+    let round = tracker.close(at(150));
+    let invented = sure(&round).iter().filter(|object| (object.y_m - 25.0).abs() < 3.0).count();
+    assert_eq!(invented, 0, "nobody believes a liar");
+}
+
+/// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that says
+/// as much; of many others that nothing is known of.
+#[test]
+fn a_liar_that_was_silent_is_still_a_liar() {
+    let mut tracker = tracker();
+    liars(&mut tracker);
+    let mut round = tracker.close(at(400));
+    assert!(round.objects.is_empty() && tracker.numbers.is_empty(), "all are forgotten");
+    let strangers = (0..2 * Standings::MOST).map(|n| (name(&format!("z{n}")), Standing::default()));
+    tracker.standings.keep(strangers.collect::<Vec<_>>());
+    for frame in 400..420 {
+        tracker.observe(&report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
+        tracker.observe(&report("newcomer", frame, vec![car(50.0, 25.0)]), at(frame));
+        round = tracker.close(at(frame));
+    }
+    let believed: Vec<_> = sure(&round).iter().map(|object| object.x_m.round()).collect();
+    assert_eq!(believed, [50.0], "{:?}", round.objects);
+}
+
+#[test]
+fn of_the_silent_those_are_forgotten_of_whom_least_is_known() {
+    let mut standings = Standings::default();
+    let config = ReputationConfig::default();
+    standings.keep([(name("liar"), Standing::new(0, 40, &config)), (name("hero"), Standing::new(40, 0, &config))]);
+    standings.keep((0..2 * Standings::MOST).map(|n| (name(&format!("a{n}")), Standing::new(1, 0, &config))));
+    assert_eq!((standings.of(&name("liar")).trust(&config), standings.of(&name("hero")).trust(&config)), (0.0, 1.0));
+    let known = (0..2 * Standings::MOST).filter(|n| standings.of(&name(&format!("a{n}"))) != Standing::default());
+    assert_eq!(known.count(), Standings::MOST - 2);
+}
+
+/// What VOTE has settled weighs in tracks too, as what the ledger says does.
+#[test]
+fn whoever_votes_wrongly_is_not_believed_in_tracks() {
+    let mut tracker = tracker();
+    let wrong = |node: &str| Evidence { node: name(node), label: "cup".into(), correct: false };
+    let mut round = TracksRound::default();
+    for frame in 0..20 {
+        tracker.observe(&report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
+        tracker.observe(&report("gauss", frame, vec![car(50.0, 25.0)]), at(frame));
+        tracker.learn(&[wrong("liar"), wrong("unheard")]);
+        round = tracker.close(at(frame));
+    }
+    let believed: Vec<_> = sure(&round).iter().map(|object| object.x_m.round()).collect();
+    assert_eq!(believed, [50.0], "{:?}", round.objects);
+}
+
+/// Four honest vehicles, one that hides most objects and one that invents them; returns the right and wrong words.
+fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+    let mut counts: BTreeMap<NodeName, (u32, u32)> = BTreeMap::new();
+    for frame in 0..150 {
+        for (n, node) in ["a", "b", "c", "d", "hider", "liar"].into_iter().enumerate() {
+            let pose = Some(WirePose { x_m: n as f64 * 6.0, y_m: 0.0, heading_rad: 0.0 });
+            let places = (0..10).map(|n| (n as f64 * 4.0 - 4.0, if n % 2 == 0 { 12.0 } else { -12.0 }));
+            let mut objects: Vec<_> = places.map(|(x, y)| car(x + noise(&mut rng, 0.2), y)).collect();
+            match node {
+                "hider" => objects.truncate(2),
+                "liar" => objects = (0..10).map(|n| car(n as f64 * 5.0, 25.0)).collect(),
+                _ => {}
+            }
+            let report = ObjectReport { pose, view, ..report(node, frame, objects) };
+            tracker.observe(&report, at(frame));
+        }
+        for evidence in tracker.close(at(frame)).evidence {
+            let (right, wrong) = counts.entry(evidence.node).or_default();
+            *(if evidence.correct { right } else { wrong }) += 1;
+        }
+    }
+    counts
+}
