@@ -4,6 +4,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
+use crate::names::Label;
+use crate::wire::is_label;
 
 /// Whether objects without a known place are tracked.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -54,6 +56,8 @@ pub struct TracksConfig {
     pub min_confidence: f64,
     /// Distance in metres from a vehicle's pose within which it sees itself, and others see it. Default 1.5.
     pub vehicle_radius_m: f64,
+    /// What a vehicle is called that nobody else has seen. Default `car`: the label that the cell's detectors give vehicles.
+    pub vehicle_label: Label,
     /// Whether offsets and rotations of vehicles' poses are estimated and corrected. Default true.
     pub align: bool,
     /// Standard deviation in metres of a pose's offset. Default 0.5.
@@ -86,6 +90,7 @@ impl Default for TracksConfig {
             even_confidence: 0.3,
             min_confidence: 0.002,
             vehicle_radius_m: 1.5,
+            vehicle_label: Label::new_static("car"),
             align: true,
             align_offset_m: 0.5,
             align_heading_rad: 0.01,
@@ -115,6 +120,9 @@ impl TracksConfig {
         check_range("even_confidence", self.even_confidence, 0.01, 0.99)?;
         check_range("min_confidence", self.min_confidence, 0.0, 1.0)?;
         check_range("vehicle_radius_m", self.vehicle_radius_m, 0.0, 100.0)?;
+        if !is_label(&self.vehicle_label) {
+            return Err(ConfigError::new("vehicle_label", &self.vehicle_label, "a label of 1 to 64 bytes"));
+        }
         check_range("align_offset_m", self.align_offset_m, 1e-3, 10.0)?;
         check_range("align_heading_rad", self.align_heading_rad, 1e-5, 0.5)?;
         check_range("align_memory_s", self.align_memory_s, 0.1, 1e4)?;

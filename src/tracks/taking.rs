@@ -260,7 +260,7 @@ impl Tracker {
         }
         let correct = word == Word::True;
         taking.source.standing.count(correct, &self.reputation);
-        self.evidence.push(Evidence { node: taking.source.node.clone(), label: track.label(), correct });
+        self.evidence.push(Evidence { node: taking.source.node.clone(), label: track.label(&self.config), correct });
     }
 
     /// A detection that is none of the known objects is a new one.

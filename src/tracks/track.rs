@@ -239,14 +239,14 @@ impl Track {
             age_s: Some(now.since(self.last_seen).as_secs_f64()),
             first_seen_us: Some(self.first_seen),
             vehicle: self.vehicle.and_then(name),
-            ..FusedObject::new(self.id, self.label(), confidence, position.x, position.y, covariance)
+            ..FusedObject::new(self.id, self.label(config), confidence, position.x, position.y, covariance)
         }
     }
 
-    /// What it is taken for; a vehicle that nobody else has seen is one.
-    pub(super) fn label(&self) -> Label {
+    /// What it is taken for; what nobody has read a label of is a vehicle by its own word.
+    pub(super) fn label(&self, config: &TracksConfig) -> Label {
         let best = self.labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
-        best.map_or_else(|| Label::new_static("vehicle"), |(label, _)| label.clone())
+        best.map_or_else(|| config.vehicle_label.clone(), |(label, _)| label.clone())
     }
 
     /// The direction of travel, where it is well known.

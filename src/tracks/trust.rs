@@ -144,7 +144,9 @@ impl Standings {
         if excess > 0 {
             let mut words: Vec<_> = self.0.iter().map(|(node, standing)| (standing.words(), node.clone())).collect();
             words.sort_by(|a, b| a.0.total_cmp(&b.0).then_with(|| a.1.cmp(&b.1)));
-            words.iter().take(excess).for_each(|(_, node)| drop(self.0.remove(node)));
+            for (_, node) in words.iter().take(excess) {
+                self.0.remove(node);
+            }
         }
     }
 }
