@@ -76,6 +76,8 @@ pub struct Tracker {
     /// Tracks by place, in cells of the gate's size and in large ones.
     near: Grid,
     wide: Grid,
+    /// By a vehicle's number, the track that it is.
+    own: HashMap<u32, u32>,
     pending: Vec<(Timestamp, ObjectReport)>,
     fused_until: Timestamp,
     late: u64,
@@ -94,6 +96,7 @@ impl Tracker {
             near: Grid::new(config.gate_m),
             wide: Grid::new(WIDE_M.max(config.gate_m)),
             config,
+            own: HashMap::new(),
             sources: Vec::new(),
             numbers: HashMap::new(),
             standings: Standings::default(),

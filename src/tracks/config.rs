@@ -130,6 +130,11 @@ impl TracksConfig {
         check_range("max_density", self.max_density as f64, 1.0, 1e4)
     }
 
+    /// Largest squared Mahalanobis distance of a detection from its object.
+    pub(super) fn gate(&self) -> f64 {
+        self.gate_sigmas * self.gate_sigmas
+    }
+
     /// Density of the white noise acceleration, m²/s³.
     pub(super) fn density(&self) -> f64 {
         self.manoeuvre_mps * self.manoeuvre_mps

@@ -126,9 +126,17 @@ impl Motion {
         self.common_m = (1.0 - share) * self.common_m + share * seen.common_m;
     }
 
-    /// Takes a velocity in, of standard deviation `sigma_mps` in each direction.
-    pub(super) fn update_velocity(&mut self, velocity: Vector2<f64>, sigma_mps: f64) {
-        let noise = self.vv + Matrix2::identity() * (sigma_mps * sigma_mps);
+    /// Takes in what the velocity was at `at`, not after the state, of standard deviation `sigma_mps` in each direction. As
+    /// errors of all that is said of it may be the same, the velocity is never better known for it than one says.
+    pub(super) fn update_velocity(&mut self, at: Timestamp, velocity: Vector2<f64>, sigma_mps: f64, density: f64) {
+        let stated = sigma_mps * sigma_mps + density * self.seconds_to(at).abs();
+        let known = self.vv.trace() / 2.0;
+        if known <= stated {
+            return;
+        }
+        // With this variance, what comes of it has the stated one.
+        let enough = known * stated / (known - stated);
+        let noise = self.vv + Matrix2::identity() * enough;
         let Some(inverse) = inverse(&noise) else { return };
         let offset = velocity - self.velocity;
         let gains = [self.pv * inverse, self.vv * inverse];

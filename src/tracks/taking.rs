@@ -11,7 +11,7 @@ use super::assignment::{Pairing, assign};
 use super::calibration::log_odds;
 use super::config::TracksConfig;
 use super::evidence::Rates;
-use super::motion::Measurement;
+use super::motion::{Measurement, Motion};
 use super::source::Source;
 use super::track::Track;
 use super::trust::{Others, Word, judge};
@@ -95,27 +95,36 @@ impl Tracker {
             independent: Matrix2::identity() * (sigma_m * sigma_m),
             common_m: self.config.common_m,
         };
-        let reach_m = self.config.gate_m.max(self.config.vehicle_radius_m);
-        let offset =
-            |track: u32| (self.tracks[track as usize].motion.position_at(taking.at) - measurement.position).norm();
-        let around = || self.near.around(&measurement.position, reach_m);
-        let own = around().find(|track| self.tracks[*track as usize].vehicle == Some(taking.number));
-        let unclaimed = around().filter(|track| {
-            self.tracks[*track as usize].vehicle.is_none() && offset(*track) <= 2.0 * self.config.vehicle_radius_m
+        let (density, number, at) = (self.config.density(), taking.number, taking.at);
+        let reach_m = 2.0 * self.config.vehicle_radius_m;
+        let offset = |track: u32| (self.tracks[track as usize].motion.position_at(at) - measurement.position).norm();
+        let unclaimed = || {
+            let around = self.near.around(&measurement.position, reach_m);
+            around.filter(|track| self.tracks[*track as usize].vehicle.is_none() && offset(*track) <= reach_m)
+        };
+        let known = self.own.get(&number).copied();
+        let known = known.or_else(|| unclaimed().min_by(|a, b| offset(*a).total_cmp(&offset(*b)).then(a.cmp(b))));
+        let is_in_reach = known.is_some_and(|track| {
+            let innovation = self.tracks[track as usize].motion.innovation(at, &measurement, density);
+            offset(track) <= self.config.gate_m.max(reach_m) || innovation.distance_squared <= self.config.gate()
         });
-        let known = own.or_else(|| unclaimed.min_by(|a, b| offset(*a).total_cmp(&offset(*b)).then(a.cmp(b))));
         let track = match known {
             Some(track) => track as usize,
             None => {
                 let id = founding_id(taking.report, usize::MAX);
-                let Some(track) = self.add(Track::new(id, taking.at, &measurement, &self.config)) else { return };
+                let Some(track) = self.add(Track::new(id, at, &measurement, &self.config)) else { return };
                 track
             }
         };
-        let (density, number, at) = (self.config.density(), taking.number, taking.at);
+        self.own.insert(number, track as u32);
         let track = &mut self.tracks[track];
         track.vehicle = Some(number);
-        track.motion.update(at, &measurement, density);
+        if is_in_reach {
+            track.motion.update(at, &measurement, density);
+        } else if at >= track.motion.at {
+            // New, or somewhere else all at once.
+            track.motion = Motion::new(at, &measurement, self.config.speed_mps);
+        }
         track.refresh(at);
         track.witness(number, at).hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
     }
@@ -138,7 +147,7 @@ impl Tracker {
 
     /// Which detections are which objects: within the gate, and the likeliest for all together.
     fn associate(&self, number: u32, seen: &[Seen<'_>], at: Timestamp) -> Vec<Pairing> {
-        let gate = self.config.gate_sigmas * self.config.gate_sigmas;
+        let gate = self.config.gate();
         let density = self.config.density();
         let mut pairings = Vec::with_capacity(2 * seen.len());
         for (detection, seen) in seen.iter().enumerate() {
@@ -280,7 +289,7 @@ impl Tracker {
 fn describe(track: &mut Track, source: &Source, seen: &Seen<'_>, at: Timestamp, config: &TracksConfig) {
     if let Some([x, y]) = seen.object.velocity_mps {
         let velocity = source.alignment.turned(&Vector2::new(x, y));
-        track.motion.update_velocity(velocity, VELOCITY_SIGMA_MPS);
+        track.motion.update_velocity(at, velocity, VELOCITY_SIGMA_MPS, config.density());
     }
     track.motion.limit_speed(config.max_speed_mps);
     let heading_rad = seen.object.heading_rad.map(|heading_rad| source.alignment.correct_heading(heading_rad));

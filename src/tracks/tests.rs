@@ -2,6 +2,7 @@ mod trust;
 
 use std::collections::BTreeSet;
 
+use nalgebra::{Matrix2, Vector2};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use rand::seq::SliceRandom;
@@ -9,6 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use uuid::Uuid;
 
+use super::motion::{Measurement, Motion};
 use super::*;
 use crate::geometry::Covariance;
 use crate::wire::{FieldOfView, GlobalMap, SCHEMA_VERSION, WirePose};
@@ -112,6 +114,73 @@ fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
     assert_eq!(vehicles, [Some(name("euclid")), Some(name("gauss"))], "{:?}", round.objects);
     assert!(near(&round.objects[0], 9.5, 0.0, 1.0));
     assert_eq!((&*round.objects[0].label, &*round.objects[1].label), ("car", "van"));
+}
+
+#[test]
+fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
+    let mut tracker = tracker();
+    let mut ids = BTreeSet::new();
+    for frame in 0..40 {
+        let x_m = if frame < 20 { 0.0 } else { 500.0 };
+        let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+        tracker.observe(&ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
+        let round = tracker.close(at(frame));
+        let [vehicle] = &*round.objects else { panic!("{:?}", round.objects) };
+        assert!(near(vehicle, x_m, 0.0, 0.5), "{vehicle:?}");
+        assert!(vehicle.velocity_mps.is_none_or(|[x, y]| x.hypot(y) < 2.0), "{vehicle:?}");
+        ids.insert(vehicle.id);
+    }
+    assert_eq!(ids.len(), 1);
+}
+
+/// A vehicle's first pose counts once: half of what a second one says.
+#[test]
+fn the_pose_that_founds_a_track_is_not_counted_twice() {
+    let mut tracker = tracker();
+    for frame in 0..2 {
+        let pose = Some(WirePose { x_m: frame as f64, y_m: 0.0, heading_rad: 0.0 });
+        tracker.observe(&ObjectReport { pose, ..report("euclid", 0, vec![]) }, at(0));
+        let round = tracker.close(at(0));
+        let variance = round.objects[0].covariance_m2[0];
+        let config = TracksConfig::default();
+        let alone = (config.vehicle_radius_m / 2.0).powi(2) + config.common_m.powi(2);
+        if frame == 0 {
+            assert!((variance - alone).abs() < 1e-9, "{variance}");
+        } else {
+            assert!((round.objects[0].x_m - 0.5).abs() < 1e-9);
+        }
+    }
+}
+
+#[test]
+fn what_is_said_of_velocities_is_never_taken_for_better_than_one_of_them_says() {
+    let mut motion = Motion::new(at(5), &measurement(), 8.0);
+    let said = Vector2::new(10.0, 0.0);
+    for _ in 0..1000 {
+        motion.update_velocity(at(5), said, 1.0, 4.0);
+    }
+    assert!((motion.velocity_covariance().trace() / 2.0 - 1.0).abs() < 1e-9);
+    assert!((motion.velocity.x - 10.0).abs() < 0.5);
+    let mut late = Motion::new(at(5), &measurement(), 8.0);
+    late.update_velocity(at(0), said, 1.0, 4.0);
+    assert!((late.velocity_covariance().trace() / 2.0 - 3.0).abs() < 1e-9, "half a second ago is less sure");
+}
+
+fn measurement() -> Measurement {
+    Measurement { position: Vector2::zeros(), independent: Matrix2::identity(), common_m: 0.2 }
+}
+
+#[test]
+fn a_heading_about_due_east_is_not_averaged_to_west() {
+    let mut tracker = tracker();
+    for frame in 0..30 {
+        let heading_rad = Some(if frame % 2 == 0 { 359f64 } else { 1.0 }.to_radians());
+        let seen = PerceivedObject { heading_rad, ..car(0.0, 0.0) };
+        tracker.observe(&report("euclid", frame, vec![seen]), at(frame));
+        let round = tracker.close(at(frame));
+        let heading_deg = round.objects[0].heading_rad.unwrap().to_degrees();
+        assert!(heading_deg.abs() < 1.01, "{heading_deg}");
+    }
 }
 
 #[test]

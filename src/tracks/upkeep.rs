@@ -1,8 +1,10 @@
 //! What happens to the objects between reports: those that turn out to be one are joined, those that are gone forgotten.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use nalgebra::Vector2;
+use uuid::Uuid;
 
 use super::Tracker;
 use super::motion::Measurement;
@@ -42,7 +44,9 @@ impl Tracker {
     pub(super) fn index(&mut self, at: Timestamp) {
         self.near.clear();
         self.wide.clear();
+        self.own.clear();
         for (index, track) in self.tracks.iter().enumerate() {
+            self.own.extend(track.vehicle.map(|number| (number, index as u32)));
             let position = track.motion.position_at(at);
             self.near.insert(&position, index as u32);
             self.wide.insert(&position, index as u32);
@@ -114,8 +118,10 @@ impl Tracker {
     /// and those unknown, on its word, which fades.
     pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
         self.index(now);
+        let stated: BTreeSet<Uuid> = map.objects.iter().map(|object| object.id).collect();
+        let mut known: BTreeSet<Uuid> = self.tracks.iter().map(|track| track.id).collect();
         for object in &map.objects {
-            if self.tracks.iter().any(|track| track.id == object.id) {
+            if !known.insert(object.id) {
                 continue;
             }
             let seen = self.inherited(object);
@@ -124,14 +130,14 @@ impl Tracker {
                 (track as usize, offset.norm())
             });
             let nearest = nearest.filter(|(track, distance)| {
-                *distance < MERGE_M && !map.objects.iter().any(|object| object.id == self.tracks[*track].id)
+                *distance < MERGE_M && !stated.contains(&self.tracks[*track].id)
             });
             match nearest.min_by(|a, b| a.1.total_cmp(&b.1)) {
                 Some((track, _)) => self.tracks[track].id = object.id,
                 None => {
                     let mut track = Track::new(object.id, now, &seen, &self.config);
                     if let Some([x, y]) = object.velocity_mps {
-                        track.motion.update_velocity(Vector2::new(x, y), 1.0);
+                        track.motion.update_velocity(now, Vector2::new(x, y), 1.0, self.config.density());
                     }
                     track.motion.limit_speed(self.config.max_speed_mps);
                     track.inherit(object, now);
