@@ -79,6 +79,8 @@ pub struct FuserArguments {
     pub aggregator: Aggregator,
     /// Where vehicles' reports wait.
     pub intake: Intake,
+    /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
+    pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
     /// Where the aggregator's inputs are recorded.
     pub recording: Recording,
     /// Where maps and verdicts are published.
@@ -104,7 +106,7 @@ pub struct FuserState {
     gateway: Seat<GatewayMessage>,
     keeper: Seat<ReputationKeeperMessage>,
     counters: Arc<Counters>,
-    /// The newest map of another aggregator, and when it came.
+    /// The newest map of another aggregator or an earlier run, and when it came.
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
@@ -122,7 +124,7 @@ impl Actor for Fuser {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let FuserArguments { aggregator, intake, recording, gateway, keeper, counters } = arguments;
+        let FuserArguments { aggregator, intake, newest, recording, gateway, keeper, counters } = arguments;
         let mut state = FuserState {
             aggregator,
             intake,
@@ -130,7 +132,7 @@ impl Actor for Fuser {
             gateway,
             keeper,
             counters,
-            last_map: None,
+            last_map: newest,
             alarm: Timestamp(u64::MAX),
             timer: None,
             losses: [0; 4],

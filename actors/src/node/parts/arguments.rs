@@ -161,7 +161,7 @@ impl Assembly {
         }
     }
 
-    /// A fuser starts with the evidence that the keeper has.
+    /// A fuser starts with the evidence that the keeper has, and goes on with the objects of the newest map.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
         let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
@@ -172,6 +172,7 @@ impl Assembly {
             aggregator,
             recording: self.recording.clone(),
             intake: self.intake.clone(),
+            newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
             gateway: self.seats.gateway.clone(),
             keeper: self.seats.keeper.clone(),
             counters: self.counters(),
