@@ -170,19 +170,21 @@ impl Town {
     fn bodies(&self) -> Vec<Body> {
         let vehicles = self.vehicles.iter().map(|vehicle| {
             let (center, heading_rad) = self.roads.place(vehicle.path, vehicle.along_m);
-            Body { length_m: vehicle.length_m, width_m: vehicle.width_m, ..body("car", center, heading_rad) }
+            let Vehicle { speed_mps, length_m, width_m, .. } = *vehicle;
+            Body { speed_mps, length_m, width_m, ..body("car", center, heading_rad) }
         });
         let walkers = self.walkers.iter().map(|walker| {
             let (center, heading_rad) = walker.place();
             let (label, length_m) = if walker.is_bicycle { ("bicycle", 1.8) } else { ("person", 0.5) };
-            Body { length_m, width_m: 0.6, is_opaque: false, ..body(label, center, heading_rad) }
+            let speed_mps = walker.speed_mps();
+            Body { speed_mps, length_m, width_m: 0.6, is_opaque: false, ..body(label, center, heading_rad) }
         });
         vehicles.chain(self.parked.iter().cloned()).chain(walkers).collect()
     }
 }
 
 fn body(label: &'static str, center: Point2<f64>, heading_rad: f64) -> Body {
-    Body { label, center, heading_rad, length_m: 4.5, width_m: 1.8, is_opaque: true }
+    Body { label, center, heading_rad, speed_mps: 0.0, length_m: 4.5, width_m: 1.8, is_opaque: true }
 }
 
 /// All observers and what has come of them.

@@ -83,6 +83,12 @@ pub struct SaidConfig {
     pub covariances: bool,
     /// What their sensors cover; needs poses. Default true.
     pub views: bool,
+    /// Velocities, with such a standard deviation in metres per second in each direction; absent by default.
+    pub velocities_mps: Option<f64>,
+    /// Headings, with such a standard deviation in radians; absent by default.
+    pub headings_rad: Option<f64>,
+    /// Lengths and widths, with such a standard deviation in metres; absent by default.
+    pub sizes_m: Option<f64>,
 }
 
 impl Default for TrafficConfig {
@@ -128,7 +134,14 @@ impl Default for SensorConfig {
 
 impl Default for SaidConfig {
     fn default() -> Self {
-        Self { poses: true, covariances: true, views: true }
+        Self {
+            poses: true,
+            covariances: true,
+            views: true,
+            velocities_mps: None,
+            headings_rad: None,
+            sizes_m: None,
+        }
     }
 }
 
@@ -150,7 +163,7 @@ impl TrafficConfig {
                 lures: 0.4,
                 ..SensorConfig::default()
             },
-            said: SaidConfig { poses: false, covariances: false, views: false },
+            said: SaidConfig { poses: false, covariances: false, views: false, ..SaidConfig::default() },
             ..Self::default()
         }
     }
@@ -172,6 +185,12 @@ impl TrafficConfig {
         check_range("duration_s", self.duration_s, 0.1, 3600.0)?;
         check_range("warm_up_s", self.warm_up_s, 0.0, 3600.0)?;
         check_range("memory_s", self.memory_s, 0.0, 3600.0)?;
+        let SaidConfig { velocities_mps, headings_rad, sizes_m, .. } = self.said;
+        for (key, value) in
+            [("velocities_mps", velocities_mps), ("headings_rad", headings_rad), ("sizes_m", sizes_m)]
+        {
+            check_range(key, value.unwrap_or_default(), 0.0, 100.0).map_err(|error| error.within("said"))?;
+        }
         self.sensor.validate().map_err(|error| error.within("sensor"))
     }
 }

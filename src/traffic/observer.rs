@@ -7,7 +7,7 @@
 
 use nalgebra::{Point2, Vector2};
 
-use super::config::TrafficConfig;
+use super::config::{SaidConfig, TrafficConfig};
 use super::dice::{Dice, Drift};
 use super::sight::{Body, Sight};
 use crate::geometry::{Covariance, Pose, wrap_angle};
@@ -53,6 +53,16 @@ struct Ghost {
     position: Point2<f64>,
     label: &'static str,
     until_s: f64,
+}
+
+/// What a detector finds.
+#[derive(Debug, Clone, Copy)]
+struct Found {
+    position: Point2<f64>,
+    label: &'static str,
+    confidence: f64,
+    /// Its place among the bodies, if it is one.
+    body: Option<usize>,
 }
 
 /// What surrounds an observer.
@@ -106,28 +116,27 @@ impl Observer {
         let sensor = &config.sensor;
         let passed_s = around.at_s - self.last_s;
         self.last_s = around.at_s;
-        let mut found: Vec<(Point2<f64>, &'static str, f64)> = Vec::new();
+        let mut found: Vec<Found> = Vec::new();
         for sight in around.sights.iter().filter(|sight| Self::sees(config, &around.pose, sight)) {
             found.extend(self.glance(config, around, sight, dice));
         }
         self.haunt(config, around, passed_s, dice);
         for ghost in &self.ghosts {
             if dice.chance(GHOST_CHANCE) {
-                found.push((ghost.position, ghost.label, share_of(0.6 * dice.normal() - 0.3)));
+                let confidence = share_of(0.6 * dice.normal() - 0.3);
+                found.push(Found { position: ghost.position, label: ghost.label, confidence, body: None });
             }
         }
         for lure in around.lures {
             let range_m = (lure - around.pose.position).norm();
             if range_m < LURE_RANGE * sensor.range_m && dice.chance(LURE_CHANCE) {
-                found.push((*lure, "car", share_of(0.6 * dice.normal() - 0.2)));
+                let confidence = share_of(0.6 * dice.normal() - 0.2);
+                found.push(Found { position: *lure, label: "car", confidence, body: None });
             }
         }
         for _ in 0..dice.poisson(sensor.clutter) {
-            found.push((
-                somewhere(config, &around.pose, dice),
-                around.label(dice),
-                share_of(0.8 * dice.normal() - 0.9),
-            ));
+            let (position, label) = (somewhere(config, &around.pose, dice), around.label(dice));
+            found.push(Found { position, label, confidence: share_of(0.8 * dice.normal() - 0.9), body: None });
         }
         let error =
             Vector2::from(self.offset.each_mut().map(|drift| drift.step(passed_s, POSE_S, dice))) * sensor.pose_m;
@@ -137,7 +146,7 @@ impl Observer {
         report.pose = is_posed.then(|| Pose { heading_rad: rounded(wrap_angle(said.heading_rad)), ..said }.into());
         report.view = (is_posed && config.said.views)
             .then_some(FieldOfView { range_m: sensor.range_m, angle_rad: sensor.angle_rad });
-        for (position, label, confidence) in found {
+        for Found { position, label, confidence, body } in found {
             let (range_m, bearing_rad) = around.pose.range_bearing(&position);
             let along_m = sensor.noise_m + sensor.noise_per_m * range_m;
             let ahead_m = range_m + along_m * dice.normal();
@@ -150,6 +159,7 @@ impl Observer {
                 .said
                 .covariances
                 .then_some([covariance.xx, covariance.xy, covariance.yy].map(|v| (v * 1e6).round() / 1e6));
+            describe(&config.said, &mut object, body.map(|body| &around.bodies[body]), turned_rad, dice);
             report.objects.push(object);
         }
     }
@@ -161,7 +171,7 @@ impl Observer {
         around: &Surroundings<'_>,
         sight: &Sight,
         dice: &mut Dice<'_>,
-    ) -> Option<(Point2<f64>, &'static str, f64)> {
+    ) -> Option<Found> {
         let body = &around.bodies[sight.body];
         let glance = &mut self.glances[sight.body];
         let passed_s = around.at_s - glance.at_s;
@@ -182,7 +192,8 @@ impl Observer {
             "bicycle" if dice.chance(CONFUSED) => "person",
             label => label,
         };
-        Some((position, label, share_of(0.6 * log_odds - 0.6 + 0.5 * dice.normal())))
+        let confidence = share_of(0.6 * log_odds - 0.6 + 0.5 * dice.normal());
+        Some(Found { position, label, confidence, body: Some(sight.body) })
     }
 
     /// Ends and begins what is not there.
@@ -198,6 +209,24 @@ impl Observer {
             });
         }
     }
+}
+
+/// What is said of an object beside its place, in a frame that is turned; what is not there seems to stand.
+fn describe(
+    said: &SaidConfig,
+    object: &mut PerceivedObject,
+    body: Option<&Body>,
+    turned_rad: f64,
+    dice: &mut Dice<'_>,
+) {
+    let heading_rad = body.map_or(0.0, |body| body.heading_rad) + turned_rad;
+    let speed_mps = body.map_or(0.0, |body| body.speed_mps);
+    let size_m = body.map_or([4.5, 1.8], |body| [body.length_m, body.width_m]);
+    let (sin, cos) = heading_rad.sin_cos();
+    object.velocity_mps =
+        said.velocities_mps.map(|sigma| [cos, sin].map(|part| rounded(speed_mps * part + sigma * dice.normal())));
+    object.heading_rad = said.headings_rad.map(|sigma| rounded(wrap_angle(heading_rad + sigma * dice.normal())));
+    object.size_m = said.sizes_m.map(|sigma| size_m.map(|side| rounded((side + sigma * dice.normal()).max(0.1))));
 }
 
 /// A place in view, all places alike.

@@ -11,6 +11,7 @@ pub(super) struct Body {
     pub(super) label: &'static str,
     pub(super) center: Point2<f64>,
     pub(super) heading_rad: f64,
+    pub(super) speed_mps: f64,
     pub(super) length_m: f64,
     pub(super) width_m: f64,
     /// Whether it hides what is behind it.
@@ -97,7 +98,7 @@ mod tests {
 
     fn car(x: f64, y: f64) -> Body {
         let center = Point2::new(x, y);
-        Body { label: "car", center, heading_rad: 0.0, length_m: 4.0, width_m: 2.0, is_opaque: true }
+        Body { label: "car", center, heading_rad: 0.0, speed_mps: 0.0, length_m: 4.0, width_m: 2.0, is_opaque: true }
     }
 
     fn share(bodies: &[Body], body: usize) -> f64 {

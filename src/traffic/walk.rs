@@ -17,7 +17,7 @@ const PAUSE_S: f64 = 4.0;
 #[derive(Debug, Clone)]
 pub(super) struct Walker {
     pub(super) is_bicycle: bool,
-    pub(super) speed_mps: f64,
+    speed_mps: f64,
     block: Point2<f64>,
     side_m: f64,
     along_m: f64,
@@ -50,6 +50,11 @@ impl Walker {
         } else {
             self.along_m = (self.along_m + self.speed_mps * step_s) % (4.0 * self.side_m);
         }
+    }
+
+    /// The present speed.
+    pub(super) fn speed_mps(&self) -> f64 {
+        if self.pauses_for_s > 0.0 { 0.0 } else { self.speed_mps }
     }
 
     /// Position and heading in radians.
