@@ -15,6 +15,7 @@ use std::fs::{self, File};
 use std::io::{BufWriter, Write as _};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
@@ -115,9 +116,9 @@ fn run(
     let (mut union, mut late, mut ours) = (judge(), judge(), judge());
     let (mut union_tracker, mut late_tracker) = (Tracker::default(), Tracker::default());
     let mut latest = Latest::default();
-    for map in maps(recording, &mut |report_or_map| match report_or_map {
+    for map in maps(recording, &mut |event| match event {
         Event::Report(report) => latest.report(report),
-        Event::Map(at) => {
+        Event::Due(at) => {
             let all = latest.union(at);
             union.said(at, &union_tracker.track(at, &all));
             let suppressed = late_tracker.track(at, &suppressed(all));
@@ -134,33 +135,39 @@ fn run(
 
 enum Event<'a> {
     Report(&'a ObjectReport),
-    Map(Timestamp),
+    /// It is time for the others to say what they make of the reports so far.
+    Due(Timestamp),
 }
 
-/// What an aggregator makes of a recording; `watch` hears of every report and every map as it comes.
+/// How often the others say what they make of the reports.
+const PERIOD: Duration = Duration::from_millis(100);
+
+/// What an aggregator makes of a recording; `watch` hears of every report as it comes and of the time.
 fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<GlobalMap> {
     let config = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
     let mut aggregator: Option<Aggregator> = None;
     let mut maps = Vec::new();
-    let mut take = |fused: Option<Fused>, watch: &mut dyn FnMut(Event<'_>)| {
-        if let Some(map) = fused.and_then(|fused| fused.map) {
-            watch(Event::Map(map.fused_at_us));
-            maps.push(map);
-        }
-    };
+    let mut take = |fused: Option<Fused>| maps.extend(fused.and_then(|fused| fused.map));
+    let mut due: Option<Timestamp> = None;
     for arrived in &recording.reports {
         let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
         let aggregator = aggregator
             .get_or_insert_with(|| Aggregator::new(NodeName::from_static("edge"), 1, config.clone(), Vec::new(), now));
         while aggregator.deadline() <= now {
-            take(aggregator.tick(aggregator.deadline()), watch);
+            take(aggregator.tick(aggregator.deadline()));
+        }
+        let due = due.get_or_insert(now);
+        while *due < now {
+            watch(Event::Due(*due));
+            *due = *due + PERIOD;
         }
         watch(Event::Report(&arrived.report));
         // A rejected report is one that comes too late.
-        take(aggregator.report(ReportKind::Detections, &arrived.report, now).unwrap_or_default(), watch);
+        take(aggregator.report(ReportKind::Detections, &arrived.report, now).unwrap_or_default());
     }
+    due.into_iter().for_each(|due| watch(Event::Due(due)));
     if let Some(aggregator) = &mut aggregator {
-        take(aggregator.tick(aggregator.deadline()), watch);
+        take(aggregator.tick(aggregator.deadline()));
     }
     maps
 }
