@@ -15,7 +15,7 @@ use baselines::{Latest, Tracker, suppressed};
 
 const SEED: u64 = 2001;
 
-fn recorded(config: &TrafficConfig) -> TrafficRecording {
+fn recording_of(config: &TrafficConfig) -> TrafficRecording {
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     generate(config, &mut || rng.random())
 }
@@ -40,7 +40,7 @@ fn traffic_is_tracked_better_than_late_fusion_does_it() {
     let town = TrafficConfig { observers: 8, duration_s: 12.0, ..TrafficConfig::default() };
     let two = TrafficConfig { duration_s: 12.0, ..TrafficConfig::two_vehicle_recording() };
     for (config, floor) in [(town, FLOOR_TOWN), (two, FLOOR_TWO)] {
-        let recording = recorded(&config);
+        let recording = recording_of(&config);
         let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap();
         let (mut ours, mut late) = (TrackEvaluation::new(truth.clone()), TrackEvaluation::new(truth));
         let (mut latest, mut tracker) = (Latest::default(), Tracker::default());
@@ -58,24 +58,30 @@ fn traffic_is_tracked_better_than_late_fusion_does_it() {
         });
         let [ours, late] = figures;
         for figure in 0..2 {
-            assert!(ours[figure] > late[figure].max(floor[figure]), "{} observers: AP@2 and MODA are {ours:?}, of late fusion {late:?}", config.observers);
+            assert!(
+                ours[figure] > late[figure].max(floor[figure]),
+                "{} observers: AP@2 and MODA are {ours:?}, of late fusion {late:?}",
+                config.observers
+            );
         }
     }
 }
 
 /// AP@2 m and MODA in percent that are not to be lost.
-const FLOOR_TOWN: [f64; 2] = [80.0, 60.0];
-const FLOOR_TWO: [f64; 2] = [85.0, 72.0];
+const FLOOR_TOWN: [f64; 2] = [82.0, 70.0];
+const FLOOR_TWO: [f64; 2] = [88.0, 76.0];
 
-/// Mean errors of velocity in metres per second, of heading in radians and of length in metres, where they are known, over the
-/// second half; the truth is that of cars that drive.
+/// Of cars that drive, over the second half: mean error of velocity in metres per second, share of those whose heading is not
+/// known to 0.15 rad, and mean error of length in metres, where it is known.
 fn errors(said: SaidConfig) -> [f64; 3] {
-    let recording = recorded(&TrafficConfig { observers: 6, duration_s: 8.0, said, ..TrafficConfig::default() });
+    let recording = recording_of(&TrafficConfig { observers: 6, duration_s: 8.0, said, ..TrafficConfig::default() });
     let frames = &recording.truth.frames;
     let mut sums = [(0.0, 0.0); 3];
     fuse(&recording, |_, map| {
         let Some(map) = map else { return };
-        let Some(place) = frames.iter().position(|frame| frame.t_us >= map.fused_at_us).filter(|n| *n > 40) else { return };
+        let Some(place) = frames.iter().position(|frame| frame.t_us >= map.fused_at_us).filter(|n| *n > 40) else {
+            return;
+        };
         let objects = || map.objects.iter().filter(|object| object.confidence > 0.5 && object.label == "car");
         for (x_m, y_m, velocity) in driving(&frames[place - 1], &frames[place]) {
             let distance = |object: &&FusedObject| (object.x_m - x_m).hypot(object.y_m - y_m);
@@ -85,12 +91,9 @@ fn errors(said: SaidConfig) -> [f64; 3] {
             }
             let [x, y] = object.velocity_mps.unwrap_or_default();
             let turn = object.heading_rad.map(|heading| heading - velocity[1].atan2(velocity[0]));
+            let is_turned = turn.is_none_or(|turn| turn.sin().atan2(turn.cos()).abs() > 0.15);
             let length = object.size_m.map(|[length, _]| (length - 4.5).abs());
-            let off = [
-                Some((x - velocity[0]).hypot(y - velocity[1])),
-                turn.map(|turn| turn.sin().atan2(turn.cos()).abs()),
-                length,
-            ];
+            let off = [Some((x - velocity[0]).hypot(y - velocity[1])), Some(f64::from(u8::from(is_turned))), length];
             for ((sum, count), off) in sums.iter_mut().zip(off) {
                 *sum += off.unwrap_or_default();
                 *count += f64::from(u8::from(off.is_some()));
@@ -114,14 +117,10 @@ fn driving(before: &TruthFrame, now: &TruthFrame) -> Vec<(f64, f64, [f64; 2])> {
 #[test]
 fn velocities_headings_and_sizes_that_are_said_make_maps_better() {
     let plain = errors(SaidConfig::default());
-    let rich = SaidConfig {
-        velocities_mps: Some(0.6),
-        headings_rad: Some(0.1),
-        sizes_m: Some(0.3),
-        ..SaidConfig::default()
-    };
+    let rich =
+        SaidConfig { velocities_mps: Some(0.6), headings_rad: Some(0.1), sizes_m: Some(0.3), ..SaidConfig::default() };
     let rich = errors(rich);
-    assert!(rich[0] < 0.8 * plain[0], "velocities are off by {} and {} m/s", rich[0], plain[0]);
-    assert!(rich[1] < 0.8 * plain[1], "headings are off by {} and {} rad", rich[1], plain[1]);
+    assert!(rich[0] < 0.95 * plain[0], "velocities are off by {} and {} m/s", rich[0], plain[0]);
+    assert!(rich[1] < 0.5 * plain[1], "{} and {} of the headings are not known", rich[1], plain[1]);
     assert!(plain[2].is_nan() && rich[2] < 1.0, "lengths are off by {} m", rich[2]);
 }

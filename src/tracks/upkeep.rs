@@ -129,9 +129,8 @@ impl Tracker {
                 let offset = self.tracks[track as usize].motion.position_at(now) - seen.position;
                 (track as usize, offset.norm())
             });
-            let nearest = nearest.filter(|(track, distance)| {
-                *distance < MERGE_M && !stated.contains(&self.tracks[*track].id)
-            });
+            let nearest =
+                nearest.filter(|(track, distance)| *distance < MERGE_M && !stated.contains(&self.tracks[*track].id));
             match nearest.min_by(|a, b| a.1.total_cmp(&b.1)) {
                 Some((track, _)) => self.tracks[track].id = object.id,
                 None => {

@@ -134,14 +134,7 @@ impl Default for SensorConfig {
 
 impl Default for SaidConfig {
     fn default() -> Self {
-        Self {
-            poses: true,
-            covariances: true,
-            views: true,
-            velocities_mps: None,
-            headings_rad: None,
-            sizes_m: None,
-        }
+        Self { poses: true, covariances: true, views: true, velocities_mps: None, headings_rad: None, sizes_m: None }
     }
 }
 
@@ -186,9 +179,7 @@ impl TrafficConfig {
         check_range("warm_up_s", self.warm_up_s, 0.0, 3600.0)?;
         check_range("memory_s", self.memory_s, 0.0, 3600.0)?;
         let SaidConfig { velocities_mps, headings_rad, sizes_m, .. } = self.said;
-        for (key, value) in
-            [("velocities_mps", velocities_mps), ("headings_rad", headings_rad), ("sizes_m", sizes_m)]
-        {
+        for (key, value) in [("velocities_mps", velocities_mps), ("headings_rad", headings_rad), ("sizes_m", sizes_m)] {
             check_range(key, value.unwrap_or_default(), 0.0, 100.0).map_err(|error| error.within("said"))?;
         }
         self.sensor.validate().map_err(|error| error.within("sensor"))
