@@ -271,6 +271,25 @@ mod tests {
     use crate::gateway::Security;
 
     #[test]
+    fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
+        use ecod::aggregator::Algorithms::{Both, Pace};
+        use ecod::tracks::TracksMode::{Auto, Off, On};
+        let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
+        for (algorithms, mode, landmarks, expected) in [
+            (Both, Off, vec![], true),
+            (Pace, Auto, vec![], true),
+            (Pace, On, vec![spot], true),
+            (Pace, Off, vec![], false),
+        ] {
+            let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
+            (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
+            let assembly = Assembly::new(config, Security::default(), watch::Sender::new(None));
+            let keeps = assembly.parts().contains(&crate::node::seats::Part::ReputationKeeper);
+            assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
+        }
+    }
+
+    #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
         let assembly = Assembly::new(config, Security::default(), watch::Sender::new(None));

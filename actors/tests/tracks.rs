@@ -1,0 +1,103 @@
+//! A cell without known locations, on real sockets: what becomes of objects and of what vehicles say about them.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use ecod::aggregator::Algorithms;
+use ecod::names::NodeName;
+use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
+use ecod_actors::clock;
+use ecod_actors::config::NodeConfig;
+use ecod_actors::counters::Event;
+use ecod_actors::gateway::GatewayMessage;
+use ecod_actors::node::{self, NodeHandle};
+use tokio::time::timeout;
+use uuid::Uuid;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+
+fn config(node: &'static str, role: Role) -> NodeConfig {
+    let mut config = NodeConfig {
+        name: Some(NodeName::from_static(node)),
+        cell: NodeName::from_static("road"),
+        role,
+        listen: Some("127.0.0.1:0".parse().unwrap()),
+        ..NodeConfig::default()
+    };
+    config.fusion.algorithms = Algorithms::Pace;
+    config.reputations.publish_period_s = 0.1;
+    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+    config.membership.multicast.enabled = false;
+    config
+}
+
+/// Lets time pass, with `act` every 20 ms, until `is_reached`.
+async fn until(what: &str, mut act: impl FnMut(), is_reached: impl Fn() -> bool) {
+    let reached = async {
+        while !is_reached() {
+            act();
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, reached).await.unwrap_or_else(|_| panic!("never: {what}"));
+}
+
+/// Has two vehicles see the same two cars, or rather have seen them some time ago.
+fn see(reporter: &NodeHandle, ago: Duration) {
+    static SEQ: AtomicU64 = AtomicU64::new(0);
+    for node in ["euclid", "gauss"] {
+        let seq = SEQ.fetch_add(1, Ordering::Relaxed);
+        let objects = [0.0, 20.0].map(|x_m| PerceivedObject::new("car", 0.9, x_m, 0.0)).to_vec();
+        let report =
+            ObjectReport { objects, ..ObjectReport::new(NodeName::from_static(node), seq, clock::now() - ago) };
+        let message = GatewayMessage::PublishReport { kind: ReportKind::Detections, report: Arc::new(report) };
+        reporter.seats().gateway.send(message);
+    }
+}
+
+fn map(node: &NodeHandle) -> Option<Arc<GlobalMap>> {
+    node.newest_map().borrow().as_ref().map(|newest| Arc::clone(&newest.map))
+}
+
+/// The identities of what is surely there.
+fn ids(map: &GlobalMap) -> Vec<Uuid> {
+    map.objects.iter().filter(|object| object.confidence > 0.5).map(|object| object.id).collect()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_cell_that_only_tracks_rates_its_vehicles_and_keeps_identities_when_its_fuser_restarts() {
+    let edge = node::start(config("edge", Role::Edge)).await.unwrap();
+    let mut config = config("euclid", Role::Cav);
+    config.mqtt.broker = edge.broker_address().map(Into::into);
+    config.mqtt.retry_max_ms = 100;
+    let euclid = node::start(config).await.unwrap();
+    let look = || see(&euclid, Duration::ZERO);
+
+    let rated = || {
+        let newest = euclid.newest_reputations().borrow().as_ref().map(|newest| Arc::clone(&newest.message));
+        newest.is_some_and(|newest| newest.reputations.values().filter(|vehicle| vehicle.correct > 0).count() == 2)
+    };
+    until("both vehicles rated", look, rated).await;
+    let before = ids(&map(&euclid).unwrap());
+    assert_eq!(before.len(), 2);
+
+    let fuser = edge.seats().fuser.holder().unwrap();
+    fuser.kill();
+    let restarted = || edge.seats().fuser.holder().is_some_and(|holder| holder.get_id() != fuser.get_id());
+    until("a new fuser", look, restarted).await;
+    let since = clock::now();
+    until("a map of the new fuser", look, || map(&euclid).is_some_and(|map| map.fused_at_us > since)).await;
+    assert_eq!(ids(&map(&euclid).unwrap()), before);
+
+    let overtaken = || {
+        look();
+        std::thread::sleep(Duration::from_millis(5));
+        see(&euclid, Duration::from_millis(100));
+    };
+    until("a report out of order", overtaken, || edge.counters().events(Event::ReportOvertaken) > 0).await;
+    let late = || see(&euclid, Duration::from_millis(700));
+    until("a late report", late, || edge.counters().events(Event::ReportLate) > 0).await;
+    euclid.stop().await;
+    edge.stop().await;
+}
