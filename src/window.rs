@@ -278,7 +278,7 @@ mod tests {
         let admitted = |window: &mut ReportWindow, n: u64| window.admit(&report("a", NOON + n * 10_000), now);
         assert_eq!(admitted(&mut window, 79), Ok(OutOfOrder(Timestamp(NOON + 790_000))));
         assert_eq!(admitted(&mut window, 79), Err(RejectReason::OutOfOrder));
-        assert_eq!(admitted(&mut window, 30), Ok(OutOfOrder(Timestamp(NOON + 300_000))));
+        assert_eq!(admitted(&mut window, 31), Ok(OutOfOrder(Timestamp(NOON + 310_000))));
         for n in [1, 2, 12] {
             assert_eq!(admitted(&mut window, n), Err(RejectReason::OutOfOrder), "nobody knows whether {n} came before");
         }
