@@ -1,6 +1,6 @@
 //! Evidence about how labels are taken for one another.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Number of a label within a cell, in order of first appearance.
 pub(super) type LabelIndex = u16;
@@ -23,6 +23,18 @@ impl Confusion {
         if truth == stated {
             self.correct += weight;
         }
+    }
+
+    /// Forgets all evidence that is about any of `labels`.
+    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+        let is_about =
+            |&(truth, stated): &(LabelIndex, LabelIndex)| labels.contains(&truth) || labels.contains(&stated);
+        let gone: Vec<_> = self.cells.iter().filter(|(cell, _)| is_about(cell)).map(|(cell, n)| (*cell, *n)).collect();
+        for ((truth, stated), count) in gone {
+            self.add(truth, stated, -count);
+            self.cells.remove(&(truth, stated));
+        }
+        self.rows.retain(|truth, _| !labels.contains(truth));
     }
 
     /// Lets all evidence fade by `factor`.
@@ -56,5 +68,23 @@ impl Confusion {
     /// All votes.
     pub(super) fn total(&self) -> f64 {
         self.total.max(0.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_forgotten_label_leaves_the_rest_as_if_it_had_never_been() {
+        let (mut confusion, mut without) = (Confusion::default(), Confusion::default());
+        for (truth, stated, weight) in [(0, 0, 4.0), (0, 1, 1.0), (1, 0, 2.0), (1, 1, 8.0), (2, 0, 0.5)] {
+            confusion.add(truth, stated, weight);
+            if truth != 1 && stated != 1 {
+                without.add(truth, stated, weight);
+            }
+        }
+        confusion.forget_labels(&[1].into());
+        assert_eq!(confusion, without);
     }
 }
