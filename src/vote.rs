@@ -143,8 +143,8 @@ impl Vote {
         Ok(())
     }
 
-    /// Forgets vehicles that have been silent if there are as many as there may be: unproven ones before proven ones,
-    /// the longest silent first.
+    /// Forgets vehicles that have been silent if there are as many as there may be: unproven ones and those that were
+    /// mostly wrong before proven ones, the longest silent first.
     fn make_room(&mut self, now: Timestamp) -> Result<(), RejectReason> {
         if self.heard.len() < self.config.max_vehicles {
             return Ok(());

@@ -24,7 +24,7 @@ use std::time::Duration;
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::reputation::{EntryKey, Evidence, ReputationConfig};
-use ecod::wire::{LedgerEntry, LedgerShare, MAX_SHARE_ENTRIES, Reputation, Reputations, SCHEMA_VERSION};
+use ecod::wire::{LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, Reputation, Reputations, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -216,19 +216,24 @@ impl ReputationKeeperState {
             book.standing = reputations;
         }
         let changed = book.ledger.entries_of(&keys);
+        let reached = book.ledger.marks_reached(epoch.term, &epoch.leader, evidence);
         drop(book);
         self.leads = Some(epoch);
         self.last_round = round;
-        self.share(&changed);
+        self.share(&changed, &reached);
     }
 
     fn merge(&mut self, delivery: &Delivery) {
         let Incoming::Ledger(share) = &delivery.message else { return };
-        let own = |entry: &LedgerEntry| {
-            self.leads.as_ref().is_some_and(|own| own.term == entry.epoch && own.leader == entry.aggregator)
+        let own = |term: u64, leader: &NodeName| {
+            self.leads.as_ref().is_some_and(|own| own.term == term && own.leader == *leader)
         };
-        let news: Vec<_> = share.entries.iter().filter(|entry| !own(entry)).cloned().collect();
-        if self.arguments.book.open().ledger.merge_entries(news) {
+        let news: Vec<_> = share.entries.iter().filter(|e| !own(e.epoch, &e.aggregator)).cloned().collect();
+        let marks: Vec<_> = share.marks.iter().filter(|m| !own(m.epoch, &m.aggregator)).cloned().collect();
+        let mut book = self.arguments.book.open();
+        let changed = book.ledger.merge_entries(news) | book.ledger.merge_marks(marks);
+        drop(book);
+        if changed {
             self.arguments.counters.count(Event::LedgerMerged);
             self.unsaved = true;
             self.unadopted = true;
@@ -236,9 +241,10 @@ impl ReputationKeeperState {
         let leader = share.epoch.map(|term| Epoch::new(term, share.node.clone()));
         if leader.is_some() && leader != self.heard {
             self.heard = leader;
-            let own: Vec<_> =
-                self.entries().into_iter().filter(|entry| entry.aggregator == self.arguments.name).collect();
-            self.share(&own);
+            let (mut entries, mut marks) = self.evidence();
+            entries.retain(|entry| entry.aggregator == self.arguments.name);
+            marks.retain(|mark| mark.aggregator == self.arguments.name);
+            self.share(&entries, &marks);
         }
     }
 
@@ -276,33 +282,37 @@ impl ReputationKeeperState {
         self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
     }
 
-    fn entries(&self) -> Vec<LedgerEntry> {
-        self.arguments.book.open().ledger.entries().collect()
+    fn evidence(&self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
+        let book = self.arguments.book.open();
+        (book.ledger.entries().collect(), book.ledger.marks().collect())
     }
 
     fn share_all(&self) {
-        self.share(&self.entries());
+        let (entries, marks) = self.evidence();
+        self.share(&entries, &marks);
     }
 
     /// Shares all evidence, and that there is none: whoever takes over waits for it.
     fn send_snapshot(&self) {
-        let entries = self.entries();
+        let (entries, marks) = self.evidence();
         if entries.is_empty() {
-            self.publish_share(&[]);
+            self.publish_share(&[], &[]);
         }
-        self.share(&entries);
+        self.share(&entries, &marks);
     }
 
-    fn share(&self, entries: &[LedgerEntry]) {
-        entries.chunks(MAX_SHARE_ENTRIES).for_each(|entries| self.publish_share(entries));
+    fn share(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) {
+        entries.chunks(MAX_SHARE_ENTRIES).for_each(|entries| self.publish_share(entries, &[]));
+        marks.chunks(MAX_SHARE_ENTRIES).for_each(|marks| self.publish_share(&[], marks));
     }
 
-    fn publish_share(&self, entries: &[LedgerEntry]) {
+    fn publish_share(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) {
         let share = LedgerShare {
             schema: SCHEMA_VERSION,
             node: self.arguments.name.clone(),
             epoch: self.leads.as_ref().map(|epoch| epoch.term),
             entries: entries.to_vec(),
+            marks: marks.to_vec(),
         };
         self.arguments.gateway.send(GatewayMessage::PublishShare { share });
     }

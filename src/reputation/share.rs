@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::{Counts, ReputationLedger};
+use super::{Counts, Record, ReputationLedger};
 use crate::epoch::Epoch;
 use crate::names::{Label, NodeName};
 use crate::wire::LedgerEntry;
@@ -10,7 +10,7 @@ use crate::wire::LedgerEntry;
 /// Most lanes that are kept: the latest.
 pub const MAX_LANES: usize = 64;
 
-/// Most entries that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its own and
+/// Most counts and marks that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its own and
 /// later ones are left.
 pub const MAX_ENTRIES: usize = 65_536;
 
@@ -30,8 +30,8 @@ impl ReputationLedger {
     pub fn entries(&self) -> impl Iterator<Item = LedgerEntry> {
         self.lanes.iter().flat_map(|(epoch, aggregators)| {
             aggregators.iter().flat_map(move |(aggregator, vehicles)| {
-                vehicles.iter().flat_map(move |(node, labels)| {
-                    labels.iter().map(move |(label, counts)| entry(*epoch, aggregator, node, label, *counts))
+                vehicles.iter().flat_map(move |(node, record)| {
+                    record.labels.iter().map(move |(label, counts)| entry(*epoch, aggregator, node, label, *counts))
                 })
             })
         })
@@ -40,7 +40,7 @@ impl ReputationLedger {
     /// The counts that `keys` name, as they are now.
     pub fn entries_of(&self, keys: &BTreeSet<EntryKey>) -> Vec<LedgerEntry> {
         let find = |EntryKey { lane, node, label }: &EntryKey| {
-            let counts = self.lanes.get(&lane.term)?.get(&lane.leader)?.get(node)?.get(label)?;
+            let counts = self.lanes.get(&lane.term)?.get(&lane.leader)?.get(node)?.labels.get(label)?;
             Some(entry(lane.term, &lane.leader, node, label, *counts))
         };
         keys.iter().filter_map(find).collect()
@@ -51,10 +51,14 @@ impl ReputationLedger {
     pub fn merge_entries(&mut self, entries: impl IntoIterator<Item = LedgerEntry>) -> bool {
         let mut changed = false;
         for LedgerEntry { epoch, aggregator, node, label, correct, incorrect } in entries {
-            let Some(counts) = self.counts_mut(epoch, &aggregator, &node, &label) else { continue };
+            let Some(record) = self.record_mut(epoch, &aggregator, &node, Some(&label)) else { continue };
+            let counts = record.labels.entry(label).or_default();
             let before = *counts;
             counts.merge(Counts { correct, incorrect });
             changed |= *counts != before;
+            let grown =
+                Counts { correct: counts.correct - before.correct, incorrect: counts.incorrect - before.incorrect };
+            record.sum = record.sum.plus(grown);
         }
         changed
     }
@@ -64,29 +68,39 @@ impl ReputationLedger {
         self.lanes.values().map(|aggregators| aggregators.len()).sum()
     }
 
-    /// The counts of a vehicle and label, new ones where there is room or older lanes make some; `None` elsewhere.
-    pub(super) fn counts_mut(
+    /// What a lane knows of a vehicle, where there is room for `label` or older lanes make some; `None` elsewhere.
+    pub(super) fn record_mut(
         &mut self,
         epoch: u64,
         aggregator: &NodeName,
         node: &NodeName,
-        label: &Label,
-    ) -> Option<&mut Counts> {
+        label: Option<&Label>,
+    ) -> Option<&mut Record> {
         let lane = self.lanes.get(&epoch).and_then(|aggregators| aggregators.get(aggregator));
-        let is_new = !lane.is_some_and(|lane| lane.get(node).is_some_and(|labels| labels.contains_key(label)));
-        if is_new {
-            let is_full = |ledger: &Self| {
-                ledger.entries >= MAX_ENTRIES || (lane_is_new(ledger, epoch, aggregator) && ledger.lanes() >= MAX_LANES)
-            };
-            while is_full(self) {
-                if !self.forget_lane_before(epoch, aggregator) {
-                    return None;
-                }
+        let knows =
+            |label| lane.and_then(|lane| lane.get(node)).is_some_and(|record| record.labels.contains_key(label));
+        if label.is_some_and(|label| !knows(label)) {
+            if !self.make_room(epoch, aggregator) {
+                return None;
             }
             self.entries += 1;
         }
         let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
-        Some(lane.entry(node.clone()).or_default().entry(label.clone()).or_default())
+        Some(lane.entry(node.clone()).or_default())
+    }
+
+    /// Forgets the oldest lanes until there is room for one more count or mark in that of `epoch` and `aggregator`;
+    /// false where only that lane and later ones are left.
+    pub(super) fn make_room(&mut self, epoch: u64, aggregator: &NodeName) -> bool {
+        let is_full = |ledger: &Self| {
+            ledger.entries >= MAX_ENTRIES || (lane_is_new(ledger, epoch, aggregator) && ledger.lanes() >= MAX_LANES)
+        };
+        while is_full(self) {
+            if !self.forget_lane_before(epoch, aggregator) {
+                return false;
+            }
+        }
+        true
     }
 
     /// Forgets the oldest lane if it is older than that of `epoch` and `aggregator`.
@@ -100,7 +114,8 @@ impl ReputationLedger {
         if oldest.get().is_empty() {
             oldest.remove();
         }
-        self.entries -= forgotten.iter().flat_map(|(_, lane)| lane.values()).map(|labels| labels.len()).sum::<usize>();
+        let records = forgotten.iter().flat_map(|(_, lane)| lane.values());
+        self.entries -= records.map(|record| record.labels.len() + record.marks.len()).sum::<usize>();
         true
     }
 }

@@ -1,5 +1,6 @@
 //! The default tally: learned reputation × calibrated confidence × visibility.
 
+mod adopt;
 mod refine;
 mod room;
 
@@ -9,13 +10,13 @@ use std::time::Duration;
 use super::ballot::{Ballot, Cast, Recent, probability};
 use super::calibration::{Calibration, Weights};
 use super::config::WeightedConfig;
-use super::confusion::{Confusion, LabelIndex};
+use super::confusion::LabelIndex;
 use super::dependence::Dependence;
 use super::labels::Labels;
 use super::model::{Model, Witness};
 use super::paper::REPUTATION_RANGE;
 use crate::names::{Label, LandmarkId, NodeName};
-use crate::reputation::{Evidence, ReputationLedger};
+use crate::reputation::Evidence;
 use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
 
@@ -79,9 +80,10 @@ impl WeightedTally {
         self.touched.remove(landmark);
     }
 
-    /// Whether a vehicle has voted often enough to be trusted on its own.
+    /// Whether a vehicle has voted often enough to be judged, and was right more often than wrong.
     pub(super) fn is_proven(&self, node: &NodeName) -> bool {
-        self.vehicles.get(node).is_some_and(|&vehicle| !self.model.is_newcomer(vehicle))
+        let is_good = |vehicle: usize| !self.model.is_newcomer(vehicle) && self.model.reliability(vehicle) > 0.5;
+        self.vehicles.get(node).is_some_and(|&vehicle| is_good(vehicle))
     }
 
     fn vehicle(&mut self, node: &NodeName) -> usize {
@@ -329,34 +331,5 @@ impl WeightedTally {
             }
         };
         self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), entry(vehicle))).collect()
-    }
-
-    /// Takes over what a ledger knows of its first `most_vehicles` vehicles beyond what was counted here, as a standby
-    /// has counted most of it itself; each at most `memory_votes` strong, in place of what it took over before.
-    ///
-    /// A ledger counts by stated label; what was right instead of a wrong one is taken to be any other label alike.
-    pub(super) fn adopt(&mut self, ledger: &ReputationLedger, (most_vehicles, most_labels): (usize, usize)) {
-        let known: Vec<_> = ledger.totals().into_iter().take(most_vehicles).collect();
-        for label in known.iter().flat_map(|(node, _)| ledger.by_label(node).into_keys()) {
-            if self.labels.has_room_for(&label, most_labels) {
-                self.label(&label, None);
-            }
-        }
-        for (node, (correct, incorrect)) in known {
-            let vehicle = self.vehicle(&node);
-            let (own_correct, own_incorrect) = self.records[vehicle];
-            let total = correct.saturating_add(incorrect);
-            let beyond = total.saturating_sub(own_correct.saturating_add(own_incorrect));
-            let scale = (beyond as f64).min(self.config.memory_votes) / total.max(1) as f64;
-            let mut inherited = Confusion::default();
-            for (label, counts) in ledger.by_label(&node) {
-                let Some(label) = self.labels.number(&label) else { continue };
-                inherited.add(label, label, scale * counts.correct as f64);
-                let others: Vec<_> = (0..self.labels.len() as LabelIndex).filter(|l| *l != label).collect();
-                let each = scale * counts.incorrect as f64 / others.len().max(1) as f64;
-                others.into_iter().for_each(|truth| inherited.add(truth, label, each));
-            }
-            self.model.witnesses[vehicle].inherited = inherited;
-        }
     }
 }
