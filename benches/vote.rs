@@ -60,7 +60,7 @@ fn many_labels(figures: &mut Figures) {
         let least = rounds.skip(5).min().expect("there are rounds");
         record(figures, &format!("weighted_round_{labels}_labels"), 10_000, least)
     });
-    figures.insert("vote_weighted_cost_of_256_labels_against_5".into(), (costs[1] / costs[0]).into());
+    figures.insert("vote_weighted_cost_of_256_labels_against_5", (costs[1] / costs[0]).into());
     println!("256 labels cost {:.1} times as much as {}", costs[1] / costs[0], LABELS.len());
 }
 

@@ -94,6 +94,9 @@ impl ReputationConfig {
     }
 }
 
+/// A vehicle's (correct, incorrect) votes that are remembered, by the label that it stated.
+pub type RememberedVotes = BTreeMap<Label, (f64, f64)>;
+
 type Vehicles<T> = BTreeMap<NodeName, T>;
 type Lanes<T> = BTreeMap<u64, BTreeMap<NodeName, Vehicles<T>>>;
 
@@ -223,13 +226,9 @@ impl ReputationLedger {
 
     /// By vehicle and stated label, the (correct, incorrect) votes among the `memory_votes` latest before as many as
     /// `own` tells; how they divide among the labels is taken from their whole lane.
-    pub fn remembered(
-        &self,
-        memory_votes: f64,
-        own: impl Fn(&NodeName) -> u64,
-    ) -> BTreeMap<NodeName, BTreeMap<Label, (f64, f64)>> {
+    pub fn remembered(&self, memory_votes: f64, own: impl Fn(&NodeName) -> u64) -> BTreeMap<NodeName, RememberedVotes> {
         let mut rooms: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
-        let mut remembered: BTreeMap<NodeName, BTreeMap<Label, (f64, f64)>> = BTreeMap::new();
+        let mut remembered: BTreeMap<NodeName, RememberedVotes> = BTreeMap::new();
         for (node, record) in self.latest_first() {
             let room = rooms.entry(node).or_insert_with(|| (own(node) as f64, memory_votes));
             let (correct, incorrect) = record.latest(*room);

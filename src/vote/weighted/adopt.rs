@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use super::WeightedTally;
 use crate::names::{Label, NodeName};
-use crate::reputation::ReputationLedger;
+use crate::reputation::{RememberedVotes, ReputationLedger};
 use crate::vote::confusion::{Confusion, LabelIndex};
 
 impl WeightedTally {
@@ -47,7 +47,7 @@ impl WeightedTally {
         }
     }
 
-    fn adopt_labels(&mut self, known: &[(NodeName, BTreeMap<Label, (f64, f64)>)], most: usize) {
+    fn adopt_labels(&mut self, known: &[(NodeName, RememberedVotes)], most: usize) {
         let mut votes: BTreeMap<&Label, f64> = BTreeMap::new();
         for (label, (correct, incorrect)) in known.iter().flat_map(|(_, labels)| labels) {
             // What is mostly wrong is of use as long as there is room.
