@@ -4,7 +4,7 @@ mod figures;
 
 use std::time::{Duration, Instant};
 
-use ecod::names::NodeName;
+use ecod::names::{Label, NodeName};
 use ecod::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
@@ -22,6 +22,7 @@ const OBJECTS: usize = 32;
 fn main() {
     let mut figures = Figures::new("vote");
     rounds(&mut figures);
+    many_labels(&mut figures);
     ledgers(&mut figures);
     memory(&mut figures);
     figures.save();
@@ -37,13 +38,8 @@ fn rounds(figures: &mut Figures) {
             let least = (0..repeats)
                 .map(|round| {
                     let now = NOON + Duration::from_secs(3 * round);
-                    let reports = reports(votes, round, now);
-                    time(|| {
-                        for report in &reports {
-                            vote.observe(report, now).expect("reports are in order");
-                        }
-                        std::hint::black_box(vote.close(now));
-                    })
+                    let reports = reports(votes, round, now, LABELS.len());
+                    round_time(&mut vote, &reports, now)
                 })
                 .min()
                 .expect("there are rounds");
@@ -51,6 +47,30 @@ fn rounds(figures: &mut Figures) {
         });
         flat(figures, &format!("vote_{name}_cost_per_vote_from_the_middle"), costs);
     }
+}
+
+/// Rounds of 10,000 votes for 5 and for 256 labels, of which every vehicle has confused many: what labels cost a vote.
+fn many_labels(figures: &mut Figures) {
+    let costs = [LABELS.len(), 256].map(|labels| {
+        let mut vote = Vote::new(config(VoteMode::Weighted), Vec::new());
+        let rounds = (0..21).map(|round| {
+            let now = NOON + Duration::from_secs(3 * round);
+            round_time(&mut vote, &reports(10_000, round, now, labels), now)
+        });
+        let least = rounds.skip(5).min().expect("there are rounds");
+        record(figures, &format!("weighted_round_{labels}_labels"), 10_000, least)
+    });
+    figures.insert("vote_weighted_cost_of_256_labels_against_5", (costs[1] / costs[0]).into());
+    println!("256 labels cost {:.1} times as much as {}", costs[1] / costs[0], LABELS.len());
+}
+
+fn round_time(vote: &mut Vote, reports: &[ObjectReport], now: Timestamp) -> Duration {
+    time(|| {
+        for report in reports {
+            vote.observe(report, now).expect("reports are in order");
+        }
+        std::hint::black_box(vote.close(now));
+    })
 }
 
 /// Settled votes written into a ledger, and the reputations that follow.
@@ -69,7 +89,15 @@ fn ledgers(figures: &mut Figures) {
             .map(|epoch| time(|| evidence.iter().for_each(|e| ledger.record(epoch / 10, &aggregator, e))))
             .min()
             .expect("there are rounds");
-        std::hint::black_box(ledger.reputations(&ReputationConfig::default()));
+        let publishing = (0..21)
+            .map(|_| {
+                time(|| {
+                    std::hint::black_box(ledger.reputations(&ReputationConfig::default()));
+                })
+            })
+            .min()
+            .expect("there are rounds");
+        record(figures, "reputations_of_64_vehicles_after", votes, publishing);
         record(figures, "ledger_update", votes, least)
     });
     flat(figures, "ledger_update_cost_per_vote_from_the_middle", costs);
@@ -105,7 +133,7 @@ fn memory(figures: &mut Figures) {
         line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|kib| kib * 1024.0)
     };
     let landmarks = 50_000;
-    let reports = reports(landmarks * WITNESSES, 0, NOON);
+    let reports = reports(landmarks * WITNESSES, 0, NOON, LABELS.len());
     let Some(before) = resident() else { return };
     let mut vote = Vote::new(config(VoteMode::Weighted), Vec::new());
     for report in &reports {
@@ -123,12 +151,16 @@ fn config(mode: VoteMode) -> VoteConfig {
     VoteConfig { mode, max_landmarks: 1_000_000, max_vehicles: 100_000, ..VoteConfig::default() }
 }
 
+fn label(n: usize) -> Label {
+    LABELS.get(n).map_or_else(|| format!("label-{n}").into(), |name| (*name).into())
+}
+
 fn node(n: usize) -> NodeName {
     NodeName::new(format!("v{n}")).expect("a valid name")
 }
 
 /// Eight reports for every group of 32 landmarks, from vehicles that drive on from group to group.
-fn reports(votes: usize, round: u64, at: Timestamp) -> Vec<ObjectReport> {
+fn reports(votes: usize, round: u64, at: Timestamp, labels: usize) -> Vec<ObjectReport> {
     let landmarks = votes.div_ceil(WITNESSES);
     let mut reports = Vec::new();
     for group in 0..landmarks.div_ceil(OBJECTS) {
@@ -139,7 +171,7 @@ fn reports(votes: usize, round: u64, at: Timestamp) -> Vec<ObjectReport> {
                 PerceivedObject {
                     landmark: Some(format!("place-{place}").into()),
                     ..PerceivedObject::new(
-                        LABELS[(place + usize::from(wrong) * (1 + witness % 4)) % LABELS.len()],
+                        label((place + usize::from(wrong) * (1 + witness % 4)) % labels),
                         0.5 + 0.5 * ((place * 31 + witness * 17) % 97) as f64 / 97.0,
                         0.0,
                         0.0,

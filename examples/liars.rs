@@ -1,6 +1,8 @@
 //! What liars achieve: ⌊(n−1)/2⌋ of n vehicles lie, in four ways, and by rejoining under new names.
 //!
-//! `cargo run --release --example liars -- [--svg FILE] [--table FILE] [--seeds N]`
+//! `cargo run --release --example liars -- [--svg FILE] [--table FILE] [--write-table FILE] [--seeds N]`
+//!
+//! `--write-table` puts the table between its markers in a text.
 //!
 //! Honest vehicles are right 80 % of the time, independently. Figures are over the rounds from 300 to 600 and all seeds,
 //! 100 rounds after the last liar has begun to lie; `worst` is the worst seed. The drawing shows the mean of all seeds.
@@ -96,7 +98,7 @@ fn chance_of_most(votes: &[usize], truth: usize) -> f64 {
 fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let liars = (vehicles - 1) / 2;
-    let mut vote = Vote::new(VoteConfig { max_vehicles: 4096, ..VoteConfig::default() }, Vec::new());
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let mut course = Course { accuracy: Vec::new(), reputation: Vec::new(), settled: 0.0, majority: 0.0, honest: 0.0 };
     let (mut right, mut settled, mut majority, mut honest) = (0, 0, 0.0, 0.0);
     let mut now = Timestamp(1_700_000_000_000_000);
@@ -213,14 +215,24 @@ fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
+fn write_table(path: &str, table: &str) -> Result<(), Box<dyn Error>> {
+    const BEGIN: &str = "<!-- liars table begin -->\n";
+    const END: &str = "<!-- liars table end -->";
+    let text = std::fs::read_to_string(path)?;
+    let (before, rest) = text.split_once(BEGIN).ok_or("no begin marker")?;
+    let (_, after) = rest.split_once(END).ok_or("no end marker")?;
+    Ok(std::fs::write(path, format!("{before}{BEGIN}{table}{END}{after}"))?)
+}
+
 fn main() -> Result<(), Box<dyn Error>> {
-    let (mut svg, mut file, mut seeds) = (None, None, 5);
+    let (mut svg, mut file, mut text, mut seeds) = (None, None, None, 5);
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
         let value = args.next().ok_or_else(|| format!("{key} needs a value"))?;
         match key.as_str() {
             "--svg" => svg = Some(value),
             "--table" => file = Some(value),
+            "--write-table" => text = Some(value),
             "--seeds" => seeds = value.parse()?,
             _ => return Err(format!("unknown option {key}").into()),
         }
@@ -241,6 +253,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     print!("{table}");
     if let Some(path) = file {
         std::fs::write(path, &table)?;
+    }
+    if let Some(path) = text {
+        write_table(&path, &table)?;
     }
     if let Some(path) = svg {
         draw(&path, &trials)?;

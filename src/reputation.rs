@@ -4,7 +4,11 @@
 //! time is an upper bound of its earlier states: merging takes the larger count, lane by lane. Merging is idempotent,
 //! commutative and associative (a state-based grow-only counter, Shapiro et al. 2011); two partitions that each went on
 //! counting merge to the sum of what they saw.
+//!
+//! So that votes can be forgotten, a lane has marks: what a vehicle's counts were when it had so many votes. Marks are
+//! written once; those that are kept follow from the latest, so that merging them is a join too.
 
+mod marks;
 mod share;
 
 use std::collections::BTreeMap;
@@ -15,7 +19,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
 use crate::names::{Label, NodeName};
-use crate::wire::Reputation;
+use crate::wire::{LedgerMark, Reputation};
+
+use marks::Marks;
 
 /// One vote of which it is settled whether it agreed with the verdict.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -39,6 +45,18 @@ pub struct Counts {
 }
 
 impl Counts {
+    /// All votes.
+    pub fn total(self) -> u64 {
+        self.correct.saturating_add(self.incorrect)
+    }
+
+    fn plus(self, other: Self) -> Self {
+        Self {
+            correct: self.correct.saturating_add(other.correct),
+            incorrect: self.incorrect.saturating_add(other.incorrect),
+        }
+    }
+
     fn merge(&mut self, other: Self) {
         self.correct = self.correct.max(other.correct);
         self.incorrect = self.incorrect.max(other.incorrect);
@@ -53,8 +71,8 @@ pub struct ReputationConfig {
     pub initial: f64,
     /// Weight of the initial score in votes; default 10. More trusts newcomers and new liars later.
     pub initial_votes: f64,
-    /// Votes that are remembered of a vehicle; default 500. Of older epochs only as much counts as later ones leave
-    /// room for, so that a change of leadership alone changes no score. Less notices a change of mind sooner.
+    /// Votes that are remembered of a vehicle, the latest; default 500. Where they begin is
+    /// interpolated between marks. Less notices a change of mind sooner.
     pub memory_votes: f64,
 }
 
@@ -81,31 +99,66 @@ impl ReputationConfig {
     }
 }
 
-type Vehicles = BTreeMap<NodeName, BTreeMap<Label, Counts>>;
-type Lanes = BTreeMap<u64, BTreeMap<NodeName, Vehicles>>;
+/// A vehicle's (correct, incorrect) votes that are remembered, by the label that it stated.
+pub type RememberedVotes = BTreeMap<Label, (f64, f64)>;
+
+type Vehicles<T> = BTreeMap<NodeName, T>;
+type Lanes<T> = BTreeMap<u64, BTreeMap<NodeName, Vehicles<T>>>;
+
+/// What one lane knows of one vehicle.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+struct Record {
+    labels: BTreeMap<Label, Counts>,
+    /// Their sum.
+    sum: Counts,
+    marks: Marks,
+}
 
 /// The evidence of all epochs. Serialised, it is the snapshot that is persisted and replicated.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "Snapshot")]
+#[serde(from = "Snapshot", into = "Snapshot")]
 pub struct ReputationLedger {
-    /// By epoch, the aggregator that wrote the lane, vehicle and stated label.
-    lanes: Lanes,
-    /// Number of counts in all lanes.
-    #[serde(skip)]
+    /// By epoch, the aggregator that wrote the lane, and vehicle.
+    lanes: Lanes<Record>,
+    /// Number of counts and marks in all lanes.
     entries: usize,
 }
 
-/// A ledger as it was written.
-#[derive(Deserialize)]
+/// A ledger as it is written: without marks if it comes from before there were any.
+#[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Snapshot {
-    lanes: Lanes,
+    lanes: Lanes<BTreeMap<Label, Counts>>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    marks: Vec<LedgerMark>,
 }
 
 impl From<Snapshot> for ReputationLedger {
-    fn from(Snapshot { lanes }: Snapshot) -> Self {
-        let entries = lanes.values().flat_map(BTreeMap::values).flat_map(BTreeMap::values).map(BTreeMap::len).sum();
-        Self { lanes, entries }
+    fn from(Snapshot { lanes, marks }: Snapshot) -> Self {
+        let mut ledger = Self::default();
+        for (epoch, aggregators) in lanes {
+            for (aggregator, vehicles) in aggregators {
+                let lane = ledger.lanes.entry(epoch).or_default().entry(aggregator).or_default();
+                for (node, labels) in vehicles {
+                    ledger.entries += labels.len();
+                    let sum = labels.values().copied().fold(Counts::default(), Counts::plus);
+                    lane.insert(node, Record { labels, sum, marks: Marks::default() });
+                }
+            }
+        }
+        ledger.merge_marks(marks, None);
+        ledger
+    }
+}
+
+impl From<ReputationLedger> for Snapshot {
+    fn from(ledger: ReputationLedger) -> Self {
+        let marks = ledger.marks().collect();
+        let labels = |vehicles: Vehicles<Record>| vehicles.into_iter().map(|(node, r)| (node, r.labels)).collect();
+        let lanes = |aggregators: BTreeMap<NodeName, Vehicles<Record>>| {
+            aggregators.into_iter().map(|(aggregator, vehicles)| (aggregator, labels(vehicles))).collect()
+        };
+        Self { lanes: ledger.lanes.into_iter().map(|(epoch, all)| (epoch, lanes(all))).collect(), marks }
     }
 }
 
@@ -113,60 +166,55 @@ impl ReputationLedger {
     /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Any other lane gives way
     /// to it, see [`Self::merge_entries`]; the vote is not counted where it takes all the room itself.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
-        let Some(counts) =
-            self.counts_mut((epoch, aggregator), &evidence.node, &evidence.label, Some((epoch, aggregator)))
-        else {
-            return;
-        };
-        let count = if evidence.correct { &mut counts.correct } else { &mut counts.incorrect };
-        *count = count.saturating_add(1);
+        let lane = (epoch, aggregator);
+        let Some(record) = self.record_mut(lane, &evidence.node, Some(&evidence.label), Some(lane)) else { return };
+        let counts = record.labels.entry(evidence.label.clone()).or_default();
+        for Counts { correct, incorrect } in [counts, &mut record.sum] {
+            let count = if evidence.correct { correct } else { incorrect };
+            *count = count.saturating_add(1);
+        }
+        let sum = record.sum;
+        self.reach_mark(lane, &evidence.node, sum);
     }
 
     /// Takes in all that `other` knows, within the same bounds.
     pub fn merge(&mut self, other: &Self) {
         self.merge_entries(other.entries(), None);
+        self.merge_marks(other.marks(), None);
     }
 
-    fn counts(&self) -> impl Iterator<Item = (u64, &NodeName, &Label, Counts)> {
-        self.lanes.iter().flat_map(|(epoch, aggregators)| {
-            let vehicles = aggregators.values().flatten();
-            vehicles.flat_map(move |(node, labels)| labels.iter().map(move |(label, c)| (*epoch, node, label, *c)))
-        })
+    /// What every lane knows of every vehicle, the latest lanes first.
+    fn latest_first(&self) -> impl Iterator<Item = (&NodeName, &Record)> {
+        self.lanes.values().rev().flat_map(|aggregators| aggregators.values().rev().flatten())
+    }
+
+    /// The latest epoch in which each vehicle was counted.
+    pub fn latest_lanes(&self) -> BTreeMap<NodeName, u64> {
+        let nodes = |(epoch, aggregators): (&u64, &BTreeMap<NodeName, Vehicles<Record>>)| {
+            let epoch = *epoch;
+            aggregators.values().flat_map(BTreeMap::keys).map(move |node| (node.clone(), epoch)).collect::<Vec<_>>()
+        };
+        self.lanes.iter().flat_map(nodes).collect()
     }
 
     /// Every vehicle's (correct, incorrect) over all lanes.
     pub fn totals(&self) -> BTreeMap<NodeName, (u64, u64)> {
-        let mut totals: BTreeMap<_, (u64, u64)> = BTreeMap::new();
-        for (_, node, _, counts) in self.counts() {
+        let mut totals: BTreeMap<NodeName, Counts> = BTreeMap::new();
+        for (node, record) in self.latest_first() {
             let total = totals.entry(node.clone()).or_default();
-            *total = (total.0.saturating_add(counts.correct), total.1.saturating_add(counts.incorrect));
+            *total = total.plus(record.sum);
         }
-        totals
+        totals.into_iter().map(|(node, Counts { correct, incorrect })| (node, (correct, incorrect))).collect()
     }
 
-    /// A vehicle's counts by the label that it stated, over all lanes.
-    pub fn by_label(&self, vehicle: &NodeName) -> BTreeMap<Label, Counts> {
-        let mut labels: BTreeMap<Label, Counts> = BTreeMap::new();
-        for (_, _, label, counts) in self.counts().filter(|(_, node, ..)| *node == vehicle) {
-            let sum = labels.entry(label.clone()).or_default();
-            sum.correct = sum.correct.saturating_add(counts.correct);
-            sum.incorrect = sum.incorrect.saturating_add(counts.incorrect);
-        }
-        labels
-    }
-
-    /// What is published: the mean of a Beta distribution (Jøsang & Ismail 2002) over the evidence that is remembered,
-    /// 0.30 to 1.00.
+    /// What is published: the mean of a Beta distribution (Jøsang & Ismail 2002) over the votes that are remembered,
+    /// 0.30 to 1.00, and the counts of all.
     pub fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
         let mut remembered: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
-        for (node, labels) in self.lanes.values().rev().flat_map(|aggregators| aggregators.values().rev().flatten()) {
-            let (correct, incorrect) = labels.values().fold((0.0, 0.0), |(correct, incorrect), counts| {
-                (correct + counts.correct as f64, incorrect + counts.incorrect as f64)
-            });
+        for (node, record) in self.latest_first() {
             let sum = remembered.entry(node).or_default();
-            let room = config.memory_votes - (sum.0 + sum.1);
-            let share = (room / f64::max(correct + incorrect, 1.0)).clamp(0.0, 1.0);
-            *sum = (sum.0 + share * correct, sum.1 + share * incorrect);
+            let (correct, incorrect) = record.latest((0.0, config.memory_votes - (sum.0 + sum.1)));
+            *sum = (sum.0 + correct, sum.1 + incorrect);
         }
         let score = |node: &NodeName| {
             let (correct, incorrect) = remembered.get(node).copied().unwrap_or_default();
@@ -180,76 +228,28 @@ impl ReputationLedger {
             })
             .collect()
     }
+
+    /// By vehicle and stated label, the (correct, incorrect) votes among the `memory_votes` latest before as many as
+    /// `own` tells; how they divide among the labels is taken from their whole lane.
+    pub fn remembered(&self, memory_votes: f64, own: impl Fn(&NodeName) -> u64) -> BTreeMap<NodeName, RememberedVotes> {
+        let mut rooms: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
+        let mut remembered: BTreeMap<NodeName, RememberedVotes> = BTreeMap::new();
+        for (node, record) in self.latest_first() {
+            let room = rooms.entry(node).or_insert_with(|| (own(node) as f64, memory_votes));
+            let (correct, incorrect) = record.latest(*room);
+            room.0 = (room.0 - record.sum.total() as f64).max(0.0);
+            room.1 -= correct + incorrect;
+            let shares = (correct / record.sum.correct.max(1) as f64, incorrect / record.sum.incorrect.max(1) as f64);
+            let labels = remembered.entry(node.clone()).or_default();
+            for (label, counts) in &record.labels {
+                let sum = labels.entry(label.clone()).or_default();
+                sum.0 += shares.0 * counts.correct as f64;
+                sum.1 += shares.1 * counts.incorrect as f64;
+            }
+        }
+        remembered
+    }
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn ledger() -> impl Strategy<Value = ReputationLedger> {
-        let vote = (0u64..3, 0usize..2, 0usize..3, 0usize..2, any::<bool>());
-        proptest::collection::vec(vote, 0..40).prop_map(|votes| {
-            let name = |prefix: &str, n: usize| NodeName::new(format!("{prefix}{n}")).unwrap();
-            let mut ledger = ReputationLedger::default();
-            for (epoch, aggregator, node, label, correct) in votes {
-                let evidence = Evidence { node: name("v", node), label: format!("l{label}").into(), correct };
-                ledger.record(epoch, &name("a", aggregator), &evidence);
-            }
-            ledger
-        })
-    }
-
-    fn merged(a: &ReputationLedger, b: &ReputationLedger) -> ReputationLedger {
-        let mut merged = a.clone();
-        merged.merge(b);
-        merged
-    }
-
-    proptest! {
-        #[test]
-        fn merging_is_a_join_semilattice(a in ledger(), b in ledger(), c in ledger()) {
-            prop_assert_eq!(merged(&a, &a), a.clone());
-            prop_assert_eq!(merged(&a, &b), merged(&b, &a));
-            prop_assert_eq!(merged(&merged(&a, &b), &c), merged(&a, &merged(&b, &c)));
-        }
-
-        #[test]
-        fn scores_stay_within_bounds_and_snapshots_come_back(a in ledger()) {
-            for reputation in a.reputations(&ReputationConfig::default()).values() {
-                prop_assert!((0.30..=1.00).contains(&reputation.score));
-            }
-            let snapshot = serde_json::to_string(&a).unwrap();
-            prop_assert_eq!(serde_json::from_str::<ReputationLedger>(&snapshot).unwrap(), a);
-        }
-    }
-
-    #[test]
-    fn a_new_epoch_alone_changes_no_score_and_new_evidence_displaces_old() {
-        let name = |n: &str| NodeName::new(n).unwrap();
-        let config = ReputationConfig::default();
-        let vote = |correct| Evidence { node: name("euclid"), label: "cup".into(), correct };
-        let mut ledger = ReputationLedger::default();
-        (0..2000).for_each(|_| ledger.record(1, &name("edge"), &vote(true)));
-        let score = |ledger: &ReputationLedger| ledger.reputations(&config)[&name("euclid")].score;
-        let before = score(&ledger);
-        ledger.record(1_732_154_400, &name("gauss"), &vote(true));
-        assert!((score(&ledger) - before).abs() < 1e-9, "{} {before}", score(&ledger));
-        (0..400).for_each(|_| ledger.record(1_732_154_400, &name("gauss"), &vote(false)));
-        assert!(score(&ledger) < 0.35, "{}", score(&ledger));
-    }
-
-    #[test]
-    fn partitions_that_counted_apart_merge_to_their_sum() {
-        let name = |n: &str| NodeName::new(n).unwrap();
-        let evidence = Evidence { node: name("euclid"), label: "cup".into(), correct: true };
-        let mut common = ReputationLedger::default();
-        common.record(1, &name("edge"), &evidence);
-        let (mut left, mut right) = (common.clone(), common);
-        left.record(2, &name("left"), &evidence);
-        right.record(2, &name("right"), &evidence);
-        left.merge(&right);
-        assert_eq!(left.totals()[&name("euclid")], (3, 0));
-    }
-}
+mod tests;

@@ -14,6 +14,7 @@ mod calibration;
 mod config;
 mod confusion;
 mod dependence;
+mod labels;
 mod model;
 mod paper;
 mod visibility;
@@ -142,8 +143,8 @@ impl Vote {
         Ok(())
     }
 
-    /// Forgets vehicles that have been silent if there are as many as there may be: unproven ones before proven ones,
-    /// the longest silent first.
+    /// Forgets vehicles that have been silent if there are as many as there may be: unproven ones and those that were
+    /// mostly wrong before proven ones, the longest silent first.
     fn make_room(&mut self, now: Timestamp) -> Result<(), RejectReason> {
         if self.heard.len() < self.config.max_vehicles {
             return Ok(());
@@ -196,12 +197,10 @@ impl Vote {
         if geometry.is_some_and(|(distance, _)| distance > self.max_range_m()) {
             return false;
         }
-        let has_room = match &self.tally {
-            Tally::Paper(tally) => tally.has_room_for(landmark, &label, self.config.max_labels),
-            Tally::Weighted(tally) => tally.has_room_for(&label, self.config.max_labels),
-        };
-        if !has_room {
-            return false;
+        match &mut self.tally {
+            Tally::Paper(tally) if !tally.has_room_for(landmark, &label, self.config.max_labels) => return false,
+            Tally::Paper(_) => {}
+            Tally::Weighted(tally) => tally.make_room_for(&label, self.config.max_labels),
         }
         if known.is_none() {
             self.open_landmark(landmark);

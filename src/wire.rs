@@ -277,6 +277,10 @@ pub struct LedgerShare {
     /// Counts, at most [`MAX_SHARE_ENTRIES`].
     #[n(3)]
     pub entries: Vec<LedgerEntry>,
+    /// Marks, at most [`MAX_SHARE_ENTRIES`]; without them votes are not told from later ones.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(4), default)]
+    pub marks: Vec<LedgerMark>,
 }
 
 /// How often one vehicle was right and wrong with one label under one leadership.
@@ -298,6 +302,29 @@ pub struct LedgerEntry {
     #[n(4)]
     pub correct: u64,
     /// Votes that did not.
+    #[n(5)]
+    pub incorrect: u64,
+}
+
+/// How often one vehicle had been right and wrong under one leadership when it had so many votes; written once.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LedgerMark {
+    /// Term of the leadership that counted.
+    #[n(0)]
+    pub epoch: u64,
+    /// Its aggregator.
+    #[n(1)]
+    pub aggregator: NodeName,
+    /// The vehicle.
+    #[n(2)]
+    pub node: NodeName,
+    /// Its votes then, in 32.
+    #[n(3)]
+    pub number: u64,
+    /// Those that agreed with the verdict.
+    #[n(4)]
+    pub correct: u64,
+    /// Those that did not.
     #[n(5)]
     pub incorrect: u64,
 }

@@ -27,7 +27,8 @@ use ecod::names::NodeName;
 use ecod::reputation::{EntryKey, Evidence, ReputationConfig};
 use ecod::time::Timestamp;
 use ecod::wire::{
-    LedgerEntry, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION,
+    LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, Reputation, Reputations, Role,
+    SCHEMA_VERSION,
 };
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
@@ -245,10 +246,11 @@ impl ReputationKeeperState {
             book.standing = reputations;
         }
         let changed = book.ledger.entries_of(&keys);
+        let reached = book.ledger.marks_reached(epoch.term, &epoch.leader, evidence);
         drop(book);
         self.leads = Some(epoch);
         self.last_round = round;
-        self.share(&changed);
+        self.share(&changed, &reached);
     }
 
     fn merge(&mut self, delivery: &Delivery) {
@@ -259,17 +261,22 @@ impl ReputationKeeperState {
             return self.arguments.counters.reject(RejectReason::NotCandidate);
         }
         let term = *self.arguments.term.borrow();
-        let own = |entry: &LedgerEntry| {
-            self.leads.as_ref().is_some_and(|own| own.term == entry.epoch && own.leader == entry.aggregator)
-        };
-        let known = |entry: &&LedgerEntry| entry.epoch <= term && !own(entry);
-        let news: Vec<_> = share.entries.iter().filter(known).cloned().collect();
-        if share.entries.iter().any(|entry| entry.epoch > term) {
+        let lanes = share.entries.iter().map(|entry| entry.epoch).chain(share.marks.iter().map(|mark| mark.epoch));
+        if lanes.max() > Some(term) {
             tracing::debug!(node = %share.node, term, "evidence of a later term");
             self.arguments.counters.reject(RejectReason::UnknownTerm);
         }
+        let is_news = |epoch: u64, leader: &NodeName| {
+            epoch <= term && self.leads.as_ref().is_none_or(|own| own.term != epoch || own.leader != *leader)
+        };
+        let entries: Vec<_> = share.entries.iter().filter(|e| is_news(e.epoch, &e.aggregator)).cloned().collect();
+        let marks: Vec<_> = share.marks.iter().filter(|m| is_news(m.epoch, &m.aggregator)).cloned().collect();
         let present = self.leads.clone().or_else(|| self.arguments.leadership.borrow().epoch.clone());
-        if self.arguments.book.open().ledger.merge_entries(news, present.as_ref()) {
+        let mut book = self.arguments.book.open();
+        let present = present.as_ref();
+        let changed = book.ledger.merge_entries(entries, present) | book.ledger.merge_marks(marks, present);
+        drop(book);
+        if changed {
             self.arguments.counters.count(Event::LedgerMerged);
             self.unsaved = true;
             self.unadopted = true;
@@ -277,8 +284,8 @@ impl ReputationKeeperState {
         let leader = share.epoch.filter(|claimed| *claimed <= term).map(|term| Epoch::new(term, share.node.clone()));
         if leader.is_some() && leader != self.heard {
             self.heard = leader;
-            let has_own = |entries: &[LedgerEntry]| entries.iter().any(|entry| entry.aggregator == self.arguments.name);
-            self.owes_all = self.has_led || has_own(&self.entries());
+            let (entries, _) = self.evidence();
+            self.owes_all = self.has_led || entries.iter().any(|entry| entry.aggregator == self.arguments.name);
         }
         self.send_all(delivery.received_at);
     }
@@ -287,7 +294,8 @@ impl ReputationKeeperState {
     fn send_all(&mut self, now: Timestamp) {
         if self.owes_all && self.all_sent.is_none_or(|at| now.since(at) >= ALL_PAUSE) {
             (self.owes_all, self.all_sent) = (false, Some(now));
-            self.share(&self.entries());
+            let (entries, marks) = self.evidence();
+            self.share(&entries, &marks);
         }
     }
 
@@ -326,29 +334,32 @@ impl ReputationKeeperState {
         self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
     }
 
-    fn entries(&self) -> Vec<LedgerEntry> {
-        self.arguments.book.open().ledger.entries().collect()
+    fn evidence(&self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
+        let book = self.arguments.book.open();
+        (book.ledger.entries().collect(), book.ledger.marks().collect())
     }
 
     /// Shares all evidence, and that there is none: whoever takes over waits for it, and whoever has some gives it.
     fn send_snapshot(&self) {
-        let entries = self.entries();
+        let (entries, marks) = self.evidence();
         if entries.is_empty() {
-            self.publish_share(&[]);
+            self.publish_share(&[], &[]);
         }
-        self.share(&entries);
+        self.share(&entries, &marks);
     }
 
-    fn share(&self, entries: &[LedgerEntry]) {
-        entries.chunks(MAX_SHARE_ENTRIES).for_each(|entries| self.publish_share(entries));
+    fn share(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) {
+        entries.chunks(MAX_SHARE_ENTRIES).for_each(|entries| self.publish_share(entries, &[]));
+        marks.chunks(MAX_SHARE_ENTRIES).for_each(|marks| self.publish_share(&[], marks));
     }
 
-    fn publish_share(&self, entries: &[LedgerEntry]) {
+    fn publish_share(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) {
         let share = LedgerShare {
             schema: SCHEMA_VERSION,
             node: self.arguments.name.clone(),
             epoch: self.leads.as_ref().map(|epoch| epoch.term),
             entries: entries.to_vec(),
+            marks: marks.to_vec(),
         };
         self.arguments.gateway.send(GatewayMessage::PublishShare { share });
     }

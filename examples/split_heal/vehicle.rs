@@ -121,8 +121,8 @@ impl Vehicle {
     }
 
     fn share(&mut self, to: Option<NodeName>) {
-        let entries = self.ledger.entries().collect();
-        let share = LedgerShare { schema: SCHEMA_VERSION, node: self.name.clone(), epoch: None, entries };
+        let (entries, marks) = (self.ledger.entries().collect(), self.ledger.marks().collect());
+        let share = LedgerShare { schema: SCHEMA_VERSION, node: self.name.clone(), epoch: None, entries, marks };
         self.outbox.push((to, Payload::Evidence(encode(&share, Encoding::Cbor))));
     }
 

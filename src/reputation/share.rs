@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::{Counts, ReputationLedger, Vehicles};
+use super::{Counts, Record, ReputationLedger, Vehicles};
 use crate::epoch::Epoch;
 use crate::names::{Label, NodeName};
 use crate::wire::LedgerEntry;
@@ -10,7 +10,7 @@ use crate::wire::LedgerEntry;
 /// Most lanes that are kept: the latest.
 pub const MAX_LANES: usize = 64;
 
-/// Most entries that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its own and
+/// Most counts and marks that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its own and
 /// later ones are left, unless it is of the present leader's lane, to which later ones give way too.
 pub const MAX_ENTRIES: usize = 65_536;
 
@@ -33,8 +33,8 @@ impl ReputationLedger {
     pub fn entries(&self) -> impl Iterator<Item = LedgerEntry> {
         self.lanes.iter().flat_map(|(epoch, aggregators)| {
             aggregators.iter().flat_map(move |(aggregator, vehicles)| {
-                vehicles.iter().flat_map(move |(node, labels)| {
-                    labels.iter().map(move |(label, counts)| entry(*epoch, aggregator, node, label, *counts))
+                vehicles.iter().flat_map(move |(node, record)| {
+                    record.labels.iter().map(move |(label, counts)| entry(*epoch, aggregator, node, label, *counts))
                 })
             })
         })
@@ -43,7 +43,7 @@ impl ReputationLedger {
     /// The counts that `keys` name, as they are now.
     pub fn entries_of(&self, keys: &BTreeSet<EntryKey>) -> Vec<LedgerEntry> {
         let find = |EntryKey { lane, node, label }: &EntryKey| {
-            let counts = self.lanes.get(&lane.term)?.get(&lane.leader)?.get(node)?.get(label)?;
+            let counts = self.lanes.get(&lane.term)?.get(&lane.leader)?.get(node)?.labels.get(label)?;
             Some(entry(lane.term, &lane.leader, node, label, *counts))
         };
         keys.iter().filter_map(find).collect()
@@ -56,10 +56,14 @@ impl ReputationLedger {
         let present = present.map(|epoch| (epoch.term, &epoch.leader));
         let mut changed = false;
         for LedgerEntry { epoch, aggregator, node, label, correct, incorrect } in entries {
-            let Some(counts) = self.counts_mut((epoch, &aggregator), &node, &label, present) else { continue };
+            let Some(record) = self.record_mut((epoch, &aggregator), &node, Some(&label), present) else { continue };
+            let counts = record.labels.entry(label).or_default();
             let before = *counts;
             counts.merge(Counts { correct, incorrect });
             changed |= *counts != before;
+            let grown =
+                Counts { correct: counts.correct - before.correct, incorrect: counts.incorrect - before.incorrect };
+            record.sum = record.sum.plus(grown);
         }
         changed
     }
@@ -69,33 +73,42 @@ impl ReputationLedger {
         self.lanes.values().map(|aggregators| aggregators.len()).sum()
     }
 
-    /// The counts of a vehicle and label, new ones where there is room or other lanes make some; `None` elsewhere.
-    pub(super) fn counts_mut(
+    /// What a lane knows of a vehicle, where there is room for `label` or other lanes make some; `None` elsewhere.
+    pub(super) fn record_mut(
         &mut self,
         lane: Lane<'_>,
         node: &NodeName,
-        label: &Label,
+        label: Option<&Label>,
         present: Option<Lane<'_>>,
-    ) -> Option<&mut Counts> {
-        let known = self.lane(lane);
-        let is_new = !known.is_some_and(|known| known.get(node).is_some_and(|labels| labels.contains_key(label)));
-        if is_new {
-            let is_full = |ledger: &Self| {
-                ledger.entries >= MAX_ENTRIES || (ledger.lane(lane).is_none() && ledger.lanes() >= MAX_LANES)
-            };
-            while is_full(self) {
-                if !self.forget_oldest(lane, present) {
-                    return None;
-                }
+    ) -> Option<&mut Record> {
+        let known = self.lane(lane).and_then(|known| known.get(node));
+        let knows = |label| known.is_some_and(|record| record.labels.contains_key(label));
+        if label.is_some_and(|label| !knows(label)) {
+            if !self.make_room(lane, present) {
+                return None;
             }
             self.entries += 1;
         }
         let (epoch, aggregator) = lane;
         let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
-        Some(lane.entry(node.clone()).or_default().entry(label.clone()).or_default())
+        Some(lane.entry(node.clone()).or_default())
     }
 
-    fn lane(&self, (epoch, aggregator): Lane<'_>) -> Option<&Vehicles> {
+    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false where only those are left
+    /// that do not give way to it.
+    pub(super) fn make_room(&mut self, lane: Lane<'_>, present: Option<Lane<'_>>) -> bool {
+        let is_full = |ledger: &Self| {
+            ledger.entries >= MAX_ENTRIES || (ledger.lane(lane).is_none() && ledger.lanes() >= MAX_LANES)
+        };
+        while is_full(self) {
+            if !self.forget_oldest(lane, present) {
+                return false;
+            }
+        }
+        true
+    }
+
+    pub(super) fn lane(&self, (epoch, aggregator): Lane<'_>) -> Option<&Vehicles<Record>> {
         self.lanes.get(&epoch)?.get(aggregator)
     }
 
@@ -110,7 +123,8 @@ impl ReputationLedger {
         if aggregators.is_empty() {
             self.lanes.remove(&epoch);
         }
-        self.entries -= forgotten.iter().flat_map(|lane| lane.values()).map(|labels| labels.len()).sum::<usize>();
+        let records = forgotten.iter().flat_map(|lane| lane.values());
+        self.entries -= records.map(|record| record.labels.len() + record.marks.len()).sum::<usize>();
         true
     }
 }

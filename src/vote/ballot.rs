@@ -61,6 +61,11 @@ impl Recent {
         more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
     }
 
+    /// Forgets what was stated for labels whose numbers may stand for others from now on.
+    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
+        self.labels.iter_mut().filter(|(label, _)| is_gone(*label)).for_each(|place| *place = (0, 0.0));
+    }
+
     /// How sure it is that the label stated most is not so by chance, 0 to 1: the difference to the next in standard
     /// deviations of a multinomial draw, as a two-sided probability. Who wavers between two labels hardly votes.
     pub(super) fn certainty(&self) -> f64 {
@@ -164,6 +169,19 @@ impl Ballot {
         let of_label = |label| self.casts.iter().filter(move |c| c.label == label);
         let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
         self.candidates().into_iter().map(|label| (label, share(label))).collect()
+    }
+
+    /// Forgets labels with the votes for them; not while it is counted.
+    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
+        self.casts.retain(|cast| !is_gone(cast.label));
+        self.posterior.retain(|(label, _)| !is_gone(*label));
+        self.shown = self.shown.filter(|label| !is_gone(*label));
+        let total: f64 = self.posterior.iter().map(|(_, p)| p).sum();
+        if total > 0.0 && !self.casts.is_empty() {
+            self.posterior.iter_mut().for_each(|(_, p)| *p /= total);
+        } else {
+            self.posterior.clear();
+        }
     }
 
     /// Whether several vehicles voted, so that they can judge each other.

@@ -30,7 +30,9 @@ pub struct VoteConfig {
     /// Most vehicles; beyond it, long silent ones make room, or else reports of others are rejected. Default 256. Bounds
     /// memory.
     pub max_vehicles: usize,
-    /// Most distinct labels of the cell; votes for others are ignored. Default 256. Bounds memory.
+    /// Most distinct labels of the cell, in `paper` mode of a landmark. Beyond it the labels that others can best do
+    /// without make room, those of who brought in the most first; in `paper` mode, whose sums never end, votes for new
+    /// ones are ignored. Default 256. Bounds memory.
     pub max_labels: usize,
 }
 

@@ -117,6 +117,15 @@ impl Dependence {
         }
     }
 
+    /// Forgets how often labels were stated; their numbers may stand for others from now on.
+    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+        for &label in labels {
+            let Some(stated) = self.stated.get_mut(usize::from(label)).map(std::mem::take) else { continue };
+            self.total -= stated;
+            self.squares -= stated * stated;
+        }
+    }
+
     /// Compares the votes on a landmark, (vehicle, label, whether new) in any fixed order, where one of a pair is new.
     pub(super) fn compare(&mut self, votes: &[(usize, LabelIndex, bool)]) {
         for &(vehicle, _, is_new) in votes {

@@ -1,5 +1,7 @@
 //! How probable each label is, given who said what: hierarchical Dawid–Skene.
 
+use std::collections::BTreeSet;
+
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
 
@@ -97,6 +99,30 @@ impl Model {
         self.labels += 1;
         self.shares.push(0.0);
         self.log_shares.push(0.0);
+    }
+
+    /// How many labels there is room for.
+    pub(super) fn labels(&self) -> usize {
+        self.labels
+    }
+
+    /// By label, how often it was stated where it was right.
+    pub(super) fn support(&self) -> Vec<f64> {
+        let evidence = [&self.live, &self.settled].into_iter().chain(self.witnesses.iter().map(|w| &w.inherited));
+        let mut support = vec![0.0; self.labels];
+        for confusion in evidence {
+            for (label, sum) in support.iter_mut().enumerate() {
+                *sum += confusion.cell(label as LabelIndex, label as LabelIndex);
+            }
+        }
+        support
+    }
+
+    /// Forgets labels, none of which is in the live evidence; their numbers may stand for others from now on.
+    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+        labels.iter().for_each(|label| self.shares[usize::from(*label)] = 0.0);
+        let of_vehicles = self.witnesses.iter_mut().flat_map(|w| [&mut w.live, &mut w.settled, &mut w.inherited]);
+        [&mut self.live, &mut self.settled].into_iter().chain(of_vehicles).for_each(|c| c.forget_labels(labels));
     }
 
     fn wrong_labels(&self) -> f64 {

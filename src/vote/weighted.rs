@@ -1,6 +1,8 @@
 //! The default tally: learned reputation × calibrated confidence × visibility.
 
+mod adopt;
 mod refine;
+mod room;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -8,12 +10,13 @@ use std::time::Duration;
 use super::ballot::{Ballot, Cast, Recent, probability};
 use super::calibration::{Calibration, Weights};
 use super::config::WeightedConfig;
-use super::confusion::{Confusion, LabelIndex};
+use super::confusion::LabelIndex;
 use super::dependence::Dependence;
+use super::labels::Labels;
 use super::model::{Model, Witness};
 use super::paper::REPUTATION_RANGE;
 use crate::names::{Label, LandmarkId, NodeName};
-use crate::reputation::{Evidence, ReputationLedger};
+use crate::reputation::Evidence;
 use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
 
@@ -35,8 +38,7 @@ pub(super) struct WeightedTally {
     /// Numbers of forgotten vehicles.
     free: Vec<usize>,
     records: Vec<(u64, u64)>,
-    labels: Vec<Label>,
-    label_numbers: BTreeMap<Label, LabelIndex>,
+    labels: Labels,
     ballots: BTreeMap<LandmarkId, Ballot>,
     touched: BTreeSet<LandmarkId>,
     expiries: BTreeSet<(Timestamp, LandmarkId)>,
@@ -56,8 +58,7 @@ impl WeightedTally {
             names: Vec::new(),
             free: Vec::new(),
             records: Vec::new(),
-            labels: Vec::new(),
-            label_numbers: BTreeMap::new(),
+            labels: Labels::default(),
             ballots: BTreeMap::new(),
             touched: BTreeSet::new(),
             expiries: BTreeSet::new(),
@@ -79,27 +80,10 @@ impl WeightedTally {
         self.touched.remove(landmark);
     }
 
-    /// Whether a vehicle has voted often enough to be trusted on its own.
+    /// Whether a vehicle has voted often enough to be judged, and was right more often than wrong.
     pub(super) fn is_proven(&self, node: &NodeName) -> bool {
-        self.vehicles.get(node).is_some_and(|&vehicle| !self.model.is_newcomer(vehicle))
-    }
-
-    /// Forgets vehicles with their votes and all that is known of them; others take their numbers.
-    pub(super) fn forget_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
-        let gone: BTreeSet<usize> = nodes.iter().filter_map(|node| self.vehicles.remove(node)).collect();
-        let is_theirs = |cast: &Cast| gone.contains(&cast.vehicle);
-        let landmarks: Vec<_> =
-            self.ballots.iter().filter(|(_, b)| b.casts.iter().any(is_theirs)).map(|(l, _)| l.clone()).collect();
-        for landmark in landmarks {
-            self.retire(&landmark, is_theirs);
-        }
-        self.dependence.forget(&gone);
-        self.calibration.forget(&gone);
-        for &vehicle in &gone {
-            self.records[vehicle] = (0, 0);
-            self.model.witnesses[vehicle] = Witness::default();
-        }
-        self.free.extend(gone);
+        let is_good = |vehicle: usize| !self.model.is_newcomer(vehicle) && self.model.reliability(vehicle) > 0.5;
+        self.vehicles.get(node).is_some_and(|&vehicle| is_good(vehicle))
     }
 
     fn vehicle(&mut self, node: &NodeName) -> usize {
@@ -119,22 +103,6 @@ impl WeightedTally {
         vehicle
     }
 
-    fn label(&mut self, label: &Label) -> LabelIndex {
-        if let Some(&number) = self.label_numbers.get(label) {
-            return number;
-        }
-        let number = self.labels.len() as LabelIndex;
-        self.labels.push(label.clone());
-        self.label_numbers.insert(label.clone(), number);
-        self.model.add_label();
-        number
-    }
-
-    /// Whether a label can be taken with at most `most` labels in all.
-    pub(super) fn has_room_for(&self, label: &Label, most: usize) -> bool {
-        self.labels.len() < most || self.label_numbers.contains_key(label)
-    }
-
     /// Takes a vote in the place of the vehicle's earlier one on the landmark.
     pub(super) fn cast(
         &mut self,
@@ -144,7 +112,8 @@ impl WeightedTally {
         at: Timestamp,
     ) {
         self.expire(at);
-        let (vehicle, label) = (self.vehicle(node), self.label(label));
+        let vehicle = self.vehicle(node);
+        let label = self.label(label, Some((vehicle, at)));
         let freshness = Duration::from_secs_f64(self.config.freshness_s);
         let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
         let mut recent = earlier.map_or_else(Recent::default, |earlier| earlier.recent);
@@ -242,7 +211,7 @@ impl WeightedTally {
                 *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
                 self.evidence.push(Evidence {
                     node: self.names[cast.vehicle].clone(),
-                    label: self.labels[usize::from(cast.label)].clone(),
+                    label: self.labels.name(cast.label).clone(),
                     correct,
                 });
             }
@@ -335,7 +304,7 @@ impl WeightedTally {
     pub(super) fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
         let ballot = self.ballots.get(landmark)?;
         let mass: f64 = ballot.casts.iter().map(|c| self.score(c.vehicle) * c.weight * c.own).sum();
-        let name = |label: LabelIndex| self.labels[usize::from(label)].clone();
+        let name = |label: LabelIndex| self.labels.name(label).clone();
         let votes = ballot.posterior.iter().map(|&(label, p)| (name(label), p * mass)).collect();
         let mut contributors: Vec<_> = ballot.casts.iter().map(|c| self.names[c.vehicle].clone()).collect();
         contributors.sort();
@@ -362,34 +331,5 @@ impl WeightedTally {
             }
         };
         self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), entry(vehicle))).collect()
-    }
-
-    /// Takes over what a ledger knows of its first `most_vehicles` vehicles beyond what was counted here, as a standby
-    /// has counted most of it itself; each at most `memory_votes` strong, in place of what it took over before.
-    ///
-    /// A ledger counts by stated label; what was right instead of a wrong one is taken to be any other label alike.
-    pub(super) fn adopt(&mut self, ledger: &ReputationLedger, (most_vehicles, most_labels): (usize, usize)) {
-        let known: Vec<_> = ledger.totals().into_iter().take(most_vehicles).collect();
-        for label in known.iter().flat_map(|(node, _)| ledger.by_label(node).into_keys()) {
-            if self.has_room_for(&label, most_labels) {
-                self.label(&label);
-            }
-        }
-        for (node, (correct, incorrect)) in known {
-            let vehicle = self.vehicle(&node);
-            let (own_correct, own_incorrect) = self.records[vehicle];
-            let total = correct.saturating_add(incorrect);
-            let beyond = total.saturating_sub(own_correct.saturating_add(own_incorrect));
-            let scale = (beyond as f64).min(self.config.memory_votes) / total.max(1) as f64;
-            let mut inherited = Confusion::default();
-            for (label, counts) in ledger.by_label(&node) {
-                let Some(&label) = self.label_numbers.get(&label) else { continue };
-                inherited.add(label, label, scale * counts.correct as f64);
-                let others: Vec<_> = (0..self.labels.len() as LabelIndex).filter(|l| *l != label).collect();
-                let each = scale * counts.incorrect as f64 / others.len().max(1) as f64;
-                others.into_iter().for_each(|truth| inherited.add(truth, label, each));
-            }
-            self.model.witnesses[vehicle].inherited = inherited;
-        }
     }
 }

@@ -143,10 +143,13 @@ impl Payload for LedgerShare {
     }
 
     fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
-        if self.entries.len() > MAX_SHARE_ENTRIES {
+        if self.entries.len() > MAX_SHARE_ENTRIES || self.marks.len() > MAX_SHARE_ENTRIES {
             return Err(RejectReason::TooManyObjects);
         }
         check_integers(self.epoch)?;
+        self.marks
+            .iter()
+            .try_for_each(|mark| check_integers([mark.epoch, mark.number, mark.correct, mark.incorrect]))?;
         self.entries.iter().try_for_each(|entry| {
             check_integers([entry.epoch, entry.correct, entry.incorrect])?;
             check_labels([&*entry.label])

@@ -38,6 +38,7 @@ mod tests {
             node: name("edge"),
             epoch: Some(3),
             entries: vec![entry; MAX_SHARE_ENTRIES],
+            marks: Vec::new(),
         }
     }
 

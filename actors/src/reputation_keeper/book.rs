@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use ecod::names::NodeName;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
-use ecod::wire::{LedgerEntry, Reputation, SCHEMA_VERSION};
+use ecod::wire::{LedgerEntry, LedgerMark, Reputation, SCHEMA_VERSION};
 use serde::{Deserialize, Serialize};
 
 use super::ReputationKeeperArguments;
@@ -52,6 +52,8 @@ pub(super) struct Saved {
     cell: NodeName,
     node: NodeName,
     entries: Vec<LedgerEntry>,
+    #[serde(default)]
+    marks: Vec<LedgerMark>,
     standing: BTreeMap<NodeName, Reputation>,
 }
 
@@ -62,6 +64,7 @@ impl Saved {
             cell: arguments.cell.clone(),
             node: arguments.name.clone(),
             entries: book.ledger.entries().collect(),
+            marks: book.ledger.marks().collect(),
             standing: book.standing.clone(),
         }
     }
@@ -84,6 +87,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments) {
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
         tracing::info!(path = %file.path().display(), entries = saved.entries.len(), "reputations restored");
         book.ledger.merge_entries(saved.entries, None);
+        book.ledger.merge_marks(saved.marks, None);
         book.standing = saved.standing;
     }
 }

@@ -55,7 +55,7 @@ impl Scene {
     }
 
     fn hear(&mut self, from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>, at_ms: u64) {
-        let share = LedgerShare { schema: SCHEMA_VERSION, node: name(from), epoch: leads, entries };
+        let share = LedgerShare { schema: SCHEMA_VERSION, node: name(from), epoch: leads, entries, marks: Vec::new() };
         let at = Timestamp(at_ms * 1000);
         self.keeper.merge(&Delivery::local(Incoming::Ledger(Arc::new(share)), at));
     }

@@ -62,10 +62,10 @@ impl Keeper {
 
     async fn hand_over(&mut self, mut to: Option<&mut Self>) {
         // The wire has taken what was sent before this.
-        self.state.publish_share(&[]);
+        self.state.publish_share(&[], &[]);
         loop {
             let share = self.next_share().await;
-            let is_last = share.entries.is_empty() && self.published.is_empty();
+            let is_last = share.entries.is_empty() && share.marks.is_empty() && self.published.is_empty();
             if let Some(other) = &mut to {
                 other.state.merge(&Delivery::local(Incoming::Ledger(Arc::new(share)), clock::now()));
             }
@@ -84,7 +84,7 @@ impl Keeper {
     }
 
     fn vehicles(&self) -> Vec<String> {
-        self.state.entries().iter().map(|entry| entry.node.to_string()).collect()
+        self.state.evidence().0.iter().map(|entry| entry.node.to_string()).collect()
     }
 }
 
@@ -115,6 +115,6 @@ async fn who_never_led_is_silent_when_it_hears_a_leader() {
     leader.record(1, "euclid");
     leader.share_with(&mut other).await;
     assert_eq!(other.vehicles(), ["euclid"]);
-    other.state.publish_share(&[]);
+    other.state.publish_share(&[], &[]);
     assert_eq!(other.next_share().await.entries, [], "nothing came before");
 }

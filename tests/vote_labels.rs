@@ -1,0 +1,96 @@
+//! Who invents labels takes the room of nobody else.
+
+use std::time::Duration;
+
+use ecod::names::NodeName;
+use ecod::reputation::{Evidence, ReputationLedger};
+use ecod::time::Timestamp;
+use ecod::vote::{Vote, VoteConfig, VoteMode};
+use ecod::wire::{ObjectReport, PerceivedObject};
+
+const START: Timestamp = Timestamp(1_700_000_000_000_000);
+const ROUND: Duration = Duration::from_millis(500);
+
+fn report(node: &str, seq: u64, votes: &[(String, String)]) -> (ObjectReport, Timestamp) {
+    let at = START + ROUND * u32::try_from(seq).unwrap();
+    let object = |(landmark, label): &(String, String)| PerceivedObject {
+        landmark: Some(landmark.as_str().into()),
+        ..PerceivedObject::new(label.as_str(), 0.8, 0.0, 0.0)
+    };
+    let objects = votes.iter().map(object).collect();
+    (ObjectReport { objects, ..ObjectReport::new(NodeName::new(node).unwrap(), seq, at) }, at)
+}
+
+fn say(vote: &mut Vote, node: &str, seq: u64, votes: &[(String, String)]) {
+    let (report, at) = report(node, seq, votes);
+    vote.observe(&report, at).unwrap();
+}
+
+fn vote_for(landmark: &str, label: &str) -> (String, String) {
+    (landmark.to_owned(), label.to_owned())
+}
+
+/// A vehicle's round of `count` labels that nobody has heard before, each at a place of its own.
+fn inventions(round: u64, count: usize) -> Vec<(String, String)> {
+    (0..count).map(|n| (format!("nowhere-{n}"), format!("invented-{round}-{n}"))).collect()
+}
+
+#[test]
+fn new_labels_are_heard_while_one_vehicle_invents_labels_without_end() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    for round in 1..40 {
+        // The liar speaks first, last, and on the others' place too.
+        say(&mut vote, "liar", 2 * round, &inventions(2 * round, 300));
+        let new = format!("thing-{}", round / 10);
+        for honest in ["a", "b", "c"] {
+            let votes = [vote_for("known", "cup"), vote_for("changing", &new)];
+            say(&mut vote, honest, 2 * round, &votes);
+        }
+        let mut lies = inventions(2 * round + 1, 300);
+        lies.push(vote_for("known", &format!("invented-{round}")));
+        say(&mut vote, "liar", 2 * round + 1, &lies);
+        let verdicts = vote.close(START + ROUND * u32::try_from(2 * round + 1).unwrap()).verdicts;
+        let label = |landmark: &str| {
+            verdicts
+                .iter()
+                .find(|v| v.landmark.as_str() == landmark)
+                .and_then(|v| v.label.as_deref().map(str::to_owned))
+        };
+        assert_eq!(label("known").as_deref(), Some("cup"), "round {round}");
+        if round % 10 >= 5 {
+            assert_eq!(label("changing"), Some(new), "round {round}");
+        }
+    }
+    let honest = vote.reputations()[&NodeName::from_static("a")];
+    assert!(honest.score > 0.7 && honest.correct > 20, "{honest:?}");
+}
+
+#[test]
+fn a_vehicle_alone_goes_on_with_the_labels_that_it_stated_last() {
+    let mut vote = Vote::new(VoteConfig { max_labels: 16, ..VoteConfig::default() }, Vec::new());
+    for round in 0..100 {
+        say(&mut vote, "a", round, &[vote_for("x", &format!("thing-{}", round / 5)), vote_for("y", "cup")]);
+        let verdicts = vote.close(START + ROUND * u32::try_from(round).unwrap()).verdicts;
+        assert_eq!(verdicts[1].label.as_deref(), Some("cup"));
+        if round % 5 == 4 {
+            assert_eq!(verdicts[0].label, Some(format!("thing-{}", round / 5).into()));
+        }
+    }
+    assert_eq!(vote.ignored(), 0);
+}
+
+#[test]
+fn a_ledger_full_of_labels_leaves_room_for_the_cells_own() {
+    let mut ledger = ReputationLedger::default();
+    for number in 0..300 {
+        let label = format!("invented-{number:03}").into();
+        let evidence = Evidence { node: NodeName::from_static("liar"), label, correct: false };
+        ledger.record(1, &NodeName::from_static("edge"), &evidence);
+    }
+    for mode in [VoteMode::Weighted, VoteMode::Paper] {
+        let mut vote = Vote::new(VoteConfig { mode, ..VoteConfig::default() }, Vec::new());
+        vote.adopt(&ledger);
+        ["a", "b"].iter().for_each(|node| say(&mut vote, node, 1, &[vote_for("x", "zebra")]));
+        assert_eq!(vote.close(START + ROUND).verdicts[0].label.as_deref(), Some("zebra"));
+    }
+}
