@@ -107,13 +107,13 @@ fn marks_that_come_before_their_counts_or_are_lost_do_no_harm() {
         ledger.reputations(&ReputationConfig::default())[&NodeName::from_static("turncoat")].score
     };
     let mut copy = ReputationLedger::default();
-    copy.merge_marks(ledger.marks());
-    copy.merge_entries(ledger.entries());
+    copy.merge_marks(ledger.marks(), None);
+    copy.merge_entries(ledger.entries(), None);
     assert_eq!(copy, ledger);
     let mut lost = ReputationLedger::default();
-    lost.merge_entries(ledger.entries());
+    lost.merge_entries(ledger.entries(), None);
     assert!(score(&lost) > 0.9, "as ledgers without marks always were");
-    assert!(lost.merge_marks(ledger.marks()));
+    assert!(lost.merge_marks(ledger.marks(), None));
     assert!(score(&lost) < 0.31);
 }
 
