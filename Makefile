@@ -72,7 +72,7 @@ soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
-	cargo clippy --locked --all-targets -- -D warnings
+	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items
 
 doc: setup ## API documentation in target/doc

@@ -38,6 +38,9 @@ pub fn wrap_angle(angle_rad: f64) -> f64 {
     if wrapped > PI { wrapped - TAU } else { wrapped }
 }
 
+/// Relative error that a product of variances may have from rounding.
+const ROUNDING: f64 = 1e-12;
+
 /// Symmetric 2×2 position covariance in m².
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Covariance {
@@ -73,9 +76,9 @@ impl Covariance {
 
     /// Whether all entries are finite and the matrix is positive semi-definite up to rounding.
     pub fn is_valid(&self) -> bool {
-        let finite = self.xx.is_finite() && self.xy.is_finite() && self.yy.is_finite();
-        let slack = 1e-9 * (self.xx.abs() + self.yy.abs());
-        finite && self.xx >= 0.0 && self.yy >= 0.0 && self.xx * self.yy - self.xy * self.xy >= -slack * slack
+        let (product, square) = (self.xx * self.yy, self.xy * self.xy);
+        let finite = self.xx.is_finite() && self.yy.is_finite() && product.is_finite();
+        finite && self.xx >= 0.0 && self.yy >= 0.0 && square <= product * (1.0 + ROUNDING)
     }
 
     /// Squared Mahalanobis distance of `offset`, with `floor_m` added as an isotropic standard deviation.
@@ -111,6 +114,19 @@ mod tests {
         let c = Covariance::along_bearing(std::f64::consts::FRAC_PI_2, 2.0, 0.5);
         assert!((c.xx - 0.25).abs() < 1e-12 && (c.yy - 4.0).abs() < 1e-12 && c.xy.abs() < 1e-12);
         assert!(c.is_valid());
+    }
+
+    #[test]
+    fn rounding_makes_no_covariance_invalid_and_more_than_rounding_does() {
+        for step in 1..1000 {
+            let (xx, yy) = (1e-6 * f64::from(step), 0.003 * f64::from(step) / 7.0);
+            let of = |correlation: f64| Covariance { xx, xy: correlation * (xx * yy).sqrt(), yy };
+            assert!(of(1.0).is_valid() && of(-1.0).is_valid(), "{:?}", of(1.0));
+            assert!(!of(1.0001).is_valid());
+        }
+        assert!(Covariance { xx: 0.0, xy: 0.0, yy: 1.0 }.is_valid());
+        assert!(!Covariance { xx: 0.0, xy: 1e-9, yy: 1.0 }.is_valid());
+        assert!(!Covariance { xx: 1.0, xy: f64::NAN, yy: 1.0 }.is_valid());
     }
 
     #[test]

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use ecod::names::NodeName;
+use ecod::time::Timestamp;
 use ecod::wire::ReportKind;
 
-use crate::gateway::Delivery;
+use crate::gateway::{Delivery, Incoming};
 
 /// Takes reports where they come in, on the links' tasks, and keeps them until the fuser is free. However many come, at
 /// most one of each vehicle and kind waits, so that no vehicle's reports wait behind a heap of another's.
@@ -26,7 +27,7 @@ struct Waiting {
 pub struct Put {
     /// Nothing waited before: the fuser has to be told.
     pub is_first: bool,
-    /// An older report of the vehicle gave way.
+    /// An older report of the vehicle gave way, or this one to a newer.
     pub has_replaced: bool,
 }
 
@@ -35,10 +36,15 @@ impl Intake {
     pub fn put(&self, node: NodeName, kind: ReportKind, delivery: Delivery) -> Put {
         let mut waiting = self.waiting();
         let is_first = waiting.reports.is_empty();
+        let key = (node, kind);
+        let known = waiting.places.get(&key).and_then(|place| waiting.reports.get(place));
+        if known.is_some_and(|known| captured_at(known) > captured_at(&delivery)) {
+            return Put { is_first, has_replaced: true };
+        }
         let place = waiting.next;
         waiting.next += 1;
         waiting.reports.insert(place, delivery);
-        let older = waiting.places.insert((node, kind), place);
+        let older = waiting.places.insert(key, place);
         let has_replaced = older.is_some_and(|older| waiting.reports.remove(&older).is_some());
         Put { is_first, has_replaced }
     }
@@ -55,13 +61,18 @@ impl Intake {
     }
 }
 
+fn captured_at(delivery: &Delivery) -> Option<Timestamp> {
+    match &delivery.message {
+        Incoming::Report { report, .. } => Some(report.captured_at_us),
+        _ => None,
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use ecod::time::Timestamp;
     use ecod::wire::ObjectReport;
 
     use super::*;
-    use crate::gateway::Incoming;
 
     #[test]
     fn the_latest_of_each_vehicle_and_kind_waits() {
@@ -81,5 +92,7 @@ mod tests {
         let taken: Vec<_> = intake.take_all().iter().map(|delivery| delivery.received_at.micros()).collect();
         assert_eq!(taken, [1, 999, 1000]);
         assert!(put("euclid", Detections, 1001).is_first);
+        assert!(put("euclid", Detections, 1000).has_replaced, "the later capture stays, whichever came first");
+        assert_eq!(intake.take_all()[0].received_at.micros(), 1001);
     }
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use chrono::DateTime;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use nix::sys::statvfs::statvfs;
+use rustix::fs::statvfs;
 
 /// How a file of a log ends.
 pub const EXTENSION: &str = "mcap";
@@ -54,7 +54,7 @@ pub(super) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
 /// What the operating system said.
 pub fn free_bytes(dir: &Path) -> io::Result<u64> {
     let facts = statvfs(dir)?;
-    Ok(facts.blocks_available().saturating_mul(facts.fragment_size()))
+    Ok(facts.f_bavail.saturating_mul(facts.f_frsize))
 }
 
 /// The files of a log, the oldest first.
