@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::names::NodeName;
-use crate::wire::{GlobalMap, RejectReason, Verdicts};
+use crate::wire::{GlobalMap, RejectReason};
 
 /// One leadership: ordered by term, then by the leader's name; no two leaderships share one.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
@@ -75,14 +75,6 @@ impl EpochGate {
     /// As [`Self::admit`].
     pub fn admit_map(&mut self, map: &GlobalMap) -> Result<(), RejectReason> {
         self.admit(&Epoch::new(map.epoch, map.aggregator.clone()), map.round)
-    }
-
-    /// Takes verdicts, or refuses them.
-    ///
-    /// # Errors
-    /// As [`Self::admit`].
-    pub fn admit_verdicts(&mut self, verdicts: &Verdicts) -> Result<(), RejectReason> {
-        self.admit(&Epoch::new(verdicts.epoch, verdicts.aggregator.clone()), verdicts.round)
     }
 
     /// The epoch and round admitted last.

@@ -90,8 +90,8 @@ impl ReportWindow {
     /// Admits a report and returns its capture time on the aggregator's clock.
     ///
     /// # Errors
-    /// [`RejectReason::FromTheFuture`] (also for a stamp that no other report agrees with), [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] for
-    /// duplicates and what may be one, or [`RejectReason::TooManyVehicles`].
+    /// [`RejectReason::FromTheFuture`] (also for a stamp that no other report agrees with), [`RejectReason::Stale`],
+    /// [`RejectReason::OutOfOrder`] for duplicates and what may be one, or [`RejectReason::TooManyVehicles`].
     pub fn admit(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<Admitted, RejectReason> {
         let delay = received_at.micros_from(report.captured_at_us);
         let reach = seconds(self.config.max_clock_offset_s) + seconds(self.config.max_age_s);
@@ -138,12 +138,6 @@ impl ReportWindow {
         vehicle.last_seq = Some(report.seq);
         vehicle.last_received = received_at;
         Ok(Admitted::InOrder(report.captured_at_us.shifted(offset)))
-    }
-
-    /// Estimated microseconds to add to a vehicle's clock to get the aggregator's; `None` for an unknown vehicle.
-    pub fn clock_offset_us(&self, node: &NodeName) -> Option<i64> {
-        let tolerance = seconds(self.config.clock_tolerance_s);
-        self.vehicles.get(node).map(|vehicle| vehicle.delay.clock_offset(tolerance))
     }
 
     fn make_room(&mut self, now: Timestamp) -> Result<(), RejectReason> {

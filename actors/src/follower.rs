@@ -193,8 +193,8 @@ impl FollowerState {
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
-        check_age(self.map_age.of(&epoch, map.fused_at_us, received_at))?;
         self.maps.admit(&epoch, map.round, received_at, &self.leadership.borrow())?;
+        check_age(self.map_age.of(&epoch, map.fused_at_us, received_at))?;
         self.counters.count(Event::MapAccepted);
         self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
@@ -207,8 +207,8 @@ impl FollowerState {
 
     fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
-        check_age(self.verdicts_age.of(&epoch, verdicts.fused_at_us, received_at))?;
         self.verdicts.admit(&epoch, verdicts.round, received_at, &self.leadership.borrow())?;
+        check_age(self.verdicts_age.of(&epoch, verdicts.fused_at_us, received_at))?;
         self.counters.count(Event::VerdictsAccepted);
         self.recording.verdicts(verdicts, received_at);
         if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
@@ -313,6 +313,19 @@ mod tests {
             assert_eq!(follower.take_map(&map(7, round, at(round)), resumed), Err(Refusal::Stale), "round {round}");
         }
         assert_eq!(follower.take_map(&map(7, 30, at(30)), resumed), Ok(()));
+    }
+
+    #[test]
+    fn a_refused_map_does_not_make_old_ones_look_fresh() {
+        let epoch = Some(Epoch::new(8, NodeName::from_static("edge")));
+        let mut follower = follower(Leadership { position: Position::Following, epoch, standby: None });
+        let at = |round: u64| Timestamp(round * 100_000);
+        for round in 0..10 {
+            assert_eq!(follower.take_map(&map(8, round, at(round)), at(round)), Ok(()));
+        }
+        let resumed = at(40);
+        assert_eq!(follower.take_map(&map(7, 99, at(10)), resumed), Err(Refusal::Superseded));
+        assert_eq!(follower.take_map(&map(8, 10, at(10)), resumed), Err(Refusal::Stale));
     }
 
     #[test]

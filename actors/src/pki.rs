@@ -20,7 +20,7 @@ mod identity;
 pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
 pub use broker_trust::BrokerTrust;
 pub use config::TlsConfig;
-pub use credentials::{Credentials, CredentialsError, Current, external_broker, external_client};
+pub use credentials::{Credentials, CredentialsError, Current, external_broker};
 pub use identity::{Identity, InvalidCertificate};
 
 /// The DNS name in the certificate of every node that may lead, below a domain that is reserved for private use.

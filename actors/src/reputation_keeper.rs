@@ -128,7 +128,7 @@ pub struct ReputationKeeperState {
     published: Option<(Epoch, u64)>,
     /// The leader whose shares came last.
     heard: Option<Epoch>,
-    /// Whether it has yet to be told the node's own lanes.
+    /// Whether it has yet to be told what this node knows.
     owes_all: bool,
     all_sent: Option<Timestamp>,
     unsaved: bool,
@@ -138,8 +138,8 @@ pub struct ReputationKeeperState {
     ticks: u32,
 }
 
-/// Least time between two times that the node's own lanes are sent to a leader that is new: leaders may come and go fast,
-/// or only seem to.
+/// Least time between two times that everything is sent to a leader that is new: leaders may come and go fast, or only
+/// seem to.
 const ALL_PAUSE: Duration = Duration::from_secs(5);
 
 /// How long a disk may take before reputations are published unsaved.

@@ -69,13 +69,6 @@ pub struct RerunSummary {
     pub written: u64,
 }
 
-impl RerunSummary {
-    /// Whether the maps and verdicts are those that were made, to the last bit.
-    pub fn is_exact(&self) -> bool {
-        self.missing == 0 && !self.continued
-    }
-}
-
 /// Runs an aggregator again.
 #[derive(Debug, Clone)]
 pub struct Rerun {

@@ -106,6 +106,7 @@ mod tests {
         confusion.forget_labels(&[1].into());
         assert_eq!(confusion, without);
     }
+
     #[test]
     fn counts_fade_as_if_each_were_faded_however_long() {
         let (mut confusion, mut expected) = (Confusion::default(), 0.0);

@@ -6,7 +6,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// Why something that came in was left out though nothing is wrong with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum ShedReason {
-    /// A node, an address or a client of this machine published more than `broker.max_messages_hz`; the embedded broker passed the message on to nobody.
+    /// A node, an address or a client of this machine published more than `broker.max_messages_hz`; the embedded broker
+    /// passed the message on to nobody.
     BrokerThrottled,
     /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
     ReportThrottled,
@@ -18,7 +19,8 @@ pub enum ShedReason {
 
 impl ShedReason {
     /// All reasons.
-    pub const ALL: [Self; 3] = [Self::BrokerThrottled, Self::ReportThrottled, Self::ReportReplaced];
+    pub const ALL: [Self; 4] =
+        [Self::BrokerThrottled, Self::ReportThrottled, Self::LedgerThrottled, Self::ReportReplaced];
 
     /// The reason as a counter's label.
     pub fn as_str(self) -> &'static str {
@@ -110,6 +112,10 @@ mod tests {
         let others = snapshot.iter().find(|shed| shed.source == OTHERS).unwrap();
         assert_eq!(others.times, 2 * MAX_SOURCES as u64);
         let sums = shedding.sums();
-        assert_eq!((sums["report_throttled"], sums["report_replaced"]), (4 * MAX_SOURCES as u64, 0));
+        let expected = [("broker_throttled", 0), ("ledger_throttled", 0), ("report_replaced", 0)];
+        assert_eq!(
+            sums,
+            BTreeMap::from_iter(expected.into_iter().chain([("report_throttled", 4 * MAX_SOURCES as u64)]))
+        );
     }
 }

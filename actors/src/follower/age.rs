@@ -13,8 +13,8 @@ pub(super) struct Age {
 }
 
 impl Age {
-    /// Time that a round of `epoch` spent in queues: a node that was stopped, or a link that was, finds the rounds of that
-    /// time waiting. The first of a leadership counts as fresh, since its clock is not known.
+    /// Time that a round of `epoch`, which the gate has admitted, spent in queues: a node that was stopped, or a link that
+    /// was, finds the rounds of that time waiting. The first of a leadership counts as fresh, since its clock is not known.
     pub(super) fn of(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> Duration {
         let known = self.delay.take().filter(|(of, _)| of == epoch);
         let (_, delay) = self.delay.insert(known.unwrap_or_else(|| (epoch.clone(), MinimumDelay::new(received_at))));

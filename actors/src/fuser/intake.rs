@@ -5,9 +5,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::ReportKind;
+use ecod::wire::{ObjectReport, ReportKind};
 
-use crate::gateway::{Delivery, Incoming};
+use crate::gateway::Delivery;
 
 /// Takes reports where they come in, on the links' tasks, and keeps them until the fuser is free. However many come, at
 /// most one of each vehicle and kind waits, so that no vehicle's reports wait behind a heap of another's.
@@ -19,7 +19,8 @@ struct Waiting {
     next: u64,
     /// In the order of their coming.
     reports: BTreeMap<u64, Delivery>,
-    places: BTreeMap<(NodeName, ReportKind), u64>,
+    /// Place and capture time of each vehicle's.
+    places: BTreeMap<(NodeName, ReportKind), (u64, Timestamp)>,
 }
 
 /// What became of a report that was put in.
@@ -32,20 +33,19 @@ pub struct Put {
 }
 
 impl Intake {
-    /// Takes a vehicle's report.
-    pub fn put(&self, node: NodeName, kind: ReportKind, delivery: Delivery) -> Put {
+    /// Takes a vehicle's report, which is what is delivered.
+    pub fn put(&self, kind: ReportKind, report: &ObjectReport, delivery: Delivery) -> Put {
         let mut waiting = self.waiting();
         let is_first = waiting.reports.is_empty();
-        let key = (node, kind);
-        let known = waiting.places.get(&key).and_then(|place| waiting.reports.get(place));
-        if known.is_some_and(|known| captured_at(known) > captured_at(&delivery)) {
+        let (key, captured_at) = ((report.node.clone(), kind), report.captured_at_us);
+        if waiting.places.get(&key).is_some_and(|(_, known)| *known > captured_at) {
             return Put { is_first, has_replaced: true };
         }
         let place = waiting.next;
         waiting.next += 1;
         waiting.reports.insert(place, delivery);
-        let older = waiting.places.insert(key, place);
-        let has_replaced = older.is_some_and(|older| waiting.reports.remove(&older).is_some());
+        let older = waiting.places.insert(key, (place, captured_at));
+        let has_replaced = older.is_some_and(|(older, _)| waiting.reports.remove(&older).is_some());
         Put { is_first, has_replaced }
     }
 
@@ -61,26 +61,18 @@ impl Intake {
     }
 }
 
-fn captured_at(delivery: &Delivery) -> Option<Timestamp> {
-    match &delivery.message {
-        Incoming::Report { report, .. } => Some(report.captured_at_us),
-        _ => None,
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use ecod::wire::ObjectReport;
-
     use super::*;
+    use crate::gateway::Incoming;
 
     #[test]
     fn the_latest_of_each_vehicle_and_kind_waits() {
         let intake = Intake::default();
         let put = |node: &str, kind, seq| {
-            let node = NodeName::new(node).unwrap();
-            let report = Arc::new(ObjectReport::new(node.clone(), seq, Timestamp(seq)));
-            intake.put(node, kind, Delivery::local(Incoming::Report { kind, report }, Timestamp(seq)))
+            let report = Arc::new(ObjectReport::new(NodeName::new(node).unwrap(), seq, Timestamp(seq)));
+            let message = Incoming::Report { kind, report: Arc::clone(&report) };
+            intake.put(kind, &report, Delivery::local(message, Timestamp(seq)))
         };
         use ReportKind::{Detections, VoteDetections};
         assert_eq!(put("mallory", Detections, 0), Put { is_first: true, has_replaced: false });

@@ -145,7 +145,7 @@ impl Assembly {
         parts.extend((leads && self.config.data_plane().embedded).then_some(Part::Broker));
         parts.extend([Part::Membership, Part::Gateway, Part::Follower]);
         if leads {
-            let rates = self.config.fusion.rates_vehicles(!self.config.landmarks().is_empty());
+            let rates = self.config.fusion.rates_vehicles(!self.config.landmarks.is_empty());
             parts.extend(rates.then_some(Part::ReputationKeeper));
             parts.push(Part::Fuser);
         }

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
@@ -14,7 +15,7 @@ use super::{Credentials, Current};
 pub struct BrokerTrust {
     client: Arc<ClientConfig>,
     shown: Arc<Shown>,
-    verifier: Arc<dyn ServerCertVerifier>,
+    verifier: Arc<WebPkiServerVerifier>,
     /// Of a broker of the cell: where lists change.
     changing: Option<(Arc<Credentials>, Arc<Current>)>,
     checked: Instant,
@@ -27,9 +28,13 @@ const LOOK: Duration = Duration::from_secs(1);
 const RECHECK: Duration = Duration::from_secs(30);
 
 impl BrokerTrust {
-    /// Trusts whom `verifier` trusts.
-    pub(super) fn new(client: &ClientConfig, verifier: Arc<dyn ServerCertVerifier>) -> Self {
-        let shown = Arc::new(Shown { verifier: Arc::clone(&verifier), chain: Mutex::default() });
+    /// Trusts whom `verifier` trusts under `name`, or under the name by which it is connected to.
+    pub(super) fn new(
+        client: &ClientConfig,
+        verifier: Arc<WebPkiServerVerifier>,
+        name: Option<ServerName<'static>>,
+    ) -> Self {
+        let shown = Arc::new(Shown::new(Arc::clone(&verifier), name));
         let mut client = client.clone();
         client.dangerous().set_certificate_verifier(Arc::clone(&shown) as Arc<dyn ServerCertVerifier>);
         Self { client: Arc::new(client), shown, verifier, changing: None, checked: Instant::now() }
@@ -38,7 +43,7 @@ impl BrokerTrust {
     /// Trusts brokers of the cell, as the node's files say at the time.
     pub fn of_cell(credentials: &Arc<Credentials>) -> Self {
         let current = credentials.current();
-        let trust = Self::new(&current.client, Arc::clone(&current.brokers));
+        let trust = Self::new(&current.client, Arc::clone(&current.brokers), Some(current.broker_name.clone()));
         Self { changing: Some((Arc::clone(credentials), current)), ..trust }
     }
 
@@ -69,20 +74,26 @@ impl BrokerTrust {
             return Ok(());
         }
         self.checked = now;
-        self.shown.check(&*self.verifier)
+        self.shown.check(&self.verifier)
     }
 }
 
 /// Verifies a broker's certificate and remembers it.
 #[derive(Debug)]
-struct Shown {
-    verifier: Arc<dyn ServerCertVerifier>,
+pub(super) struct Shown {
+    verifier: Arc<WebPkiServerVerifier>,
+    /// The name that the certificate must bear; without one that by which the broker is connected to.
+    name: Option<ServerName<'static>>,
     chain: Mutex<Option<(Vec<CertificateDer<'static>>, ServerName<'static>)>>,
 }
 
 impl Shown {
+    pub(super) fn new(verifier: Arc<WebPkiServerVerifier>, name: Option<ServerName<'static>>) -> Self {
+        Self { verifier, name, chain: Mutex::default() }
+    }
+
     /// Verifies again what was shown, if anything was.
-    fn check(&self, verifier: &dyn ServerCertVerifier) -> Result<(), rustls::Error> {
+    fn check(&self, verifier: &WebPkiServerVerifier) -> Result<(), rustls::Error> {
         let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
         let Some((chain, name)) = &*chain else { return Ok(()) };
         let Some((own, intermediates)) = chain.split_first() else { return Ok(()) };
@@ -99,6 +110,7 @@ impl ServerCertVerifier for Shown {
         ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, rustls::Error> {
+        let name = self.name.as_ref().unwrap_or(name);
         let verified = self.verifier.verify_server_cert(end_entity, intermediates, name, ocsp_response, now)?;
         let chain = [end_entity].into_iter().chain(intermediates).map(|shown| shown.clone().into_owned()).collect();
         *self.chain.lock().unwrap_or_else(PoisonError::into_inner) = Some((chain, name.to_owned()));

@@ -6,16 +6,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use ecod::names::NodeName;
-use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::client::{Resumption, WebPkiServerVerifier};
 use rustls::crypto::{CryptoProvider, ring as provider};
 use rustls::pki_types::pem::PemObject;
-use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer, ServerName, UnixTime};
+use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer, ServerName};
 use rustls::server::danger::ClientCertVerifier;
 use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::version::TLS13;
-use rustls::{ClientConfig, DigitallySignedStruct, RootCertStore, ServerConfig, SignatureScheme};
+use rustls::{ClientConfig, RootCertStore, ServerConfig};
 
+use super::broker_trust::Shown;
 use super::{BROKER_NAME, BrokerTrust, Identity, TlsConfig};
 
 /// The certificates of a node, read again when their files change.
@@ -45,8 +45,9 @@ pub struct Current {
     pub client: Arc<ClientConfig>,
     /// Checks certificates of clients.
     pub clients: Arc<dyn ClientCertVerifier>,
-    /// Checks certificates of brokers of the cell.
-    pub brokers: Arc<dyn ServerCertVerifier>,
+    /// Checks certificates of brokers of the cell, which bear `broker_name` at whatever address they are.
+    pub(super) brokers: Arc<WebPkiServerVerifier>,
+    pub(super) broker_name: ServerName<'static>,
     certificates: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
 }
@@ -114,28 +115,21 @@ impl Credentials {
     }
 }
 
-/// How a node connects to a broker that is none of the cell's: its certificate must be signed by one of those in `ca` and
-/// bear the name under which it is configured. The node shows its own certificate, if it has one.
-///
-/// # Errors
-/// [`CredentialsError`] naming the file.
-pub fn external_client(ca: &Path, own: Option<&Current>) -> Result<ClientConfig, CredentialsError> {
-    let roots = roots("mqtt.ca", ca)?;
-    let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
-    let builder = builder.map_err(unusable)?.with_root_certificates(roots);
-    match own {
-        Some(own) => builder.with_client_auth_cert(own.certificates.clone(), own.key.clone_key()).map_err(unusable),
-        None => Ok(builder.with_no_client_auth()),
-    }
-}
-
-/// How a node goes on trusting a broker that is none of the cell's: as [`external_client`] says.
+/// How a node connects to a broker that is none of the cell's, and goes on trusting it: its certificate must be signed by one
+/// of those in `ca` and bear the name under which it is configured. The node shows its own certificate, if it has one.
 ///
 /// # Errors
 /// [`CredentialsError`] naming the file.
 pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, CredentialsError> {
-    let verifier = server_verifier(Arc::new(roots("mqtt.ca", ca)?), Vec::new())?;
-    Ok(BrokerTrust::new(&external_client(ca, own)?, verifier))
+    let roots = Arc::new(roots("mqtt.ca", ca)?);
+    let verifier = server_verifier(Arc::clone(&roots), Vec::new())?;
+    let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
+    let builder = builder.map_err(unusable)?.with_root_certificates(roots);
+    let client = match own {
+        Some(own) => builder.with_client_auth_cert(own.certificates.clone(), own.key.clone_key()).map_err(unusable)?,
+        None => builder.with_no_client_auth(),
+    };
+    Ok(BrokerTrust::new(&client, verifier, None))
 }
 
 fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError> {
@@ -160,16 +154,19 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
         .map_err(unusable)?;
     server.session_storage = Arc::new(NoServerSessionStorage {});
     server.send_tls13_tickets = 0;
-    let brokers: Arc<dyn ServerCertVerifier> = Arc::new(CellBroker(server_verifier(roots, lists)?));
+    let brokers = server_verifier(roots, lists)?;
+    let broker_name = ServerName::try_from(BROKER_NAME);
+    let broker_name = broker_name.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
     let mut client = ClientConfig::builder_with_provider(crypto())
         .with_protocol_versions(&[&TLS13])
         .map_err(unusable)?
         .dangerous()
-        .with_custom_certificate_verifier(Arc::clone(&brokers))
+        .with_custom_certificate_verifier(Arc::new(Shown::new(Arc::clone(&brokers), Some(broker_name.clone()))))
         .with_client_auth_cert(certificates.clone(), key.clone_key())
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
-    Ok(Current { identity, server: Arc::new(server), client: Arc::new(client), clients, brokers, certificates, key })
+    let (server, client) = (Arc::new(server), Arc::new(client));
+    Ok(Current { identity, server, client, clients, brokers, broker_name, certificates, key })
 }
 
 fn client_verifier(
@@ -192,46 +189,6 @@ fn server_verifier(
         builder = builder.with_crls(lists).only_check_end_entity_revocation();
     }
     builder.build().map_err(|error| CredentialsError::Unusable(error.to_string()))
-}
-
-/// Takes any broker of the cell, at whatever address: its certificate must bear [`BROKER_NAME`].
-#[derive(Debug)]
-struct CellBroker(Arc<WebPkiServerVerifier>);
-
-impl ServerCertVerifier for CellBroker {
-    fn verify_server_cert(
-        &self,
-        end_entity: &CertificateDer<'_>,
-        intermediates: &[CertificateDer<'_>],
-        _address: &ServerName<'_>,
-        ocsp_response: &[u8],
-        now: UnixTime,
-    ) -> Result<ServerCertVerified, rustls::Error> {
-        let name = ServerName::try_from(BROKER_NAME).map_err(|error| rustls::Error::General(error.to_string()))?;
-        self.0.verify_server_cert(end_entity, intermediates, &name, ocsp_response, now)
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        message: &[u8],
-        cert: &CertificateDer<'_>,
-        dss: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        self.0.verify_tls12_signature(message, cert, dss)
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        cert: &CertificateDer<'_>,
-        dss: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        self.0.verify_tls13_signature(message, cert, dss)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.0.supported_verify_schemes()
-    }
 }
 
 fn crypto() -> Arc<CryptoProvider> {

@@ -102,10 +102,10 @@ impl Assembly {
                     true
                 }
                 Incoming::Report { kind, report } => {
-                    let (node, kind) = (report.node.clone(), *kind);
-                    let put = intake.put(node.clone(), kind, delivery);
+                    let (kind, report) = (*kind, Arc::clone(report));
+                    let put = intake.put(kind, &report, delivery);
                     if put.has_replaced {
-                        counters.shed(ShedReason::ReportReplaced, node.as_str());
+                        counters.shed(ShedReason::ReportReplaced, report.node.as_str());
                     }
                     !put.is_first || fuser.send(FuserMessage::TakeReports)
                 }
