@@ -13,7 +13,6 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
 use ecod::epoch::Epoch;
 use ecod::names::NodeName;
@@ -100,6 +99,8 @@ pub struct FollowerArguments {
     pub recording: Recording,
     /// The lowest term taken at first: the highest that an earlier run of the node knew.
     pub least_term: u64,
+    /// The highest term that the election knows.
+    pub term: watch::Receiver<u64>,
     /// Who leads.
     pub leadership: watch::Receiver<Leadership>,
     /// Is told of the rounds taken.
@@ -172,8 +173,11 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, recording, least_term, leadership, election, fuser, counters, .. } = arguments;
-        let [maps, verdicts, reputations] = [(); 3].map(|()| Gate::new(least_term));
+        let FollowerArguments { newest, recording, least_term, term, leadership, election, fuser, counters, .. } =
+            arguments;
+        let [maps, verdicts] = [(); 2].map(|()| Gate::new(least_term, Some(term.clone())));
+        // They are retained: a node that starts gets them before it can have heard of any term, and perhaps not again.
+        let reputations = Gate::new(least_term, None);
         let (map_age, verdicts_age) = (Age::default(), Age::default());
         Self {
             newest,
@@ -194,7 +198,7 @@ impl FollowerState {
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         self.maps.admit(&epoch, map.round, received_at, &self.leadership.borrow())?;
-        check_age(self.map_age.of(&epoch, map.fused_at_us, received_at))?;
+        check(self.map_age.is_fresh(&epoch, map.fused_at_us, received_at))?;
         self.counters.count(Event::MapAccepted);
         self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
@@ -208,7 +212,7 @@ impl FollowerState {
     fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), Refusal> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
         self.verdicts.admit(&epoch, verdicts.round, received_at, &self.leadership.borrow())?;
-        check_age(self.verdicts_age.of(&epoch, verdicts.fused_at_us, received_at))?;
+        check(self.verdicts_age.is_fresh(&epoch, verdicts.fused_at_us, received_at))?;
         self.counters.count(Event::VerdictsAccepted);
         self.recording.verdicts(verdicts, received_at);
         if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
@@ -238,11 +242,8 @@ impl FollowerState {
     }
 }
 
-/// What a driver was to be told longer ago than this is not told any more.
-const MAX_AGE: Duration = Duration::from_secs(1);
-
-fn check_age(age: Duration) -> Result<(), Refusal> {
-    if age <= MAX_AGE { Ok(()) } else { Err(Refusal::Stale) }
+fn check(is_fresh: bool) -> Result<(), Refusal> {
+    if is_fresh { Ok(()) } else { Err(Refusal::Stale) }
 }
 
 /// The aggregator of reputations that name none; it sorts before all others.
@@ -266,6 +267,7 @@ mod tests {
             log: None,
             recording: Recording::default(),
             least_term: 0,
+            term: watch::channel(u64::MAX).1,
             leadership: watch::channel(leadership).1,
             election: Seat::default(),
             fuser: Seat::default(),
@@ -291,14 +293,15 @@ mod tests {
     #[test]
     fn a_huge_epoch_silences_the_others_for_a_moment_only() {
         let mut follower = follower(Leadership::default());
-        let second = |n: u64| Timestamp(n * 1_000_000);
+        let ms = |n: u64| Timestamp(n * 1000);
         let accepted = |follower: &FollowerState| follower.newest.map.borrow().as_ref().map(|newest| newest.map.epoch);
-        assert_eq!(follower.take_map(&map(u64::MAX, 1, second(0)), second(0)), Ok(()));
-        assert_eq!(follower.take_map(&map(7, 1, second(1)), second(1)), Err(Refusal::Superseded));
+        assert_eq!(follower.take_map(&map(u64::MAX, 1, ms(0)), ms(0)), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 1, ms(1000)), ms(1000)), Err(Refusal::Superseded));
         assert_eq!(accepted(&follower), Some(u64::MAX));
-        assert_eq!(follower.take_map(&map(7, 2, second(4)), second(4)), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 2, ms(3000)), ms(3000)), Err(Refusal::Stale), "it may have waited");
+        assert_eq!(follower.take_map(&map(7, 3, ms(3300)), ms(3300)), Ok(()));
         assert_eq!(accepted(&follower), Some(7));
-        assert_eq!(follower.take_map(&map(7, 2, second(5)), second(5)), Err(Refusal::Repeated), "not taken twice");
+        assert_eq!(follower.take_map(&map(7, 3, ms(3400)), ms(3400)), Err(Refusal::Repeated), "not taken twice");
     }
 
     #[test]

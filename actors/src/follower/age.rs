@@ -6,21 +6,48 @@ use ecod::delay::MinimumDelay;
 use ecod::epoch::Epoch;
 use ecod::time::Timestamp;
 
-/// The present leadership's least delay, against which its rounds are old.
+/// What a driver was to be told longer ago than this is not told any more.
+const MAX_AGE: Duration = Duration::from_secs(1);
+
+/// How long the clock of a leadership is learnt whose first round came when a node had long heard none: what waited for
+/// the node comes at once, the newest last.
+const LEARNING: Duration = Duration::from_millis(250);
+
+/// Tells rounds that have just been made from those that waited.
 #[derive(Debug, Default)]
 pub(super) struct Age {
-    delay: Option<(Epoch, MinimumDelay)>,
+    /// The present leadership's least delay, against which its rounds are old.
+    delay: Option<(Epoch, LeadersDelay)>,
+    newest_at: Option<Timestamp>,
+    /// When a round came after none had for [`MAX_AGE`].
+    resumed_at: Option<Timestamp>,
+}
+
+#[derive(Debug)]
+struct LeadersDelay {
+    least: MinimumDelay,
+    learnt_at: Timestamp,
 }
 
 impl Age {
-    /// Time that a round of `epoch`, which the gate has admitted, spent in queues: a node that was stopped, or a link that
-    /// was, finds the rounds of that time waiting. The first of a leadership counts as fresh, since its clock is not known.
-    pub(super) fn of(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> Duration {
-        let known = self.delay.take().filter(|(of, _)| of == epoch);
-        let (_, delay) = self.delay.insert(known.unwrap_or_else(|| (epoch.clone(), MinimumDelay::new(received_at))));
+    /// Whether a round of `epoch`, which the gate has admitted, spent no more than [`MAX_AGE`] in queues: a node that was
+    /// stopped, or a link that was, finds the rounds of that time waiting. The first round of a leadership is fresh, since
+    /// its clock is not known, but after such a time.
+    pub(super) fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
+        if self.newest_at.replace(received_at).is_some_and(|newest_at| received_at.since(newest_at) > MAX_AGE) {
+            self.resumed_at = Some(received_at);
+        }
         let delay_us = received_at.micros_from(fused_at);
-        delay.observe(delay_us, received_at);
-        Duration::from_micros(delay_us.saturating_sub(delay.least()).unsigned_abs())
+        let known = self.delay.take().filter(|(of, _)| of == epoch).map(|(_, delay)| delay);
+        let mut delay = known.unwrap_or_else(|| LeadersDelay {
+            least: MinimumDelay::new(received_at),
+            learnt_at: self.resumed_at.map_or(Timestamp::default(), |resumed_at| resumed_at + LEARNING),
+        });
+        delay.least.observe(delay_us, received_at);
+        let waited = Duration::from_micros(delay_us.saturating_sub(delay.least.least()).unsigned_abs());
+        let is_fresh = received_at >= delay.learnt_at && waited <= MAX_AGE;
+        self.delay = Some((epoch.clone(), delay));
+        is_fresh
     }
 }
 
@@ -41,30 +68,42 @@ mod tests {
         for ahead in [0, 3_600_000] {
             let (epoch, mut age) = (Epoch::new(3, NodeName::from_static("edge")), Age::default());
             for round in 0..20 {
-                let fresh = age.of(&epoch, ms(ahead + 100 * round), ms(100 * round + 2));
-                assert_eq!(fresh, Duration::ZERO, "round {round}");
+                assert!(age.is_fresh(&epoch, ms(ahead + 100 * round), ms(100 * round + 2)), "round {round}");
             }
             // Stopped for three seconds, the node finds thirty rounds.
-            let waited: Vec<_> = (20..50).map(|n| age.of(&epoch, ms(ahead + 100 * n), ms(5002)).as_millis()).collect();
-            assert_eq!((waited[0], waited[29]), (3000, 100));
+            let fresh: Vec<_> = (20..50).filter(|n| age.is_fresh(&epoch, ms(ahead + 100 * n), ms(5002))).collect();
+            assert_eq!(fresh, Vec::from_iter(40..50));
         }
     }
 
     #[test]
     fn a_new_leadership_has_a_clock_of_its_own() {
         let mut age = Age::default();
-        age.of(&Epoch::new(3, NodeName::from_static("edge")), ms(0), ms(1));
-        let other = age.of(&Epoch::new(4, NodeName::from_static("gauss")), ms(0), ms(60_000));
-        assert_eq!(other, Duration::ZERO);
+        assert!(age.is_fresh(&Epoch::new(3, NodeName::from_static("edge")), ms(0), ms(60_000)));
+        assert!(age.is_fresh(&Epoch::new(4, NodeName::from_static("gauss")), ms(0), ms(60_300)));
+    }
+
+    #[test]
+    fn of_a_leadership_that_began_while_the_node_was_stopped_only_what_is_made_now_is_taken() {
+        let (edge, gauss) =
+            (Epoch::new(3, NodeName::from_static("edge")), Epoch::new(4, NodeName::from_static("gauss")));
+        let mut age = Age::default();
+        assert!(age.is_fresh(&edge, ms(0), ms(1)));
+        // Stopped for eleven seconds, it hands out a round of its own, and then finds those of its successor.
+        assert!(age.is_fresh(&edge, ms(11_000), ms(11_000)));
+        let waiting = (5..110).filter(|n| age.is_fresh(&gauss, ms(7 + 100 * n), ms(11_001 + n / 10))).count();
+        assert_eq!(waiting, 0);
+        let live: Vec<_> = (110..120).filter(|n| age.is_fresh(&gauss, ms(7 + 100 * n), ms(9 + 100 * n))).collect();
+        assert_eq!(live, Vec::from_iter(113..120));
     }
 
     #[test]
     fn a_way_that_became_longer_is_believed_in_the_end() {
         let (epoch, mut age) = (Epoch::new(3, NodeName::from_static("edge")), Age::default());
-        let of = |n: u64, age: &mut Age| age.of(&epoch, ms(100 * n), ms(100 * n + if n < 10 { 1 } else { 1500 }));
-        assert!((0..10).all(|n| of(n, &mut age).is_zero()));
-        assert!(of(10, &mut age) > Duration::from_secs(1));
-        let last = (11..250).map(|n| of(n, &mut age)).last();
-        assert_eq!(last, Some(Duration::ZERO));
+        let is_fresh =
+            |n: u64, age: &mut Age| age.is_fresh(&epoch, ms(100 * n), ms(100 * n + if n < 10 { 1 } else { 1500 }));
+        assert!((0..10).all(|n| is_fresh(n, &mut age)));
+        assert!(!is_fresh(10, &mut age));
+        assert_eq!((11..250).map(|n| is_fresh(n, &mut age)).last(), Some(true));
     }
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 use ecod::epoch::{Epoch, EpochGate};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
+use tokio::sync::watch;
 
 use crate::leader_election::Leadership;
 
@@ -41,6 +42,8 @@ pub(super) enum Refusal {
 #[derive(Debug)]
 pub(super) struct Gate {
     gate: EpochGate,
+    /// The highest term that the election knows; without it any is believed where nobody is known to lead.
+    known_term: Option<watch::Receiver<u64>>,
     newest_at: Option<Timestamp>,
     /// The last round of the elected, and when it came.
     elected: Option<(Epoch, u64, Timestamp)>,
@@ -48,13 +51,23 @@ pub(super) struct Gate {
     others_since: Option<Timestamp>,
     /// The elected epoch in which others have used up their credit.
     overruled: Option<Epoch>,
+    /// Who publishes in a term that the election has not heard of while nobody is known to lead.
+    stranger: Option<Stranger>,
+}
+
+/// One whom no election vouches for.
+#[derive(Debug)]
+struct Stranger {
+    epoch: Epoch,
+    since: Timestamp,
+    last: Timestamp,
 }
 
 impl Gate {
-    /// A gate that refuses terms below `least_term` at first.
-    pub(super) fn new(least_term: u64) -> Self {
+    /// A gate that refuses terms below `least_term` at first, and later than the one after `known_term` for a while.
+    pub(super) fn new(least_term: u64, known_term: Option<watch::Receiver<u64>>) -> Self {
         let gate = EpochGate::new(least_term);
-        Self { gate, newest_at: None, elected: None, others_since: None, overruled: None }
+        Self { gate, known_term, newest_at: None, elected: None, others_since: None, overruled: None, stranger: None }
     }
 
     /// Takes round `round` of `epoch`, or refuses it, knowing what the election says.
@@ -68,7 +81,31 @@ impl Gate {
         match leadership.epoch.as_ref().filter(|_| leadership.leader().is_some()) {
             Some(elected) if elected == epoch => self.admit_elected(epoch, round, received_at),
             Some(elected) => self.admit_other(epoch, round, received_at, elected, leadership.standby.as_ref()),
+            None if self.is_strange(epoch, received_at) => Err(Refusal::NotElected),
             None => self.admit_in_order(epoch, round, received_at, true),
+        }
+    }
+
+    /// Whether an epoch that nobody vouches for is not to be believed yet. The election hears of terms from those who know
+    /// the cell's key, at the latest when the next leader beats; only who publishes on and on without any election is
+    /// believed without, and of several the first.
+    fn is_strange(&mut self, epoch: &Epoch, received_at: Timestamp) -> bool {
+        let known = self.known_term.as_ref().is_none_or(|known| epoch.term <= known.borrow().saturating_add(1));
+        if known || self.gate.latest().is_some_and(|(latest, _)| latest == epoch) {
+            return false;
+        }
+        match &mut self.stranger {
+            Some(stranger) if received_at.since(stranger.last) < CREDIT => {
+                if stranger.epoch != *epoch {
+                    return true;
+                }
+                stranger.last = received_at;
+                received_at.since(stranger.since) < CREDIT
+            }
+            _ => {
+                self.stranger = Some(Stranger { epoch: epoch.clone(), since: received_at, last: received_at });
+                true
+            }
         }
     }
 
@@ -157,7 +194,7 @@ mod tests {
     fn a_forged_epoch_does_not_silence_the_elected() {
         let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "gauss"));
         let leadership = led_by(elected.clone(), Some("euclid"));
-        let mut gate = Gate::new(0);
+        let mut gate = Gate::new(0, None);
         for round in 0..100 {
             assert_eq!(gate.admit(&elected, round, at(100 * round), &leadership), Ok(()), "round {round}");
             let refused = gate.admit(&forged, round, at(100 * round + 50), &leadership);
@@ -169,7 +206,7 @@ mod tests {
     fn one_that_poses_as_the_next_leader_is_believed_once_and_briefly() {
         let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "euclid"));
         let leadership = led_by(elected.clone(), Some("euclid"));
-        let mut gate = Gate::new(0);
+        let mut gate = Gate::new(0, None);
         let mut lost = Vec::new();
         for round in 0..100 {
             if gate.admit(&elected, round, at(100 * round), &leadership).is_err() {
@@ -183,7 +220,7 @@ mod tests {
     #[test]
     fn the_next_leader_is_taken_before_word_of_its_election_came() {
         let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
-        let mut gate = Gate::new(0);
+        let mut gate = Gate::new(0, None);
         let (before, after) = (led_by(old.clone(), Some("euclid")), led_by(new.clone(), None));
         assert_eq!(gate.admit(&old, 1, at(0), &before), Ok(()));
         assert_eq!(gate.admit(&new, 2, at(100), &before), Ok(()));
@@ -198,7 +235,7 @@ mod tests {
     fn a_standby_that_still_leads_on_its_own_is_not_taken_for_the_next_leader() {
         let (elected, lone) = (epoch(2, "euclid"), epoch(3, "edge"));
         let leadership = led_by(elected.clone(), Some("edge"));
-        let mut gate = Gate::new(0);
+        let mut gate = Gate::new(0, None);
         assert_eq!(gate.admit(&elected, 42, at(0), &leadership), Ok(()));
         assert_eq!(gate.admit(&lone, 3, at(50), &leadership), Err(Refusal::NotElected), "it has just started");
         assert_eq!(gate.admit(&lone, 9000, at(50), &leadership), Err(Refusal::NotElected), "it was alone for long");
@@ -207,9 +244,32 @@ mod tests {
     }
 
     #[test]
+    fn while_nobody_leads_an_unknown_term_is_believed_only_of_one_who_goes_on_publishing() {
+        let seeking = Leadership::default();
+        let (known_term, receiver) = watch::channel(7);
+        let mut gate = Gate::new(0, Some(receiver));
+        let next = epoch(8, "edge");
+        for round in 0..20 {
+            let forged = epoch(1 << 40 | round, "mallory");
+            let refused = gate.admit(&forged, round, at(100 * round), &seeking);
+            assert_eq!(refused, Err(Refusal::NotElected), "round {round}");
+            assert_eq!(gate.admit(&next, round, at(100 * round + 1), &seeking), Ok(()), "round {round}");
+        }
+        let later = epoch(12, "euclid");
+        assert_eq!(gate.admit(&later, 20, at(10_000), &seeking), Err(Refusal::NotElected));
+        known_term.send_replace(12);
+        assert_eq!(gate.admit(&later, 21, at(10_100), &seeking), Ok(()), "the election has heard of it");
+
+        let unelected = epoch(1_763_683_200, "aggregator");
+        let taken = |round: &u64| gate.admit(&unelected, *round, at(20_000 + 100 * round), &seeking).is_ok();
+        let taken: Vec<_> = (0..8).filter(taken).collect();
+        assert_eq!(taken, [5, 6, 7], "after half a second");
+    }
+
+    #[test]
     fn the_last_round_of_the_old_leader_passes_while_the_new_one_has_sent_none() {
         let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
-        let mut gate = Gate::new(0);
+        let mut gate = Gate::new(0, None);
         let after = led_by(new.clone(), None);
         assert_eq!(gate.admit(&old, 1, at(0), &led_by(old.clone(), None)), Ok(()));
         assert_eq!(gate.admit(&old, 2, at(100), &after), Ok(()));

@@ -30,14 +30,18 @@ fn map(Epoch { term, leader }: Epoch, round: u64) -> FollowerMessage {
 #[tokio::test]
 async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
     let elected = Leadership { position: Position::Following, epoch: Some(epoch(7, "edge")), standby: None };
-    // The gate refuses it where a leader is known; where none is, the gate is taken in and the fuser is not.
-    for (leadership, honest, admitted) in [(elected, 3, 3), (Leadership::default(), 1, 2)] {
+    let seeking = Leadership::default();
+    // The gate refuses it where a leader is known, and an unknown term where none is; where it is taken in, the fuser is not.
+    for (leadership, known_term, honest, admitted) in
+        [(elected, 7, 3, 3), (seeking.clone(), 7, 3, 3), (seeking, u64::MAX, 1, 2)]
+    {
         let (fuser, mut told) = listening::seat().await;
         let arguments = FollowerArguments {
             newest: Newest::default(),
             log: None,
             recording: Recording::default(),
             least_term: 0,
+            term: watch::channel(known_term).1,
             leadership: watch::channel(leadership.clone()).1,
             election: Seat::default(),
             fuser: fuser.clone(),

@@ -8,7 +8,7 @@ mod disturbance;
 mod growth;
 mod intruder;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -45,6 +45,7 @@ struct Summary {
     minutes: Vec<Minute>,
     maps_accepted: usize,
     stale_accepted: u64,
+    forged_accepted: usize,
     accepted_older_than_1_s: usize,
     oldest_accepted_ms: u64,
     unrecovered_minutes: usize,
@@ -127,7 +128,8 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         past.push(minute);
     }
     drop(intruder);
-    let runs = cell.runs()?;
+    let mut runs = cell.runs()?;
+    let forged_accepted = take_out_forged(&mut runs);
     for minute in &mut past {
         minute.longest_gap_ms = longest_gap(&runs, minute.span).as_millis() as u64;
     }
@@ -138,6 +140,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         seed,
         maps_accepted: accepted().count(),
         stale_accepted: runs.iter().map(stale).sum(),
+        forged_accepted,
         accepted_older_than_1_s: accepted().filter(|map| map.age() > MAX_AGE).count(),
         oldest_accepted_ms: accepted().map(Accepted::age).max().unwrap_or_default().as_millis() as u64,
         unrecovered_minutes: past.iter().filter(|minute| minute.recovered_after_ms.is_none()).count(),
@@ -145,6 +148,15 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         largest: past.iter().map(|minute| minute.largest).fold(Resources::default(), Resources::max),
         minutes: past,
     })
+}
+
+/// Removes the maps of aggregators that are no nodes of the cell, beside whose epochs right ones would seem superseded.
+fn take_out_forged(runs: &mut [NodeRun]) -> usize {
+    let nodes: BTreeSet<_> = runs.iter().map(|run| run.node.clone()).collect();
+    let all = |runs: &[NodeRun]| runs.iter().map(|run| run.accepted.len()).sum::<usize>();
+    let before = all(runs);
+    runs.iter_mut().for_each(|run| run.accepted.retain(|map| nodes.contains(&map.epoch.leader)));
+    before - all(runs)
 }
 
 /// The longest wait of any process that took maps before and after the span.
@@ -174,13 +186,14 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
         println!("{:>6}  {what:<44}{gap:>10}{well:>12}  {:<8}{}", number + 1, minute.leader, minute.largest);
     }
     println!(
-        "\n{} nodes, {} minutes, seed {}: {} maps taken, {} of them superseded, {} older than 1 s (the oldest {} ms); \
+        "\n{} nodes, {} minutes, seed {}: {} maps taken, {} of them superseded, {} forged, {} older than 1 s (the oldest {} ms); \
          {} minutes unrecovered; at most {}; {} processes grow",
         summary.nodes,
         summary.minutes.len(),
         summary.seed,
         summary.maps_accepted,
         summary.stale_accepted,
+        summary.forged_accepted,
         summary.accepted_older_than_1_s,
         summary.oldest_accepted_ms,
         summary.unrecovered_minutes,
@@ -193,6 +206,7 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
     let count = |what: &str, count: usize| (count > 0).then(|| format!("{what}: {count}"));
     let counted = [
         count("superseded maps taken", summary.stale_accepted as usize),
+        count("forged maps taken", summary.forged_accepted),
         count("maps older than 1 s taken", summary.accepted_older_than_1_s),
         count("minutes unrecovered", summary.unrecovered_minutes),
     ];

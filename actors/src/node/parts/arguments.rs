@@ -139,6 +139,7 @@ impl Assembly {
             log: self.config.map_log.clone(),
             recording: self.recording.clone(),
             least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
+            term: self.term.subscribe(),
             leadership: self.leadership(),
             election: self.seats.election.clone(),
             fuser: self.seats.fuser.clone(),
