@@ -54,10 +54,12 @@ impl Testbed {
     }
 
     /// What the vehicle's camera could read at a spot, judged by the geometry alone: the plate of an occupied spot, the
-    /// `EMPTY` placard of a free one; `None` when it is outside the image, seen from behind, or mostly hidden.
+    /// `EMPTY` placard of a free one; `None` when it is outside the image, seen from behind, too small in it, or mostly hidden. A free spot without a
+    /// placard can be seen to be free where its plate could be read.
     pub fn sighting(&self, scene: &Scene, cav: &Cav, spot: &Spot) -> Option<Sighting> {
-        let card = spot.plate_card().or_else(|| spot.empty_card(&self.placard))?;
-        Sighting::of(&card, &self.cards(scene), &cav.pose, self).filter(Sighting::is_clear)
+        let place = || Card { text: Label::default(), position: spot.occupied, facing_rad: spot.facing_rad };
+        let card = spot.plate_card().or_else(|| spot.empty_card(&self.placard)).unwrap_or_else(place);
+        Sighting::of(&card, &self.cards(scene), &cav.pose, self).filter(Sighting::is_legible)
     }
 }
 
@@ -167,12 +169,8 @@ pub struct Cav {
 /// Accuracies recorded in one run on the physical testbed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedRun {
-    /// The run's number.
-    pub run: u64,
-    /// How many fused maps were judged.
-    pub verdicts: u64,
-    /// Accuracy of PACE in percent.
-    pub pace_accuracy_pct: f64,
+    /// Accuracy of PACE in percent, if it was recorded.
+    pub pace_accuracy_pct: Option<f64>,
     /// Accuracy of each vehicle alone in percent, in the order of the scene's vehicles; those recorded only.
     pub single_cav_accuracy_pct: Vec<(NodeName, f64)>,
 }

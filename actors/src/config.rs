@@ -31,7 +31,7 @@ use crate::vehicle_pose::PoseConfig;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NodeConfig {
-    /// Name of the node, unique in its cell. Default `edge` for an edge; a vehicle's must be given.
+    /// Name of the node, unique in its cell. Default `edge` for an edge, the machine's host name for others.
     pub name: Option<NodeName>,
     /// Name of the cell; nodes of other cells are not heard. Default `cell`.
     pub cell: NodeName,
@@ -134,8 +134,9 @@ impl NodeConfig {
         }
         let figment = figment.merge(environment()).merge(Serialized::defaults(flags));
         let mut config = extract(figment)?;
-        if config.role == Role::Edge && config.name.is_none() {
-            config.name = Some(NodeName::from_static("edge"));
+        if config.name.is_none() {
+            let edge = (config.role == Role::Edge).then_some(NodeName::from_static("edge"));
+            config.name = edge.or_else(host_name);
         }
         if config.state_dir.is_none() {
             config.state_dir = std::env::var_os("STATE_DIRECTORY").map(PathBuf::from);
@@ -164,7 +165,11 @@ impl NodeConfig {
     /// [`ConfigError`] naming the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.name.is_none() {
-            return Err(ConfigError::new("name", "nothing", "the node's name, unique in its cell"));
+            return Err(ConfigError::new(
+                "name",
+                "nothing",
+                "the node's name, unique in its cell (`--name`): the host name cannot serve as one",
+            ));
         }
         self.pose.validate().map_err(|error| error.within("pose"))?;
         self.membership.validate().map_err(|error| error.within("membership"))?;
@@ -277,6 +282,14 @@ impl NodeConfig {
 }
 
 const ENVIRONMENT_PREFIX: &str = "ECOD_";
+
+/// The machine's name without its domain, as far as names of nodes may have its characters.
+fn host_name() -> Option<NodeName> {
+    let system = rustix::system::uname();
+    let host = system.nodename().to_str().ok()?.split('.').next()?;
+    let allowed = |c: char| if c.is_ascii_alphanumeric() || c == '_' { c } else { '-' };
+    NodeName::new(host.chars().map(allowed).collect::<String>()).ok()
+}
 
 fn environment() -> Env {
     Env::prefixed(ENVIRONMENT_PREFIX).split("__")

@@ -71,6 +71,8 @@ pub enum Event {
     FrameFailed,
     /// A camera frame gave way to a later one.
     FrameSkipped,
+    /// A camera or another source of frames failed or gave none in time; it is opened again.
+    SourceFailed,
     /// A browser's request was refused: a wrong or missing token, a foreign host name, or no room.
     BrowserRefused,
     /// A browser's request was refused because too many were made lately.
@@ -103,7 +105,7 @@ pub enum Event {
 
 impl Event {
     /// All events, for snapshots.
-    pub const ALL: [Self; 42] = [
+    pub const ALL: [Self; 43] = [
         Self::Published,
         Self::PublishRefused,
         Self::PublishTooLarge,
@@ -133,6 +135,7 @@ impl Event {
         Self::FrameDetected,
         Self::FrameFailed,
         Self::FrameSkipped,
+        Self::SourceFailed,
         Self::BrowserRefused,
         Self::BrowserThrottled,
         Self::DashboardNotBound,
@@ -180,6 +183,7 @@ impl Event {
             Self::FrameDetected => "frame_detected",
             Self::FrameFailed => "frame_failed",
             Self::FrameSkipped => "frame_skipped",
+            Self::SourceFailed => "source_failed",
             Self::BrowserRefused => "browser_refused",
             Self::BrowserThrottled => "browser_throttled",
             Self::DashboardNotBound => "dashboard_not_bound",

@@ -154,15 +154,25 @@ impl Drop for DetectorState {
 /// Hands over the latest frame whenever the detector is ready, until the source or the detector ends.
 async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>) {
     let turns = Arc::new(Semaphore::new(1));
-    let (mut skipped, mut unusable) = (0, 0);
+    let mut status = capture.status();
+    let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
     while let Ok(turn) = Arc::clone(&turns).acquire_owned().await {
-        let frame = capture.next_frame().await;
-        for (event, total, counted) in [
-            (Event::FrameSkipped, capture.skipped(), &mut skipped),
-            (Event::FrameFailed, capture.unusable(), &mut unusable),
-        ] {
-            counters.add(event, total - std::mem::replace(counted, total));
-        }
+        let frame = loop {
+            let frame = tokio::select! {
+                frame = capture.next_frame() => Some(frame),
+                Ok(()) = status.changed() => None,
+            };
+            for (event, total, counted) in [
+                (Event::FrameSkipped, capture.skipped(), &mut skipped),
+                (Event::FrameFailed, capture.unusable(), &mut unusable),
+                (Event::SourceFailed, capture.failures(), &mut failures),
+            ] {
+                counters.add(event, total - std::mem::replace(counted, total));
+            }
+            if let Some(frame) = frame {
+                break frame;
+            }
+        };
         let Some(frame) = frame else { return };
         if detector.cast(DetectorMessage::Look { frame, turn }).is_err() {
             return;

@@ -267,7 +267,7 @@ mod tests {
             log: None,
             recording: Recording::default(),
             least_term: 0,
-            term: watch::channel(u64::MAX).1,
+            term: watch::channel(7).1,
             leadership: watch::channel(leadership).1,
             election: Seat::default(),
             fuser: Seat::default(),
@@ -295,13 +295,14 @@ mod tests {
         let mut follower = follower(Leadership::default());
         let ms = |n: u64| Timestamp(n * 1000);
         let accepted = |follower: &FollowerState| follower.newest.map.borrow().as_ref().map(|newest| newest.map.epoch);
-        assert_eq!(follower.take_map(&map(u64::MAX, 1, ms(0)), ms(0)), Ok(()));
+        assert_eq!(follower.take_map(&map(u64::MAX, 1, ms(0)), ms(0)), Err(Refusal::NotElected));
+        assert_eq!(follower.take_map(&map(u64::MAX, 2, ms(500)), ms(500)), Ok(()), "it goes on and on");
         assert_eq!(follower.take_map(&map(7, 1, ms(1000)), ms(1000)), Err(Refusal::Superseded));
         assert_eq!(accepted(&follower), Some(u64::MAX));
-        assert_eq!(follower.take_map(&map(7, 2, ms(3000)), ms(3000)), Err(Refusal::Stale), "it may have waited");
-        assert_eq!(follower.take_map(&map(7, 3, ms(3300)), ms(3300)), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 2, ms(3500)), ms(3500)), Err(Refusal::Stale), "it may have waited");
+        assert_eq!(follower.take_map(&map(7, 4, ms(3700)), ms(3700)), Ok(()));
         assert_eq!(accepted(&follower), Some(7));
-        assert_eq!(follower.take_map(&map(7, 3, ms(3400)), ms(3400)), Err(Refusal::Repeated), "not taken twice");
+        assert_eq!(follower.take_map(&map(7, 4, ms(3800)), ms(3800)), Err(Refusal::Repeated), "not taken twice");
     }
 
     #[test]

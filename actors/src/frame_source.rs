@@ -170,9 +170,11 @@ impl SourceConfig {
             Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => {
                 Err(ConfigError::new("pipeline", pipeline, "a pipeline that ends in appsink"))
             }
-            Self::Url { url } if !url.contains("://") => {
-                Err(ConfigError::new("url", video::without_credentials(url), "an rtsp or http address"))
-            }
+            Self::Url { url } if !has_known_scheme(url) => Err(ConfigError::new(
+                "url",
+                video::without_credentials(url),
+                "an address that begins with rtsp://, rtsps://, http:// or https://",
+            )),
             _ => Ok(()),
         }
     }
@@ -209,6 +211,11 @@ impl Pace {
         std::thread::sleep(due.saturating_duration_since(now));
         self.due = Some(due.max(now) + self.period);
     }
+}
+
+fn has_known_scheme(url: &str) -> bool {
+    let scheme = url.split_once("://").map(|(scheme, _)| scheme.to_ascii_lowercase());
+    scheme.is_some_and(|scheme| matches!(&*scheme, "rtsp" | "rtsps" | "http" | "https"))
 }
 
 #[cfg(test)]

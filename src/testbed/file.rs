@@ -300,9 +300,8 @@ impl CavFields {
 
 #[derive(Deserialize)]
 struct RunFields {
-    run: u64,
-    verdicts: u64,
-    pace_accuracy_pct: f64,
+    #[serde(default)]
+    pace_accuracy_pct: Option<f64>,
     #[serde(default)]
     single_cav_accuracy_pct: BTreeMap<String, f64>,
 }
@@ -311,8 +310,6 @@ impl RunFields {
     fn order_by(self, cavs: &[Cav]) -> RecordedRun {
         let accuracy = |cav: &Cav| Some((cav.name.clone(), *self.single_cav_accuracy_pct.get(cav.name.as_str())?));
         RecordedRun {
-            run: self.run,
-            verdicts: self.verdicts,
             pace_accuracy_pct: self.pace_accuracy_pct,
             single_cav_accuracy_pct: cavs.iter().filter_map(accuracy).collect(),
         }

@@ -91,11 +91,21 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
         Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|error| {
             // serde_json has no other way to tell 1e999 from a syntax error.
             let overflow = error.to_string().starts_with("number out of range");
-            if overflow { RejectReason::NotFinite } else { RejectReason::Malformed }
+            let not_finite = overflow || (error.is_syntax() && names_no_number(bytes, &error));
+            if not_finite { RejectReason::NotFinite } else { RejectReason::Malformed }
         }),
         Some(_) => ciborium::from_reader(bytes).map_err(|_| RejectReason::Malformed),
         None => Err(RejectReason::Malformed),
     }
+}
+
+/// Whether it is at a word for a number that is none, as Python writes them, that the text ends to be JSON.
+fn names_no_number(bytes: &[u8], error: &serde_json::Error) -> bool {
+    let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
+    // The column is that of the word's first letter, or of one beside it.
+    let from = line.get(error.column().saturating_sub(3)..).unwrap_or_default();
+    let around = &from[..from.len().min("-Infinity".len() + 2)];
+    ["NaN", "Infinity"].iter().any(|word| around.windows(word.len()).any(|part| part == word.as_bytes()))
 }
 
 #[cfg(test)]
@@ -196,6 +206,10 @@ mod tests {
             (json.replace("\"seq\":412", "\"seq\":-1").into(), RejectReason::Malformed),
             (json.replace("\"euclid\"", "\"a/b\"").into(), RejectReason::Malformed),
             (json.replace("0.25", "1e999").into(), RejectReason::NotFinite),
+            (json.replace("0.25", "NaN").into(), RejectReason::NotFinite),
+            (json.replace("0.25", "\n -Infinity").into(), RejectReason::NotFinite),
+            (json.replace("0.25", " Infinity").into(), RejectReason::NotFinite),
+            (json.replace("0.25", "nan").into(), RejectReason::Malformed),
             (b"{\"schema\":2}".to_vec(), RejectReason::UnknownSchema),
             (vec![b' '; Limits::default().payload_bytes + 1], RejectReason::TooLarge),
         ];

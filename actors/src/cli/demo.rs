@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::Args;
-use ecod::testbed::Scene;
+use ecod::testbed::{Scene, Testbed};
 use ecod::time::Timestamp;
 use nalgebra::Point2;
 use tokio::signal::unix::{SignalKind, signal};
@@ -18,12 +18,15 @@ use crate::node_process::free_address;
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
 
+/// The recorded parking lots that are shown if no others are given.
+const RECORDED: &str = include_str!("../../../examples/testbed/pace_setup1.json");
+
 /// Flags of `demo`.
 #[derive(Debug, Args)]
 pub(super) struct DemoArguments {
-    /// Scene file, such as examples/testbed/pace_setup1.json
+    /// Scene file [default: the parking lots of the paper's first setup]
     #[arg(long, value_name = "FILE")]
-    scenes: PathBuf,
+    scenes: Option<PathBuf>,
     /// Run this scene only
     #[arg(long, value_name = "NAME")]
     scene: Option<String>,
@@ -36,13 +39,17 @@ pub(super) struct DemoArguments {
 }
 
 pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
-    let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
+    let testbed = match &arguments.scenes {
+        Some(file) => read(file),
+        None => Testbed::from_json(RECORDED).context("the scenes of this program"),
+    };
+    let testbed = testbed.map_err(Failure::usage)?;
     let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;
     let program = std::env::current_exe().context("this program cannot be found")?;
-    let file = fs::canonicalize(&arguments.scenes).context("the scene file has gone")?;
     let runtime = tokio::runtime::Runtime::new().context("no threads for the demo")?;
     let results_file = arguments.out.join("result.json");
     fs::create_dir_all(&arguments.out).with_context(|| format!("cannot make {}", arguments.out.display()))?;
+    let file = scene_file(arguments)?;
     check_writable(&results_file)?;
     print(&format!("a cell on this machine: 1 edge, killed half-way, {}\n\n", vehicles(&scenes)))?;
     let dashboard = free_address()?;
@@ -85,6 +92,15 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     print(&format!("\n{}\n", table(&results)))?;
     write_json(&results_file, &Results { scenes: &results })?;
     Ok(print(&format!("pictures, results, configurations and logs: {}\n", arguments.out.display()))?)
+}
+
+/// The scene file for the vehicles to read; that of this program is written beside the results.
+fn scene_file(arguments: &DemoArguments) -> anyhow::Result<PathBuf> {
+    let file = arguments.scenes.clone().unwrap_or_else(|| arguments.out.join("scenes.json"));
+    if arguments.scenes.is_none() {
+        fs::write(&file, RECORDED).with_context(|| format!("cannot write {}", file.display()))?;
+    }
+    fs::canonicalize(&file).with_context(|| format!("the scene file {} has gone", file.display()))
 }
 
 /// Who led when, how right its maps were, and what the change cost the vehicles.

@@ -9,9 +9,9 @@ use ecod::time::Timestamp;
 /// What a driver was to be told longer ago than this is not told any more.
 const MAX_AGE: Duration = Duration::from_secs(1);
 
-/// How long the clock of a leadership is learnt whose first round came when a node had long heard none: what waited for
-/// the node comes at once, the newest last.
-const LEARNING: Duration = Duration::from_millis(250);
+/// How long the rounds of a leadership whose first came when a node had long heard none must come as slowly as they were
+/// made: what waited for the node comes faster.
+const LEARNING: Duration = Duration::from_millis(150);
 
 /// Tells rounds that have just been made from those that waited.
 #[derive(Debug, Default)]
@@ -26,7 +26,30 @@ pub(super) struct Age {
 #[derive(Debug)]
 struct LeadersDelay {
     least: MinimumDelay,
-    learnt_at: Timestamp,
+    /// Whether the least is that of rounds that did not wait.
+    is_learnt: bool,
+    /// For how long rounds have come as slowly as they were made.
+    live_for: Duration,
+    /// When the last round was made and came.
+    last: (Timestamp, Timestamp),
+}
+
+impl LeadersDelay {
+    fn new(is_learnt: bool, fused_at: Timestamp, received_at: Timestamp) -> Self {
+        let least = MinimumDelay::new(received_at);
+        Self { least, is_learnt, live_for: Duration::ZERO, last: (fused_at, received_at) }
+    }
+
+    /// Takes a round and tells how long it waited, as far as is known.
+    fn observe(&mut self, fused_at: Timestamp, received_at: Timestamp) -> Duration {
+        let (last_fused_at, last_received_at) = std::mem::replace(&mut self.last, (fused_at, received_at));
+        let (made_in, came_in) = (fused_at.since(last_fused_at), received_at.since(last_received_at));
+        self.live_for = if 2 * came_in >= made_in { self.live_for + came_in } else { Duration::ZERO };
+        self.is_learnt |= self.live_for >= LEARNING;
+        let delay_us = received_at.micros_from(fused_at);
+        self.least.observe(delay_us, received_at);
+        Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs())
+    }
 }
 
 impl Age {
@@ -37,15 +60,11 @@ impl Age {
         if self.newest_at.replace(received_at).is_some_and(|newest_at| received_at.since(newest_at) > MAX_AGE) {
             self.resumed_at = Some(received_at);
         }
-        let delay_us = received_at.micros_from(fused_at);
         let known = self.delay.take().filter(|(of, _)| of == epoch).map(|(_, delay)| delay);
-        let mut delay = known.unwrap_or_else(|| LeadersDelay {
-            least: MinimumDelay::new(received_at),
-            learnt_at: self.resumed_at.map_or(Timestamp::default(), |resumed_at| resumed_at + LEARNING),
-        });
-        delay.least.observe(delay_us, received_at);
-        let waited = Duration::from_micros(delay_us.saturating_sub(delay.least.least()).unsigned_abs());
-        let is_fresh = received_at >= delay.learnt_at && waited <= MAX_AGE;
+        let has_waited = self.resumed_at.is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_AGE);
+        let mut delay = known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
+        let waited = delay.observe(fused_at, received_at);
+        let is_fresh = delay.is_learnt && waited <= MAX_AGE;
         self.delay = Some((epoch.clone(), delay));
         is_fresh
     }
@@ -91,10 +110,10 @@ mod tests {
         assert!(age.is_fresh(&edge, ms(0), ms(1)));
         // Stopped for eleven seconds, it hands out a round of its own, and then finds those of its successor.
         assert!(age.is_fresh(&edge, ms(11_000), ms(11_000)));
-        let waiting = (5..110).filter(|n| age.is_fresh(&gauss, ms(7 + 100 * n), ms(11_001 + n / 10))).count();
-        assert_eq!(waiting, 0);
-        let live: Vec<_> = (110..120).filter(|n| age.is_fresh(&gauss, ms(7 + 100 * n), ms(9 + 100 * n))).collect();
-        assert_eq!(live, Vec::from_iter(113..120));
+        let waiting = (5..110).filter(|n| age.is_fresh(&gauss, ms(7 + 100 * n), ms(11_001 + 3 * n))).count();
+        assert_eq!(waiting, 0, "however slowly they come");
+        let live: Vec<_> = (115..125).filter(|n| age.is_fresh(&gauss, ms(7 + 100 * n), ms(9 + 100 * n))).collect();
+        assert_eq!(live, Vec::from_iter(117..125));
     }
 
     #[test]

@@ -21,6 +21,10 @@ const SILENCE: Duration = Duration::from_millis(250);
 /// How long one with a later epoch is believed while the election names another: the word may be under way.
 const CREDIT: Duration = Duration::from_millis(500);
 
+/// How many terms above the highest known the next leader's is: one that was started anew skips the term that it may have
+/// used before.
+const TERMS_AHEAD: u64 = 2;
+
 /// How many rounds the standby that takes over may be ahead of the elected's last. One that stands by since it was found
 /// leading on its own counts its own rounds, and is still to be told to follow.
 const CATCH_UP: u64 = 16;
@@ -87,21 +91,20 @@ impl Gate {
     }
 
     /// Whether an epoch that nobody vouches for is not to be believed yet. The election hears of terms from those who know
-    /// the cell's key, at the latest when the next leader beats; only who publishes on and on without any election is
-    /// believed without, and of several the first.
+    /// the cell's key, at the latest when the next leader beats, and of a term that is over it knows; only who publishes
+    /// on and on without any election is believed without, and of several the first.
     fn is_strange(&mut self, epoch: &Epoch, received_at: Timestamp) -> bool {
-        let known = self.known_term.as_ref().is_none_or(|known| epoch.term <= known.borrow().saturating_add(1));
-        if known || self.gate.latest().is_some_and(|(latest, _)| latest == epoch) {
+        let Some(known_term) = self.known_term.as_ref().map(|known| *known.borrow()) else { return false };
+        let vouched = known_term..=known_term.saturating_add(TERMS_AHEAD);
+        if vouched.contains(&epoch.term) || self.gate.latest().is_some_and(|(latest, _)| latest == epoch) {
             return false;
         }
         match &mut self.stranger {
-            Some(stranger) if received_at.since(stranger.last) < CREDIT => {
-                if stranger.epoch != *epoch {
-                    return true;
-                }
+            Some(stranger) if stranger.epoch == *epoch => {
                 stranger.last = received_at;
                 received_at.since(stranger.since) < CREDIT
             }
+            Some(stranger) if received_at.since(stranger.last) < MEMORY => true,
             _ => {
                 self.stranger = Some(Stranger { epoch: epoch.clone(), since: received_at, last: received_at });
                 true
@@ -259,11 +262,23 @@ mod tests {
         assert_eq!(gate.admit(&later, 20, at(10_000), &seeking), Err(Refusal::NotElected));
         known_term.send_replace(12);
         assert_eq!(gate.admit(&later, 21, at(10_100), &seeking), Ok(()), "the election has heard of it");
+        assert_eq!(gate.admit(&next, 22, at(20_000), &seeking), Err(Refusal::NotElected), "it is over");
+    }
 
-        let unelected = epoch(1_763_683_200, "aggregator");
-        let taken = |round: &u64| gate.admit(&unelected, *round, at(20_000 + 100 * round), &seeking).is_ok();
-        let taken: Vec<_> = (0..8).filter(taken).collect();
-        assert_eq!(taken, [5, 6, 7], "after half a second");
+    #[test]
+    fn who_publishes_without_any_election_is_believed_however_seldom() {
+        for (period_ms, believed_from) in [(100, 5), (1000, 1), (5000, 1)] {
+            let mut gate = Gate::new(0, Some(watch::channel(7).1));
+            for term in [3, 1_763_683_200] {
+                let unelected = epoch(term, "aggregator");
+                let start = 100_000 * (1 + u64::from(term > 3));
+                let taken = |round: &u64| {
+                    gate.admit(&unelected, *round, at(start + period_ms * round), &Leadership::default()).is_ok()
+                };
+                let taken: Vec<_> = (0..8).filter(taken).collect();
+                assert_eq!(taken, Vec::from_iter(believed_from..8), "term {term} every {period_ms} ms");
+            }
+        }
     }
 
     #[test]

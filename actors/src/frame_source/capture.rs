@@ -89,6 +89,7 @@ pub struct Capture {
     status: watch::Receiver<CaptureStatus>,
     events: SyncSender<Event>,
     unusable: Arc<AtomicU64>,
+    failures: Arc<AtomicU64>,
 }
 
 impl Capture {
@@ -111,10 +112,11 @@ impl Capture {
             left_behind: Vec::new(),
             captured: 0,
             unusable: Arc::default(),
+            failures: Arc::default(),
         };
-        let unusable = Arc::clone(&keeper.unusable);
+        let (unusable, failures) = (Arc::clone(&keeper.unusable), Arc::clone(&keeper.failures));
         thread::Builder::new().name("capture".into()).spawn(move || keeper.run())?;
-        Ok(Self { slot, status, events, unusable })
+        Ok(Self { slot, status, events, unusable, failures })
     }
 
     /// The latest frame, waiting for one; `None` once the source has ended. Frames are numbered across openings.
@@ -130,6 +132,11 @@ impl Capture {
     /// Frames of a recording that were no images and were passed over.
     pub fn unusable(&self) -> u64 {
         self.unusable.load(Ordering::Relaxed)
+    }
+
+    /// How often the source failed or stalled and was to be opened again.
+    pub fn failures(&self) -> u64 {
+        self.failures.load(Ordering::Relaxed)
     }
 
     /// How the source is doing, now and from now on.
@@ -172,6 +179,7 @@ struct Keeper {
     left_behind: Vec<JoinHandle<()>>,
     captured: u64,
     unusable: Arc<AtomicU64>,
+    failures: Arc<AtomicU64>,
 }
 
 impl Keeper {
@@ -192,6 +200,7 @@ impl Keeper {
             };
             failures = if self.captured > captured { 1 } else { failures + 1 };
             let retry_after = self.config.retry_after(failures);
+            self.failures.fetch_add(1, Ordering::Relaxed);
             tracing::warn!(%error, failures, ?retry_after, "frame source failed");
             self.status.send_replace(CaptureStatus::Failed { error, failures, retry_after });
             if self.is_stopped_within(retry_after) {

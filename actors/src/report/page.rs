@@ -19,13 +19,14 @@ const PARTS: usize = 700;
 const MOST_CURVES: usize = 12;
 
 /// Counted events that mean that something was lost.
-const LOSSES: [Event; 10] = [
+const LOSSES: [Event; 11] = [
     Event::PublishRefused,
     Event::PublishTooLarge,
     Event::InboxFull,
     Event::RecordDropped,
     Event::FrameFailed,
     Event::FrameSkipped,
+    Event::SourceFailed,
     Event::DetectionUnplaced,
     Event::PoseRejected,
     Event::FrameWithoutPose,

@@ -12,13 +12,13 @@ use nalgebra::Point2;
 use svg::Document;
 use svg::node::element::{Circle, ClipPath, Definitions, Group, Line, Path, Rectangle, Text};
 
+use super::score::is_right;
 use sheet::{METRES_PER_INCH, Sheet, round};
 
 /// Draws a scene as a self-contained SVG, in inches.
 ///
 /// `detections` are places in the world with the vehicle that saw them; those beyond the frame are not drawn but
-/// counted in the legend. A spot is right when `map` reads its plate to the letter or, if it is free, reads the `EMPTY`
-/// placard; it is unknown without a label.
+/// counted in the legend. Spots are judged as in [`super::score`].
 ///
 /// # Errors
 /// [`BirdseyeError`] when a detection is not from one of the scene's vehicles, or a place is not finite.
@@ -83,11 +83,11 @@ enum Judgement {
 }
 
 impl Judgement {
-    fn of(agreed: Option<&Label>, truth: &Label) -> Self {
-        match agreed {
+    fn of(is_right: Option<bool>) -> Self {
+        match is_right {
             None => Self::Unknown,
-            Some(label) if label == truth => Self::Right,
-            Some(_) => Self::Wrong,
+            Some(true) => Self::Right,
+            Some(false) => Self::Wrong,
         }
     }
 
@@ -353,7 +353,7 @@ impl Picture<'_> {
     }
 
     fn judge(&self, spot: &Spot) -> Judgement {
-        Judgement::of(self.state(spot).and_then(|state| state.label.as_ref()), self.truth(spot))
+        Judgement::of(self.state(spot).and_then(|state| is_right(self.testbed, spot, state)))
     }
 }
 

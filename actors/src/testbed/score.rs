@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use ecod::names::{LandmarkId, NodeName};
 use ecod::testbed::{Scene, Spot, Testbed};
-use ecod::wire::GlobalMap;
-use serde::Serialize;
+use ecod::wire::{GlobalMap, LandmarkState};
+use serde::{Serialize, Serializer};
 
 /// Right and judged spots, of all and of the occupied ones.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -17,14 +17,11 @@ pub struct Score {
 }
 
 impl Score {
-    /// Judges every spot of a map: a plate must be read to the letter, an empty spot must be said to be empty, and
-    /// not knowing is wrong.
+    /// Judges every spot of a map; not knowing is wrong.
     pub fn judge(&mut self, testbed: &Testbed, scene: &Scene, map: &GlobalMap) {
         for spot in &scene.spots {
             let state = map.landmarks.iter().find(|state| state.id == spot.id);
-            let label = state.and_then(|state| state.label.as_ref());
-            let right = label == Some(spot.truth.as_ref().unwrap_or(&testbed.placard.empty_text));
-            self.count(spot, right);
+            self.count(spot, state.and_then(|state| is_right(testbed, spot, state)) == Some(true));
         }
     }
 
@@ -48,6 +45,18 @@ impl Score {
     }
 }
 
+/// Whether what a map says of a spot is right; `None` when it does not know. A plate must be read to the letter. A free spot
+/// must be said to be empty: by its placard's text, or without a placard by vehicles that looked and found nothing.
+pub(super) fn is_right(testbed: &Testbed, spot: &Spot, state: &LandmarkState) -> Option<bool> {
+    match (&state.label, &spot.truth) {
+        (Some(label), Some(truth)) => Some(label == truth),
+        (Some(label), None) => Some(*label == testbed.placard.empty_text),
+        (None, _) if state.observers.is_empty() => None,
+        (None, Some(_)) => Some(false),
+        (None, None) => spot.empty.is_none().then_some(true),
+    }
+}
+
 /// What came of one scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SceneResult {
@@ -57,7 +66,8 @@ pub struct SceneResult {
     pub verdicts: u64,
     /// Right spots in percent, fused.
     pub pace_accuracy_pct: f64,
-    /// Right spots among the occupied ones in percent, fused; null when none is occupied.
+    /// Right spots among the occupied ones in percent, fused; written as 100 when none is occupied, as none is wrong.
+    #[serde(serialize_with = "hundred_if_none")]
     pub occupied_accuracy_pct: Option<f64>,
     /// Right spots in percent of every vehicle alone.
     pub single_cav_accuracy_pct: BTreeMap<NodeName, f64>,
@@ -93,11 +103,15 @@ impl SceneResult {
             occupied_accuracy_pct: fused.occupied_accuracy_pct(),
             single_cav_accuracy_pct: single.iter().map(|(name, s)| (name.clone(), s.accuracy_pct())).collect(),
             always_empty_pct: percent(empty, scene.spots.len() as u64),
-            recorded_pace_accuracy_pct: mean(scene.recorded.iter().map(|run| run.pace_accuracy_pct)),
+            recorded_pace_accuracy_pct: mean(scene.recorded.iter().filter_map(|run| run.pace_accuracy_pct)),
             recorded_single_cav_accuracy_pct: recorded_single.collect(),
             unseen_spots: scene.spots.iter().filter(unseen).map(|spot| spot.id.clone()).collect(),
         }
     }
+}
+
+fn hundred_if_none<S: Serializer>(pct: &Option<f64>, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_f64(pct.unwrap_or(100.0))
 }
 
 fn percent(part: u64, whole: u64) -> f64 {

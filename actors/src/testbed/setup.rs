@@ -12,6 +12,7 @@ use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
 use ecod::round::RoundConfig;
 use ecod::testbed::{Cav, Placard, Scene, Testbed};
 use ecod::view::ViewConfig;
+use ecod::window::WindowConfig;
 use ecod::wire::Role;
 
 use crate::camera::{CameraConfig, MountConfig, OpticsConfig};
@@ -27,6 +28,11 @@ use crate::vehicle_pose::PoseConfig;
 
 /// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
 const GATE_M: f64 = 0.032;
+
+/// For how many frames a report counts at the least, as far as [`MOST_AGE_S`] allows.
+const FRAMES_REMEMBERED: f64 = 3.0;
+/// The most seconds that a report may count.
+const MOST_AGE_S: f64 = 3600.0;
 
 /// The edge's configuration: role, known locations and fusion.
 pub fn edge(testbed: &Testbed, scene: &Scene) -> NodeConfig {
@@ -88,13 +94,18 @@ pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
     Perception::new(vantage, projection(&testbed.placard), view(&testbed.placard), gate)
 }
 
-/// How reports are fused: a round for every frame.
+/// How reports are fused: a round for every frame, which counts until some more have come.
 pub fn fusion(testbed: &Testbed) -> FusionConfig {
     let period_s = testbed.camera.capture_interval.as_secs_f64();
+    let (mut window, mut pace) = (WindowConfig::default(), PaceConfig::default());
+    (pace.gate_m, pace.position_floor_m) = (GATE_M, 0.01);
+    pace.max_age_s = pace.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MOST_AGE_S);
+    window.max_age_s = window.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MOST_AGE_S);
     FusionConfig {
         algorithms: Algorithms::Pace,
         round: RoundConfig { period_s, ..RoundConfig::default() },
-        pace: PaceConfig { gate_m: GATE_M, position_floor_m: 0.01, ..PaceConfig::default() },
+        pace,
+        window,
         ..FusionConfig::default()
     }
 }
@@ -116,7 +127,6 @@ fn view(placard: &Placard) -> ViewConfig {
     ViewConfig {
         target_width_m: placard.qr_width_m,
         min_target_px: 30.0,
-        max_range_m: 1.0,
         max_yaw_rad: 66f64.to_radians(),
         occluder_width_m: placard.card_width_m,
         ..ViewConfig::default()

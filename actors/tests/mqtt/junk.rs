@@ -31,6 +31,7 @@ fn junk() -> Vec<(&'static str, Vec<u8>, RejectReason)> {
         ("detections/trent", good.clone().into(), RejectReason::NodeMismatch),
         ("detections/mallory", encode(&nan, Encoding::Cbor), RejectReason::NotFinite),
         ("detections/mallory", good.replace("\"x_m\":0.0", "\"x_m\":1e999").into(), RejectReason::NotFinite),
+        ("detections/mallory", good.replace("\"x_m\":0.0", "\"x_m\": NaN").into(), RejectReason::NotFinite),
         ("detections/mallory", good.replace("0.5", "2").into(), RejectReason::ConfidenceOutOfRange),
         ("vote_detections/mallory", good.replace("0.5", "-0.1").into(), RejectReason::ConfidenceOutOfRange),
         ("detections/mallory", objects(2000).into(), RejectReason::TooManyObjects),

@@ -108,7 +108,7 @@ export function nodes({ nodes, node, leadership }) {
 const DROPS = {
   publish_refused: "not sent: link down or full", publish_too_large: "not sent: too large", inbox_full: "dropped: node too far behind",
   name_conflict: "another node has this name", disconnected: "link lost", connect_failed: "link not established", broker_refused: "refused by a broker",
-  vote_ignored: "vote for nothing", report_late: "too late for tracks", object_refused: "no room for tracks", reputations_not_saved: "reputations not saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped",
+  vote_ignored: "vote for nothing", report_late: "too late for tracks", object_refused: "no room for tracks", reputations_not_saved: "reputations not saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
   detection_unplaced: "detection not placed", pose_rejected: "pose not taken", frame_without_pose: "frame without a pose", browser_refused: "browser refused", browser_throttled: "browser slowed down", dashboard_not_bound: "page's address not free",
 };
 
