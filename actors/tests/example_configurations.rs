@@ -40,8 +40,9 @@ fn the_example_vehicles_fit_the_example_edge() {
 
 #[cfg(feature = "camera")]
 #[test]
-fn configurations_in_the_operations_manual_can_be_used() {
-    let manual = manual();
+fn configurations_in_the_documentation_can_be_used() {
+    let manual = ["README.md", "docs/configuration.md", "docs/cameras.md", "docs/operations.md", "docs/dashboard.md"];
+    let manual = manual.map(page).concat();
     let blocks: Vec<&str> = manual.split("```toml\n").skip(1).map(|rest| rest.split_once("```").unwrap().0).collect();
     assert!(blocks.len() >= 10, "only {} blocks found", blocks.len());
     for block in blocks {
@@ -59,19 +60,18 @@ fn configurations_in_the_operations_manual_can_be_used() {
 
 #[cfg(feature = "camera")]
 #[test]
-fn the_operations_manual_names_every_key() {
-    let manual = manual();
+fn the_documentation_names_every_key() {
+    let manual = page("docs/configuration.md") + &page("docs/cameras.md");
     let config = toml::to_string(&load("cav.toml")).unwrap();
     let keys = config.lines().filter_map(|line| Some(line.split_once(" = ")?.0.trim()));
     for key in keys {
         let named =
             [format!("`{key}`"), format!(".{key}`"), format!("\n{key} = ")].iter().any(|name| manual.contains(name));
-        assert!(named, "docs/operations.md does not name `{key}`");
+        assert!(named, "neither docs/configuration.md nor docs/cameras.md names `{key}`");
     }
 }
 
 #[cfg(feature = "camera")]
-fn manual() -> String {
-    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/operations.md");
-    std::fs::read_to_string(file).unwrap()
+fn page(name: &str) -> String {
+    std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(name)).unwrap()
 }
