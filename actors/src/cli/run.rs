@@ -140,7 +140,8 @@ impl RunArguments {
         let seeds = (!self.seeds.is_empty()).then_some(&*self.seeds);
         let membership = seeds.map(|seeds| MembershipOverrides { seeds });
         let wanted = self.dashboard.map(|listen| DashboardOverrides { enabled: true, listen });
-        let dashboard = if self.no_dashboard { Some(DashboardOverrides { enabled: false, listen: None }) } else { wanted };
+        let dashboard =
+            if self.no_dashboard { Some(DashboardOverrides { enabled: false, listen: None }) } else { wanted };
         let overrides = Overrides { top: self, mqtt, membership, dashboard };
         NodeConfig::load(self.config.as_deref(), &overrides).map_err(Failure::usage)
     }

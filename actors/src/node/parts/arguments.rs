@@ -224,11 +224,7 @@ impl Assembly {
             frames: self.frames(),
             feed: Arc::clone(&self.feed),
         };
-        DashboardArguments {
-            config: self.config.dashboard.clone(),
-            sources,
-            bound: self.dashboard_address.clone(),
-        }
+        DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
     }
 
     /// What the node's readiness is judged from.
