@@ -1,4 +1,4 @@
-//! The configurations that the documentation hands out can be used as they are.
+//! The configurations that the documentation hands out can be used as they are, and what it points to is there.
 
 use std::collections::BTreeMap;
 #[cfg(feature = "camera")]
@@ -69,6 +69,38 @@ fn the_documentation_names_every_key() {
             [format!("`{key}`"), format!(".{key}`"), format!("\n{key} = ")].iter().any(|name| manual.contains(name));
         assert!(named, "neither docs/configuration.md nor docs/cameras.md names `{key}`");
     }
+}
+
+#[test]
+fn links_in_the_documentation_lead_somewhere() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let docs = std::fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path());
+    let pages = docs.filter(|path| path.extension().is_some_and(|end| end == "md"));
+    let pages: Vec<_> = pages.chain(["README.md", "CHANGELOG.md"].map(|name| root.join(name))).collect();
+    let mut followed = 0;
+    for page in &pages {
+        let text = std::fs::read_to_string(page).unwrap();
+        let links = text.split("](").skip(1).filter_map(|rest| Some(rest.split_once(')')?.0));
+        for link in links.filter(|link| !link.starts_with("http")) {
+            let (file, heading) = link.split_once('#').unwrap_or((link, ""));
+            let target = if file.is_empty() { page.clone() } else { page.parent().unwrap().join(file) };
+            assert!(target.exists(), "{}: {link}", page.display());
+            if !heading.is_empty() {
+                let target = std::fs::read_to_string(&target).unwrap();
+                assert!(target.lines().any(|line| anchor(line) == heading), "{}: {link}", page.display());
+            }
+            followed += 1;
+        }
+    }
+    assert!(followed > 40, "only {followed} links found");
+}
+
+/// What a heading is called in links to it.
+fn anchor(line: &str) -> String {
+    let Some(words) = line.strip_prefix('#') else { return String::new() };
+    let kept = words.trim_start_matches('#').trim().chars();
+    let kept = kept.filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
+    kept.collect::<String>().to_lowercase().replace(' ', "-")
 }
 
 #[cfg(feature = "camera")]
