@@ -32,6 +32,7 @@ use std::time::Duration;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
+pub use assets::paths as page_paths;
 pub use config::{DEFAULT_ADDRESS, DashboardConfig};
 pub use feed::{Feed, MAX_SHOWN, Sighting};
 pub use picture::{LandmarkFacts, NodeFacts};
