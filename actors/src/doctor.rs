@@ -61,6 +61,8 @@ pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
     findings.extend(camera::examine(config).await);
     findings.extend(network::broker(config).await);
     findings.extend(network::gossip(config));
+    #[cfg(feature = "camera")]
+    findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
     #[cfg(feature = "foxglove")]
     findings.extend(network::live(config));
@@ -145,6 +147,16 @@ mod tests {
             assert_eq!(finding.verdict, Verdict::Broken);
             assert!(finding.seen.contains(&port.to_string()) && finding.fix.unwrap().contains(key));
         }
+    }
+
+    #[cfg(feature = "camera")]
+    #[tokio::test]
+    async fn a_pose_port_in_use_is_named() {
+        let taken = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let mut config = config();
+        config.pose.listen = taken.local_addr().ok();
+        let finding = finding(&config, "pose port").await;
+        assert!(finding.verdict == Verdict::Broken && finding.fix.unwrap().contains("`pose.listen`"));
     }
 
     #[tokio::test]

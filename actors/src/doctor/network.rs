@@ -61,6 +61,16 @@ pub(super) fn gossip(config: &NodeConfig) -> Option<Finding> {
     })
 }
 
+/// The port on which a vehicle that moves is told its poses.
+#[cfg(feature = "camera")]
+pub(super) fn poses(config: &NodeConfig) -> Option<Finding> {
+    let (check, address) = ("pose port", config.pose.listen?);
+    Some(match UdpSocket::bind(address) {
+        Ok(_) => Finding::fine(check, format!("{address} is free")),
+        Err(error) => not_bound(check, address, &error, "pose.listen"),
+    })
+}
+
 /// The address of the dashboard, unless it is switched off.
 pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
     let (check, listen) = ("dashboard", config.dashboard.listen);
