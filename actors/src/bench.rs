@@ -19,6 +19,7 @@ mod echo;
 pub mod latency;
 pub mod load;
 pub mod measurement;
+pub mod page;
 pub mod saturation;
 mod schedule;
 pub mod two_hop;

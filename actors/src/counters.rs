@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use ecod::wire::RejectReason;
 
 use shed::Shedding;
-pub use shed::{Shed, ShedReason};
+pub use shed::{OTHERS, Shed, ShedReason};
 
 /// Something that happens often enough to be counted rather than logged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -32,7 +32,8 @@ use std::time::Duration;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
-pub use config::DashboardConfig;
+pub use assets::paths as page_paths;
+pub use config::{DEFAULT_ADDRESS, DashboardConfig};
 pub use feed::{Feed, MAX_SHOWN, Sighting};
 pub use picture::{LandmarkFacts, NodeFacts};
 pub use sources::Sources;
@@ -50,13 +51,11 @@ pub enum DashboardMessage {
 /// What a dashboard needs at its start.
 #[derive(Debug)]
 pub struct DashboardArguments {
-    /// Limits and token.
+    /// Address, limits and token.
     pub config: DashboardConfig,
-    /// Where to listen. A run before this one may have bound another port; it is then taken again.
-    pub listen: SocketAddr,
     /// What it shows.
     pub sources: Sources,
-    /// Gets the address that is listened on.
+    /// Gets the address that is listened on. A run before this one may have bound it; it is then taken again.
     pub bound: watch::Sender<Option<SocketAddr>>,
 }
 
@@ -83,10 +82,10 @@ impl Actor for Dashboard {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DashboardArguments { config, listen, sources, bound } = arguments;
+        let DashboardArguments { config, sources, bound } = arguments;
         config.validate()?;
         let observer = Arc::new(Observer::new(sources, config.max_rate_hz));
-        let server = Server::start(config, listen, observer, bound)?;
+        let server = Server::start(config, observer, bound)?;
         myself.send_interval(CHECK_PERIOD, || DashboardMessage::CheckServer);
         Ok(DashboardState { server })
     }

@@ -255,7 +255,8 @@ impl Demo<'_> {
         let mut config = setup::cav(self.testbed, self.scene, cav, source);
         config.role = Role::Auto;
         // The first vehicle's: the edge is killed half-way.
-        config.dashboard.listen = (index == 1).then_some(self.dashboard);
+        config.dashboard.enabled = index == 1;
+        config.dashboard.listen = Some(self.dashboard);
         let log = self.map_log(cav);
         if log.exists() {
             fs::remove_file(&log).with_context(|| format!("cannot remove {}", log.display()))?;

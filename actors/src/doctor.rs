@@ -61,7 +61,11 @@ pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
     findings.extend(camera::examine(config).await);
     findings.extend(network::broker(config).await);
     findings.extend(network::gossip(config));
-    findings.extend(network::pages(config));
+    #[cfg(feature = "camera")]
+    findings.extend(network::poses(config));
+    findings.extend(network::dashboard(config));
+    #[cfg(feature = "foxglove")]
+    findings.extend(network::live(config));
     findings.extend(network::multicast(config));
     findings.push(storage::key(config));
     findings.extend(certificates::examine(config));
@@ -86,6 +90,7 @@ mod tests {
         config.listen = Some("127.0.0.1:0".parse().unwrap());
         config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
         config.membership.multicast.enabled = false;
+        config.dashboard.enabled = false;
         config
     }
 
@@ -132,7 +137,7 @@ mod tests {
         config.listen = tcp.local_addr().ok();
         config.membership.bind = udp.local_addr().ok();
         let page = TcpListener::bind("127.0.0.1:0").unwrap();
-        config.dashboard.listen = page.local_addr().ok();
+        (config.dashboard.enabled, config.dashboard.listen) = (true, page.local_addr().ok());
         for (check, port, key) in [
             ("broker port", tcp.local_addr().unwrap().port(), "`listen`"),
             ("gossip port", udp.local_addr().unwrap().port(), "`membership.bind`"),
@@ -142,6 +147,27 @@ mod tests {
             assert_eq!(finding.verdict, Verdict::Broken);
             assert!(finding.seen.contains(&port.to_string()) && finding.fix.unwrap().contains(key));
         }
+    }
+
+    #[cfg(feature = "camera")]
+    #[tokio::test]
+    async fn a_pose_port_in_use_is_named() {
+        let taken = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let mut config = config();
+        config.pose.listen = taken.local_addr().ok();
+        let finding = finding(&config, "pose port").await;
+        assert!(finding.verdict == Verdict::Broken && finding.fix.unwrap().contains("`pose.listen`"));
+    }
+
+    #[tokio::test]
+    async fn a_page_that_can_have_another_port_is_not_broken_and_one_switched_off_is_not_looked_for() {
+        // Somebody has it: this test or another.
+        let _taken = TcpListener::bind(crate::dashboard::DEFAULT_ADDRESS);
+        let mut config = config();
+        config.dashboard.enabled = true;
+        assert!(finding(&config, "dashboard").await.verdict < Verdict::Broken);
+        config.dashboard.enabled = false;
+        assert!(examine(&config).await.iter().all(|finding| finding.check != "dashboard"));
     }
 
     #[cfg(feature = "foxglove")]

@@ -10,7 +10,7 @@
 //! ├─ ReputationKeeper  publishes and keeps reputations    may lead, in a cell that votes or tracks
 //! ├─ Fuser             closes rounds: maps and verdicts   may lead; publishes only while leading
 //! ├─ LeaderElection    who leads, and what follows        always
-//! ├─ Dashboard         page, metrics and health           if it has an address
+//! ├─ Dashboard         page, metrics and health           unless switched off
 //! ├─ Projector         detections -> report               with a camera
 //! └─ Detector          frames -> detections               with a camera
 //! ```

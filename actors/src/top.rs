@@ -46,21 +46,25 @@ pub struct View {
     pub reputations: Option<Received<Reputations>>,
     /// The observer's counters.
     pub counters: CounterSnapshot,
+    /// How many lines of what is where are above the first that is shown.
+    pub scroll: usize,
 }
 
 impl View {
     /// What `node` knows; `before` hands on the history.
     pub fn of(node: &NodeHandle, cell: &NodeName, before: Option<Self>, now: Timestamp) -> Self {
+        let (history, scroll) = before.map(|before| (before.history, before.scroll)).unwrap_or_default();
         let mut view = Self {
             cell: cell.clone(),
             now,
             leadership: node.leadership().borrow().clone(),
-            history: before.map(|before| before.history).unwrap_or_default(),
+            history,
             members: node.members().borrow().clone(),
             map: node.newest_map().borrow().clone(),
             verdicts: node.newest_verdicts().borrow().clone(),
             reputations: node.newest_reputations().borrow().clone(),
             counters: node.counters().snapshot(),
+            scroll,
         };
         view.remember();
         view
@@ -83,17 +87,18 @@ impl View {
     }
 }
 
-/// Draws the cell.
-pub fn draw(frame: &mut Frame<'_>, view: &View) {
+/// Draws the cell; scrolls back what was scrolled beyond the end.
+pub fn draw(frame: &mut Frame<'_>, view: &mut View) {
     let [head, places, below, foot] =
         Layout::vertical([Constraint::Length(4), Constraint::Min(5), Constraint::Length(9), Constraint::Length(1)])
             .areas(frame.area());
     let [nodes, losses] = Layout::horizontal([Constraint::Percentage(60), Constraint::Percentage(40)]).areas(below);
+    let what_is_where = landmarks(view, places.height);
     frame.render_widget(summary(view), head);
-    frame.render_widget(landmarks(view), places);
+    frame.render_widget(what_is_where, places);
     frame.render_widget(vehicles(view), nodes);
     frame.render_widget(counted(view), losses);
-    frame.render_widget(Line::from(" q quits").dim(), foot);
+    frame.render_widget(Line::from(" q quits, arrow keys scroll").dim(), foot);
 }
 
 fn summary(view: &View) -> Paragraph<'_> {
@@ -117,7 +122,23 @@ fn summary(view: &View) -> Paragraph<'_> {
     Paragraph::new(lines).block(Block::bordered().title(format!(" cell {} ", view.cell)))
 }
 
-fn landmarks(view: &View) -> Table<'_> {
+/// What is where, as far as it finds room in a box of so many lines.
+fn landmarks(view: &mut View, height: u16) -> Table<'static> {
+    // The frame and the head take three.
+    let room = usize::from(height.saturating_sub(3)).max(1);
+    let rows = places(view);
+    view.scroll = view.scroll.min(rows.len().saturating_sub(room));
+    let (first, last) = (view.scroll, rows.len().min(view.scroll + room));
+    let title = match rows.len() {
+        all if all > room => format!(" what is where, {} to {last} of {all} ", first + 1),
+        _ => " what is where ".to_owned(),
+    };
+    let widths = [16, 16, 6, 16, 7].map(Constraint::Length).into_iter().chain([Constraint::Fill(1)]);
+    let head = Row::new(["location", "map", "conf.", "verdict", "margin", "by"]).style(Style::new().bold());
+    Table::new(rows.into_iter().skip(first).take(room), widths).header(head).block(Block::bordered().title(title))
+}
+
+fn places(view: &View) -> Vec<Row<'static>> {
     let verdicts = view.verdicts.as_ref().map(|received| &received.message.verdicts);
     let verdict = |id: &str| verdicts?.iter().find(|verdict| verdict.landmark == *id);
     let mut rows = Vec::new();
@@ -157,9 +178,7 @@ fn landmarks(view: &View) -> Table<'_> {
             listed(&object.contributors),
         ]));
     }
-    let widths = [16, 16, 6, 16, 7].map(Constraint::Length).into_iter().chain([Constraint::Fill(1)]);
-    let head = Row::new(["location", "map", "conf.", "verdict", "margin", "by"]).style(Style::new().bold());
-    Table::new(rows, widths).header(head).block(Block::bordered().title(" what is where "))
+    rows
 }
 
 fn vehicles(view: &View) -> Table<'_> {
@@ -271,12 +290,13 @@ mod tests {
             verdicts: None,
             reputations: Some(Received { received_at: Timestamp(7_000_000), message: Arc::new(reputations) }),
             counters: Counters::default().snapshot(),
+            scroll: 0,
         };
         view.remember();
         view
     }
 
-    fn shown(view: &View, width: u16, height: u16) -> String {
+    fn shown(view: &mut View, width: u16, height: u16) -> String {
         let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
         terminal.draw(|frame| draw(frame, view)).unwrap();
         terminal.backend().to_string()
@@ -284,7 +304,7 @@ mod tests {
 
     #[test]
     fn the_leader_the_places_and_the_nodes_are_seen() {
-        let text = shown(&view(Timestamp(7_200_000)), 100, 30);
+        let text = shown(&mut view(Timestamp(7_200_000)), 100, 30);
         for part in [
             "cell lot-1",
             "euclid leads in term 4",
@@ -306,9 +326,9 @@ mod tests {
 
     #[test]
     fn an_old_map_is_not_passed_off_as_fresh() {
-        assert!(shown(&view(Timestamp(12_000_000)), 100, 30).contains("STALE: no map for 5 s"));
-        let alone = View { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
-        let text = shown(&alone, 100, 30);
+        assert!(shown(&mut view(Timestamp(12_000_000)), 100, 30).contains("STALE: no map for 5 s"));
+        let mut alone = View { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
+        let text = shown(&mut alone, 100, 30);
         assert!(text.contains("nobody leads") && text.contains("no map yet"), "{text}");
     }
 
@@ -318,14 +338,26 @@ mod tests {
         for vehicle in ["euclid", "gauss"] {
             counters.shed(ShedReason::ReportReplaced, vehicle);
         }
-        let text = shown(&View { counters: counters.snapshot(), ..view(Timestamp(7_200_000)) }, 100, 30);
+        let text = shown(&mut View { counters: counters.snapshot(), ..view(Timestamp(7_200_000)) }, 100, 30);
         assert!(text.contains(" lost here ") && text.contains("report replaced"), "{text}");
+    }
+
+    #[test]
+    fn what_finds_no_room_is_said_and_scrolled_to() {
+        // Two locations and an object, and room for two lines.
+        let (mut view, height) = (view(Timestamp(7_200_000)), 4 + 5 + 9 + 1);
+        let text = shown(&mut view, 100, height);
+        assert!(text.contains("what is where, 1 to 2 of 3") && !text.contains("van"), "{text}");
+        view.scroll += 40;
+        let text = shown(&mut view, 100, height);
+        assert!(text.contains("what is where, 2 to 3 of 3") && text.contains("van"), "{text}");
+        assert_eq!(view.scroll, 1);
     }
 
     #[test]
     fn a_small_terminal_is_no_trouble() {
         for (width, height) in [(1, 1), (20, 5), (40, 12)] {
-            shown(&view(Timestamp(0)), width, height);
+            shown(&mut view(Timestamp(0)), width, height);
         }
     }
 }

@@ -36,6 +36,7 @@ fn config(name: &str, role: Role) -> NodeConfig {
     // Cells of other tests are not met.
     config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
     config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
     config
 }
 

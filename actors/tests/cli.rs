@@ -57,6 +57,28 @@ fn errors_in_the_environment_name_the_variable_and_show_no_password() {
 }
 
 #[test]
+fn the_page_is_there_unless_it_is_switched_off() {
+    let off = ("ECOD_DASHBOARD__ENABLED", "false");
+    for (environment, flags, enabled, listen) in [
+        (None, &[][..], true, None),
+        (Some(off), &[], false, None),
+        (Some(off), &["--dashboard"], true, None),
+        (None, &["--dashboard", "127.0.0.1:8081"], true, Some("127.0.0.1:8081")),
+        (None, &["--no-dashboard"], false, None),
+    ] {
+        let mut command = ecod_node();
+        command.args(["--role", "edge", "--print-config"]).args(flags).envs(environment);
+        let output = command.output().unwrap();
+        let printed: toml::Table = String::from_utf8(output.stdout).unwrap().parse().unwrap();
+        let page = &printed["dashboard"];
+        assert_eq!(page["enabled"].as_bool(), Some(enabled), "{flags:?}");
+        assert_eq!(page.get("listen").and_then(toml::Value::as_str), listen, "{flags:?}");
+    }
+    let both = ecod_node().args(["--role", "edge", "--dashboard", "--no-dashboard"]).output().unwrap();
+    assert_eq!(both.status.code(), Some(2));
+}
+
+#[test]
 fn a_listening_address_without_ip_is_told_what_is_missing() {
     for listen in ["1883", "localhost:1883", "127.0.0.1:80000"] {
         let output = ecod_node().args(["--role", "edge", "--listen", listen]).output().unwrap();

@@ -33,6 +33,7 @@ async fn edge() -> (NodeHandle, SocketAddr) {
     };
     config.membership.bind = Some(SocketAddr::from(([127, 0, 0, 1], 0)));
     config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
     config.validate().unwrap();
     let node = node::start(config).await.unwrap();
     let mut maps = node.newest_map();

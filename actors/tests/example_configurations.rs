@@ -1,4 +1,4 @@
-//! The configurations that the documentation hands out can be used as they are.
+//! The configurations that the documentation hands out can be used as they are, and what it points to is there.
 
 use std::collections::BTreeMap;
 #[cfg(feature = "camera")]
@@ -40,8 +40,9 @@ fn the_example_vehicles_fit_the_example_edge() {
 
 #[cfg(feature = "camera")]
 #[test]
-fn configurations_in_the_operations_manual_can_be_used() {
-    let manual = manual();
+fn configurations_in_the_documentation_can_be_used() {
+    let manual = ["README.md", "docs/configuration.md", "docs/cameras.md", "docs/operations.md", "docs/dashboard.md"];
+    let manual = manual.map(page).concat();
     let blocks: Vec<&str> = manual.split("```toml\n").skip(1).map(|rest| rest.split_once("```").unwrap().0).collect();
     assert!(blocks.len() >= 10, "only {} blocks found", blocks.len());
     for block in blocks {
@@ -59,19 +60,50 @@ fn configurations_in_the_operations_manual_can_be_used() {
 
 #[cfg(feature = "camera")]
 #[test]
-fn the_operations_manual_names_every_key() {
-    let manual = manual();
+fn the_documentation_names_every_key() {
+    let manual = page("docs/configuration.md") + &page("docs/cameras.md");
     let config = toml::to_string(&load("cav.toml")).unwrap();
     let keys = config.lines().filter_map(|line| Some(line.split_once(" = ")?.0.trim()));
     for key in keys {
         let named =
             [format!("`{key}`"), format!(".{key}`"), format!("\n{key} = ")].iter().any(|name| manual.contains(name));
-        assert!(named, "docs/operations.md does not name `{key}`");
+        assert!(named, "neither docs/configuration.md nor docs/cameras.md names `{key}`");
     }
 }
 
+#[test]
+fn links_in_the_documentation_lead_somewhere() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let docs = std::fs::read_dir(root.join("docs")).unwrap().map(|entry| entry.unwrap().path());
+    let pages = docs.filter(|path| path.extension().is_some_and(|end| end == "md"));
+    let pages: Vec<_> = pages.chain(["README.md", "CHANGELOG.md"].map(|name| root.join(name))).collect();
+    let mut followed = 0;
+    for page in &pages {
+        let text = std::fs::read_to_string(page).unwrap();
+        let links = text.split("](").skip(1).filter_map(|rest| Some(rest.split_once(')')?.0));
+        for link in links.filter(|link| !link.starts_with("http")) {
+            let (file, heading) = link.split_once('#').unwrap_or((link, ""));
+            let target = if file.is_empty() { page.clone() } else { page.parent().unwrap().join(file) };
+            assert!(target.exists(), "{}: {link}", page.display());
+            if !heading.is_empty() {
+                let target = std::fs::read_to_string(&target).unwrap();
+                assert!(target.lines().any(|line| anchor(line) == heading), "{}: {link}", page.display());
+            }
+            followed += 1;
+        }
+    }
+    assert!(followed > 40, "only {followed} links found");
+}
+
+/// What a heading is called in links to it.
+fn anchor(line: &str) -> String {
+    let Some(words) = line.strip_prefix('#') else { return String::new() };
+    let kept = words.trim_start_matches('#').trim().chars();
+    let kept = kept.filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
+    kept.collect::<String>().to_lowercase().replace(' ', "-")
+}
+
 #[cfg(feature = "camera")]
-fn manual() -> String {
-    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/operations.md");
-    std::fs::read_to_string(file).unwrap()
+fn page(name: &str) -> String {
+    std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(name)).unwrap()
 }

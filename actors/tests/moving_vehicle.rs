@@ -42,6 +42,7 @@ fn cell() -> NodeConfig {
     };
     config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
     config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
     config
 }
 

@@ -29,6 +29,7 @@ async fn edge(change: impl FnOnce(&mut NodeConfig)) -> (NodeHandle, SocketAddr) 
     };
     config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
     config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
     change(&mut config);
     config.validate().unwrap();
     let edge = node::start(config).await.unwrap();

@@ -76,7 +76,8 @@ fn program() -> Command {
     for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
         command.env_remove(key);
     }
-    command.env("ECOD_MEMBERSHIP__MULTICAST__ENABLED", "false").env_remove("RUST_LOG");
+    command.env("ECOD_MEMBERSHIP__MULTICAST__ENABLED", "false").env("ECOD_DASHBOARD__ENABLED", "false");
+    command.env_remove("RUST_LOG");
     command
 }
 

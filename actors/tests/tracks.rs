@@ -29,6 +29,7 @@ fn config(node: &'static str, role: Role) -> NodeConfig {
     config.reputations.publish_period_s = 0.1;
     config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
     config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
     config
 }
 

@@ -60,6 +60,7 @@ impl Cell {
         };
         config.membership.bind = Some(([127, 0, 0, 1], 0).into());
         config.membership.multicast.enabled = false;
+        config.dashboard.enabled = false;
         let addresses = self.nodes.values().filter_map(|(node, _)| node.gossip_address());
         config.membership.seeds = addresses.map(|address| address.to_string()).collect();
         config.validate()?;

@@ -1,6 +1,7 @@
 //! An aggregator of the benchmark's own: a node in a process of its own, with its broker, on loopback.
 
 use std::fs;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -21,6 +22,7 @@ pub struct OwnAggregator {
     process: NodeProcess,
     directory: PathBuf,
     target: Target,
+    page: SocketAddr,
 }
 
 impl OwnAggregator {
@@ -31,7 +33,7 @@ impl OwnAggregator {
     pub async fn start(program: &Path, records: bool) -> anyhow::Result<Self> {
         let directory = std::env::temp_dir().join(format!("ecod-bench-{}", std::process::id()));
         fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
-        let broker = free_address()?;
+        let (broker, page) = (free_address()?, free_address()?);
         let mut config = NodeConfig {
             name: Some(NodeName::from_static("edge")),
             cell: NodeName::from_static("bench"),
@@ -41,7 +43,7 @@ impl OwnAggregator {
             record: records.then(|| RecordConfig::new(directory.join("log"))),
             ..NodeConfig::default()
         };
-        config.dashboard.listen = Some(free_address()?);
+        config.dashboard.listen = Some(page);
         config.membership.bind = Some(([127, 0, 0, 1], 0).into());
         config.membership.multicast.enabled = false;
         let mut process = NodeProcess::start(program, &config, &directory)?;
@@ -56,7 +58,7 @@ impl OwnAggregator {
             encoding: config.mqtt.encoding,
             aggregator: process.pid(),
         };
-        Ok(Self { process, directory, target })
+        Ok(Self { process, directory, target, page })
     }
 
     /// What there is to measure.
@@ -66,6 +68,11 @@ impl OwnAggregator {
     pub fn target(&mut self) -> anyhow::Result<&Target> {
         self.process.check()?;
         Ok(&self.target)
+    }
+
+    /// Where its page is.
+    pub fn page(&self) -> SocketAddr {
+        self.page
     }
 
     /// Stops it and removes its files.

@@ -18,6 +18,7 @@ use crate::bench::aggregator::OwnAggregator;
 use crate::bench::latency::{Latencies, Quantiles};
 use crate::bench::load::Load;
 use crate::bench::measurement::{Target, measure};
+use crate::bench::page;
 use crate::bench::saturation::{self, Saturation, Shares, Step};
 use crate::config::NodeConfig;
 use crate::gateway::BrokerAddress;
@@ -92,6 +93,9 @@ const PASSES: u64 = 4;
 
 /// Vehicles for which the costs are told.
 const COST_VEHICLES: usize = 32;
+
+/// How long they report for somebody who looks at the page.
+const LOOK: Duration = Duration::from_secs(4);
 
 /// The load at which the search begins and ends.
 const SEARCH: [usize; 2] = [4, 1000];
@@ -220,13 +224,17 @@ async fn saturate(target: &Target, arguments: &BenchArguments, figures: &mut Fig
     Ok(())
 }
 
-/// What a node without camera costs, with the dashboard on and nobody looking, and what recording adds.
+/// What a node without camera costs, with the dashboard on and nobody looking, and what recording adds; then how soon
+/// somebody who looks sees something.
 async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
     let load = Load { bare: false, ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds)) };
-    let mut usages = Vec::new();
+    let (mut usages, mut looked) = (Vec::new(), None);
     for records in [false, true] {
         let mut aggregator = OwnAggregator::start(program, records).await?;
         let measured = measure(aggregator.target()?, load).await?;
+        if !records {
+            looked = Some(look(&mut aggregator).await?);
+        }
         aggregator.stop().await;
         usages.push(measured.aggregator.context("the aggregator ended")?);
     }
@@ -238,8 +246,15 @@ async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures
     figures.goal(format!("vehicles_{COST_VEHICLES}_resident_mb"), resident_mb, 25.0);
     figures.goal(format!("vehicles_{COST_VEHICLES}_cpu_percent"), plain.percent(), 5.0);
     figures.goal(format!("vehicles_{COST_VEHICLES}_recording_cpu_percent"), added, 5.0);
+    let looked = looked.context("nobody looked")?;
+    let (page_kb, first_picture_ms) = (looked.bytes as f64 / 1e3, looked.first_picture.as_secs_f64() * 1e3);
+    print(&format!("its page: {page_kb:.1} kB uncompressed, first picture after {first_picture_ms:.1} ms\n"))?;
+    figures.goal("page_kb".into(), page_kb, 150.0);
+    figures.goal("page_first_picture_ms".into(), first_picture_ms, 1000.0);
     figures.costs = Some(json!({
         "vehicles": COST_VEHICLES,
+        "page_kb": page_kb,
+        "page_first_picture_ms": first_picture_ms,
         "resident_mb": resident_mb,
         "resident_mb_without_files": plain.anonymous_bytes as f64 / 1e6,
         "cpu_percent": plain.percent(),
@@ -249,6 +264,19 @@ async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures
         "recording_cpu_percent_by_thread": recording.threads,
     }));
     Ok(())
+}
+
+/// What a browser gets of the page while the vehicles report.
+async fn look(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigures> {
+    let address = aggregator.page();
+    let load = Load { bare: false, ..Load::new(COST_VEHICLES, LOOK) };
+    let looked = async {
+        tokio::time::sleep(LOOK / 2).await;
+        page::fetch(address).await
+    };
+    let (measured, looked) = tokio::join!(measure(aggregator.target()?, load), looked);
+    measured?;
+    looked
 }
 
 impl Figures {

@@ -59,10 +59,15 @@ pub struct RunArguments {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     map_log: Option<PathBuf>,
-    /// Serve a web page with the cell, metrics and health; other addresses than loopback need `dashboard.token`
-    #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1, default_missing_value = "127.0.0.1:8080")]
+    /// Where the web page with the cell, metrics and health is served: 127.0.0.1:8080 if nothing is said, or a free port
+    /// if that is taken; other addresses than loopback need `dashboard.token`
+    #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1)]
     #[serde(skip)]
-    dashboard: Option<SocketAddr>,
+    dashboard: Option<Option<SocketAddr>>,
+    /// Serve neither page nor metrics nor health
+    #[arg(long, conflicts_with = "dashboard")]
+    #[serde(skip)]
+    no_dashboard: bool,
     /// Record in this directory (MCAP); the table `record` of the configuration file has more
     #[arg(long, value_name = "DIR")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -106,7 +111,9 @@ struct MembershipOverrides<'a> {
 
 #[derive(Serialize)]
 struct DashboardOverrides {
-    listen: SocketAddr,
+    enabled: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    listen: Option<SocketAddr>,
 }
 
 pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
@@ -132,7 +139,9 @@ impl RunArguments {
         let mqtt = self.broker.as_ref().map(|broker| MqttOverrides { broker });
         let seeds = (!self.seeds.is_empty()).then_some(&*self.seeds);
         let membership = seeds.map(|seeds| MembershipOverrides { seeds });
-        let dashboard = self.dashboard.map(|listen| DashboardOverrides { listen });
+        let wanted = self.dashboard.map(|listen| DashboardOverrides { enabled: true, listen });
+        let dashboard =
+            if self.no_dashboard { Some(DashboardOverrides { enabled: false, listen: None }) } else { wanted };
         let overrides = Overrides { top: self, mqtt, membership, dashboard };
         NodeConfig::load(self.config.as_deref(), &overrides).map_err(Failure::usage)
     }
@@ -221,7 +230,7 @@ impl ObserverArguments {
             config.camera = None;
         }
         (config.membership.advertise, config.state_dir, config.map_log) = (None, None, None);
-        config.dashboard.listen = None;
+        config.dashboard.enabled = false;
         Ok(config)
     }
 }
@@ -254,7 +263,7 @@ mod tests {
         let arguments =
             ObserverArguments { config: Some(path), name: None, cell: None, broker: None, seeds: Vec::new() };
         let Ok(config) = arguments.load("recorder") else { panic!("the configuration is valid") };
-        assert_eq!(config.dashboard.listen, None);
+        assert!(!config.dashboard.enabled);
         assert_eq!(config.membership.bind.map(|bind| bind.port()), Some(0));
         assert!(config.name.unwrap().as_str().starts_with("recorder-"));
     }

@@ -20,6 +20,9 @@ pub(super) struct TopArguments {
     observer: ObserverArguments,
 }
 
+/// Lines that a page is scrolled by.
+const PAGE: usize = 10;
+
 /// How often the terminal is drawn.
 const PERIOD: Duration = Duration::from_millis(250);
 
@@ -43,11 +46,9 @@ fn show(
     node: &NodeHandle,
     cell: &ecod::names::NodeName,
 ) -> std::io::Result<()> {
-    let mut view = None;
+    let mut view = View::of(node, cell, None, clock::now());
     loop {
-        let now = View::of(node, cell, view.take(), clock::now());
-        terminal.draw(|frame| draw(frame, &now))?;
-        view = Some(now);
+        terminal.draw(|frame| draw(frame, &mut view))?;
         if event::poll(PERIOD)?
             && let Event::Key(key) = event::read()?
             && key.kind == KeyEventKind::Press
@@ -56,6 +57,14 @@ fn show(
             if interrupted || matches!(key.code, KeyCode::Char('q') | KeyCode::Esc) {
                 return Ok(());
             }
+            view.scroll = match key.code {
+                KeyCode::Up => view.scroll.saturating_sub(1),
+                KeyCode::Down => view.scroll + 1,
+                KeyCode::PageUp => view.scroll.saturating_sub(PAGE),
+                KeyCode::PageDown => view.scroll + PAGE,
+                _ => view.scroll,
+            };
         }
+        view = View::of(node, cell, Some(view), clock::now());
     }
 }

@@ -54,7 +54,7 @@ pub(super) struct Shedding {
 const MAX_SOURCES: usize = 64;
 
 /// The source of what further sources send.
-const OTHERS: &str = "others";
+pub const OTHERS: &str = "others";
 
 impl Shedding {
     /// Counts one message, and warns of the first of a source.

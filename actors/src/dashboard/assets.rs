@@ -29,6 +29,11 @@ const fn asset(path: &'static str, content_type: &'static str, content: &'static
     Asset { path, content_type, content }
 }
 
+/// The paths of all of the page's files, the page itself first.
+pub fn paths() -> impl Iterator<Item = &'static str> {
+    ASSETS.iter().map(|asset| asset.path)
+}
+
 impl Asset {
     /// The file at a path of the page.
     pub(super) fn find(path: &str) -> Option<Self> {

@@ -1,6 +1,6 @@
 //! Where the dashboard listens and who may look.
 
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
@@ -11,8 +11,10 @@ use crate::gateway::Secret;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DashboardConfig {
-    /// Where the page is served, port 0 for a free one, which the log names. Default none: no page. An address that
-    /// other machines reach needs a token.
+    /// Whether the page is served; default true. Without, nothing listens, and metrics and health are not there either.
+    pub enabled: bool,
+    /// Where the page is served, port 0 for a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a free port
+    /// if that is taken, as by another node of the machine. An address that other machines reach needs a token.
     pub listen: Option<SocketAddr>,
     /// What who looks has to know, at least 12 characters. Default none, which only a loopback address allows. Give it as
     /// `ECOD_DASHBOARD__TOKEN` rather than in a file that others read.
@@ -23,12 +25,15 @@ pub struct DashboardConfig {
     pub max_connections: usize,
 }
 
+/// Where the page is served if nothing else is said and nobody else is there.
+pub const DEFAULT_ADDRESS: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::LOCALHOST, 8080));
+
 /// The shortest token.
 const MIN_TOKEN_BYTES: usize = 12;
 
 impl Default for DashboardConfig {
     fn default() -> Self {
-        Self { listen: None, token: None, max_rate_hz: 10.0, max_connections: 64 }
+        Self { enabled: true, listen: None, token: None, max_rate_hz: 10.0, max_connections: 64 }
     }
 }
 
@@ -44,7 +49,7 @@ impl DashboardConfig {
             (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => {
                 Err(ConfigError::new("token", "a short text", format!("at least {MIN_TOKEN_BYTES} characters")))
             }
-            (None, Some(address)) if !address.ip().is_loopback() => {
+            (None, Some(address)) if self.enabled && !address.ip().is_loopback() => {
                 Err(ConfigError::new("token", "nothing", format!("a secret, as other machines reach {address}")))
             }
             _ => Ok(()),
@@ -70,5 +75,7 @@ mod tests {
             validate(address, Some("a long enough token")).unwrap();
         }
         assert_eq!(validate("127.0.0.1:8080", Some("short")).unwrap_err().key, "token");
+        let listen = "0.0.0.0:8080".parse().ok();
+        DashboardConfig { enabled: false, listen, ..DashboardConfig::default() }.validate().unwrap();
     }
 }

@@ -16,7 +16,7 @@ use super::feed::kind_label;
 use super::history::MAX_VEHICLES;
 use super::observer::{Observer, age_s};
 use super::process;
-use crate::counters::{Event, Shed};
+use crate::counters::{Event, OTHERS, Shed, ShedReason};
 use crate::gateway::LinkState;
 use crate::leader_election::Position;
 
@@ -140,6 +140,10 @@ fn traffic(registry: &mut Registry, observer: &Observer) {
         add(&rejected, [("reason", reason.to_owned())], number);
     }
     let shed = counters(registry, "shed", "Messages left out under overload, by reason and source; bounded");
+    // A rate needs a series that is there before it matters.
+    for reason in ShedReason::ALL {
+        add(&shed, [("reason", reason.as_str().to_owned()), ("source", OTHERS.to_owned())], 0);
+    }
     for Shed { reason, source, times } in sources.counters.all_shed() {
         add(&shed, [("reason", reason.as_str().to_owned()), ("source", source)], times);
     }

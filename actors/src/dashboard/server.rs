@@ -13,8 +13,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, oneshot, watch};
 use tokio_io_timeout::TimeoutStream;
 
-use super::DashboardConfig;
 use super::access::Access;
+use super::config::{DEFAULT_ADDRESS, DashboardConfig};
 use super::observer::Observer;
 use super::routes::Site;
 use crate::counters::Event;
@@ -46,7 +46,6 @@ impl Server {
     /// When the operating system gives no thread.
     pub(super) fn start(
         config: DashboardConfig,
-        address: SocketAddr,
         observer: Arc<Observer>,
         bound: watch::Sender<Option<SocketAddr>>,
     ) -> io::Result<Self> {
@@ -56,7 +55,7 @@ impl Server {
             runtime.block_on(async {
                 tokio::select! {
                     () = observer.run() => {}
-                    () = serve(&config, address, &observer, &bound) => {}
+                    () = serve(&config, &observer, &bound) => {}
                     // The sender is dropped too when its owner is.
                     _ = stopped => {}
                 }
@@ -81,13 +80,13 @@ impl Drop for Server {
     }
 }
 
-async fn serve(
-    config: &DashboardConfig,
-    address: SocketAddr,
-    observer: &Arc<Observer>,
-    bound: &watch::Sender<Option<SocketAddr>>,
-) {
-    let listener = listen(bound.borrow().unwrap_or(address), observer).await;
+async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch::Sender<Option<SocketAddr>>) {
+    // A run before this one may have been given a port, which browsers now know.
+    let wanted = bound.borrow().or(config.listen);
+    let listener = match wanted {
+        Some(address) => listen(address, observer).await,
+        None => listen_anywhere(observer).await,
+    };
     let Ok(address) = listener.local_addr() else { return };
     let node = &observer.sources().node.name;
     let access = Access::new(config.token.as_ref(), address, node);
@@ -131,6 +130,17 @@ async fn answer(stream: TcpStream, router: axum::Router) -> hyper::Result<()> {
         .max_buf_size(MAX_BUFFER_BYTES)
         .serve_connection(TokioIo::new(Box::pin(stream)), TowerToHyperService::new(router))
         .await
+}
+
+/// Listens at the default address or, as other nodes of the machine do it too, on a free port of loopback.
+async fn listen_anywhere(observer: &Observer) -> TcpListener {
+    match TcpListener::bind(DEFAULT_ADDRESS).await {
+        Ok(listener) => listener,
+        Err(error) => {
+            tracing::info!(address = %DEFAULT_ADDRESS, %error, "dashboard takes a free port, key `dashboard.listen` is not set");
+            listen(SocketAddr::new(DEFAULT_ADDRESS.ip(), 0), observer).await
+        }
+    }
 }
 
 /// Listens as soon as the address is free.

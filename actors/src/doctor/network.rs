@@ -8,6 +8,7 @@ use ecod::names::NodeName;
 
 use super::Finding;
 use crate::config::NodeConfig;
+use crate::dashboard::DEFAULT_ADDRESS;
 use crate::gateway::{self, Security};
 use crate::membership::DEFAULT_PORT;
 
@@ -60,19 +61,40 @@ pub(super) fn gossip(config: &NodeConfig) -> Option<Finding> {
     })
 }
 
-/// The addresses of the dashboard and of the log's live server, where they are wanted.
-pub(super) fn pages(config: &NodeConfig) -> Vec<Finding> {
-    #[cfg(feature = "foxglove")]
-    let live = config.record.as_ref().and_then(|record| record.live_port);
-    #[cfg(not(feature = "foxglove"))]
-    let live: Option<u16> = None;
-    let live = live.map(|port| ("live port", SocketAddr::from(([127, 0, 0, 1], port)), "record.live_port"));
-    let page = config.dashboard.listen.map(|address| ("dashboard", address, "dashboard.listen"));
-    let look = |(check, address, key)| match TcpListener::bind(address) {
+/// The port on which a vehicle that moves is told its poses.
+#[cfg(feature = "camera")]
+pub(super) fn poses(config: &NodeConfig) -> Option<Finding> {
+    let (check, address) = ("pose port", config.pose.listen?);
+    Some(match UdpSocket::bind(address) {
         Ok(_) => Finding::fine(check, format!("{address} is free")),
-        Err(error) => not_bound(check, address, &error, key),
-    };
-    page.into_iter().chain(live).map(look).collect()
+        Err(error) => not_bound(check, address, &error, "pose.listen"),
+    })
+}
+
+/// The address of the dashboard, unless it is switched off.
+pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
+    let (check, listen) = ("dashboard", config.dashboard.listen);
+    let address = listen.unwrap_or(DEFAULT_ADDRESS);
+    config.dashboard.enabled.then(|| match TcpListener::bind(address) {
+        Ok(_) => Finding::fine(check, format!("{address} is free")),
+        Err(error) if listen.is_none() => Finding::doubtful(
+            check,
+            format!("{address}: {}, a free one will be taken", words(&error)),
+            "set `dashboard.listen` if its address has to be known",
+        ),
+        Err(error) => not_bound(check, address, &error, "dashboard.listen"),
+    })
+}
+
+/// The address of the log's live server, where it is wanted.
+#[cfg(feature = "foxglove")]
+pub(super) fn live(config: &NodeConfig) -> Option<Finding> {
+    let port = config.record.as_ref().and_then(|record| record.live_port)?;
+    let (check, address) = ("live port", SocketAddr::from(([127, 0, 0, 1], port)));
+    Some(match TcpListener::bind(address) {
+        Ok(_) => Finding::fine(check, format!("{address} is free")),
+        Err(error) => not_bound(check, address, &error, "record.live_port"),
+    })
 }
 
 fn not_bound(check: &'static str, address: SocketAddr, error: &io::Error, key: &str) -> Finding {

@@ -150,7 +150,7 @@ impl Assembly {
             parts.push(Part::Fuser);
         }
         parts.push(Part::LeaderElection);
-        parts.extend(self.config.dashboard.listen.map(|_| Part::Dashboard));
+        parts.extend(self.config.dashboard.enabled.then_some(Part::Dashboard));
         #[cfg(feature = "camera")]
         if self.config.camera.is_some() {
             parts.extend([Part::Projector, Part::Detector]);

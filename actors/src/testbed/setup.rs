@@ -17,6 +17,7 @@ use ecod::wire::Role;
 
 use crate::camera::{CameraConfig, MountConfig, OpticsConfig};
 use crate::config::NodeConfig;
+use crate::dashboard::DashboardConfig;
 use crate::detect::DetectorConfig;
 use crate::detect::placard::PlacardConfig;
 use crate::frame_source::SourceConfig;
@@ -133,7 +134,8 @@ fn view(placard: &Placard) -> ViewConfig {
     }
 }
 
-/// What all nodes of the cell share; they gossip on loopback, where no other cell of this machine is met.
+/// What all nodes of the cell share; they gossip on loopback, where no other cell of this machine is met, and serve no
+/// page.
 fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
     let membership = MembershipConfig {
         bind: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
@@ -142,6 +144,7 @@ fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
     };
     NodeConfig {
         membership,
+        dashboard: DashboardConfig { enabled: false, ..DashboardConfig::default() },
         cell: NodeName::from_static("testbed"),
         landmarks: scene.landmarks(&testbed.placard).iter().map(LandmarkConfig::from).collect(),
         fusion: fusion(testbed),

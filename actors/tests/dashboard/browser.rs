@@ -65,16 +65,49 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     browser.screenshot(&pictures.join("failover.png")).await;
 
     keyboard_and_table(&browser).await;
+    finger(&browser).await;
     assert_eq!(browser.complaints().await, Vec::<String>::new());
 
     drop(_euclid);
     browser.until("document.querySelector('#state').classList.contains('stale')").await;
     browser.until("!document.querySelector('#notice').hidden && document.body.classList.contains('stale-data')").await;
+    let age = browser.evaluate("document.querySelector('#state-age[aria-hidden=true]').textContent").await;
+    assert!(age.as_str().unwrap().ends_with(" s old"), "{age}");
+    let said = browser.evaluate("document.querySelector('#state-text').textContent").await;
+    assert_eq!(said, "Connection lost", "and nothing that changes every second");
     browser.screenshot(&pictures.join("stale.png")).await;
     let _euclid = start("euclid", Role::Auto, at_euclid, &places, directory.path());
     browser.until("document.querySelector('#state').classList.contains('live')").await;
     browser.quit().await;
     println!("pictures of the page: {}", pictures.display());
+}
+
+/// A finger scrolls past the whole map, and moves one that is zoomed; all of it is shown again by Fit.
+async fn finger(browser: &Browser) {
+    browser.look(390, 844, "light").await;
+    let middle = async || {
+        browser.evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })").await;
+        let middle = "(({ x, y, width, height }) => [x + width / 2, y + height / 2])\
+            (document.querySelector('#map').getBoundingClientRect())";
+        let middle = browser.evaluate(middle).await;
+        [0, 1].map(|axis| middle[axis].as_f64().unwrap())
+    };
+    let place = "Number(document.querySelector('#map .place').getAttribute('y'))";
+    let whole = browser.evaluate(place).await.as_f64().unwrap();
+    middle().await;
+    let scrolled = browser.evaluate("window.scrollY").await.as_f64().unwrap();
+    browser.swipe(middle().await, [0.0, -80.0]).await;
+    browser.until(&format!("window.scrollY > {scrolled}")).await;
+    assert!((browser.evaluate(place).await.as_f64().unwrap() - whole).abs() < 5.0);
+
+    browser.evaluate("document.querySelector('#zoom-in').click()").await;
+    browser.until("document.querySelector('#map').classList.contains('zoomed')").await;
+    let zoomed = browser.evaluate(place).await.as_f64().unwrap();
+    browser.swipe(middle().await, [0.0, 60.0]).await;
+    browser.until(&format!("{place} - {zoomed} > 40")).await;
+    browser.evaluate("document.querySelector('#fit').click()").await;
+    browser.until(&format!("Math.abs({place} - {whole}) < 20")).await;
+    browser.look(1440, 900, "light").await;
 }
 
 /// The map moves by keys and has a table in its place; everything that is pressed or scrolled can be reached and has a name.

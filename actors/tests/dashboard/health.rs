@@ -4,6 +4,7 @@ use std::net::TcpListener;
 
 use ecod::wire::Role;
 use ecod_actors::counters::Event;
+use ecod_actors::dashboard::{DEFAULT_ADDRESS, DashboardConfig};
 
 use crate::cell::{config, join, start, until};
 use crate::http::{get, try_request};
@@ -41,6 +42,36 @@ async fn a_busy_port_is_counted_and_taken_as_soon_as_it_is_free() {
     assert_eq!(get(address, "/healthz").await.status, 200);
     node.stop().await;
     assert!(TcpListener::bind(address).is_ok(), "a stopped node leaves its port");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nodes_that_are_told_no_address_have_a_page_each_on_this_machine_only() {
+    let unplaced = |name| {
+        let mut config = config(name, Role::Cav, 1);
+        config.dashboard = DashboardConfig::default();
+        config
+    };
+    let (one, first) = start(unplaced("euclid")).await;
+    let (other, second) = start(unplaced("gauss")).await;
+    assert!(first.ip().is_loopback() && second.ip().is_loopback());
+    for (node, page) in [("euclid", first), ("gauss", second)] {
+        assert_eq!(get(page, "/api/picture").await.json()["node"]["name"], node, "{first} {second}");
+    }
+    assert_ne!(second, DEFAULT_ADDRESS, "the first has it, or whoever had it before");
+    assert_eq!(other.counters().events(Event::DashboardNotBound), 0);
+    one.stop().await;
+    other.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_page_that_is_switched_off_is_not_there() {
+    let mut config = config("euclid", Role::Auto, 1);
+    config.dashboard.enabled = false;
+    let node = ecod_actors::node::start(config).await.unwrap();
+    until("the node leads", || async { node.leadership().borrow().is_leading() }).await;
+    assert!(node.seats().dashboard.holder().is_none());
+    assert_eq!(*node.dashboard_address().borrow(), None);
+    node.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

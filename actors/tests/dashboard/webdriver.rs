@@ -78,6 +78,19 @@ impl Browser {
         }
     }
 
+    /// Draws a finger over the screen, from a place in CSS pixels by so many of them to the right and down, and lets it rest
+    /// there, so that the page does not go on by itself.
+    pub(crate) async fn swipe(&self, from: [f64; 2], by: [f64; 2]) {
+        self.chromium("Emulation.setTouchEmulationEnabled", json!({ "enabled": true })).await;
+        for (kind, share) in [("touchStart", 0.0), ("touchMove", 0.5), ("touchMove", 1.0), ("touchMove", 1.0)] {
+            let point = json!({ "x": from[0] + share * by[0], "y": from[1] + share * by[1] });
+            self.chromium("Input.dispatchTouchEvent", json!({ "type": kind, "touchPoints": [point] })).await;
+            tokio::time::sleep(Duration::from_millis(150)).await;
+        }
+        self.chromium("Input.dispatchTouchEvent", json!({ "type": "touchEnd", "touchPoints": [] })).await;
+        self.chromium("Emulation.setTouchEmulationEnabled", json!({ "enabled": false })).await;
+    }
+
     /// What the browser complained of: errors of scripts, of policies, of missing files.
     pub(crate) async fn complaints(&self) -> Vec<String> {
         let log = self.command("se/log", json!({ "type": "browser" })).await;

@@ -50,6 +50,7 @@ pub(crate) fn config(
     config.membership.bind = Some(bind.unwrap_or(SocketAddr::from(([127, 0, 0, 1], 0))));
     config.membership.seeds = vec![seed.to_string()];
     config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
     config.election.stable_ms = 500;
     config.reputations.publish_period_s = 0.2;
     config.fusion.vote.weighted.freshness_s = 0.3;

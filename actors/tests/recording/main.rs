@@ -5,7 +5,10 @@ mod disk;
 mod files;
 #[cfg(feature = "foxglove")]
 mod live;
+#[cfg(feature = "camera")]
+mod pictures;
 mod python;
+mod report;
 
 use std::collections::BTreeMap;
 use std::process::Command;

@@ -35,6 +35,7 @@ fn config(node: &str, role: Role, broker: SocketAddr, gossip: Option<SocketAddr>
     config.membership.key = Some(Secret::new("5e".repeat(32)));
     config.membership.bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
     config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
     config.membership.seeds = gossip.iter().map(ToString::to_string).collect();
     config.validate().unwrap();
     config

@@ -86,7 +86,8 @@ pub(crate) fn configuration(
     let mut text = format!(
         "name = \"{name}\"\ncell = \"{CELL}\"\nrole = \"{role}\"\nlisten = \"{}\"\nstate_dir = \"state\"\n\n\
          [membership]\nkey = \"a key for trials\"\nbind = \"{}\"\nseeds = [{seeds}]\n\n\
-         [membership.multicast]\nenabled = {}\n\n[broker]\nallow_plaintext = true\n",
+         [membership.multicast]\nenabled = {}\n\n[broker]\nallow_plaintext = true\n\n\
+         [dashboard]\nenabled = false\n",
         own.broker, own.gossip, plan.bridged
     );
     if let Some(broker) = broker {

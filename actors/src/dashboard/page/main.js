@@ -86,10 +86,12 @@ function drawText(picture, scene) {
 function drawState() {
   const { picture } = live;
   const [look, words] = !picture ? (live.refused ? ["stale", "Sign in"] : ["waiting", "Connecting"])
-    : !live.connected ? ["stale", `Connection lost, ${span((live.now - picture.now_us) / 1e6).replace(/\.\d/, "")} old`]
+    : !live.connected ? ["stale", "Connection lost"]
     : picture.readiness.ready ? ["live", `Live, ${picture.readiness.reason}`] : ["unready", sentence(picture.readiness.reason)];
   byId("state").className = `state ${look}`;
   text(byId("state-text"), words);
+  // Beside the words and not among them: a screen reader would say every second.
+  text(byId("state-age"), picture && !live.connected ? `${Math.round((live.now - picture.now_us) / 1e6)} s old` : "");
   const stale = picture !== null && (!live.connected || !picture.readiness.ready);
   document.body.classList.toggle("stale-data", stale);
   const notice = live.refused ? "This page needs the node's token: open it with ?token= and the token."

@@ -1,11 +1,12 @@
 // The bird's-eye view: world metres to screen pixels, signs of constant size, labels that do not cover each other.
 
-import { byId, keyed, set, span, svg, text } from "./dom.js";
+import { ago, byId, keyed, set, span, svg, text } from "./dom.js";
 
 /// Where the error ellipse of a plane normal distribution holds 95 %: the square root of its χ² quantile.
 const SIGMAS_95 = 2.4477;
 /// More places or objects than this are only in the table.
 const MAX_DRAWN = 2000;
+/// Vehicles that have not reported, and objects that nobody has seen for so long are pale and say how long.
 const OLD_S = 2;
 const MARGIN_PX = 56;
 
@@ -44,6 +45,7 @@ export class BirdsEye {
     byId("map-empty").hidden = !empty;
     if (box.width < 40 || empty) return;
     set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene) });
+    this.#picture.classList.toggle("zoomed", this.#zoom !== 1);
     const at = this.#projection(scene, box);
     const labels = new Labels(box);
     this.#grid(at, box);
@@ -122,8 +124,10 @@ export class BirdsEye {
       const degrees = ((-turn * 180) / Math.PI).toFixed(1);
       set(around, { rx: Math.max(a * at.scale, 5), ry: Math.max(b * at.scale, 5), transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
       set(centre, { cx: x, cy: y });
-      text(title, `${object.label}, ${Math.round(object.confidence * 100)} %, ± ${a.toFixed(2)} m, seen by ${object.contributors.join(", ")}`);
-      labels.put(`object ${object.id}`, object.vehicle ?? object.label, x, y, 9, "");
+      const age = object.age_s ?? 0;
+      set(g, { class: age > OLD_S ? "old" : "" });
+      text(title, `${object.label}, ${Math.round(object.confidence * 100)} %, ± ${a.toFixed(2)} m, seen ${ago(age)} by ${object.contributors.join(", ")}`);
+      labels.put(`object ${object.id}`, aged(object.vehicle ?? object.label, age), x, y, 9, age > OLD_S ? "old" : "");
     });
   }
 
@@ -147,8 +151,9 @@ export class BirdsEye {
       const degrees = ((-v.pose.heading_rad * 180) / Math.PI).toFixed(1);
       set(g, { class: `c${v.colour} ${old(v)}` });
       set(g.firstChild, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
-      text(g.lastChild, `${v.node}, report ${span((now - v.received_at_us) / 1e6)} old`);
-      labels.put(`vehicle ${v.node}`, v.node, x, y, 14, `vehicle c${v.colour} ${old(v)}`);
+      const age = (now - v.received_at_us) / 1e6;
+      text(g.lastChild, `${v.node}, report ${span(age)} old`);
+      labels.put(`vehicle ${v.node}`, aged(v.node, age), x, y, 14, `vehicle c${v.colour} ${old(v)}`);
     });
   }
 
@@ -175,16 +180,17 @@ export class BirdsEye {
     this.redraw();
   }
 
+  /// A finger scrolls the page until the map is zoomed, and then moves the map.
   #drag() {
     let last = null;
     this.#picture.addEventListener("pointerdown", (event) => {
-      if (event.pointerType === "touch") return;
+      if (!event.isPrimary || (event.pointerType === "touch" && this.#zoom === 1)) return;
       last = [event.clientX, event.clientY];
       this.#picture.setPointerCapture(event.pointerId);
       this.#picture.classList.add("dragging");
     });
     this.#picture.addEventListener("pointermove", (event) => {
-      if (!last) return;
+      if (!last || !event.isPrimary) return;
       this.#shift = [this.#shift[0] + event.clientX - last[0], this.#shift[1] + event.clientY - last[1]];
       last = [event.clientX, event.clientY];
       this.redraw();
@@ -219,6 +225,9 @@ function wedge(vehicle, at) {
   const [x, y] = at(pose).map((c) => c.toFixed(1));
   return `M${x} ${y}L${point(-half)}A${r} ${r} 0 ${half > Math.PI / 2 ? 1 : 0} 0 ${point(half)}Z`;
 }
+
+/// A name, with how long ago if that is long.
+const aged = (name, age) => (age > OLD_S ? `${name}, ${span(age)}` : name);
 
 const turn = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 

@@ -44,7 +44,7 @@ export function places(scene) {
   ];
   rows(byId("places"), entries, (entry) => entry.id, (entry) => [
     entry.name, entry.label ?? { text: entry.words ?? "–", class: "dim" }, n(entry.label ? percent(entry.confidence) : "–"),
-    n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), { text: list(entry.contributors ?? []), class: "dim" },
+    n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), n(entry.age_s === undefined ? "–" : ago(entry.age_s)), { text: list(entry.contributors ?? []), class: "dim" },
   ]);
 }
 

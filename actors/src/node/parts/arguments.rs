@@ -1,6 +1,5 @@
 //! What each part is given at its start.
 
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -225,9 +224,7 @@ impl Assembly {
             frames: self.frames(),
             feed: Arc::clone(&self.feed),
         };
-        let config = self.config.dashboard.clone();
-        let listen = config.listen.unwrap_or(SocketAddr::from(([127, 0, 0, 1], 0)));
-        DashboardArguments { config, listen, sources, bound: self.dashboard_address.clone() }
+        DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
     }
 
     /// What the node's readiness is judged from.
