@@ -68,6 +68,31 @@ async fn a_plate_goes_from_pixels_to_the_map_though_detector_and_projector_are_k
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_camera_that_is_missing_is_counted_each_time_and_the_node_lives_on() {
+    let toml = r#"
+        name = "blind"
+        dashboard = { enabled = false }
+        membership = { bind = "127.0.0.1:0", multicast = { enabled = false } }
+        listen = "127.0.0.1:0"
+        [camera]
+        source = { kind = "v4l2", device = "/dev/no-such-camera" }
+        detector = { kind = "placard" }
+        capture = { retry_min_s = 0.05, retry_max_s = 0.05 }
+    "#;
+    let node = node::start(toml::from_str(toml).unwrap()).await.unwrap();
+    let failures = node.counters().events(Event::SourceFailed);
+    let counted = async {
+        while node.counters().events(Event::SourceFailed) < failures + 2 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, counted).await.expect("it is tried again and counted");
+    let mut newest = node.newest_map();
+    timeout(PATIENCE, newest.wait_for(Option::is_some)).await.expect("it serves itself").unwrap();
+    node.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_node_whose_detector_cannot_be_built_says_why() {
     let toml = r#"
         name = "blind"

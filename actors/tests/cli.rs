@@ -209,6 +209,43 @@ mod demo {
         assert_eq!(std::fs::read_to_string(file).unwrap(), "kept");
     }
 
+    /// Four cameras, each before two of eight spots; `change` is applied to the file.
+    fn result_of(change: impl Fn(&mut serde_json::Value)) -> serde_json::Value {
+        let directory = tempfile::tempdir().unwrap();
+        let mut file: serde_json::Value = serde_json::from_slice(&std::fs::read(scenes()).unwrap()).unwrap();
+        change(&mut file);
+        let (scenes, out) = (directory.path().join("scenes.json"), directory.path().join("result.json"));
+        std::fs::write(&scenes, file.to_string()).unwrap();
+        let mut testbed = ecod_node();
+        testbed.args(["testbed", "--scene", "setup1-lot2", "--verdicts", "3", "--scenes"]).arg(&scenes);
+        let output = testbed.arg("--out").arg(&out).output().unwrap();
+        assert!(output.status.success(), "{}", stderr(&output));
+        serde_json::from_slice::<serde_json::Value>(&std::fs::read(out).unwrap()).unwrap()["scenes"][0].clone()
+    }
+
+    #[test]
+    fn scenes_may_differ_from_the_recorded_ones() {
+        let free_without_placards = result_of(|file| {
+            for spot in file["scenes"][1]["spots"].as_array_mut().unwrap() {
+                spot.as_object_mut().unwrap().remove("empty_placard");
+            }
+        });
+        assert_eq!(free_without_placards["pace_accuracy_pct"], 100.0, "{free_without_placards}");
+        let slow = result_of(|file| {
+            file["camera"]["capture_interval_s"] = 2.0.into();
+            file["camera"]["submission_interval_s"] = 4.0.into();
+            file["scenes"][1]["recorded"] = serde_json::json!([{"run": "14a"}]);
+        });
+        assert_eq!(slow["pace_accuracy_pct"], 100.0, "{slow}");
+        let without_cars = result_of(|file| {
+            for spot in file["scenes"][1]["spots"].as_array_mut().unwrap() {
+                spot["truth"] = serde_json::Value::Null;
+            }
+        });
+        assert_eq!(without_cars["occupied_accuracy_pct"], 100.0, "{without_cars}");
+        assert_eq!(without_cars["always_empty_pct"], 100.0);
+    }
+
     /// Processes with the directory in their command line.
     fn working_in(directory: &Path) -> Vec<i32> {
         let processes = std::fs::read_dir("/proc").unwrap().filter_map(Result::ok);
@@ -233,7 +270,7 @@ mod demo {
     fn a_demo_that_is_killed_leaves_no_nodes_behind() {
         let directory = tempfile::tempdir().unwrap();
         let mut demo = ecod_node();
-        demo.args(["demo", "--scene", "setup1-lot1", "--out"]).arg(directory.path()).arg("--scenes").arg(scenes());
+        demo.args(["demo", "--scene", "setup1-lot1", "--out"]).arg(directory.path());
         let mut demo = demo.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         until("five nodes and the demo run", || working_in(directory.path()).len() == 6);
         kill(Pid::from_raw(i32::try_from(demo.id()).unwrap()), Signal::SIGKILL).unwrap();

@@ -55,6 +55,21 @@ fn the_recorded_setups_are_read_in_metres_and_radians() {
 }
 
 #[test]
+fn what_is_too_small_in_the_image_cannot_be_read() {
+    let at = |x: f64| seen(&json!([spot(1, x, 0.0, Some("A"))]))[0];
+    assert!(at(40.0), "26 px wide");
+    assert!(!at(44.0), "23 px wide");
+}
+
+#[test]
+fn what_was_recorded_may_be_told_in_part() {
+    let mut file = lot(&json!([spot(1, 10.0, 0.0, None)]));
+    file["scenes"][0]["recorded"] = json!([{"run": "14a"}, {"pace_accuracy_pct": 87.5}]);
+    let recorded = read(&file).unwrap().scenes[0].recorded.clone();
+    assert_eq!(recorded.iter().filter_map(|run| run.pace_accuracy_pct).collect::<Vec<_>>(), [87.5]);
+}
+
+#[test]
 fn other_files_of_the_kind_may_leave_much_out() {
     let mut file = lot(&json!([
         {"id": "north", "occupied_placard": [10, 0], "empty_placard": [10, 3]},
