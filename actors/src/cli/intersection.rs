@@ -8,8 +8,8 @@ use ecod::testbed::Recording;
 use tracing::subscriber::NoSubscriber;
 
 use super::columns::{columns, percent};
-use super::testbed::{Results, TestbedArguments};
-use super::{Failure, write_json};
+use super::testbed::{Results, TestbedArguments, check_writable};
+use super::{Failure, print, write_json};
 use crate::testbed::intersection::generate::Confusion;
 use crate::testbed::intersection::{self, IntersectionResult};
 
@@ -27,6 +27,9 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
         let chosen = arguments.scene.as_deref().unwrap_or_default();
         return Err(Failure::usage(anyhow::anyhow!("no scene {chosen:?}; there are {RECORDING}, {GENERATED}")));
     }
+    if let Some(out) = &arguments.out {
+        check_writable(out)?;
+    }
     let mut results = Vec::new();
     if is_chosen(RECORDING) {
         results.push(intersection::run(RECORDING, &recording)?);
@@ -36,7 +39,7 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
         let generate = || generated(arguments, &recording);
         results.extend(tracing::subscriber::with_default(NoSubscriber::new(), generate)?);
     }
-    print!("{}", table(&results));
+    print(&table(&results))?;
     if let Some(file) = &arguments.reports {
         let lines = intersection::reports(&recording).iter().map(intersection::line).collect::<Result<Vec<_>, _>>();
         let text = lines.context("reports are plain json")?.join("\n") + "\n";
