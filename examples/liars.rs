@@ -21,8 +21,12 @@ use rand_chacha::ChaCha8Rng;
 
 const LABELS: [&str; 5] = ["car", "cup", "mouse", "sports ball", "vase"];
 const SIZES: [usize; 5] = [3, 5, 7, 9, 15];
-const SERIES: [(&str, RGBColor); 3] =
-    [("share of right verdicts", BLACK), ("reputation of the honest", BLUE), ("reputation of liars", RED)];
+const SERIES: [(&str, RGBColor); 4] = [
+    ("share of right majorities", RGBColor(150, 150, 150)),
+    ("share of right verdicts", BLACK),
+    ("reputation of the honest", BLUE),
+    ("reputation of liars", RED),
+];
 const LANDMARKS: usize = 6;
 const ROUNDS: u64 = 600;
 const SETTLED: u64 = 300;
@@ -45,8 +49,8 @@ enum Lie {
 }
 
 struct Course {
-    /// Share of right verdicts of each ten rounds.
-    accuracy: Vec<f64>,
+    /// Share of right verdicts and of right majorities of all vehicles of each ten rounds.
+    accuracy: Vec<(f64, f64)>,
     /// Mean reputation of the honest and of the liars at the end of each ten rounds.
     reputation: Vec<(f64, f64)>,
     /// Percent of right verdicts once settled, of all votes' majorities, and of the honest votes' majorities.
@@ -67,14 +71,27 @@ impl Trial {
         self.courses.iter().map(of).sum::<f64>() / self.courses.len().max(1) as f64
     }
 
+    fn liars(&self) -> usize {
+        (self.vehicles - 1) / 2
+    }
+
+    fn lie_name(&self) -> String {
+        format!("{:?}", self.lie).to_lowercase()
+    }
+
+    /// What stands above its panel.
+    fn name(&self) -> String {
+        format!("{}, {} of {} lie", self.lie_name(), self.liars(), self.vehicles)
+    }
+
     fn row(&self) -> String {
         let worst = self.courses.iter().map(|c| c.settled).fold(f64::INFINITY, f64::min);
         let last = |c: &Course| c.reputation.last().copied().unwrap_or_default();
         format!(
             "| {} | {} | {} | {:.1} | {:.1} | {:.1} | {worst:.1} | {:.2} | {:.2} |\n",
             self.vehicles,
-            (self.vehicles - 1) / 2,
-            format!("{:?}", self.lie).to_lowercase(),
+            self.liars(),
+            self.lie_name(),
             self.mean(|c| c.majority),
             self.mean(|c| c.honest),
             self.mean(|c| c.settled),
@@ -100,7 +117,7 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     let liars = (vehicles - 1) / 2;
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let mut course = Course { accuracy: Vec::new(), reputation: Vec::new(), settled: 0.0, majority: 0.0, honest: 0.0 };
-    let (mut right, mut settled, mut majority, mut honest) = (0, 0, 0.0, 0.0);
+    let (mut right, mut right_most, mut settled, mut majority, mut honest) = (0, 0.0, 0, 0.0, 0.0);
     let mut now = Timestamp(1_700_000_000_000_000);
     let mut truths = [0; LANDMARKS];
     for round in 0..ROUNDS {
@@ -149,16 +166,19 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
         for (place, &truth) in truths.iter().enumerate() {
             let label = verdicts.get(format!("place-{place}").as_str()).cloned().flatten();
             let good = usize::from(label.as_deref() == Some(LABELS[truth]));
+            let most = chance_of_most(&said[place], truth);
             right += good;
+            right_most += most;
             if round >= SETTLED {
                 settled += good;
-                majority += chance_of_most(&said[place], truth);
+                majority += most;
                 honest += chance_of_most(&said_honestly[place], truth);
             }
         }
         if round % 10 == 9 {
-            course.accuracy.push(right as f64 / (10 * LANDMARKS) as f64);
-            right = 0;
+            let judged = (10 * LANDMARKS) as f64;
+            course.accuracy.push((right as f64 / judged, right_most / judged));
+            (right, right_most) = (0, 0.0);
             let reputations = vote.reputations();
             let mean = |prefix: &str| {
                 let scores: Vec<f64> =
@@ -180,36 +200,40 @@ fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
     let columns = SIZES.len();
     let area = SVGBackend::new(path, (320 * columns as u32, 1200)).into_drawing_area();
     area.fill(&WHITE)?;
-    let (legend, panels) = area.split_vertically(28);
+    let (legend, panels) = area.split_vertically(32);
     let mut x = 12;
     for (name, color) in SERIES {
-        legend.draw(&PathElement::new([(x, 14), (x + 24, 14)], color.stroke_width(2)))?;
-        legend.draw(&Text::new(name, (x + 30, 8), ("sans-serif", 14)))?;
-        x += 230;
+        legend.draw(&PathElement::new([(x, 16), (x + 28, 16)], color.stroke_width(3)))?;
+        legend.draw(&Text::new(name, (x + 34, 8), ("sans-serif", 17)))?;
+        x += 270;
     }
     for (place, area) in panels.split_evenly((LIES.len(), columns)).iter().enumerate() {
         let Some(trial) = trials.get(place % columns * LIES.len() + place / columns) else { continue };
         let mut chart = ChartBuilder::on(area)
             .margin(8)
             .margin_right(24)
-            .caption(format!("{:?}, {} vehicles", trial.lie, trial.vehicles), ("sans-serif", 15))
-            .x_label_area_size(24)
-            .y_label_area_size(32)
-            .build_cartesian_2d(0.0..ROUNDS as f64, 0.0..1.0)?;
+            .caption(trial.name(), ("sans-serif", 17))
+            .x_label_area_size(36)
+            .y_label_area_size(36)
+            .build_cartesian_2d(0.0..ROUNDS as f64, 0.0..1.04)?;
         chart
             .configure_mesh()
             .x_labels(4)
             .x_label_formatter(&|x| format!("{x:.0}"))
             .y_labels(6)
+            .y_label_formatter(&|y| format!("{y:.1}"))
             .x_desc("round")
+            .label_style(("sans-serif", 14))
             .light_line_style(WHITE)
             .draw()?;
         let course = |of: fn(&Course, usize) -> f64| {
             (0..(ROUNDS / 10) as usize).map(move |n| (n as f64 * 10.0 + 10.0, trial.mean(|c| of(c, n))))
         };
-        chart.draw_series(LineSeries::new(course(|c, n| c.accuracy[n]), SERIES[0].1.stroke_width(2)))?;
-        chart.draw_series(LineSeries::new(course(|c, n| c.reputation[n].0), SERIES[1].1.stroke_width(2)))?;
-        chart.draw_series(LineSeries::new(course(|c, n| c.reputation[n].1), SERIES[2].1.stroke_width(2)))?;
+        let courses: [fn(&Course, usize) -> f64; SERIES.len()] =
+            [|c, n| c.accuracy[n].1, |c, n| c.accuracy[n].0, |c, n| c.reputation[n].0, |c, n| c.reputation[n].1];
+        for ((_, color), of) in SERIES.iter().zip(courses) {
+            chart.draw_series(LineSeries::new(course(of), color.stroke_width(2)))?;
+        }
     }
     area.present()?;
     Ok(())

@@ -2,6 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use hashbrown::HashMap;
+
 use super::config::PaperConfig;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::wire::{Reputation, Verdict};
@@ -26,55 +28,67 @@ impl Vehicle {
     }
 }
 
+/// What was said at a location.
+#[derive(Debug, Clone, Default)]
+struct Place {
+    scores: BTreeMap<Label, f64>,
+    contributors: BTreeSet<NodeName>,
+    /// Whether it was voted on in this round.
+    is_touched: bool,
+}
+
 /// S(ρ,l) = Σ_v Σ_ω [l_ω = l] r_v c_ω k(ρ,v), never cleared; λ_ρ = argmax_l S(ρ,l); r_v += Δr_v after each verdict.
 #[derive(Debug, Clone)]
 pub struct PaperTally {
     config: PaperConfig,
-    scores: BTreeMap<LandmarkId, (BTreeMap<Label, f64>, BTreeSet<NodeName>)>,
+    /// By hash, as their order does not matter: a vote is on one of many.
+    places: HashMap<LandmarkId, Place>,
     vehicles: BTreeMap<NodeName, Vehicle>,
-    touched: BTreeSet<LandmarkId>,
+    touched: Vec<LandmarkId>,
 }
 
 impl PaperTally {
     /// An empty tally.
     pub fn new(config: PaperConfig) -> Self {
-        Self { config, scores: BTreeMap::new(), vehicles: BTreeMap::new(), touched: BTreeSet::new() }
+        Self { config, places: HashMap::new(), vehicles: BTreeMap::new(), touched: Vec::new() }
     }
 
     /// Makes a location known, so that it has a verdict even without votes.
     pub fn expect(&mut self, landmark: LandmarkId) {
-        self.scores.entry(landmark).or_default();
+        self.places.entry(landmark).or_default();
     }
 
     /// Forgets a location.
     pub fn forget(&mut self, landmark: &LandmarkId) {
-        self.scores.remove(landmark);
+        self.places.remove(landmark);
     }
 
     /// Forgets vehicles' reputations and names; what they said stays in the sums.
     pub fn forget_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.vehicles.retain(|node, _| !nodes.contains(node));
-        self.scores.values_mut().for_each(|(_, contributors)| contributors.retain(|node| !nodes.contains(node)));
+        self.places.values_mut().for_each(|place| place.contributors.retain(|node| !nodes.contains(node)));
     }
 
     /// Whether a location can take a label with at most `most` labels in all.
     pub fn has_room_for(&self, landmark: &LandmarkId, label: &Label, most: usize) -> bool {
-        self.scores.get(landmark).is_none_or(|(scores, _)| scores.len() < most || scores.contains_key(label))
+        self.places.get(landmark).is_none_or(|place| place.scores.len() < most || place.scores.contains_key(label))
     }
 
     /// Adds r_v · c_ω · k for one detection.
     pub fn add(&mut self, landmark: &LandmarkId, node: &NodeName, label: &Label, confidence: f64, visibility: f64) {
         let vehicle = self.vehicles.entry(node.clone()).or_insert_with(|| Vehicle::new(&self.config));
-        let (scores, contributors) = self.scores.entry(landmark.clone()).or_default();
-        *scores.entry(label.clone()).or_insert(0.0) += vehicle.reputation * confidence * visibility;
-        contributors.insert(node.clone());
-        self.touched.insert(landmark.clone());
+        let place = self.places.entry_ref(landmark).or_default();
+        *place.scores.entry(label.clone()).or_insert(0.0) += vehicle.reputation * confidence * visibility;
+        place.contributors.insert(node.clone());
+        if !std::mem::replace(&mut place.is_touched, true) {
+            self.touched.push(landmark.clone());
+        }
         vehicle.votes.push((landmark.clone(), label.clone()));
     }
 
     /// The label with the most score at a location, the first in alphabetical order on a tie.
     pub fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
-        let (scores, contributors) = self.scores.get(landmark)?;
+        let Place { scores, contributors, .. } = self.places.get(landmark)?;
         Some(super::verdict(landmark.clone(), scores.clone(), None, contributors.iter().cloned().collect()))
     }
 
@@ -82,12 +96,13 @@ impl PaperTally {
     /// the last verdict, and returns the locations that were voted on.
     pub fn close(&mut self) -> BTreeSet<LandmarkId> {
         let touched = std::mem::take(&mut self.touched);
-        let labels: BTreeMap<_, _> = touched
-            .iter()
-            .filter_map(|landmark| {
-                self.scores.get(landmark).map(|(scores, _)| (landmark, super::best(scores).cloned()))
-            })
-            .collect();
+        let mut labels: HashMap<&LandmarkId, Option<Label>> = HashMap::with_capacity(touched.len());
+        for landmark in &touched {
+            if let Some(place) = self.places.get_mut(landmark) {
+                place.is_touched = false;
+                labels.insert(landmark, super::best(&place.scores).cloned());
+            }
+        }
         for vehicle in self.vehicles.values_mut().filter(|v| !v.votes.is_empty()) {
             let objects = vehicle.votes.len() as u64;
             let right =
@@ -100,7 +115,8 @@ impl PaperTally {
             vehicle.incorrect += objects - correct;
             vehicle.votes.clear();
         }
-        touched
+        drop(labels);
+        touched.into_iter().collect()
     }
 
     /// Goes on from reputations that an earlier tally arrived at; those of vehicles that it does not name stay.
