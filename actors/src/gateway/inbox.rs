@@ -55,6 +55,8 @@ pub enum Incoming {
 pub enum LinkState {
     /// Connected, subscribed, status published.
     Up,
+    /// Connected, but nothing comes back of what is sent: the broker hangs, or its answers are lost.
+    Stalled,
     /// Not connected; attempts go on.
     Down,
     /// Not connected and nothing listens there: the broker's process is gone. Attempts go on.

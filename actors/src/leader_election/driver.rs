@@ -354,7 +354,8 @@ impl ElectionDriver {
 
     async fn update_health(&mut self) -> Result<(), ActorProcessingErr> {
         let (plane, brokers) = (self.routes.plane(), self.routes.brokers());
-        let health = self.monitor.health(plane, brokers, self.round_period, clock::now());
+        let no_other = self.election.is_leading() && self.election.standby().is_none();
+        let health = self.monitor.health(plane, brokers, no_other, self.round_period, clock::now());
         let is_reached = self.is_reached();
         self.set_health(Health { broker: health.broker && is_reached, ..health }).await
     }

@@ -44,15 +44,14 @@ impl HealthMonitor {
     pub(super) fn note_link(&mut self, broker: &BrokerAddress, state: LinkState) -> bool {
         match state {
             // Whether nothing listens there is not known yet.
-            LinkState::Down if self.links.contains_key(broker) => {
-                self.links.insert(broker.clone(), LinkState::Down);
+            LinkState::Down | LinkState::Stalled => {
+                self.links.entry(broker.clone()).and_modify(|known| *known = state);
                 false
             }
             LinkState::Up => {
-                self.links.insert(broker.clone(), LinkState::Up);
+                self.links.insert(broker.clone(), state);
                 false
             }
-            LinkState::Down => false,
             LinkState::Refused => self.links.remove(broker).is_some(),
         }
     }
@@ -66,8 +65,8 @@ impl HealthMonitor {
     pub(super) fn note_probe(&mut self, probe: Probe) {
         for (broker, state) in probe.links.iter().flatten() {
             match state {
-                LinkState::Up => {
-                    self.links.insert(broker.clone(), LinkState::Up);
+                LinkState::Up | LinkState::Stalled => {
+                    self.links.insert(broker.clone(), *state);
                 }
                 // That it is refused is news of its own, which may still be under way.
                 LinkState::Down | LinkState::Refused => {
@@ -89,9 +88,20 @@ impl HealthMonitor {
     }
 
     /// The parts as the election wants to know them. A node that uses an external broker, its own, or both, needs one of
-    /// them.
-    pub(super) fn health(&self, plane: &DataPlane, brokers: &Brokers, period: Duration, now: Timestamp) -> Health {
-        let up = |broker: Option<&BrokerAddress>| broker.is_some_and(|b| self.links.get(b) == Some(&LinkState::Up));
+    /// them. A stalled link is none, but in a leader with `no_other` to lead, which would only make way for nobody.
+    pub(super) fn health(
+        &self,
+        plane: &DataPlane,
+        brokers: &Brokers,
+        no_other: bool,
+        period: Duration,
+        now: Timestamp,
+    ) -> Health {
+        let up = |broker: Option<&BrokerAddress>| match broker.and_then(|broker| self.links.get(broker)) {
+            Some(LinkState::Up) => true,
+            Some(LinkState::Stalled) => no_other,
+            Some(LinkState::Down | LinkState::Refused) | None => false,
+        };
         let external = up(plane.external.as_ref());
         let embedded = plane.embedded && self.probe.broker_serves;
         let patience = ROUND_PATIENCE + 3 * period;
@@ -174,14 +184,14 @@ mod tests {
         let mut monitor = monitor(&counters, now);
         let plane = DataPlane { external: None, embedded: true };
         let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
-        assert!(!monitor.health(&plane, &brokers, PERIOD, now).is_fit(), "no link to its own broker yet");
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD, now).is_fit(), "no link to its own broker yet");
         monitor.note_link(&address(1), LinkState::Up);
-        assert!(monitor.health(&plane, &brokers, PERIOD, now).is_fit());
+        assert!(monitor.health(&plane, &brokers, false, PERIOD, now).is_fit());
         let later = now + Duration::from_secs(3);
         monitor.look(&counters, later);
-        assert!(!monitor.health(&plane, &brokers, PERIOD, later).fuser, "no rounds");
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD, later).fuser, "no rounds");
         monitor.note_link(&address(1), LinkState::Down);
-        assert!(!monitor.health(&plane, &brokers, PERIOD, now).gateway);
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD, now).gateway);
     }
 
     #[test]
@@ -193,9 +203,28 @@ mod tests {
         let links = |state| Some(BTreeMap::from([(address(1), state)]));
         let probe = |state| Probe { broker_serves: true, links: links(state), fuser_runs: true };
         monitor.note_probe(probe(LinkState::Up));
-        assert!(monitor.health(&plane, &brokers, PERIOD, now).is_fit());
+        assert!(monitor.health(&plane, &brokers, false, PERIOD, now).is_fit());
         monitor.note_probe(probe(LinkState::Down));
-        assert!(!monitor.health(&plane, &brokers, PERIOD, now).is_fit());
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD, now).is_fit());
+        assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
+    }
+
+    #[test]
+    fn a_broker_that_passes_nothing_on_is_none_unless_nobody_else_could_lead() {
+        let now = Timestamp(60_000_000);
+        let mut monitor = monitor(&Counters::default(), now);
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        monitor.note_link(&address(1), LinkState::Up);
+        let fit = |monitor: &HealthMonitor, no_other| {
+            let plane = DataPlane { external: None, embedded: true };
+            monitor.health(&plane, &brokers, no_other, PERIOD, now).is_fit()
+        };
+        assert!(fit(&monitor, false));
+        assert!(!monitor.note_link(&address(1), LinkState::Stalled));
+        assert_eq!((fit(&monitor, false), fit(&monitor, true)), (false, true));
+        monitor.note_link(&address(1), LinkState::Down);
+        assert!(!fit(&monitor, true));
+        monitor.note_link(&address(1), LinkState::Stalled);
         assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
     }
 
@@ -208,7 +237,7 @@ mod tests {
         monitor.note_link(&address(1), LinkState::Up);
         let fit = |monitor: &HealthMonitor, embedded| {
             let plane = DataPlane { external: Some(address(9)), embedded };
-            monitor.health(&plane, &brokers, PERIOD, now).is_fit()
+            monitor.health(&plane, &brokers, false, PERIOD, now).is_fit()
         };
         assert!(!fit(&monitor, false));
         assert!(fit(&monitor, true), "falls back to its own");
