@@ -1,10 +1,12 @@
 //! Clients that knock too often, wait too long, or send what is no MQTT or too much of it.
 
+use std::collections::VecDeque;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::wire::Role;
+use ecod_actors::broker::BrokerConfig;
 use ecod_actors::counters::Event;
 use ecod_actors::pki::BROKER_NAME;
 use rand::{RngExt, SeedableRng};
@@ -22,8 +24,12 @@ use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, 
 const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
 
 async fn knock(broker: SocketAddr) -> TcpStream {
+    knock_from(ELSEWHERE, broker).await
+}
+
+async fn knock_from(address: Ipv4Addr, broker: SocketAddr) -> TcpStream {
     let socket = TcpSocket::new_v4().unwrap();
-    socket.bind((ELSEWHERE, 0).into()).unwrap();
+    socket.bind((address, 0).into()).unwrap();
     socket.connect(broker).await.unwrap()
 }
 
@@ -50,6 +56,37 @@ async fn who_knocks_too_often_is_not_heard_and_others_are() {
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     Client::new(cell.address, "gauss", &client_config("gauss", &files)).log_in().await.unwrap();
     cell.honest_traffic_goes_on().await;
+}
+
+/// A flood from the address of an honest node, such as from behind the same address translation.
+#[tokio::test]
+async fn a_node_comes_back_while_its_own_address_floods() {
+    let adjust = |config: &mut BrokerConfig| {
+        config.connects_per_s = 20;
+        config.handshake_timeout_ms = 5000;
+    };
+    let mut cell = Cell::start_with(adjust).await;
+    let broker = cell.address;
+    let flood = tokio::spawn(async move {
+        let mut held = VecDeque::new();
+        let mut ticks = tokio::time::interval(Duration::from_millis(20));
+        loop {
+            ticks.tick().await;
+            held.push_back(knock_from(Ipv4Addr::LOCALHOST, broker).await);
+            if held.len() > 200 {
+                held.pop_front();
+            }
+        }
+    });
+    // By now a stranger's burst would be used up, and as many wait as may.
+    cell.counted(Event::ClientThrottled, 60).await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    for _ in 0..5 {
+        Client::new(cell.address, "gauss", &client_config("gauss", &files)).log_in().await.expect("kept out");
+        cell.honest_traffic_goes_on().await;
+    }
+    assert!(!flood.is_finished());
+    flood.abort();
 }
 
 #[tokio::test]
@@ -150,7 +187,7 @@ async fn one_certificate_does_not_take_the_places_of_others() {
 #[tokio::test]
 async fn limits_hold_without_certificates_too() {
     use ecod::wire::Topics;
-    use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+    use ecod_actors::broker::{EmbeddedBroker, Guard, Mqtt};
     use ecod_actors::counters::Counters;
 
     let counters = Arc::<Counters>::default();
