@@ -1,4 +1,4 @@
-//! The embedded broker: rmqtt on a thread of its own, behind a gate where others than this machine's can reach it.
+//! The embedded broker: rmqtt on a thread of its own, in a node behind a gate.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -183,21 +183,15 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 const END_TIMEOUT: Duration = Duration::from_millis(1500);
 
 impl EmbeddedBroker {
-    /// A broker that is not started.
+    /// A broker that is not started and has no gate: whoever reaches it is let in.
     pub fn new(config: BrokerConfig) -> Self {
         Self { config, guard: None, counters: Arc::default(), running: None }
     }
 
-    /// A broker behind a gate: clients show certificates, if the guard has any, and strangers are limited.
+    /// A broker that is not started, behind a gate: clients show certificates, if the guard has any, and strangers are limited.
     pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
         let counters = Arc::clone(&guard.counters);
         Self { config, guard: Some(guard), counters, running: None }
-    }
-
-    /// Counts what it does not pass on in `counters`.
-    pub fn counting(mut self, counters: Arc<Counters>) -> Self {
-        self.counters = counters;
-        self
     }
 
     fn listener(&self, address: SocketAddr) -> Builder {

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use ecod::wire::Role;
 use ecod_actors::broker::BrokerConfig;
+use ecod_actors::config::NodeConfig;
 use ecod_actors::counters::Event;
 use ecod_actors::pki::BROKER_NAME;
 use rand::{RngExt, SeedableRng};
@@ -18,7 +19,7 @@ use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
-use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config};
+use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, node};
 
 /// Another host than the honest ones, as far as a broker can see.
 const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
@@ -183,6 +184,38 @@ async fn one_certificate_does_not_take_the_places_of_others() {
     timeout(SOON, returned).await.expect("who leaves makes room");
 }
 
+/// The broker of a node that nobody configured: for this machine only, without certificates.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn limits_hold_on_loopback_as_they_come() {
+    let mut config = NodeConfig { name: Some(node("edge")), role: Role::Edge, ..NodeConfig::default() };
+    config.listen = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+    config.membership.bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+    config.membership.multicast.enabled = false;
+    let edge = ecod_actors::node::start(config).await.unwrap();
+    let address = edge.broker_address().unwrap();
+    let mut silent = Vec::new();
+    for _ in 0..20 {
+        silent.push(knock_from(Ipv4Addr::LOCALHOST, address).await);
+    }
+    let mut dribbling = knock_from(Ipv4Addr::LOCALHOST, address).await;
+    dribbling.write_all(&[0x10, 60, 0, 4]).await.unwrap();
+    let mut options = rumqttc::MqttOptions::new("anyone", "127.0.0.1", address.port());
+    options.set_keep_alive(Duration::from_secs(5));
+    let (_client, mut events) = rumqttc::AsyncClient::new(options, 8);
+    timeout(SOON, events.poll()).await.expect("kept out").unwrap();
+    closed(&mut dribbling).await;
+    for stream in &mut silent {
+        closed(stream).await;
+    }
+    let counted = async {
+        while edge.counters().events(Event::ClientTimedOut) < 21 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    timeout(SOON, counted).await.expect("not counted");
+    edge.stop().await;
+}
+
 /// A broker that is not behind TLS but open to others has the same limits.
 #[tokio::test]
 async fn limits_hold_without_certificates_too() {
@@ -193,7 +226,7 @@ async fn limits_hold_without_certificates_too() {
     let counters = Arc::<Counters>::default();
     let guard = Guard {
         credentials: None,
-        topics: Topics::new(&crate::fixture::node("lot")),
+        topics: Topics::new(&node("lot")),
         limits: Default::default(),
         elected: Arc::new(|_| true),
         counters: Arc::clone(&counters),
