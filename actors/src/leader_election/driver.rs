@@ -356,7 +356,7 @@ impl ElectionDriver {
         let (plane, brokers) = (self.routes.plane(), self.routes.brokers());
         let no_other = self.election.is_leading() && self.election.standby().is_none();
         let health = self.monitor.health(plane, brokers, no_other, self.round_period, clock::now());
-        let is_reached = self.is_reached();
+        let is_reached = self.is_reached(no_other);
         self.set_health(Health { broker: health.broker && is_reached, ..health }).await
     }
 

@@ -97,19 +97,29 @@ impl HealthMonitor {
         period: Duration,
         now: Timestamp,
     ) -> Health {
-        let up = |broker: Option<&BrokerAddress>| match broker.and_then(|broker| self.links.get(broker)) {
-            Some(LinkState::Up) => true,
-            Some(LinkState::Stalled) => no_other,
-            Some(LinkState::Down | LinkState::Refused) | None => false,
-        };
-        let external = up(plane.external.as_ref());
+        let external = self.is_up(plane.external.as_ref(), no_other);
         let embedded = plane.embedded && self.probe.broker_serves;
         let patience = ROUND_PATIENCE + 3 * period;
         Health {
             broker: external || embedded,
             fuser: self.probe.fuser_runs && now.since(self.round_closed_at) < patience,
-            gateway: self.probe.links.is_some() && (external || (embedded && up(brokers.own.as_ref()))),
+            gateway: self.probe.links.is_some()
+                && (external || (embedded && self.is_up(brokers.own.as_ref(), no_other))),
             load_percent: self.load_percent,
+        }
+    }
+
+    /// Whether members on other machines are reached: by the node's own broker, unless it is `private` to this machine, or
+    /// by an external one for as long as there is a link to it.
+    pub(super) fn reaches_others(&self, plane: &DataPlane, private: bool, no_other: bool) -> bool {
+        !private || self.is_up(plane.external.as_ref(), no_other)
+    }
+
+    fn is_up(&self, broker: Option<&BrokerAddress>, no_other: bool) -> bool {
+        match broker.and_then(|broker| self.links.get(broker)) {
+            Some(LinkState::Up) => true,
+            Some(LinkState::Stalled) => no_other,
+            Some(LinkState::Down | LinkState::Refused) | None => false,
         }
     }
 }
@@ -226,6 +236,18 @@ mod tests {
         assert!(!fit(&monitor, true));
         monitor.note_link(&address(1), LinkState::Stalled);
         assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
+    }
+
+    #[test]
+    fn an_external_broker_makes_up_for_a_private_one_only_while_it_is_there() {
+        let mut monitor = HealthMonitor::default();
+        let plane = DataPlane { external: Some(address(9)), embedded: true };
+        let reaches = |monitor: &HealthMonitor, private| monitor.reaches_others(&plane, private, false);
+        assert_eq!((reaches(&monitor, true), reaches(&monitor, false)), (false, true), "never reached");
+        for (state, reached) in [(LinkState::Up, true), (LinkState::Stalled, false), (LinkState::Down, false)] {
+            monitor.note_link(&address(9), state);
+            assert_eq!(reaches(&monitor, true), reached, "{state:?}");
+        }
     }
 
     #[test]
