@@ -7,8 +7,9 @@
 //! ```
 //!
 //! A broker that cannot start is an answer to whoever asked, not a failure of the actor: the node decides whether
-//! another address, an external broker or giving up is right. One that ended by itself ends the actor as soon as anyone
-//! asks how it is, so that the node starts both anew.
+//! another address, an external broker or giving up is right. One that ended by itself, or hangs, ends the actor as soon as
+//! anyone asks how it is, so that the node starts both anew. One that hangs keeps its port, so that the node then ends: only
+//! a new process is rid of it.
 
 mod admission;
 mod embedded;
@@ -16,6 +17,7 @@ mod gate;
 mod holder;
 mod login;
 mod permissions;
+mod pulse;
 mod retained;
 mod throttle;
 
@@ -56,7 +58,7 @@ pub enum BrokerHealth {
     Stopped,
     /// Accepts clients at this address.
     Serving(SocketAddr),
-    /// Was started, but has ended by itself; a node without its broker must not lead. The actor ends with this answer.
+    /// Was started, but has ended by itself or hangs; a node without its broker must not lead. The actor ends with this answer.
     Dead,
 }
 
@@ -101,7 +103,7 @@ impl Actor for Broker {
                 let health = broker.health();
                 answer(reply, health);
                 if health == BrokerHealth::Dead {
-                    return Err("broker ended by itself".into());
+                    return Err("broker ended by itself or hangs".into());
                 }
             }
         }

@@ -23,6 +23,7 @@ mod link;
 mod part;
 mod probe;
 mod security;
+mod silence;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -46,6 +47,7 @@ pub use part::Part;
 pub use probe::probe;
 pub use security::{ENVELOPE_BYTES, Security, SecurityError};
 
+use crate::clock;
 use crate::counters::{Counters, Event};
 use connection::{Handling, LastWill, last_will};
 use inbox::Inbox;
@@ -340,7 +342,23 @@ impl GatewayState {
         let payload = Bytes::from(encode(payload, self.encoding));
         let path = self.topics.path(topic);
         if self.fits::<T>(&path, &payload) {
-            self.send(&path, &sealed(&self.setup.security, &path, payload), handling);
+            let payload = sealed(&self.setup.security, &path, payload);
+            self.send(&path, &payload, handling);
+            self.expect_back(topic);
+        }
+    }
+
+    /// Notes on which links what was just sent should come back, and which broker passes nothing on any more.
+    fn expect_back(&mut self, topic: &Topic) {
+        let now = clock::now();
+        let of_all = matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts);
+        let of_one = matches!(topic, Topic::Detections(_) | Topic::VoteDetections(_)) && self.part == Part::Candidate;
+        let reports: Vec<_> = self.links.values().map(|link| of_one && self.takes_reports_of(&link.broker)).collect();
+        for (link, reports) in self.links.values_mut().zip(reports) {
+            if (of_all || reports) && link.state == LinkState::Up && link.misses_echo(now) {
+                link.state = LinkState::Stalled;
+                tell_state(&self.setup.inbox, link);
+            }
         }
     }
 
@@ -404,6 +422,8 @@ impl GatewayState {
                 }
                 return;
             }
+            LinkNews::Answered if link.state == LinkState::Stalled => LinkState::Up,
+            LinkNews::Answered => return,
             LinkNews::Lost(state) => {
                 link.client = None;
                 state
@@ -411,10 +431,16 @@ impl GatewayState {
         };
         if link.state != state {
             link.state = state;
-            tracing::info!(broker = %link.broker, ?state, "link changed");
-            self.setup.inbox.deliver_local(Incoming::Link { broker: link.broker.clone(), state });
+            tell_state(&self.setup.inbox, link);
         }
     }
+}
+
+/// Tells this node's parts that a link is no longer as it was.
+fn tell_state(inbox: &Inbox, link: &Link) {
+    let (broker, state) = (link.broker.clone(), link.state);
+    tracing::info!(%broker, ?state, "link changed");
+    inbox.deliver_local(Incoming::Link { broker, state });
 }
 
 /// The payload with its signature, where payloads are signed.

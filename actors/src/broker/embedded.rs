@@ -1,7 +1,8 @@
-//! The embedded broker: rmqtt on a thread of its own, behind a gate where others than this machine's can reach it.
+//! The embedded broker: rmqtt on a thread of its own, in a node behind a gate.
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::{Arc, mpsc};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 use std::{fmt, io};
@@ -17,8 +18,10 @@ use tokio::sync::oneshot;
 
 use super::BrokerHealth;
 use super::gate::{Gate, Guard};
+use super::pulse::{PULSE, Pulse};
 use super::retained::RetainedMessages;
 use super::throttle::ClientThrottle;
+use crate::clock;
 use crate::counters::Counters;
 
 /// An MQTT broker that lives inside the process.
@@ -30,7 +33,7 @@ pub trait Mqtt: Send + fmt::Debug {
     fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError>;
 
     /// Disconnects all clients and frees the port before it returns; nothing happens when not started. Retained
-    /// messages are lost.
+    /// messages are lost. A broker that hangs is left to itself after a moment, and may keep its port.
     fn stop(&mut self);
 
     /// Whether it serves.
@@ -165,6 +168,9 @@ struct Running {
     address: SocketAddr,
     stop: oneshot::Sender<()>,
     thread: JoinHandle<()>,
+    /// Closed when the thread has ended.
+    ended: mpsc::Receiver<()>,
+    pulse: Mutex<Pulse>,
 }
 
 /// Largest packet of a broker that was not told of a cell's limits: the default maps and their topics.
@@ -173,22 +179,19 @@ const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
 /// How long connections may take to end when the broker stops; beyond it their thread is left to end by itself.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 
+/// How long the broker's thread is waited for.
+const END_TIMEOUT: Duration = Duration::from_millis(1500);
+
 impl EmbeddedBroker {
-    /// A broker that is not started.
+    /// A broker that is not started and has no gate: whoever reaches it is let in.
     pub fn new(config: BrokerConfig) -> Self {
         Self { config, guard: None, counters: Arc::default(), running: None }
     }
 
-    /// A broker behind a gate: clients show certificates, if the guard has any, and strangers are limited.
+    /// A broker that is not started, behind a gate: clients show certificates, if the guard has any, and strangers are limited.
     pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
         let counters = Arc::clone(&guard.counters);
         Self { config, guard: Some(guard), counters, running: None }
-    }
-
-    /// Counts what it does not pass on in `counters`.
-    pub fn counting(mut self, counters: Arc<Counters>) -> Self {
-        self.counters = counters;
-        self
     }
 
     fn listener(&self, address: SocketAddr) -> Builder {
@@ -213,16 +216,22 @@ impl Mqtt for EmbeddedBroker {
         let thread_error = |source| BrokerError::Thread { address, source };
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
+        let (ending, ended) = mpsc::channel();
+        let pulse = Pulse::default();
         let plan = Plan {
             address,
             listener: self.listener(address),
             config: self.config.clone(),
             guard: self.guard.clone(),
             counters: Arc::clone(&self.counters),
+            beats: pulse.beats(),
         };
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
-            .spawn(move || serve(plan, &ready, stopped))
+            .spawn(move || {
+                serve(plan, &ready, stopped);
+                drop::<mpsc::Sender<()>>(ending);
+            })
             .map_err(thread_error)?;
         let outcome = started.recv().unwrap_or_else(|_| Err(thread_error(io::Error::other("it ended at once"))));
         let bound = match outcome {
@@ -235,13 +244,16 @@ impl Mqtt for EmbeddedBroker {
                 return Err(error);
             }
         };
-        self.running = Some(Running { address: bound, stop, thread });
+        self.running = Some(Running { address: bound, stop, thread, ended, pulse: Mutex::new(pulse) });
         Ok(bound)
     }
 
     fn stop(&mut self) {
-        let Some(Running { address, stop, thread }) = self.running.take() else { return };
-        if stop.send(()).is_err() || thread.join().is_err() {
+        let Some(Running { address, stop, thread, ended, .. }) = self.running.take() else { return };
+        let told = stop.send(()).is_ok();
+        if ended.recv_timeout(END_TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
+            tracing::error!(%address, "broker hangs and is left to itself");
+        } else if thread.join().is_err() || !told {
             tracing::warn!(%address, "broker had ended by itself");
         }
     }
@@ -249,9 +261,15 @@ impl Mqtt for EmbeddedBroker {
     fn health(&self) -> BrokerHealth {
         match &self.running {
             None => BrokerHealth::Stopped,
-            Some(running) if running.thread.is_finished() => BrokerHealth::Dead,
+            Some(running) if running.thread.is_finished() || running.hangs() => BrokerHealth::Dead,
             Some(running) => BrokerHealth::Serving(running.address),
         }
+    }
+}
+
+impl Running {
+    fn hangs(&self) -> bool {
+        self.pulse.lock().unwrap_or_else(PoisonError::into_inner).is_lost(clock::now())
     }
 }
 
@@ -274,11 +292,13 @@ struct Plan {
     config: BrokerConfig,
     guard: Option<Guard>,
     counters: Arc<Counters>,
+    /// Counts on while the thread does not hang.
+    beats: Arc<AtomicU64>,
 }
 
 /// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made here.
 fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
-    let address = plan.address;
+    let (address, beats) = (plan.address, Arc::clone(&plan.beats));
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(source) => {
@@ -302,7 +322,15 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
                 None => std::future::pending().await,
             }
         };
+        let beating = async {
+            let mut ticks = tokio::time::interval(PULSE);
+            loop {
+                ticks.tick().await;
+                beats.fetch_add(1, Ordering::Relaxed);
+            }
+        };
         tokio::select! {
+            () = beating => {}
             ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
             () = admitting => tracing::error!("gate ended by itself"),
             _ = stopped => {}
@@ -313,7 +341,7 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
 
 /// Opens the sockets: rmqtt's own is the public one, or behind the gate's.
 async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketAddr)> {
-    let Plan { address, listener, config, guard, counters } = plan;
+    let Plan { address, listener, config, guard, counters, .. } = plan;
     let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let listener = match &guard {
         // Without anonymous clients, the hooks are asked about each.

@@ -24,7 +24,7 @@ use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
 use super::BrokerConfig;
-use super::admission::{Admission, Rate, Ticket};
+use super::admission::{Admission, Origin, Rate, Ticket};
 use super::holder::{Holder, Passes, Shares};
 use super::login;
 use super::permissions::{Elected, Permissions};
@@ -133,7 +133,10 @@ impl Gate {
     }
 
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
-        let Some(ticket) = self.admission.admit(from.ip(), clock::now()) else {
+        // Certificates tell even this machine's clients apart.
+        let is_here = self.current.is_none() && from.ip().to_canonical().is_loopback();
+        let origin = if is_here { Origin::Here } else { Origin::Address(from.ip()) };
+        let Some(ticket) = self.admission.admit(origin, clock::now()) else {
             self.shared.counters.count(Event::ClientThrottled);
             return;
         };
@@ -162,6 +165,8 @@ impl Gate {
 pub(super) enum TurnedAway {
     #[error("no login in time")]
     TimedOut,
+    #[error("no login before many others of its address wanted one")]
+    Displaced,
     #[error("not trusted: {0}")]
     Untrusted(String),
     #[error("no MQTT")]
@@ -180,6 +185,7 @@ impl TurnedAway {
     fn event(&self) -> Event {
         match self {
             Self::TimedOut => Event::ClientTimedOut,
+            Self::Displaced => Event::ClientThrottled,
             Self::Untrusted(_) => Event::ClientUntrusted,
             Self::Malformed | Self::Lost(_) => Event::ClientMalformed,
             Self::Full | Self::Crowded => Event::ClientsFull,
@@ -201,7 +207,7 @@ impl Shared {
         stream: TcpStream,
         from: SocketAddr,
         current: Option<watch::Receiver<Arc<Current>>>,
-        ticket: Ticket,
+        mut ticket: Ticket,
     ) -> Result<(), TurnedAway> {
         stream.set_nodelay(true)?;
         let mut stream = Box::pin(TimeoutStream::new(stream));
@@ -217,8 +223,11 @@ impl Shared {
             let connect = login::read(&mut stream).await?;
             Ok((stream, certificates, connect))
         };
-        let login = timeout_at(Instant::now() + self.patience, login).await;
-        let (stream, certificates, connect) = login.unwrap_or(Err(TurnedAway::TimedOut))?;
+        let login = tokio::select! {
+            login = timeout_at(Instant::now() + self.patience, login) => login.unwrap_or(Err(TurnedAway::TimedOut)),
+            () = ticket.displaced() => Err(TurnedAway::Displaced),
+        };
+        let (stream, certificates, connect) = login?;
         let identity = certificates.first().map(|certificate| Identity::of(certificate)).transpose();
         let identity = identity.map_err(|error| TurnedAway::Untrusted(error.to_string()))?;
         let holder = Holder::new(identity, from.ip(), connect.is_nameless);
@@ -232,7 +241,7 @@ impl Shared {
         let mut behind = socket.connect(self.behind).await?;
         behind.set_nodelay(true)?;
         behind.write_all(&connect.packet).await?;
-        drop(ticket);
+        let _visit = ticket.log_in();
         tokio::select! {
             () = relay(stream, behind) => Ok(()),
             error = expulsion(current, &certificates) => Err(TurnedAway::Expelled(error)),

@@ -13,14 +13,21 @@ pub enum ShedReason {
     ReportThrottled,
     /// A candidate shared evidence more often than `mqtt.max_report_hz`; the share was not decoded.
     LedgerThrottled,
+    /// A node told its status more often than `mqtt.max_report_hz`; it was not decoded.
+    StatusThrottled,
     /// A newer report of the same vehicle came before the fuser had taken this one.
     ReportReplaced,
 }
 
 impl ShedReason {
     /// All reasons.
-    pub const ALL: [Self; 4] =
-        [Self::BrokerThrottled, Self::ReportThrottled, Self::LedgerThrottled, Self::ReportReplaced];
+    pub const ALL: [Self; 5] = [
+        Self::BrokerThrottled,
+        Self::ReportThrottled,
+        Self::LedgerThrottled,
+        Self::StatusThrottled,
+        Self::ReportReplaced,
+    ];
 
     /// The reason as a counter's label.
     pub fn as_str(self) -> &'static str {
@@ -28,6 +35,7 @@ impl ShedReason {
             Self::BrokerThrottled => "broker_throttled",
             Self::ReportThrottled => "report_throttled",
             Self::LedgerThrottled => "ledger_throttled",
+            Self::StatusThrottled => "status_throttled",
             Self::ReportReplaced => "report_replaced",
         }
     }
@@ -112,7 +120,8 @@ mod tests {
         let others = snapshot.iter().find(|shed| shed.source == OTHERS).unwrap();
         assert_eq!(others.times, 2 * MAX_SOURCES as u64);
         let sums = shedding.sums();
-        let expected = [("broker_throttled", 0), ("ledger_throttled", 0), ("report_replaced", 0)];
+        let expected =
+            [("broker_throttled", 0), ("ledger_throttled", 0), ("report_replaced", 0), ("status_throttled", 0)];
         assert_eq!(
             sums,
             BTreeMap::from_iter(expected.into_iter().chain([("report_throttled", 4 * MAX_SOURCES as u64)]))

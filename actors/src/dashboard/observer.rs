@@ -261,6 +261,7 @@ fn ticks(period: Duration) -> Interval {
 fn link_label(state: LinkState) -> &'static str {
     match state {
         LinkState::Up => "up",
+        LinkState::Stalled => "stalled",
         LinkState::Down => "down",
         LinkState::Refused => "refused",
     }

@@ -42,7 +42,7 @@ pub(super) struct Picture {
     pub vehicles: Vec<Sighting>,
     /// This node and the others.
     pub nodes: Vec<NodeEntry>,
-    /// State of the link to each broker: `up`, `down` or `refused`.
+    /// State of the link to each broker: `up`, `stalled`, `down` or `refused`.
     pub links: BTreeMap<String, &'static str>,
     /// What went wrong or was left out, by reason.
     pub counters: CounterSnapshot,

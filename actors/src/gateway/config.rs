@@ -48,8 +48,8 @@ pub struct MqttConfig {
     pub send_queue: usize,
     /// Most decoded messages that receivers may be behind; default 1024. When full, new ones are dropped and counted.
     pub inbox: usize,
-    /// Most reports a second of one vehicle and kind, and shares of evidence of one candidate, and at once after a second of
-    /// silence; default 100. What is beyond is not decoded and counted by node. More lets one node take the others' time.
+    /// Most reports a second of one vehicle and kind, shares of evidence of one candidate, and statuses of one node, and at
+    /// once after a second of silence; default 100. What is beyond is not decoded and counted by node. More lets one node take the others' time.
     pub max_report_hz: u32,
     /// Largest report or status in bytes that is decoded; default 262144.
     pub max_payload_bytes: usize,

@@ -47,7 +47,9 @@ pub(super) enum Packet {
     Left,
     /// The broker answered a subscription and refused some of its filters, by their place in it, with its reason.
     Denied(Vec<(usize, String)>),
-    /// Something that only the protocol is concerned with.
+    /// Something was sent.
+    Sent,
+    /// Something came in that only the protocol is concerned with.
     Other,
 }
 
@@ -274,7 +276,8 @@ impl Connection {
                     denied(answer.return_codes, |code| matches!(code, rumqttc::SubscribeReasonCode::Success(_)))
                 }
                 rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
-                _ => Packet::Other,
+                rumqttc::Event::Outgoing(_) => Packet::Sent,
+                rumqttc::Event::Incoming(_) => Packet::Other,
             },
             Self::V5(events) => match events.poll().await.map_err(|e| ConnectionError::V5(Box::new(e)))? {
                 v5::Event::Incoming(v5::Incoming::ConnAck(_)) => Packet::Accepted,
@@ -285,7 +288,8 @@ impl Connection {
                     matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
                 }),
                 v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
-                _ => Packet::Other,
+                v5::Event::Outgoing(_) => Packet::Sent,
+                v5::Event::Incoming(_) => Packet::Other,
             },
         })
     }

@@ -55,6 +55,8 @@ pub enum Incoming {
 pub enum LinkState {
     /// Connected, subscribed, status published.
     Up,
+    /// Connected, but nothing comes back of what is sent: the broker hangs, or its answers are lost.
+    Stalled,
     /// Not connected; attempts go on.
     Down,
     /// Not connected and nothing listens there: the broker's process is gone. Attempts go on.
@@ -93,6 +95,7 @@ pub(super) struct Inbox {
     places: Arc<Semaphore>,
     reporters: [Mutex<Throttles<NodeName>>; ReportKind::COUNT],
     sharers: Mutex<Throttles<NodeName>>,
+    tellers: Mutex<Throttles<NodeName>>,
 }
 
 /// What became of a packet, as far as the link has to act on it.
@@ -127,6 +130,7 @@ impl Inbox {
             places: Arc::new(Semaphore::new(places)),
             reporters: std::array::from_fn(|_| Mutex::new(Throttles::new(max_report_hz))),
             sharers: Mutex::new(Throttles::new(max_report_hz)),
+            tellers: Mutex::new(Throttles::new(max_report_hz)),
         }
     }
 
@@ -202,7 +206,7 @@ impl Inbox {
                 }
                 Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?))
             }
-            Topic::Nodes(node) => return self.read_status(&node, payload),
+            Topic::Nodes(node) => return self.read_status(&node, payload, received_at),
             Topic::GlobalDetections => {
                 let map: GlobalMap = decode(payload, &self.limits)?;
                 if map.aggregator == self.node {
@@ -251,9 +255,13 @@ impl Inbox {
         Ok(Read::Message(Incoming::Report { kind, report }))
     }
 
-    fn read_status(&self, node: &NodeName, payload: &[u8]) -> Result<Read, RejectReason> {
+    fn read_status(&self, node: &NodeName, payload: &[u8], received_at: Timestamp) -> Result<Read, RejectReason> {
         if payload.is_empty() {
             return Ok(Read::Cleared);
+        }
+        if !self.tellers.lock().unwrap_or_else(PoisonError::into_inner).allow(node, received_at) {
+            self.counters.shed(ShedReason::StatusThrottled, node.as_str());
+            return Ok(Read::Shed);
         }
         let status: NodeStatus = decode(payload, &self.limits)?;
         if status.node != *node {
@@ -295,7 +303,7 @@ impl fmt::Debug for Inbox {
 mod tests {
     use std::collections::BTreeMap;
 
-    use ecod::wire::{Encoding, encode};
+    use ecod::wire::{Encoding, Role, encode};
 
     use super::*;
     use crate::counters::Shed;
@@ -369,6 +377,38 @@ mod tests {
             ["mallory", "euclid"].map(NodeName::from_static).map(|node| taken.lock().unwrap()[&node]);
         assert_eq!((mallory, euclid), (59, 10), "a second's worth at once, then 30 a second");
         let shed = Shed { reason: ShedReason::ReportThrottled, source: "mallory".into(), times: 10_000 - mallory };
+        assert_eq!(counters.all_shed(), [shed]);
+    }
+    #[test]
+    fn statuses_of_one_node_beyond_measure_reach_nobody() {
+        let counters = Arc::new(Counters::default());
+        let taken = Arc::new(Mutex::new(BTreeMap::<NodeName, u64>::new()));
+        let receiver = Arc::clone(&taken);
+        let inbox = Inbox::new(
+            (NodeName::new("edge").unwrap(), Uuid::nil()),
+            Topics::new(&NodeName::new("lot").unwrap()),
+            (Limits::default(), None),
+            (16, 30),
+            Arc::clone(&counters),
+            Arc::new(move |delivery| {
+                let Incoming::Status(status) = delivery.message else { return };
+                *receiver.lock().unwrap().entry(status.node.clone()).or_default() += 1;
+            }),
+        );
+        let accept = |node: &'static str, ms: u64| {
+            let status = NodeStatus::starting(NodeName::from_static(node), Uuid::max(), Role::Auto, "0.1.0");
+            let topic = format!("ecod/v1/lot/nodes/{node}");
+            inbox.accept(topic.as_bytes(), &encode(&status, Encoding::Json), Timestamp(ms * 1000))
+        };
+        for ms in 0..1000 {
+            accept("mallory", ms);
+            if ms % 250 == 0 {
+                accept("euclid", ms);
+            }
+        }
+        let taken = ["mallory", "euclid"].map(NodeName::from_static).map(|node| taken.lock().unwrap()[&node]);
+        assert_eq!(taken, [59, 4], "a second's worth at once, then 30 a second");
+        let shed = Shed { reason: ShedReason::StatusThrottled, source: "mallory".into(), times: 1000 - 59 };
         assert_eq!(counters.all_shed(), [shed]);
     }
 }

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use ecod::time::Timestamp;
 use ecod::wire::RejectReason;
 use ractor::ActorRef;
 use rand::{RngExt, SeedableRng};
@@ -17,6 +18,7 @@ use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet};
 use super::inbox::{Inbox, LinkState, Outcome};
 use super::security::Security;
+use super::silence::{Hearing, Silence};
 use crate::clock;
 use crate::counters::{Counters, Event};
 
@@ -39,6 +41,8 @@ pub(super) enum LinkNews {
     DeclaredOffline,
     /// Another living run has this node's name.
     Namesake(Uuid),
+    /// A broker that seemed stalled has sent something.
+    Answered,
     /// Not connected; attempts go on.
     Lost(LinkState),
 }
@@ -63,6 +67,8 @@ pub(super) struct Link {
     pub(super) broker: BrokerAddress,
     pub(super) state: LinkState,
     pub(super) client: Option<Client>,
+    hearing: Arc<Hearing>,
+    silence: Silence,
     task: Option<JoinHandle<()>>,
     abort: AbortHandle,
 }
@@ -75,10 +81,22 @@ impl Link {
         gateway: ActorRef<GatewayMessage>,
     ) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
-        let task = tokio::spawn(
-            Task { id, broker: broker.clone(), setup, gateway, told: None, told_oversized: false }.run(backoff),
-        );
-        Self { broker, state: LinkState::Down, client: None, abort: task.abort_handle(), task: Some(task) }
+        let (hearing, at) = (Arc::<Hearing>::default(), broker.clone());
+        let task = Task { id, broker: at, setup, gateway, hearing, told: None, told_oversized: false };
+        let hearing = Arc::clone(&task.hearing);
+        let task = tokio::spawn(task.run(backoff));
+        let (abort, silence) = (task.abort_handle(), Silence::default());
+        Self { broker, state: LinkState::Down, client: None, hearing, silence, abort, task: Some(task) }
+    }
+
+    /// Notes a message that the broker should pass back to this node, whether or not there was room for it; true when the
+    /// broker seems stalled.
+    pub(super) fn misses_echo(&mut self, now: Timestamp) -> bool {
+        let is_stalled = self.silence.note_sent(self.hearing.packets(), now);
+        if is_stalled {
+            self.hearing.miss();
+        }
+        is_stalled
     }
 
     /// Takes leave of the broker without a last will; what was queued before goes out first, within `patience`.
@@ -111,6 +129,7 @@ struct Task {
     broker: BrokerAddress,
     setup: Arc<LinkSetup>,
     gateway: ActorRef<GatewayMessage>,
+    hearing: Arc<Hearing>,
     /// What the broker refused, as last told of.
     told: Option<String>,
     told_oversized: bool,
@@ -178,16 +197,30 @@ impl Task {
         // The protocol's own timeouts are whole seconds.
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
+        self.hearing.note();
         self.told.take_if(|told| told.starts_with(NOT_ADMITTED));
         if !self.tell(LinkNews::Accepted(client)) {
             return Ok(());
         }
-        // Pings alone make a poll return every keep-alive; longer silence is a connection that hangs.
+        // Pings alone make something come in every keep-alive; longer silence is a connection that hangs. What is sent is no
+        // sign of life, and a poll that takes longer was held up on this side.
         let patience = 2 * config.keep_alive();
+        let mut silent = Duration::ZERO;
         let accepted = Instant::now();
         let mut heard_itself = false;
         loop {
-            match connection.next(patience).await.inspect_err(|_| counters.count(Event::Disconnected))? {
+            let polled = Instant::now();
+            let packet = connection.next(patience.saturating_sub(silent)).await;
+            let packet = packet.inspect_err(|_| counters.count(Event::Disconnected))?;
+            if matches!(packet, Packet::Sent) {
+                silent += polled.elapsed().min(config.keep_alive());
+                continue;
+            }
+            silent = Duration::ZERO;
+            if self.hearing.note() {
+                self.tell(LinkNews::Answered);
+            }
+            match packet {
                 Packet::Message { topic, payload } => match inbox.accept(&topic, &payload, clock::now()) {
                     Outcome::DeclaredOffline => {
                         self.tell(LinkNews::DeclaredOffline);
@@ -209,7 +242,7 @@ impl Task {
                     self.tell_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
                 Packet::Left => return Ok(()),
-                Packet::Accepted | Packet::Other => {}
+                Packet::Accepted | Packet::Sent | Packet::Other => {}
             }
             if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.told.is_none() {
                 self.tell_refusal(NOT_HEARD.to_owned());

@@ -111,7 +111,7 @@ impl ElectionDriver {
             all_members: arguments.members,
             missing_since: None,
             own_broker: arguments.own_broker,
-            monitor: HealthMonitor::default(),
+            monitor: HealthMonitor::new(clock::now()),
             health: Health::default(),
             routes: Routes::new(plane),
             runs: HashMap::new(),
@@ -354,8 +354,9 @@ impl ElectionDriver {
 
     async fn update_health(&mut self) -> Result<(), ActorProcessingErr> {
         let (plane, brokers) = (self.routes.plane(), self.routes.brokers());
-        let health = self.monitor.health(plane, brokers, self.round_period, clock::now());
-        let is_reached = self.is_reached();
+        let no_other = self.election.is_leading() && self.election.standby().is_none();
+        let health = self.monitor.health(plane, brokers, no_other, self.round_period);
+        let is_reached = self.is_reached(no_other);
         self.set_health(Health { broker: health.broker && is_reached, ..health }).await
     }
 

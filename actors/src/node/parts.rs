@@ -259,15 +259,17 @@ impl Assembly {
         Ok(id)
     }
 
-    /// Where only this machine reaches the broker, nothing has to stand between it and its clients.
+    /// The broker behind its gate: also where only this machine reaches it, who connects and says nothing would hold the
+    /// node's file descriptors.
     fn embedded_broker(&self) -> EmbeddedBroker {
         let (config, listen) = (self.config.broker(), self.config.broker_listen());
         let credentials = self.security.credentials.clone();
         match (&credentials, listen.ip().is_loopback()) {
-            (None, true) => {
-                tracing::info!("broker for this machine only: no certificates are configured");
-                return EmbeddedBroker::new(config).counting(self.counters());
-            }
+            (None, true) if self.config.data_plane().external.is_some() => tracing::warn!(
+                "mqtt.fallback_to_embedded serves this machine only: without certificates in [tls] or \
+                 broker.allow_plaintext other machines are without maps when the external broker is gone"
+            ),
+            (None, true) => tracing::info!("broker for this machine only: no certificates are configured"),
             (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
             (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
         }

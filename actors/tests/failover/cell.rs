@@ -43,8 +43,14 @@ impl Default for Cell {
 impl Cell {
     /// Starts a node on a runtime of its own; the first is the seed of the others.
     pub(crate) async fn start(&mut self, name: &str, role: Role) {
+        self.start_with(name, role, |_| ()).await;
+    }
+
+    /// The same with an adjusted configuration.
+    pub(crate) async fn start_with(&mut self, name: &str, role: Role, adjust: impl FnOnce(&mut NodeConfig)) {
         let is_seed = self.nodes.is_empty();
-        let config = config(name, role, is_seed.then_some(self.seed), self.seed, self.directory.path());
+        let mut config = config(name, role, is_seed.then_some(self.seed), self.seed, self.directory.path());
+        adjust(&mut config);
         let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
         let node = runtime.spawn(node::start(config)).await.unwrap().unwrap();
         self.nodes.insert(name.to_owned(), Running { node, runtime });
@@ -80,6 +86,15 @@ impl Cell {
 
     pub(crate) fn record(&self, name: &str) -> Record {
         Record::read(&self.directory.path().join(format!("{name}.maps")))
+    }
+
+    /// Waits until every node follows this node, whatever maps it gets.
+    pub(crate) async fn led_by(&self, leader: &str) {
+        self.until(&format!("all follow {leader}"), |cell| {
+            let follows = |name: &String| cell.leadership(name).leader().is_some_and(|name| name.as_str() == leader);
+            cell.names().iter().all(follows).then_some(())
+        })
+        .await;
     }
 
     /// Waits until every node takes maps of this node and follows it.

@@ -3,15 +3,20 @@
 //! Bounds in here are generous, for a machine that does much else; how long a gap usually is, is printed.
 
 mod cell;
+mod path;
 mod processes;
 mod record;
 
-use std::time::Duration;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
+use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::config::NodeConfig;
 use ecod_actors::leader_election::Position;
 
 use cell::Cell;
+use path::Path;
 
 /// A cell of an edge and three vehicles finds together by one seed, goes on without the edge, and gives it the lead back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -102,6 +107,42 @@ async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
     for name in ["euclid", "gauss"] {
         cell.record(name).never_goes_back();
     }
+    cell.stop().await;
+}
+
+/// A leader whose broker falls silent makes way for one whose broker does not, and for nobody else.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
+    let mut broker = EmbeddedBroker::new(BrokerConfig::default());
+    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let (first, second) = (Path::to(address).await, Path::to(address).await);
+    let mut cell = Cell::default();
+    for (name, path) in [("euclid", &first), ("gauss", &second)] {
+        let through = |config: &mut NodeConfig| {
+            config.mqtt.broker = Some(path.address.into());
+            // The protocol's own signs of life tell nothing in here.
+            config.mqtt.keep_alive_s = 600;
+        };
+        cell.start_with(name, Role::Auto, through).await;
+    }
+    cell.served_by("euclid").await;
+    cell.standby_is_named().await;
+    first.block(true);
+    let blocked = Instant::now();
+    cell.led_by("gauss").await;
+    eprintln!("the other led {:?} after the leader's broker fell silent", blocked.elapsed());
+
+    second.block(true);
+    let epoch = cell.leadership("gauss").epoch;
+    for _ in 0..30 {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        assert_eq!(cell.leadership("gauss").position, Position::Leading, "there is nobody to make way for");
+        assert_eq!(cell.leadership("gauss").epoch, epoch);
+    }
+    first.block(false);
+    cell.led_by("euclid").await;
+    second.block(false);
+    cell.served_by("euclid").await;
     cell.stop().await;
 }
 

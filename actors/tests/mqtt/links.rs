@@ -1,9 +1,12 @@
 //! Links: payloads pass, several at once, and after a broker's death.
 
+use std::time::{Duration, Instant};
+
 use ecod::wire::Encoding;
 use ecod_actors::broker::Mqtt;
 use ecod_actors::counters::Event;
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, LinkState, MqttConfig, MqttVersion, Part, Secret};
+use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion, Part, Secret};
+use tokio::task::JoinHandle;
 
 use crate::cell::{LOOPBACK, Node, embedded, map, name, until};
 use crate::mosquitto::Mosquitto;
@@ -178,4 +181,41 @@ async fn an_observer_takes_reports_whoever_stops_looking_at_them() {
     until("the status returns", || observer.counters.events(Event::Echo) > before).await;
     euclid.report(5);
     assert_eq!(observer.next_report().await, (name("euclid"), 5));
+}
+
+#[tokio::test]
+async fn a_broker_that_hangs_is_noticed_by_what_does_not_come_back() {
+    for version in [MqttVersion::V311, MqttVersion::V5] {
+        let broker = Mosquitto::start();
+        let address = broker.address();
+        // Long enough for the protocol's own signs of life to tell nothing in here.
+        let mqtt = MqttConfig { version, keep_alive_s: 600, ..MqttConfig::default() };
+        let mut edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[&address]).await;
+        let publishing = publish_maps(&edge);
+        tokio::time::sleep(Duration::from_secs(2)).await;
+        broker.freeze();
+        let frozen = Instant::now();
+        // Whatever was said of the link so far is that it came up: that was taken by `join`.
+        let stalled = edge.next(|message| match message {
+            Incoming::Link { state, .. } => Some(*state),
+            _ => None,
+        });
+        assert_eq!(stalled.await, LinkState::Stalled);
+        eprintln!("{version:?}: noticed after {:?}", frozen.elapsed());
+        broker.thaw();
+        edge.link(LinkState::Up).await;
+        publishing.abort();
+    }
+}
+
+/// Ten maps a second until aborted.
+fn publish_maps(node: &Node) -> JoinHandle<()> {
+    let gateway = node.gateway.clone();
+    tokio::spawn(async move {
+        let mut ticks = tokio::time::interval(Duration::from_millis(100));
+        for round in 1.. {
+            ticks.tick().await;
+            gateway.cast(GatewayMessage::PublishMap { map: map("edge", round) }).unwrap();
+        }
+    })
 }

@@ -77,6 +77,11 @@ pub(crate) struct Cell {
 
 impl Cell {
     pub(crate) async fn start() -> Self {
+        Self::start_with(|_| ()).await
+    }
+
+    /// The same with other limits.
+    pub(crate) async fn start_with(adjust: impl FnOnce(&mut BrokerConfig)) -> Self {
         let mut pki = Pki::new();
         let edge = pki.issue("edge", Role::Edge, DAY);
         let euclid = pki.issue("euclid", Role::Cav, DAY);
@@ -88,13 +93,14 @@ impl Cell {
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::clone(&counters),
         };
-        let config = BrokerConfig {
+        let mut config = BrokerConfig {
             max_packet_bytes: Some(MAX_PACKET as u32),
             handshake_timeout_ms: LOGIN.as_millis() as u64,
             connects_per_s: 1,
             max_clients_each: MAX_EACH,
             ..BrokerConfig::default()
         };
+        adjust(&mut config);
         let mut broker = EmbeddedBroker::guarded(config, guard);
         let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
         let mut edge = Client::new(address, "edge", &client_config("edge", &edge));

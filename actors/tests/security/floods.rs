@@ -1,10 +1,13 @@
 //! Clients that knock too often, wait too long, or send what is no MQTT or too much of it.
 
+use std::collections::VecDeque;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::wire::Role;
+use ecod_actors::broker::BrokerConfig;
+use ecod_actors::config::NodeConfig;
 use ecod_actors::counters::Event;
 use ecod_actors::pki::BROKER_NAME;
 use rand::{RngExt, SeedableRng};
@@ -16,14 +19,18 @@ use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
-use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config};
+use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, node};
 
 /// Another host than the honest ones, as far as a broker can see.
 const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
 
 async fn knock(broker: SocketAddr) -> TcpStream {
+    knock_from(ELSEWHERE, broker).await
+}
+
+async fn knock_from(address: Ipv4Addr, broker: SocketAddr) -> TcpStream {
     let socket = TcpSocket::new_v4().unwrap();
-    socket.bind((ELSEWHERE, 0).into()).unwrap();
+    socket.bind((address, 0).into()).unwrap();
     socket.connect(broker).await.unwrap()
 }
 
@@ -50,6 +57,37 @@ async fn who_knocks_too_often_is_not_heard_and_others_are() {
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     Client::new(cell.address, "gauss", &client_config("gauss", &files)).log_in().await.unwrap();
     cell.honest_traffic_goes_on().await;
+}
+
+/// A flood from the address of an honest node, such as from behind the same address translation.
+#[tokio::test]
+async fn a_node_comes_back_while_its_own_address_floods() {
+    let adjust = |config: &mut BrokerConfig| {
+        config.connects_per_s = 20;
+        config.handshake_timeout_ms = 5000;
+    };
+    let mut cell = Cell::start_with(adjust).await;
+    let broker = cell.address;
+    let flood = tokio::spawn(async move {
+        let mut held = VecDeque::new();
+        let mut ticks = tokio::time::interval(Duration::from_millis(20));
+        loop {
+            ticks.tick().await;
+            held.push_back(knock_from(Ipv4Addr::LOCALHOST, broker).await);
+            if held.len() > 200 {
+                held.pop_front();
+            }
+        }
+    });
+    // By now a stranger's burst would be used up, and as many wait as may.
+    cell.counted(Event::ClientThrottled, 60).await;
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    for _ in 0..5 {
+        Client::new(cell.address, "gauss", &client_config("gauss", &files)).log_in().await.expect("kept out");
+        cell.honest_traffic_goes_on().await;
+    }
+    assert!(!flood.is_finished());
+    flood.abort();
 }
 
 #[tokio::test]
@@ -146,17 +184,49 @@ async fn one_certificate_does_not_take_the_places_of_others() {
     timeout(SOON, returned).await.expect("who leaves makes room");
 }
 
+/// The broker of a node that nobody configured: for this machine only, without certificates.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn limits_hold_on_loopback_as_they_come() {
+    let mut config = NodeConfig { name: Some(node("edge")), role: Role::Edge, ..NodeConfig::default() };
+    config.listen = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+    config.membership.bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+    config.membership.multicast.enabled = false;
+    let edge = ecod_actors::node::start(config).await.unwrap();
+    let address = edge.broker_address().unwrap();
+    let mut silent = Vec::new();
+    for _ in 0..20 {
+        silent.push(knock_from(Ipv4Addr::LOCALHOST, address).await);
+    }
+    let mut dribbling = knock_from(Ipv4Addr::LOCALHOST, address).await;
+    dribbling.write_all(&[0x10, 60, 0, 4]).await.unwrap();
+    let mut options = rumqttc::MqttOptions::new("anyone", "127.0.0.1", address.port());
+    options.set_keep_alive(Duration::from_secs(5));
+    let (_client, mut events) = rumqttc::AsyncClient::new(options, 8);
+    timeout(SOON, events.poll()).await.expect("kept out").unwrap();
+    closed(&mut dribbling).await;
+    for stream in &mut silent {
+        closed(stream).await;
+    }
+    let counted = async {
+        while edge.counters().events(Event::ClientTimedOut) < 21 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    timeout(SOON, counted).await.expect("not counted");
+    edge.stop().await;
+}
+
 /// A broker that is not behind TLS but open to others has the same limits.
 #[tokio::test]
 async fn limits_hold_without_certificates_too() {
     use ecod::wire::Topics;
-    use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+    use ecod_actors::broker::{EmbeddedBroker, Guard, Mqtt};
     use ecod_actors::counters::Counters;
 
     let counters = Arc::<Counters>::default();
     let guard = Guard {
         credentials: None,
-        topics: Topics::new(&crate::fixture::node("lot")),
+        topics: Topics::new(&node("lot")),
         limits: Default::default(),
         elected: Arc::new(|_| true),
         counters: Arc::clone(&counters),

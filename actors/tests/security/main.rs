@@ -6,4 +6,5 @@ mod claims;
 mod fixture;
 mod floods;
 mod frames;
+mod hung;
 mod payloads;

@@ -60,15 +60,15 @@ impl ElectionDriver {
     }
 
     /// Whether the members reach the broker that this node would lead with; the first time that they do not is told of.
-    pub(super) fn is_reached(&mut self) -> bool {
+    pub(super) fn is_reached(&mut self, no_other: bool) -> bool {
         let is_private = self.own_broker.borrow().is_some_and(|broker| broker.ip().is_loopback());
-        let is_alone = self.routes.plane().external.is_some() || self.elsewhere.is_empty();
-        let is_reached = !is_private || is_alone;
+        let is_reached =
+            self.elsewhere.is_empty() || self.monitor.reaches_others(self.routes.plane(), is_private, no_other);
         if !is_reached && !std::mem::replace(&mut self.told_out_of_reach, true) {
             tracing::warn!(
                 members = ?self.elsewhere,
                 "other machines do not reach this node's broker: it does not lead; give the nodes certificates in [tls], \
-                 or set broker.allow_plaintext, or an external mqtt.broker"
+                 or set broker.allow_plaintext, or an external mqtt.broker that is there"
             );
         }
         is_reached

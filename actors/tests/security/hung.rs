@@ -1,0 +1,49 @@
+//! A broker whose thread hangs.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::{Arc, Mutex, mpsc};
+use std::time::{Duration, Instant};
+
+use ecod::wire::{Role, Topics};
+use ecod_actors::broker::{BrokerConfig, BrokerHealth, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::pki::Credentials;
+use tokio::time::{sleep, timeout};
+
+use crate::fixture::{Client, DAY, Pki, SOON, client_config, node};
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_broker_that_hangs_is_found_dead_and_not_waited_for() {
+    let mut pki = Pki::new();
+    let files = pki.issue("edge", Role::Edge, DAY);
+    let (release, held) = mpsc::channel::<()>();
+    let held = Mutex::new(held);
+    let guard = Guard {
+        credentials: Some(Arc::new(Credentials::load(&files, &node("edge")).unwrap())),
+        topics: Topics::new(&node("lot")),
+        limits: Default::default(),
+        // Asked on the broker's thread, and does not answer while the test runs.
+        elected: Arc::new(move |_| held.lock().unwrap().recv().is_ok()),
+        counters: Arc::default(),
+    };
+    let mut broker = EmbeddedBroker::guarded(BrokerConfig::default(), guard);
+    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let mut edge = Client::new(address, "edge", &client_config("edge", &files));
+    edge.log_in().await.unwrap();
+    for _ in 0..10 {
+        assert_eq!(broker.health(), BrokerHealth::Serving(address));
+        sleep(Duration::from_millis(250)).await;
+    }
+    edge.publish("ecod/v1/lot/global_detections", b"map");
+    let driving = tokio::spawn(async move { edge.drive().await });
+    let found = async {
+        while broker.health() != BrokerHealth::Dead {
+            sleep(Duration::from_millis(250)).await;
+        }
+    };
+    timeout(SOON, found).await.expect("still taken for well");
+    let begun = Instant::now();
+    broker.stop();
+    assert!(begun.elapsed() < SOON / 2, "waited {:?} for a broker that hangs", begun.elapsed());
+    driving.abort();
+    drop(release);
+}
