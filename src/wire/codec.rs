@@ -220,6 +220,21 @@ mod tests {
     }
 
     #[test]
+    fn a_compact_object_with_all_that_a_vote_needs_takes_at_most_40_bytes() {
+        let object = |x_m: f64, y_m: f64| PerceivedObject {
+            covariance_m2: Some([0.0123, -0.0045, 0.0678]),
+            landmark: Some("slot-31".into()),
+            ..PerceivedObject::new("ABCD123", 0.931, x_m, y_m)
+        };
+        // A coordinate takes the same bytes from 65.536 m to 4,294 km.
+        for (x_m, y_m) in [(65.537, -65.538), (-48_211.007, 90_310.12), (4_294_967.0, -4_294_967.0)] {
+            let with = |objects| ObjectReport { objects: vec![object(x_m, y_m); objects], ..report() };
+            let [ten, eleven] = [10, 11].map(|objects| encode(&with(objects), Encoding::Compact).len());
+            assert!(eleven - ten <= 40, "{} bytes at {x_m}, {y_m}", eleven - ten);
+        }
+    }
+
+    #[test]
     fn unknown_fields_are_ignored_and_optional_ones_may_be_null() {
         let text = r#" {"schema":1,"node":"euclid","seq":1,"captured_at_us":5,"pose":null,"objects":[],"mood":[1e3]}"#;
         let report = decode_report(text.as_bytes(), &node(), &Limits::default()).unwrap();
