@@ -10,6 +10,8 @@
 //! another address, an external broker or giving up is right. One that ended by itself ends the actor as soon as anyone
 //! asks how it is, so that the node starts both anew.
 
+#![deny(clippy::indexing_slicing)]
+
 mod admission;
 mod embedded;
 mod gate;
@@ -25,6 +27,8 @@ use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
 
 pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, Mqtt};
 pub use gate::Guard;
+#[cfg(fuzzing)]
+pub use login::read_login;
 pub use permissions::Elected;
 
 /// What the broker's actor is asked to do.

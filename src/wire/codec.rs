@@ -24,6 +24,7 @@ pub enum Encoding {
 ///
 /// # Panics
 /// Never for the payloads of this crate: they serialise into memory.
+#[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
     match encoding {

@@ -82,6 +82,7 @@ fn spots(vehicle: usize, known: &[LandmarkConfig]) -> Vec<LandmarkConfig> {
 ///
 /// # Panics
 /// Never: a number makes a name.
+#[expect(clippy::expect_used, reason = "letters, a dash and digits are a name")]
 fn name(vehicle: usize) -> NodeName {
     NodeName::new(format!("cav-{vehicle}")).expect("a number makes a name")
 }

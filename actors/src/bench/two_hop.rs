@@ -110,6 +110,7 @@ pub async fn raw(broker: &BrokerAddress, load: Load) -> Result<Histogram<u64>, T
 ///
 /// # Panics
 /// Never: the bounds are allowed.
+#[expect(clippy::expect_used, reason = "the bounds are constant and allowed")]
 pub fn latencies() -> Histogram<u64> {
     Histogram::new_with_bounds(1, 60_000_000_000, 3).expect("the bounds are allowed")
 }
