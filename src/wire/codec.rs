@@ -105,7 +105,7 @@ fn names_no_number(bytes: &[u8], error: &serde_json::Error) -> bool {
     let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
     // The column is that of the word's first letter, or of one beside it.
     let from = line.get(error.column().saturating_sub(3)..).unwrap_or_default();
-    let around = &from[..from.len().min("-Infinity".len() + 2)];
+    let around = from.get(.."-Infinity".len() + 2).unwrap_or(from);
     ["NaN", "Infinity"].iter().any(|word| around.windows(word.len()).any(|part| part == word.as_bytes()))
 }
 
