@@ -3,7 +3,8 @@
 use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 
-use crate::names::Label;
+use crate::names::{Label, MAX_NAME_BYTES};
+use crate::wire::is_label;
 
 /// An axis-aligned box in pixels; x grows to the right, y downwards.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -77,4 +78,24 @@ pub struct Detection {
     /// Corners of a square target in pixels, as seen from its front: top left, top right, bottom right, bottom left.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub corners: Option<[Point2<f64>; 4]>,
+}
+
+/// The detections of one frame, from a line of a recording: a JSON array.
+///
+/// # Errors
+/// What is wrong with it, in words.
+pub fn detections_in(line: &str) -> Result<Vec<Detection>, String> {
+    let detections: Vec<Detection> = serde_json::from_str(line).map_err(|error| error.to_string())?;
+    for Detection { label, confidence, bounding_box, .. } in &detections {
+        if !bounding_box.is_valid() {
+            return Err(format!("the box of {label:?} has no area"));
+        }
+        if !is_label(label) {
+            return Err(format!("the label {label:?} is no text of 1 to {MAX_NAME_BYTES} bytes"));
+        }
+        if !(0.0..=1.0).contains(confidence) {
+            return Err(format!("the confidence of {label:?} is {confidence}, must be 0 to 1"));
+        }
+    }
+    Ok(detections)
 }

@@ -42,6 +42,8 @@
 //! To keep a leader's packets few, only its standby gets every beat, its other successors every eighth, and everyone else
 //! one each `idle_beat_ms`.
 
+#![deny(clippy::indexing_slicing)]
+
 mod claiming;
 mod clock;
 mod config;

@@ -4,7 +4,8 @@
 //! equal inputs give equal outputs. Lengths are metres, angles radians, positions east-north with counter-clockwise
 //! headings; other units are converted where they enter.
 
-#![deny(clippy::unwrap_used, clippy::panic, clippy::todo, clippy::unimplemented)]
+#![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+#![cfg_attr(not(test), deny(clippy::string_slice))]
 
 pub mod aggregator;
 pub mod camera;

@@ -105,6 +105,7 @@ pub struct TruthObject {
 }
 
 /// The name of an observer.
+#[expect(clippy::expect_used, reason = "letters, a dash and digits are a name")]
 pub fn observer_name(number: usize) -> NodeName {
     NodeName::new(format!("cav-{number}")).expect("letters, a dash and digits are a name")
 }

@@ -14,6 +14,8 @@
 //!
 //! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
 
+#![deny(clippy::indexing_slicing)]
+
 mod check;
 mod codec;
 mod compact;

@@ -11,6 +11,8 @@
 //! anyone asks how it is, so that the node starts both anew. One that hangs keeps its port, so that the node then ends: only
 //! a new process is rid of it.
 
+#![deny(clippy::indexing_slicing)]
+
 mod admission;
 mod embedded;
 mod gate;
@@ -27,6 +29,8 @@ use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
 
 pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, Mqtt};
 pub use gate::Guard;
+#[cfg(fuzzing)]
+pub use login::read_login;
 pub use permissions::Elected;
 
 /// What the broker's actor is asked to do.

@@ -31,6 +31,8 @@ use anyhow::Context;
 use clap::{CommandFactory, Parser, Subcommand};
 use serde::Serialize;
 
+#[cfg(fuzzing)]
+pub use replay::rounds_of_log;
 pub use run::RunArguments;
 
 use logging::LogFormat;

@@ -1,6 +1,7 @@
 //! ECOD nodes: the actors, transports and cameras around the core of [`ecod`].
 
-#![deny(clippy::unwrap_used, clippy::panic, clippy::todo, clippy::unimplemented)]
+#![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+#![cfg_attr(not(test), deny(clippy::string_slice))]
 
 pub mod bench;
 pub mod broker;

@@ -5,6 +5,8 @@
 //!                                └──> MembershipEvent, watch of all members
 //! ```
 
+#![deny(clippy::indexing_slicing)]
+
 mod config;
 mod counters;
 mod frame;
@@ -236,7 +238,7 @@ impl MembershipState {
         let mut buffer = [0; 2 * MAX_PAYLOAD_BYTES];
         for _ in 0..MOST_AT_ONCE {
             let Some((length, from)) = self.socket.receive(&mut buffer) else { break };
-            self.machine.receive(&buffer[..length], from, clock::now());
+            self.machine.receive(buffer.get(..length).unwrap_or_default(), from, clock::now());
             self.carry_out();
         }
         self.machine.tick(clock::now());

@@ -34,6 +34,8 @@ use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
+#[cfg(fuzzing)]
+pub use book::read_saved;
 pub use book::{Book, SharedBook};
 pub use config::ReputationKeeperConfig;
 

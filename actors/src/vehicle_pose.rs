@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 
 use ecod::config::{ConfigError, check_range};
 use ecod::geometry::Pose;
+use ecod::time::Timestamp;
 use serde::{Deserialize, Serialize};
 
 /// The vehicle's pose in the cell's east-north frame; `[pose]` in the configuration file.
@@ -36,5 +37,62 @@ impl PoseConfig {
     /// The constant pose.
     pub fn pose(&self) -> Pose {
         Pose::new(self.x_m, self.y_m, self.heading_deg.to_radians())
+    }
+}
+
+/// A pose as told; unknown fields are left alone.
+#[derive(Debug, Deserialize)]
+struct Fix {
+    x_m: f64,
+    y_m: f64,
+    heading_rad: f64,
+    /// Unix time by this machine's clock; the time of receipt without it.
+    captured_at_us: Option<Timestamp>,
+}
+
+/// Farthest from the origin that a vehicle may be, in metres.
+const WORLD_M: f64 = 1e8;
+
+/// A pose and its time, as localisation tells it in JSON:
+///
+/// ```json
+/// {"x_m": 4.2, "y_m": -1.0, "heading_rad": 1.57, "captured_at_us": 1732154400000000}
+/// ```
+///
+/// # Errors
+/// What is wrong with it, in words.
+pub fn read_pose(datagram: &[u8], now: Timestamp) -> Result<(Timestamp, Pose), String> {
+    let fix: Fix = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
+    let within = |value: f64, most: f64| value.abs() <= most;
+    if !within(fix.x_m, WORLD_M) || !within(fix.y_m, WORLD_M) || !within(fix.heading_rad, 1e3) {
+        return Err(format!("{fix:?} is not in this world"));
+    }
+    Ok((fix.captured_at_us.unwrap_or(now), Pose::new(fix.x_m, fix.y_m, fix.heading_rad)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pose_has_its_own_time_or_that_of_its_receipt() {
+        let now = Timestamp(7);
+        let told =
+            read_pose(br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#, now).unwrap();
+        assert_eq!(told, (Timestamp(5), Pose::new(1.0, -2.5, 3.1)));
+        assert_eq!(read_pose(br#"{"x_m":1,"y_m":2,"heading_rad":0}"#, now).unwrap().0, now);
+    }
+
+    #[test]
+    fn what_is_no_pose_is_refused_with_a_reason() {
+        for (datagram, reason) in [
+            (&b"{\"x_m\":1,\"y_m\":2}"[..], "heading_rad"),
+            (b"{\"x_m\":1e12,\"y_m\":2,\"heading_rad\":0}", "world"),
+            (b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":0,\"captured_at_us\":-1}", "invalid value"),
+            (b"\xff\xfe", "line 1"),
+        ] {
+            let error = read_pose(datagram, Timestamp(0)).unwrap_err();
+            assert!(error.contains(reason), "{error}");
+        }
     }
 }

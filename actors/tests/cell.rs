@@ -158,7 +158,7 @@ async fn the_cell_goes_on_under_another_candidate_when_a_supervisor_is_killed() 
         config.membership.seeds = seeds.clone();
         others.push(node::start(config).await.unwrap());
     }
-    let [gauss, euclid] = &others[..] else { unreachable!("two were started") };
+    let [gauss, euclid] = &others[..] else { panic!("two were started") };
     let led_by =
         |name: &'static str| move |map: &GlobalMap| map.aggregator.as_str() == name && label(map, 0) == Some("x");
     reported(euclid, euclid, || report("euclid", "x", 0), led_by("edge")).await;

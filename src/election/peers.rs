@@ -182,8 +182,10 @@ impl Peers {
     /// beats that a standby may miss: the membership may hear less than the election does.
     pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
         let silence = self.patience / 4;
-        let given_up =
-            |name: &NodeName| self.table[name].given_up_at.is_some() && !self.heard_since(name, now - silence);
+        let given_up = |name: &NodeName| {
+            self.table.get(name).is_some_and(|peer| peer.given_up_at.is_some())
+                && !self.heard_since(name, now - silence)
+        };
         let mut fit: Vec<_> =
             self.candidates(now).filter(|(name, _)| self.hears(name, now) && !given_up(name)).collect();
         fit.sort_by_key(|&(name, standing)| (standing.class(), standing.load, name.clone()));
@@ -207,7 +209,7 @@ impl Peers {
                 let (ours, theirs) = (standing.class(), other.class());
                 theirs < ours || (theirs == ours && other.load <= standing.load && name < leader)
             })
-            .filter_map(|(name, other)| Some((name, other, self.table[name].fit_since? + stable)))
+            .filter_map(|(name, other)| Some((name, other, self.table.get(name)?.fit_since? + stable)))
             .min_by_key(|&(name, other, from)| (from > now, other.class(), name.clone()))
             .map(|(name, _, from)| (name.clone(), from))
     }

@@ -151,6 +151,7 @@ fn is_free(vehicles: &[Vehicle], number: usize, crossing: Crossing, heading: Dir
 
 impl Vehicle {
     /// What it drives on after this.
+    #[expect(clippy::expect_used, reason = "the grid of roads has no dead ends")]
     fn next(&self, roads: &Roads) -> Path {
         match self.path {
             Path::Turn { at, to, .. } => Path::Lane { from: at, heading: to },

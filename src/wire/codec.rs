@@ -24,6 +24,7 @@ pub enum Encoding {
 ///
 /// # Panics
 /// Never for the payloads of this crate: they serialise into memory.
+#[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
     match encoding {
@@ -104,7 +105,7 @@ fn names_no_number(bytes: &[u8], error: &serde_json::Error) -> bool {
     let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
     // The column is that of the word's first letter, or of one beside it.
     let from = line.get(error.column().saturating_sub(3)..).unwrap_or_default();
-    let around = &from[..from.len().min("-Infinity".len() + 2)];
+    let around = from.get(.."-Infinity".len() + 2).unwrap_or(from);
     ["NaN", "Infinity"].iter().any(|word| around.windows(word.len()).any(|part| part == word.as_bytes()))
 }
 
@@ -216,6 +217,21 @@ mod tests {
         for (payload, expected) in table {
             let decoded = decode_report(&payload, &node(), &Limits::default());
             assert_eq!(decoded, Err(expected), "{:?}", String::from_utf8_lossy(&payload[..payload.len().min(99)]));
+        }
+    }
+
+    #[test]
+    fn a_compact_object_with_all_that_a_vote_needs_takes_at_most_40_bytes() {
+        let object = |x_m: f64, y_m: f64| PerceivedObject {
+            covariance_m2: Some([0.0123, -0.0045, 0.0678]),
+            landmark: Some("slot-31".into()),
+            ..PerceivedObject::new("ABCD123", 0.931, x_m, y_m)
+        };
+        // A coordinate takes the same bytes from 65.536 m to 4,294 km.
+        for (x_m, y_m) in [(65.537, -65.538), (-48_211.007, 90_310.12), (4_294_967.0, -4_294_967.0)] {
+            let with = |objects| ObjectReport { objects: vec![object(x_m, y_m); objects], ..report() };
+            let [ten, eleven] = [10, 11].map(|objects| encode(&with(objects), Encoding::Compact).len());
+            assert!(eleven - ten <= 40, "{} bytes at {x_m}, {y_m}", eleven - ten);
         }
     }
 

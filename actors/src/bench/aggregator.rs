@@ -10,11 +10,15 @@ use ecod::names::NodeName;
 use ecod::wire::Role;
 use tokio::net::TcpStream;
 
+use super::access::Access;
 use super::load::landmarks;
 use super::measurement::Target;
 use crate::config::NodeConfig;
 use crate::node_process::{NodeProcess, free_address};
 use crate::recorder::RecordConfig;
+
+/// All vehicles of the largest load vote.
+const MOST_VOTERS: usize = 1000;
 
 /// A running aggregator; killed when dropped, though only [`OwnAggregator::stop`] removes its files.
 #[derive(Debug)]
@@ -43,6 +47,7 @@ impl OwnAggregator {
             record: records.then(|| RecordConfig::new(directory.join("log"))),
             ..NodeConfig::default()
         };
+        config.fusion.vote.max_vehicles = MOST_VOTERS;
         config.dashboard.listen = Some(page);
         config.membership.bind = Some(([127, 0, 0, 1], 0).into());
         config.membership.multicast.enabled = false;
@@ -52,10 +57,11 @@ impl OwnAggregator {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
         let target = Target {
-            broker: broker.into(),
+            access: Access::open(broker.into()),
             cell: config.cell,
             landmarks: config.landmarks,
             encoding: config.mqtt.encoding,
+            votes: true,
             aggregator: process.pid(),
         };
         Ok(Self { process, directory, target, page })

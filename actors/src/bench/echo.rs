@@ -2,15 +2,14 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::thread;
 
 use anyhow::Context;
 use rumqttc::{Event, Packet, QoS};
 use tokio::sync::oneshot;
 
-use super::two_hop::subscribed;
-use crate::gateway::BrokerAddress;
+use super::access::Access;
+use super::vehicle::AnswerBytes;
 
 /// Where vehicles send; below it their names.
 pub(super) const OUT: &str = "ecod/bench/out";
@@ -18,18 +17,20 @@ pub(super) const OUT: &str = "ecod/bench/out";
 /// Where the answers are.
 pub(super) const BACK: &str = "ecod/bench/back";
 
-/// Answers once all vehicles have sent; has a thread of its own, as the aggregator has, and ends when dropped.
+/// Answers once all vehicles have sent, with a map's and a verdict's bytes; has a thread of its own, as the aggregator has, and ends when dropped.
 #[derive(Debug)]
 pub(super) struct Echo {
     _stop: oneshot::Sender<()>,
 }
 
 impl Echo {
-    /// Starts it; it is subscribed when this returns. Answers have as many bytes as `answer_bytes` says when they are sent.
+    /// Starts it; it is subscribed when this returns. A tick is complete with `packets`, and its answers have as many bytes as
+    /// `answer_bytes` says when they are sent; without verdicts there is one.
     pub(super) async fn start(
-        broker: BrokerAddress,
-        vehicles: usize,
-        answer_bytes: Arc<AtomicUsize>,
+        access: Access,
+        packets: usize,
+        answer_bytes: Arc<AnswerBytes>,
+        votes: bool,
     ) -> anyhow::Result<Self> {
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = oneshot::channel();
@@ -37,7 +38,7 @@ impl Echo {
         let serve = async move {
             // An aggregator gets its own maps back too.
             let filters = [&*format!("{OUT}/+"), BACK];
-            let (client, mut events) = match subscribed(&broker, "ecod-bench-echo", &filters).await {
+            let (client, mut events) = match access.subscribed("ecod-bench-echo", &filters).await {
                 Ok(connected) => connected,
                 Err(error) => return ready.send(Err(error)).unwrap_or_default(),
             };
@@ -49,12 +50,14 @@ impl Echo {
                 let Some(tick) = tick_of(&publish.payload).filter(|_| publish.topic != BACK) else { continue };
                 let count = arrived.entry(tick).or_default();
                 *count += 1;
-                if *count == vehicles {
+                if *count == packets {
                     // Those of before that are incomplete lost packets.
                     arrived.retain(|earlier, _| *earlier > tick);
-                    let answer = stamped(tick, vec![0; answer_bytes.load(Relaxed)]);
-                    // A refusal shows as a missing answer.
-                    client.try_publish(BACK, QoS::AtMostOnce, false, answer).unwrap_or_default();
+                    for bytes in answer_bytes.all().into_iter().take(1 + usize::from(votes)) {
+                        let answer = stamped(tick, vec![0; bytes]);
+                        // A refusal shows as a missing answer.
+                        client.try_publish(BACK, QoS::AtMostOnce, false, answer).unwrap_or_default();
+                    }
                 }
             }
         };

@@ -1,5 +1,7 @@
 //! Distribution of latencies.
 
+use std::time::Instant;
+
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
@@ -12,6 +14,15 @@ pub struct Latencies {
     pub histogram: Histogram<u64>,
     /// Answers that never came.
     pub missing: u64,
+}
+
+/// What came back by one way.
+#[derive(Debug, Clone, Default)]
+pub struct Answers {
+    /// As maps.
+    pub map: Latencies,
+    /// As verdicts; empty where nobody votes.
+    pub verdict: Latencies,
 }
 
 /// Quantiles of a distribution.
@@ -43,6 +54,13 @@ impl Latencies {
         self.missing += other.missing;
     }
 
+    /// Takes in one answer that was due, or the time for which it was waited.
+    pub(super) fn take(&mut self, due: Instant, arrival: Option<Instant>, waited_until: Instant) {
+        self.missing += u64::from(arrival.is_none());
+        let taken = arrival.unwrap_or(waited_until).saturating_duration_since(due);
+        self.histogram.saturating_record(u64::try_from(taken.as_nanos()).unwrap_or(u64::MAX));
+    }
+
     /// What is usually said of a distribution.
     pub fn quantiles(&self) -> Quantiles {
         let micros = |quantile| self.histogram.value_at_quantile(quantile) as f64 / 1000.0;
@@ -53,5 +71,13 @@ impl Latencies {
             n: self.histogram.len(),
             missing: self.missing,
         }
+    }
+}
+
+impl Answers {
+    /// Takes those of another run in.
+    pub fn add(&mut self, other: &Self) {
+        self.map.add(&other.map);
+        self.verdict.add(&other.verdict);
     }
 }

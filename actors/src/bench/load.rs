@@ -20,12 +20,14 @@ pub struct Load {
     pub duration: Duration,
     /// Whether the bare way is measured too.
     pub bare: bool,
+    /// Whether vehicles vote too, with a second report before that for the map.
+    pub votes: bool,
 }
 
 impl Load {
-    /// Reports of this many vehicles ten times a second, all at once, beside the bare way.
+    /// Reports and votes of this many vehicles ten times a second, all at once, beside the bare way.
     pub fn new(vehicles: usize, duration: Duration) -> Self {
-        Self { vehicles, period: Duration::from_millis(100), spread: Duration::ZERO, duration, bare: true }
+        Self { vehicles, period: Duration::from_millis(100), spread: Duration::ZERO, duration, bare: true, votes: true }
     }
 
     /// How often every vehicle reports, at least twice.
@@ -47,24 +49,40 @@ pub fn landmarks() -> Vec<LandmarkConfig> {
     (0..32).map(|index| LandmarkConfig::at(format!("slot-{index}"), 3.0 * f64::from(index), 0.0)).collect()
 }
 
-/// What one vehicle says of ten neighbouring locations: an object at each, and that all were in view.
+/// What one vehicle says of ten neighbouring locations: an object at each, and that all were in view. In a cell that has no
+/// locations, objects stand where [`landmarks`] are.
 pub(super) fn report(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport {
-    let spots = landmarks.iter().cycle().skip(vehicle % landmarks.len().max(1)).take(OBJECTS.min(landmarks.len()));
+    let spots = spots(vehicle, landmarks);
     let object = |spot: &LandmarkConfig| PerceivedObject {
         covariance_m2: Some([0.01, 0.0012, 0.0104]),
         ..PerceivedObject::new("ABCD123", 0.931, spot.x_m + 0.1037, spot.y_m - 0.0512)
     };
     ObjectReport {
-        objects: spots.clone().map(object).collect(),
-        seen: Some(spots.map(|spot| spot.id.clone()).collect()),
+        objects: spots.iter().map(object).collect(),
+        seen: (!landmarks.is_empty()).then(|| spots.iter().map(|spot| spot.id.clone()).collect()),
         ..ObjectReport::new(name(vehicle), 0, Timestamp(0))
     }
+}
+
+/// The same as votes.
+pub(super) fn vote(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport {
+    let mut vote = report(vehicle, landmarks);
+    for (object, spot) in vote.objects.iter_mut().zip(spots(vehicle, landmarks)) {
+        object.landmark = Some(spot.id);
+    }
+    ObjectReport { seen: None, ..vote }
+}
+
+fn spots(vehicle: usize, known: &[LandmarkConfig]) -> Vec<LandmarkConfig> {
+    let lot = if known.is_empty() { landmarks() } else { known.to_vec() };
+    lot.iter().cycle().skip(vehicle % lot.len()).take(OBJECTS.min(lot.len())).cloned().collect()
 }
 
 /// The vehicle's name.
 ///
 /// # Panics
 /// Never: a number makes a name.
+#[expect(clippy::expect_used, reason = "letters, a dash and digits are a name")]
 fn name(vehicle: usize) -> NodeName {
     NodeName::new(format!("cav-{vehicle}")).expect("a number makes a name")
 }
@@ -79,7 +97,21 @@ mod tests {
         let spots = |vehicle| report(vehicle, &lot).seen.unwrap_or_default();
         assert_eq!(spots(30).len(), OBJECTS);
         assert_eq!(spots(30)[1..], spots(31)[..OBJECTS - 1]);
-        assert_eq!(report(5, &[]).objects.len(), 0);
+    }
+
+    #[test]
+    fn votes_name_the_spots_of_the_report() {
+        let vote = vote(3, &landmarks());
+        assert_eq!(vote.objects[0].landmark.as_deref(), Some("slot-3"));
+        let at = |report: &ObjectReport| report.objects.iter().map(|object| object.x_m).collect::<Vec<_>>();
+        assert_eq!(at(&vote), at(&report(3, &landmarks())));
+    }
+
+    #[test]
+    fn a_cell_without_locations_has_objects_all_the_same() {
+        let report = report(5, &[]);
+        assert_eq!((report.objects.len(), report.seen), (OBJECTS, None));
+        assert!(vote(5, &[]).objects.iter().all(|object| object.landmark.is_some()));
     }
 
     #[test]

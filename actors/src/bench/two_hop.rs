@@ -4,10 +4,11 @@
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
-use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, NetworkOptions, Packet, Publish, QoS, SubscribeFilter};
+use rumqttc::{Event, EventLoop, Packet, Publish, QoS};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 
+use super::access::Access;
 use crate::gateway::BrokerAddress;
 
 /// What is sent.
@@ -61,8 +62,9 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// [`TwoHopError`] when the broker cannot be reached or loses messages.
 pub async fn raw(broker: &BrokerAddress, load: Load) -> Result<Histogram<u64>, TwoHopError> {
     let error = |source| TwoHopError::Connection { broker: broker.clone(), source: Box::new(source) };
-    let (echoer, echo_events) = subscribed(broker, "ecod-bench-echo", &[OUT]).await.map_err(error)?;
-    let (sender, events) = subscribed(broker, "ecod-bench", &[BACK]).await.map_err(error)?;
+    let access = Access::open(broker.clone());
+    let (echoer, echo_events) = access.subscribed("ecod-bench-echo", &[OUT]).await.map_err(error)?;
+    let (sender, events) = access.subscribed("ecod-bench", &[BACK]).await.map_err(error)?;
     let (arrivals, mut arrived) = mpsc::unbounded_channel();
     let echo = tokio::spawn(each_message(echo_events, move |publish| {
         echoer.try_publish(BACK, QoS::AtMostOnce, false, publish.payload).is_ok()
@@ -108,36 +110,13 @@ pub async fn raw(broker: &BrokerAddress, load: Load) -> Result<Histogram<u64>, T
 ///
 /// # Panics
 /// Never: the bounds are allowed.
+#[expect(clippy::expect_used, reason = "the bounds are constant and allowed")]
 pub fn latencies() -> Histogram<u64> {
     Histogram::new_with_bounds(1, 60_000_000_000, 3).expect("the bounds are allowed")
 }
 
-/// A connected client that is subscribed to the topics.
-pub(super) async fn subscribed(
-    broker: &BrokerAddress,
-    client_id: &str,
-    topics: &[&str],
-) -> Result<(AsyncClient, EventLoop), rumqttc::ConnectionError> {
-    let mut options = MqttOptions::new(client_id, broker.host(), broker.port());
-    options.set_max_packet_size(1 << 20, 1 << 20);
-    let (client, mut events) = AsyncClient::new(options, 1024);
-    let mut network = NetworkOptions::new();
-    network.set_tcp_nodelay(true);
-    events.set_network_options(network);
-    loop {
-        match events.poll().await? {
-            Event::Incoming(Packet::ConnAck(_)) => {
-                let filters = topics.iter().map(|topic| SubscribeFilter::new((*topic).to_owned(), QoS::AtMostOnce));
-                client.try_subscribe_many(filters).unwrap_or_default();
-            }
-            Event::Incoming(Packet::SubAck(_)) => return Ok((client, events)),
-            _ => {}
-        }
-    }
-}
-
 /// Calls `act` for each message until it declines or the connection ends.
-pub(super) async fn each_message(mut events: EventLoop, act: impl Fn(Publish) -> bool) {
+async fn each_message(mut events: EventLoop, act: impl Fn(Publish) -> bool) {
     while let Ok(event) = events.poll().await {
         if let Event::Incoming(Packet::Publish(publish)) = event
             && !act(publish)

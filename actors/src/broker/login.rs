@@ -22,10 +22,10 @@ const MQTT_5: u8 = 5;
 
 /// Reads the first packet, which must be CONNECT; rmqtt itself would wait for its first bytes for good.
 pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Login, TurnedAway> {
-    let mut packet = vec![stream.read_u8().await?];
-    if packet[0] != CONNECT {
+    if stream.read_u8().await? != CONNECT {
         return Err(TurnedAway::Malformed);
     }
+    let mut packet = vec![CONNECT];
     let mut length = 0;
     for shift in [0, 7, 14] {
         let byte = stream.read_u8().await?;
@@ -38,11 +38,21 @@ pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Login,
     if packet.last().is_some_and(|byte| byte & 0x80 != 0) || length > MAX_BYTES {
         return Err(TurnedAway::Malformed);
     }
-    let head = packet.len();
-    packet.resize(head + length, 0);
-    stream.read_exact(&mut packet[head..]).await?;
-    let is_nameless = client_id(&packet[head..]).is_some_and(<[u8]>::is_empty);
+    let mut body = vec![0; length];
+    stream.read_exact(&mut body).await?;
+    let is_nameless = client_id(&body).is_some_and(<[u8]>::is_empty);
+    packet.append(&mut body);
     Ok(Login { packet, is_nameless })
+}
+
+/// The length of the first packet in what a client sent, if all of it is there; only built for the fuzz targets.
+#[cfg(fuzzing)]
+pub fn read_login(sent: &[u8]) -> Option<usize> {
+    use futures_util::FutureExt;
+
+    let login = read(&mut &*sent).now_or_never().expect("bytes that are there are not waited for").ok()?;
+    assert!(sent.starts_with(&login.packet), "rmqtt gets what the client sent");
+    Some(login.packet.len())
 }
 
 /// The client id in a CONNECT packet without its head; none where rmqtt will find the packet malformed.
@@ -50,7 +60,7 @@ fn client_id(body: &[u8]) -> Option<&[u8]> {
     let (_protocol, rest) = text(body)?;
     // Level, flags and the keep-alive.
     let (fixed, mut rest) = rest.split_at_checked(4)?;
-    if fixed[0] == MQTT_5 {
+    if fixed.first() == Some(&MQTT_5) {
         let mut length = 0;
         for shift in [0, 7, 14, 21] {
             let (byte, after) = rest.split_first()?;

@@ -124,8 +124,8 @@ impl Register {
     /// How many topics there are of observers that share the certificate of this one.
     fn observers_beside(&self, topic: &str) -> usize {
         let name = topic.rfind('/').map_or(0, |slash| slash + 1);
-        let Some(mark) = topic[name..].find(OBSERVER_MARK) else { return 0 };
-        let holder = &topic[..name + mark + OBSERVER_MARK.len()];
+        let mark = topic.get(name..).and_then(|name| name.find(OBSERVER_MARK));
+        let Some(holder) = mark.and_then(|mark| topic.get(..name + mark + OBSERVER_MARK.len())) else { return 0 };
         self.kept.range(holder.to_owned()..).take_while(|(topic, _)| topic.starts_with(holder)).count()
     }
 }

@@ -7,6 +7,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 use ecod::names::NodeName;
+use ecod::vote::VoteMode;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
@@ -14,12 +15,13 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::columns::columns;
 use super::{Failure, print};
+use crate::bench::access::Access;
 use crate::bench::aggregator::OwnAggregator;
-use crate::bench::latency::{Latencies, Quantiles};
+use crate::bench::latency::{Answers, Latencies, Quantiles};
 use crate::bench::load::Load;
-use crate::bench::measurement::{Target, measure};
+use crate::bench::measurement::{Measurement, Target, measure};
 use crate::bench::page;
-use crate::bench::saturation::{self, Saturation, Shares, Step};
+use crate::bench::saturation::{self, AggregatorShares, Saturation, Step};
 use crate::config::NodeConfig;
 use crate::gateway::BrokerAddress;
 
@@ -44,11 +46,14 @@ pub(super) struct BenchArguments {
     /// Name of the running cell
     #[arg(long)]
     cell: Option<NodeName>,
-    /// Look for the highest load at which 99 of 100 reports are answered within 100 ms, up to 1000 vehicles
+    /// Do not look for the highest load at which 99 of 100 reports are answered within 100 ms
     #[arg(long)]
-    saturate: bool,
+    no_saturate: bool,
+    /// Most vehicles of that search
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u16).range(4..=1000))]
+    up_to: u16,
     /// Measure instead what an aggregator of its own costs with 32 vehicles: memory, processor time, recording
-    #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "saturate"])]
+    #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "no_saturate", "up_to"])]
     costs: bool,
     /// Write the figures to this file as JSON, in the section `cell` or `costs`; other sections stay
     #[arg(long, value_name = "FILE")]
@@ -70,14 +75,23 @@ struct Figures {
 /// A cell beside the bare way.
 #[derive(Debug, Serialize)]
 struct Comparison {
+    map: Ways,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    verdict: Option<Ways>,
+    report_bytes: usize,
+    map_bytes: usize,
+    verdict_bytes: usize,
+    refused: u64,
+    sent_late_us: u128,
+}
+
+/// One kind of answer by both ways.
+#[derive(Debug, Serialize)]
+struct Ways {
     cell: Quantiles,
     bare: Quantiles,
     p50_ratio: f64,
     p99_ratio: f64,
-    report_bytes: usize,
-    map_bytes: usize,
-    refused: u64,
-    sent_late_us: u128,
 }
 
 /// A figure that must not be exceeded.
@@ -88,6 +102,9 @@ struct Goal {
     met: bool,
 }
 
+/// How much longer than the bare way an answer may take.
+const MOST_RATIO: f64 = 1.5;
+
 /// Rounds of a measurement, between which vehicles connect anew.
 const PASSES: u64 = 4;
 
@@ -97,8 +114,8 @@ const COST_VEHICLES: usize = 32;
 /// How long they report for somebody who looks at the page.
 const LOOK: Duration = Duration::from_secs(4);
 
-/// The load at which the search begins and ends.
-const SEARCH: [usize; 2] = [4, 1000];
+/// The load at which the search begins.
+const SEARCH_FROM: usize = 4;
 
 /// Seconds of one load of the search.
 const SEARCH_SPAN: Duration = Duration::from_secs(4);
@@ -119,7 +136,7 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
     allow_many_connections();
     let mut figures = Figures::default();
     if let Some(target) = arguments.running_cell()? {
-        print(&format!("cell {} through the broker at {}\n", target.cell, target.broker))?;
+        print(&format!("cell {} through the broker at {}\n", target.cell, target.access.broker))?;
         compare(&target, arguments, &mut figures).await?;
         saturate(&target, arguments, &mut figures).await?;
     } else {
@@ -156,18 +173,27 @@ impl BenchArguments {
             return Ok(None);
         };
         let config = config.unwrap_or_default();
+        if !config.fusion.algorithms.pace() {
+            bail!(
+                "the configuration has `fusion.algorithms` vote: without maps it shows nowhere which reports a round rests on"
+            );
+        }
+        let access = Access::of(broker, &config)?;
+        // By packets, not every round has verdicts.
+        let votes = config.fusion.algorithms.vote() && config.fusion.vote.mode == VoteMode::Weighted;
         let cell = self.cell.clone().unwrap_or(config.cell);
-        Ok(Some(Target { broker, cell, landmarks: config.landmarks, encoding: config.mqtt.encoding, aggregator: None }))
+        let (landmarks, encoding) = (config.landmarks, config.mqtt.encoding);
+        Ok(Some(Target { access, cell, landmarks, encoding, votes, aggregator: None }))
     }
 }
 
 /// The cell beside the bare way, for each number of vehicles.
 async fn compare(target: &Target, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
     let spread = Duration::from_millis(arguments.spread_ms);
-    let mut rows = vec![row(["vehicles", "way", "p50 µs", "p99 µs", "p99.9 µs", "n", "missing"])];
+    let mut rows = vec![row(["vehicles", "answer", "way", "p50 µs", "p99 µs", "p99.9 µs", "n", "missing"])];
     for vehicles in arguments.cavs.iter().map(|vehicles| usize::from(*vehicles)) {
         let load = Load { spread, ..Load::new(vehicles, Duration::from_secs(arguments.seconds) / PASSES as u32) };
-        let (mut cell, mut bare) = (Latencies::default(), Latencies::default());
+        let (mut cell, mut bare) = (Answers::default(), Answers::default());
         let mut last = None;
         for _ in 0..PASSES {
             let measured = measure(target, load).await?;
@@ -176,24 +202,38 @@ async fn compare(target: &Target, arguments: &BenchArguments, figures: &mut Figu
             last = Some(measured);
         }
         let Some(last) = last else { continue };
-        let (cell, bare) = (cell.quantiles(), bare.quantiles());
-        let (p50_ratio, p99_ratio) = (cell.p50_us / bare.p50_us, cell.p99_us / bare.p99_us);
-        for (way, quantiles) in [("cell", &cell), ("bare", &bare)] {
-            let Quantiles { p50_us, p99_us, p999_us, n, missing } = quantiles;
-            let numbers = [p50_us, p99_us, p999_us].map(|us| format!("{us:.0}"));
-            let counts = [n.to_string(), missing.to_string()];
-            rows.push([vec![vehicles.to_string(), way.into()], numbers.to_vec(), counts.to_vec()].concat());
+        let map = Ways::of(&cell.map, &bare.map);
+        let verdict = target.votes.then(|| Ways::of(&cell.verdict, &bare.verdict));
+        for (answer, ways) in [("map", Some(&map)), ("verdict", verdict.as_ref())] {
+            let Some(ways) = ways else { continue };
+            ways.tell(vehicles, answer, &mut rows);
+            figures.goal(format!("vehicles_{vehicles}_{answer}_p50_ratio"), ways.p50_ratio, MOST_RATIO);
+            figures.goal(format!("vehicles_{vehicles}_{answer}_p99_ratio"), ways.p99_ratio, MOST_RATIO);
         }
-        rows.push(row(["", "ratio", &format!("{p50_ratio:.2}"), &format!("{p99_ratio:.2}")]));
-        figures.goal(format!("vehicles_{vehicles}_p50_ratio"), p50_ratio, 1.5);
-        figures.goal(format!("vehicles_{vehicles}_p99_ratio"), p99_ratio, 1.5);
-        let (report_bytes, map_bytes) = (last.report_bytes, last.map_bytes);
-        let (refused, sent_late_us) = (last.refused, last.latest.as_micros());
-        let comparison =
-            Comparison { cell, bare, p50_ratio, p99_ratio, report_bytes, map_bytes, refused, sent_late_us };
+        let Measurement { report_bytes, map_bytes, verdict_bytes, refused, latest, .. } = last;
+        let sent_late_us = latest.as_micros();
+        let comparison = Comparison { map, verdict, report_bytes, map_bytes, verdict_bytes, refused, sent_late_us };
         figures.vehicles.insert(vehicles, comparison);
     }
     print(&format!("\n{}", columns(&rows)))
+}
+
+impl Ways {
+    fn of(cell: &Latencies, bare: &Latencies) -> Self {
+        let (cell, bare) = (cell.quantiles(), bare.quantiles());
+        Self { cell, bare, p50_ratio: cell.p50_us / bare.p50_us, p99_ratio: cell.p99_us / bare.p99_us }
+    }
+
+    fn tell(&self, vehicles: usize, answer: &str, rows: &mut Vec<Vec<String>>) {
+        for (way, quantiles) in [("cell", self.cell), ("bare", self.bare)] {
+            let Quantiles { p50_us, p99_us, p999_us, n, missing } = quantiles;
+            let numbers = [p50_us, p99_us, p999_us].map(|us| format!("{us:.0}"));
+            let counts = [n.to_string(), missing.to_string()];
+            rows.push([row([&vehicles.to_string(), answer, way]), numbers.to_vec(), counts.to_vec()].concat());
+        }
+        let ratios = [self.p50_ratio, self.p99_ratio].map(|ratio| format!("{ratio:.2}"));
+        rows.push(row(["", "", "ratio", &ratios[0], &ratios[1]]));
+    }
 }
 
 fn row<const N: usize>(cells: [&str; N]) -> Vec<String> {
@@ -201,33 +241,52 @@ fn row<const N: usize>(cells: [&str; N]) -> Vec<String> {
 }
 
 async fn saturate(target: &Target, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
-    if !arguments.saturate {
+    if arguments.no_saturate {
         return Ok(());
     }
-    print("\nvehicles    p50 ms    p99 ms  missing   map kB  broker %  aggregator %  vehicles %\n")?;
+    print("\nvehicles    map ms p50, p99   verdict ms p50, p99   missing  refused  late ms   map kB  verdict kB  ")?;
+    print("broker %  aggregator %  vehicles %\n")?;
     let tell = |step: &Step| {
-        let Step { vehicles, latency, map_bytes, shares: Shares { broker, fusion, vehicles: own }, .. } = step;
-        let [p50, p99] = [latency.p50_us, latency.p99_us].map(|us| us / 1000.0);
-        let map_kb = *map_bytes as f64 / 1000.0;
+        let times = |latency: Option<Quantiles>| {
+            let [p50, p99] = [latency.map(|latency| latency.p50_us), latency.map(|latency| latency.p99_us)].map(in_ms);
+            format!("{p50:>9} {p99:>8}")
+        };
+        let missing = step.map.missing + step.verdict.map_or(0, |verdict| verdict.missing);
+        let [map_kb, verdict_kb] = [step.map_bytes, step.verdict_bytes].map(|bytes| bytes as f64 / 1000.0);
+        let watched = step.shares.aggregator;
+        let percent =
+            |part: fn(AggregatorShares) -> f64| watched.map_or("-".into(), |parts| format!("{:.0}", part(parts)));
+        let [broker, fusion] = [percent(|parts| parts.broker), percent(|parts| parts.fusion)];
         print(&format!(
-            "{vehicles:>8} {p50:>9.2} {p99:>9.2} {:>8} {map_kb:>8.1} {broker:>9.0} {fusion:>13.0} {own:>11.0}\n",
-            latency.missing
+            "{:>8} {}    {} {missing:>9} {:>8} {:>8.1} {map_kb:>8.1} {verdict_kb:>11.1} {broker:>9} {fusion:>13} {:>11.0}\n",
+            step.vehicles,
+            times(Some(step.map)),
+            times(step.verdict),
+            step.refused,
+            step.sent_late_ms,
+            step.shares.vehicles,
         ))
     };
-    let found = saturation::search(target, SEARCH, SEARCH_SPAN, tell).await?;
-    let most = found.most_vehicles.map_or_else(|| "none".to_owned(), |vehicles| vehicles.to_string());
-    print(&format!("most vehicles with p99 below {:?}: {most}\n", saturation::LIMIT))?;
-    if let Some(first) = &found.first_saturated {
-        print(&format!("saturated first: {first}\n"))?;
+    let most = usize::from(arguments.up_to);
+    let found = saturation::search(target, [SEARCH_FROM, most], SEARCH_SPAN, tell).await?;
+    let carried = found.most_vehicles.map_or_else(|| "none".to_owned(), |vehicles| vehicles.to_string());
+    print(&format!("most vehicles with p99 below {:?}: {carried}\n", saturation::LIMIT))?;
+    match &found.first_saturated {
+        Some(first) => print(&format!("saturated first: {first}\n"))?,
+        None => print(&format!("nothing saturated up to {most} vehicles\n"))?,
     }
     figures.saturation = Some(found);
     Ok(())
 }
 
+fn in_ms(us: Option<f64>) -> String {
+    us.map_or_else(|| "-".to_owned(), |us| format!("{:.2}", us / 1000.0))
+}
+
 /// What a node without camera costs, with the dashboard on and nobody looking, and what recording adds; then how soon
 /// somebody who looks sees something.
 async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
-    let load = Load { bare: false, ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds)) };
+    let load = Load { bare: false, votes: false, ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds)) };
     let (mut usages, mut looked) = (Vec::new(), None);
     for records in [false, true] {
         let mut aggregator = OwnAggregator::start(program, records).await?;

@@ -14,6 +14,8 @@ use crate::config::NodeConfig;
 use crate::lines::{self, LineRead, read_line};
 use crate::recorder::{self, LogReader};
 use log::LogReplay;
+#[cfg(fuzzing)]
+pub use log::rounds_of_log;
 
 /// Flags of `replay`.
 #[derive(Debug, Args)]

@@ -10,9 +10,7 @@
 
 use std::path::{Path, PathBuf};
 
-use ecod::detection::Detection;
-use ecod::names::MAX_NAME_BYTES;
-use ecod::wire::is_label;
+use ecod::detection::{Detection, detections_in};
 use serde::{Deserialize, Serialize};
 
 use super::{Detect, DetectError};
@@ -87,20 +85,7 @@ impl Detect for RecordedDetector {
 }
 
 fn read_line(path: &Path, line: usize, text: &str) -> Result<Vec<Detection>, RecordingError> {
-    let malformed = |reason: String| RecordingError::Malformed { path: path.to_owned(), line, reason };
-    let detections: Vec<Detection> = serde_json::from_str(text).map_err(|e| malformed(e.to_string()))?;
-    for Detection { label, confidence, bounding_box, .. } in &detections {
-        if !bounding_box.is_valid() {
-            return Err(malformed(format!("the box of {label:?} has no area")));
-        }
-        if !is_label(label) {
-            return Err(malformed(format!("the label {label:?} is no text of 1 to {MAX_NAME_BYTES} bytes")));
-        }
-        if !(0.0..=1.0).contains(confidence) {
-            return Err(malformed(format!("the confidence of {label:?} is {confidence}, must be 0 to 1")));
-        }
-    }
-    Ok(detections)
+    detections_in(text).map_err(|reason| RecordingError::Malformed { path: path.to_owned(), line, reason })
 }
 
 #[cfg(test)]

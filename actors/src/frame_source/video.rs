@@ -122,9 +122,9 @@ impl FrameSource for Video {
 pub(super) fn without_credentials(url: &str) -> String {
     match url.split_once("://") {
         Some((scheme, rest)) => {
-            let host_end = rest.find('/').unwrap_or(rest.len());
-            let host_start = rest[..host_end].rfind('@').map_or(0, |at| at + 1);
-            format!("{scheme}://{}", &rest[host_start..])
+            let (login_and_host, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+            let host = login_and_host.rsplit('@').next().unwrap_or_default();
+            format!("{scheme}://{host}{path}")
         }
         None => url.rsplit('@').next().unwrap_or_default().to_owned(),
     }

@@ -58,7 +58,7 @@ impl Security {
     }
 
     /// How to speak TLS to a broker, for one connection; none where it is spoken to in plaintext.
-    pub(super) fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
+    pub(crate) fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self.external.as_ref().filter(|external| external.address == *broker) {
             Some(External { ca: Some(ca), .. }) => {
                 let current = self.credentials.as_ref().map(|credentials| credentials.current());
@@ -67,6 +67,27 @@ impl Security {
             Some(External { ca: None, .. }) => Ok(None),
             None => Ok(self.credentials.as_ref().map(BrokerTrust::of_cell)),
         }
+    }
+
+    /// The payload as it travels on a topic: signed where the cell signs.
+    pub(crate) fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
+        match &self.signing {
+            Some(key) => key.seal(topic, &payload),
+            None => payload,
+        }
+    }
+
+    /// Whether an envelope of another's making is shut, and one's own holds the payload; only built for the fuzz targets.
+    #[cfg(fuzzing)]
+    pub fn keeps_shut(&self, topic: &str, bytes: &[u8]) -> bool {
+        let Some(key) = &self.signing else { return false };
+        key.open(topic.as_bytes(), bytes).is_none()
+            && key.open(topic.as_bytes(), &key.seal(topic, bytes)) == Some(bytes)
+    }
+
+    /// Bytes before a payload that travels.
+    pub(crate) fn envelope_bytes(&self) -> usize {
+        if self.signing.is_some() { ENVELOPE_BYTES } else { 0 }
     }
 }
 

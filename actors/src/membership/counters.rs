@@ -82,11 +82,13 @@ pub struct FrameCounters([AtomicU64; FrameEvent::ALL.len()]);
 
 impl FrameCounters {
     /// Counts one.
+    #[expect(clippy::indexing_slicing, reason = "there is a place for every event")]
     pub fn count(&self, event: FrameEvent) {
         self.0[event as usize].fetch_add(1, Ordering::Relaxed);
     }
 
     /// How often it happened.
+    #[expect(clippy::indexing_slicing, reason = "there is a place for every event")]
     pub fn get(&self, event: FrameEvent) -> u64 {
         self.0[event as usize].load(Ordering::Relaxed)
     }

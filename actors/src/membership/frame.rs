@@ -125,23 +125,27 @@ impl Head {
         if frame.len() > MAX_FRAME_BYTES {
             return Err(HeadError::Oversized);
         }
-        if frame.len() < HEAD_BYTES + SEAL_BYTES || frame[..2] != MAGIC || frame[2] != VERSION {
+        let Some((head, _)) = frame.split_first_chunk::<HEAD_BYTES>().filter(|(_, body)| body.len() >= SEAL_BYTES)
+        else {
+            return Err(HeadError::Malformed);
+        };
+        let [m0, m1, version, kind, c0, c1, c2, c3, rest @ ..] = head;
+        if [*m0, *m1] != MAGIC || *version != VERSION {
             return Err(HeadError::Malformed);
         }
-        let kind = match frame[3] {
+        let kind = match kind {
             1 => Kind::Hello,
             2 => Kind::Handshake,
             3 => Kind::Gossip,
             4 => Kind::Payload,
             _ => return Err(HeadError::Malformed),
         };
-        if frame[4..8] != cell {
+        if [*c0, *c1, *c2, *c3] != cell {
             return Err(HeadError::WrongCell);
         }
-        let mut sender = SessionId::default();
-        sender.copy_from_slice(&frame[8..24]);
-        let mut counter = [0; 8];
-        counter.copy_from_slice(&frame[24..32]);
+        let (Some(&sender), Some(&counter)) = (rest.first_chunk(), rest.last_chunk()) else {
+            return Err(HeadError::Malformed);
+        };
         Ok(Self { kind, sender, counter: u64::from_be_bytes(counter) })
     }
 

@@ -81,12 +81,11 @@ impl CellKey {
         }
         let root = hkdf::Salt::new(hkdf::HKDF_SHA256, cell.as_str().as_bytes()).extract(&secret);
         let hash = digest::digest(&digest::SHA256, cell.as_str().as_bytes());
-        let mut tag = [0; 4];
-        tag.copy_from_slice(&hash.as_ref()[..4]);
-        Self { root, tag }
+        Self { root, tag: hash.as_ref().first_chunk().copied().unwrap_or_default() }
     }
 
     /// Signs payloads that go through brokers of others.
+    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
     pub(super) fn payload_key(&self) -> hmac::Key {
         let info: [&[u8]; 1] = [b"ecod payload 1"];
         let key = self.root.expand(&info, hmac::HMAC_SHA256).map(hmac::Key::from);
@@ -100,6 +99,7 @@ impl CellKey {
 
     /// The key of frames from one session to another. With the sender's frame counter as nonce, no two frames share
     /// both.
+    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
     pub(super) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> Seal {
         let info: [&[u8]; 3] = [b"ecod frame 1", sender, receiver];
         let key = self.root.expand(&info, &aead::CHACHA20_POLY1305).map(aead::UnboundKey::from);
@@ -112,6 +112,7 @@ pub(super) struct Seal(aead::LessSafeKey);
 
 impl Seal {
     /// Encrypts what follows the first `head` bytes of the frame, and authenticates all of it.
+    #[expect(clippy::expect_used, reason = "the cipher seals 256 GiB, a datagram has 64 KiB")]
     pub(super) fn close(&self, counter: u64, frame: &mut Vec<u8>, head: usize) {
         let mut body = frame.split_off(head);
         let sealed = self.0.seal_in_place_append_tag(nonce(counter), aead::Aad::from(&frame[..]), &mut body);
@@ -143,9 +144,7 @@ impl CookieJar {
     pub(super) fn bake(&self, session: &SessionId, address: std::net::SocketAddr, slot: u64) -> Cookie {
         let text = format!("{slot} {address}");
         let tag = hmac::sign(&self.0, &[&session[..], text.as_bytes()].concat());
-        let mut cookie = [0; 16];
-        cookie.copy_from_slice(&tag.as_ref()[..16]);
-        cookie
+        tag.as_ref().first_chunk().copied().unwrap_or_default()
     }
 }
 
@@ -153,17 +152,17 @@ impl CookieJar {
 const STRETCHING: NonZeroU32 = NonZeroU32::new(100_000).expect("not zero");
 
 fn nonce(counter: u64) -> aead::Nonce {
-    let mut nonce = [0; aead::NONCE_LEN];
-    nonce[4..].copy_from_slice(&counter.to_be_bytes());
-    aead::Nonce::assume_unique_for_key(nonce)
+    let [a, b, c, d, e, f, g, h] = counter.to_be_bytes();
+    aead::Nonce::assume_unique_for_key([0, 0, 0, 0, a, b, c, d, e, f, g, h])
 }
 
 /// Whether the text is exactly the hexadecimal form of as many bytes.
 fn decode_hex(text: &str, bytes: &mut [u8]) -> bool {
     let digits: Option<Vec<u8>> = text.chars().map(|c| c.to_digit(16).map(|digit| digit as u8)).collect();
     let Some(digits) = digits.filter(|digits| digits.len() == 2 * bytes.len()) else { return false };
-    for (byte, pair) in bytes.iter_mut().zip(digits.chunks_exact(2)) {
-        *byte = pair[0] << 4 | pair[1];
+    let (pairs, _) = digits.as_chunks();
+    for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
+        *byte = high << 4 | low;
     }
     true
 }

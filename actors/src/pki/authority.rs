@@ -109,11 +109,13 @@ impl Authority {
         set_validity(&mut parameters, now, days(CA_DAYS));
         parameters.serial_number = Some(draw_serial()?);
         let certificate = parameters.self_signed(&key)?;
-        write_secret(&directory.join(CA_KEY), &key.serialize_pem())?;
+        let secret = key.serialize_pem();
         write(&directory.join(CA), &certificate.pem())?;
         let register = Register { cell: cell.clone(), revision: 0, issued: Vec::new() };
         let mut authority = Self { directory: directory.into(), register };
-        authority.save(now)?;
+        authority.save(&Issuer::from_ca_cert_pem(&certificate.pem(), key)?, now)?;
+        // Last: with the key there is a CA, and what is left of an attempt without it gives way to the next.
+        write_secret(&directory.join(CA_KEY), &secret)?;
         Ok(authority)
     }
 
@@ -158,12 +160,13 @@ impl Authority {
         let serial = draw_serial()?;
         parameters.serial_number = Some(serial.clone());
         let key = KeyPair::generate()?;
-        let certificate = parameters.signed_by(&key, &self.issuer()?)?;
+        let issuer = self.issuer()?;
+        let certificate = parameters.signed_by(&key, &issuer)?;
         let serial = hex(serial.as_ref());
         let issued = Issued { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
         // Known before it exists, so that nothing can be valid that cannot be revoked.
         self.register.issued.push(issued);
-        self.save(now)?;
+        self.save(&issuer, now)?;
         let nodes = self.directory.join(NODES);
         write_secret(&nodes.join(format!("{node}.key")), &key.serialize_pem())?;
         write(&nodes.join(format!("{node}.pem")), &certificate.pem())
@@ -184,7 +187,7 @@ impl Authority {
         if revoked == 0 {
             return Err(AuthorityError::Unknown(node.clone()));
         }
-        self.save(now)?;
+        self.save(&self.issuer()?, now)?;
         Ok(revoked)
     }
 
@@ -210,7 +213,7 @@ impl Authority {
     }
 
     /// Writes the revocation list and then the register.
-    fn save(&mut self, now: Timestamp) -> Result<(), AuthorityError> {
+    fn save(&mut self, issuer: &Issuer<'_, KeyPair>, now: Timestamp) -> Result<(), AuthorityError> {
         self.register.revision += 1;
         let revoked = |issued: &Issued| {
             let serial = SerialNumber::from_slice(&unhex(&issued.serial));
@@ -226,7 +229,7 @@ impl Authority {
             revoked_certs: self.register.issued.iter().filter_map(revoked).collect(),
             key_identifier_method: KeyIdMethod::Sha256,
         };
-        write(&self.revocation_list(), &list.signed_by(&self.issuer()?)?.pem()?)?;
+        write(&self.revocation_list(), &list.signed_by(issuer)?.pem()?)?;
         let text = serde_json::to_string_pretty(&self.register)
             .map_err(|error| AuthorityError::Register { path: REGISTER.into(), reason: error.to_string() })?;
         write(&self.directory.join(REGISTER), &(text + "\n"))
@@ -312,6 +315,18 @@ mod tests {
         }
         let again = Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
         assert!(matches!(again, AuthorityError::Exists(_)));
+    }
+
+    #[test]
+    fn a_ca_that_was_left_half_made_can_be_made_again() {
+        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let obstacle = directory.path().join("issued.new");
+        fs::create_dir(&obstacle).unwrap();
+        Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
+        fs::remove_dir(&obstacle).unwrap();
+        Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        let mut authority = Authority::open(directory.path()).unwrap();
+        authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
     }
 
     #[test]

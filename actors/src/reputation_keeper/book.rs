@@ -25,6 +25,12 @@ impl Book {
     pub(super) fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
         if self.by_evidence { self.ledger.reputations(config) } else { self.standing.clone() }
     }
+
+    fn take(&mut self, saved: Saved) {
+        self.ledger.merge_entries(saved.entries, None);
+        self.ledger.merge_marks(saved.marks, None);
+        self.standing = saved.standing;
+    }
 }
 
 /// A [`Book`] that several hold.
@@ -86,8 +92,16 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments) {
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
         tracing::info!(path = %file.path().display(), entries = saved.entries.len(), "reputations restored");
-        book.ledger.merge_entries(saved.entries, None);
-        book.ledger.merge_marks(saved.marks, None);
-        book.standing = saved.standing;
+        book.take(saved);
+    }
+}
+
+/// Takes what a file holds into an empty book; only built for the fuzz targets.
+#[cfg(fuzzing)]
+pub fn read_saved(bytes: &[u8]) {
+    if let Ok(saved) = serde_json::from_slice(bytes) {
+        let book = SharedBook::new(true);
+        book.open().take(saved);
+        drop(book.open().reputations(&ReputationConfig::default()));
     }
 }

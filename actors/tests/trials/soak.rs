@@ -49,6 +49,8 @@ struct Summary {
     accepted_older_than_1_s: usize,
     oldest_accepted_ms: u64,
     unrecovered_minutes: usize,
+    /// Processes that lived for long enough to show whether they grow.
+    watched_for_growth: usize,
     growing: Vec<String>,
     largest: Resources,
 }
@@ -144,6 +146,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         accepted_older_than_1_s: accepted().filter(|map| map.age() > MAX_AGE).count(),
         oldest_accepted_ms: accepted().map(Accepted::age).max().unwrap_or_default().as_millis() as u64,
         unrecovered_minutes: past.iter().filter(|minute| minute.recovered_after_ms.is_none()).count(),
+        watched_for_growth: series.values().filter(|series| series.is_telling()).count(),
         growing: growing.collect(),
         largest: past.iter().map(|minute| minute.largest).fold(Resources::default(), Resources::max),
         minutes: past,
@@ -187,7 +190,7 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
     }
     println!(
         "\n{} nodes, {} minutes, seed {}: {} maps taken, {} of them superseded, {} forged, {} older than 1 s (the oldest {} ms); \
-         {} minutes unrecovered; at most {}; {} processes grow",
+         {} minutes unrecovered; at most {}; {} processes grow, of {} that lived long enough to tell",
         summary.nodes,
         summary.minutes.len(),
         summary.seed,
@@ -199,6 +202,7 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
         summary.unrecovered_minutes,
         summary.largest,
         summary.growing.len(),
+        summary.watched_for_growth,
     );
     let file = target_file("soak.json");
     std::fs::write(&file, serde_json::to_string_pretty(summary)? + "\n")

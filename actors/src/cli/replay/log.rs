@@ -46,8 +46,7 @@ impl<'a> LogReplay<'a> {
             let mut log = LogReader::open(file).map_err(Failure::usage)?;
             for event in log.by_ref() {
                 let lines = match event {
-                    Ok(LogEvent::Identity(identity)) => self.meet(*identity, file)?,
-                    Ok(LogEvent::Message(message)) => self.message(&message),
+                    Ok(event) => self.event(event, file)?,
                     Err(error @ LogError::Unreadable { .. }) => return Err(anyhow!(error).into()),
                     Err(error) => {
                         eprintln!("ecod-node: {:#}", anyhow!(error));
@@ -63,6 +62,13 @@ impl<'a> LogReplay<'a> {
             }
         }
         self.finish(sink, output)
+    }
+
+    fn event(&mut self, event: LogEvent, file: &Path) -> Result<Vec<FusedLine>, Failure> {
+        match event {
+            LogEvent::Identity(identity) => self.meet(*identity, file),
+            LogEvent::Message(message) => Ok(self.message(&message)),
+        }
     }
 
     fn meet(&mut self, identity: Identity, file: &Path) -> Result<Vec<FusedLine>, Failure> {
@@ -153,6 +159,18 @@ impl<'a> LogReplay<'a> {
         }
         Ok(())
     }
+}
+
+/// What comes of a log, by its journal or its reports; only built for the fuzz targets.
+#[cfg(fuzzing)]
+pub fn rounds_of_log(file: &Path) -> Vec<FusedLine> {
+    let mut replay = LogReplay::new(None, None);
+    let Ok(log) = LogReader::open(file) else { return Vec::new() };
+    let mut rounds: Vec<_> = log.flatten().map_while(|event| replay.event(event, file).ok()).flatten().collect();
+    if let Machine::Reports(machine) = replay.machine {
+        rounds.extend(machine.finish().0);
+    }
+    rounds
 }
 
 fn say(rerun: &Rerun) {

@@ -58,9 +58,14 @@ impl Series {
         self.0.push(resources);
     }
 
+    /// Whether the process lived for long enough to show whether it grows.
+    pub(super) fn is_telling(&self) -> bool {
+        self.0.len() >= LEAST_MINUTES
+    }
+
     /// What grows, in words: the medians of the middle and the last third of the process's life are compared.
     pub(super) fn growth(&self) -> Option<String> {
-        if self.0.len() < LEAST_MINUTES {
+        if !self.is_telling() {
             return None;
         }
         let third = self.0.len() / 3;
@@ -103,7 +108,9 @@ mod tests {
         assert_eq!(leak.growth().unwrap(), "resident KiB 29000 to 35000");
         assert_eq!(series(30, |minute| resident(if minute < 5 { 20_000 } else { 40_000 })).growth(), None);
         assert_eq!(series(30, |minute| resident(if minute == 25 { 90_000 } else { 20_000 })).growth(), None);
-        assert_eq!(series(8, |minute| resident(20_000 * minute)).growth(), None, "too short a life");
+        let short = series(8, |minute| resident(20_000 * minute));
+        assert_eq!((short.is_telling(), short.growth()), (false, None), "too short a life");
+        assert!(leak.is_telling());
     }
 
     #[test]

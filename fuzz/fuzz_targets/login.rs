@@ -1,0 +1,12 @@
+//! What a stranger sends to a broker first, before anybody asks who it is.
+
+#![no_main]
+
+use ecod_actors::broker::read_login;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|sent: &[u8]| {
+    if let Some(length) = read_login(sent) {
+        assert_eq!(read_login(&sent[..length]), Some(length), "nothing beyond the packet is read");
+    }
+});

@@ -1,0 +1,44 @@
+//! Whatever else is read: poses, recorded detections, signed payloads, files of state and of truth.
+//!
+//! The first byte of an input chooses what the rest is.
+
+#![no_main]
+
+use std::sync::LazyLock;
+
+use ecod::detection::detections_in;
+use ecod::eval::Truth;
+use ecod::eval::tracks::TrackTruth;
+use ecod::time::Timestamp;
+use ecod_actors::config::NodeConfig;
+use ecod_actors::gateway::{Secret, Security};
+use ecod_actors::reputation_keeper::read_saved;
+use ecod_actors::vehicle_pose::read_pose;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|input: &[u8]| {
+    let Some((kind, bytes)) = input.split_first() else { return };
+    let text = std::str::from_utf8(bytes).unwrap_or_default();
+    match kind % 5 {
+        0 => {
+            if let Ok((_, pose)) = read_pose(bytes, Timestamp(0)) {
+                assert!(pose.position.x.is_finite() && pose.position.y.is_finite() && pose.heading_rad.is_finite());
+            }
+        }
+        1 => {
+            let detections = detections_in(text).unwrap_or_default();
+            assert!(detections.iter().all(|detection| detection.bounding_box.is_valid()));
+        }
+        2 => assert!(SIGNING.keeps_shut("ecod/lot-1/detections/euclid", bytes)),
+        3 => read_saved(bytes),
+        _ => drop((Truth::parse(text), TrackTruth::is_in(text), TrackTruth::parse(text))),
+    }
+});
+
+/// Of a cell that signs, by 64 hexadecimal digits, which need no stretching.
+static SIGNING: LazyLock<Security> = LazyLock::new(|| {
+    let mut config = NodeConfig::default();
+    config.mqtt.sign = true;
+    config.membership.key = Some(Secret::new("01".repeat(32)));
+    Security::of(&config).expect("the key is a key")
+});
