@@ -97,7 +97,7 @@ async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
     let [quiet_median, flooded_median] = [&quiet, &flooded].map(|times| times[times.len() / 2]);
     let left_out = shed(&edge, "mallory");
     println!("median {quiet_median:?}, beside a flood {flooded_median:?}; {left_out} left out");
-    assert!(flooded_median < quiet_median + Duration::from_millis(100), "{quiet:?} {flooded:?}");
+    assert!(flooded_median < quiet_median + Duration::from_millis(50), "{quiet:?} {flooded:?}");
     assert!(flooded.last().unwrap() < &Duration::from_secs(1), "{flooded:?}");
     assert!(left_out > 500, "the flood was {left_out} messages more than is taken");
     assert!(edge.counters().all_shed().iter().any(|shed| shed.reason == ShedReason::BrokerThrottled));
@@ -141,7 +141,7 @@ async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
     let [median, longest] = [gaps[gaps.len() / 2], gaps[gaps.len() - 1]];
     println!("rounds {median:?} apart, at most {longest:?}; {grown_mb:.1} MB more");
     assert!(median < Duration::from_millis(130), "{gaps:?}");
-    assert!(longest < Duration::from_secs(1), "{gaps:?}");
+    assert!(longest < Duration::from_millis(500), "{gaps:?}");
     assert!(grown_mb < 16.0, "{grown_mb}");
     for index in 0..VEHICLES {
         assert!(shed(&edge, &format!("v{index}")) > 100, "{:?}", edge.counters().all_shed());
