@@ -45,7 +45,7 @@ fn rounds(figures: &mut Figures) {
                 .expect("there are rounds");
             record(figures, &format!("{name}_round"), votes, least)
         });
-        flat(figures, &format!("vote_{name}_cost_per_vote_from_the_middle"), costs);
+        figures.flat(&format!("vote_{name}_cost_per_vote"), &costs);
     }
 }
 
@@ -100,7 +100,7 @@ fn ledgers(figures: &mut Figures) {
         record(figures, "reputations_of_64_vehicles_after", votes, publishing);
         record(figures, "ledger_update", votes, least)
     });
-    flat(figures, "ledger_update_cost_per_vote_from_the_middle", costs);
+    figures.flat("ledger_update_cost_per_vote", &costs);
 }
 
 #[expect(clippy::disallowed_methods, reason = "a benchmark reads the clock")]
@@ -116,13 +116,6 @@ fn record(figures: &mut Figures, name: &str, votes: usize, time: Duration) -> f6
     let value = serde_json::json!({ "round_ms": time.as_secs_f64() * 1e3, "ns_per_vote": per_vote });
     figures.insert(format!("{name}_{votes}_votes"), value);
     per_vote
-}
-
-fn flat(figures: &mut Figures, name: &str, mut costs: [f64; 4]) {
-    costs.sort_by(f64::total_cmp);
-    let middle = (costs[1] + costs[2]) / 2.0;
-    let deviation = (costs[3] / middle - 1.0).max(1.0 - costs[0] / middle) * 100.0;
-    figures.goal(name, deviation, 50.0, " %");
 }
 
 /// Growth of the process per landmark that has eight fresh votes, from the resident set; Linux only.
