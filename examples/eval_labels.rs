@@ -1,4 +1,5 @@
-//! Accuracy of VOTE on label sets, measured on the program: one landmark per item, one vehicle per annotator, no geometry.
+//! Accuracy of VOTE on label sets, measured on the program: one landmark per item, one vehicle per annotator, no
+//! geometry.
 //!
 //! `make eval-labels`, or `cargo run --example eval_labels -- --program target/release/ecod-node [--sets DIR]
 //! [--config FILE] [--passes N] [--seed S] [--keep FRACTION] [--work DIR] [--write-table FILE]`
@@ -8,8 +9,9 @@
 //! by `ecod-node replay` in one pass, with passes, and in `paper` mode, and judged by `ecod-node eval`. All files stay
 //! in the work folder.
 //!
-//! The recording is as from a drive: items one after the other in random order, all annotators of an item in random order
-//! within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests on.
+//! The recording is as from a drive: items one after the other in random order, all annotators of an item in random
+//! order within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests
+//! on.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write as _;

@@ -4,9 +4,9 @@
 //! [`Aggregator::deadline`]; either may close a round and return what it made. The live node and the replay of a log
 //! run this same machine.
 //!
-//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time. Where
-//! both run, verdicts come from the first vote on. In VOTE's `paper` mode verdicts come with the rounds in which a packet
-//! of frames is complete, and only with them.
+//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time.
+//! Where both run, verdicts come from the first vote on. In VOTE's `paper` mode verdicts come with the rounds in which
+//! a packet of frames is complete, and only with them.
 //!
 //! A standby runs the machine without leading: it takes reports and closes rounds, but nothing comes out. From
 //! [`Aggregator::lead`] on its rounds count, with all the evidence it has gathered.
@@ -125,8 +125,8 @@ impl Aggregator {
         self.leads.as_ref()
     }
 
-    /// Takes a report received at `now`; returns what came of the round if it closes with it. One that a later report of
-    /// its vehicle overtook is of use to tracking only.
+    /// Takes a report received at `now`; returns what came of the round if it closes with it. One that a later report
+    /// of its vehicle overtook is of use to tracking only.
     ///
     /// # Errors
     /// The reason for which the report was not used; nothing is fused of it, at most the estimate of its vehicle's

@@ -1,7 +1,8 @@
 //! The pinhole camera: intrinsics and how the camera sits on its vehicle.
 //!
 //! Camera frame: x to the right, y downwards, z along the axis, metres. Pixels: origin at the upper left corner of the
-//! image, x to the right, y downwards. Lens distortion is removed where images are handled; pixels here are undistorted.
+//! image, x to the right, y downwards. Lens distortion is removed where images are handled; pixels here are
+//! undistorted.
 
 use nalgebra::{Point2, Point3};
 

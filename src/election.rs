@@ -37,9 +37,9 @@
 //! is given up after 160 ms takes 140 ms at the median and 164 ms at most; SWIM gossip (foca, 40 ms period) takes 155
 //! and 251 ms. A silent leader has to be replaced within 400 ms, a period of 100 ms included, and 251 ms leaves no room
 //! for a lost packet. Moreover the beat carries what a successor needs, its round and its successors, and proves that
-//! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as
-//! its cost per node does not grow with the cell; what it finds enters as [`Input::PeerAlive`] and [`Input::PeerDown`].
-//! To keep a leader's packets few, only its standby gets every beat, its other successors every eighth, and everyone else
+//! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as its
+//! cost per node does not grow with the cell; what it finds enters as [`Input::PeerAlive`] and [`Input::PeerDown`]. To
+//! keep a leader's packets few, only its standby gets every beat, its other successors every eighth, and everyone else
 //! one each `idle_beat_ms`.
 
 #![deny(clippy::indexing_slicing)]

@@ -1,12 +1,12 @@
 //! How right maps and verdicts are, beside majority vote and every vehicle alone.
 //!
 //! An item is one location for as long as its truth stays the same. It is judged by the last label that was given for
-//! it in that time, `null` if there was none; where nothing stands, by the last entry. Beside this, every entry of every
-//! line counts in [`Scores::rounds`]. Baselines need the reports: all votes on an item count alike, a vehicle alone is
-//! the majority of its own votes, ties count as the chance of drawing the right label among the first.
+//! it in that time, `null` if there was none; where nothing stands, by the last entry. Beside this, every entry of
+//! every line counts in [`Scores::rounds`]. Baselines need the reports: all votes on an item count alike, a vehicle
+//! alone is the majority of its own votes, ties count as the chance of drawing the right label among the first.
 //!
-//! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines, [`Evaluation::report`] with every
-//! report, in any order; then [`Evaluation::result`].
+//! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines, [`Evaluation::report`] with
+//! every report, in any order; then [`Evaluation::result`].
 
 pub mod tracks;
 mod truth;

@@ -5,9 +5,10 @@
 //! `received_at_us`. The time of a line is when it was received or else captured, and never before the line before it.
 //! The machine behind it is the [`Aggregator`] of a live node.
 //!
-//! A line that is ahead of most of the [`LOOKAHEAD`] lines after it, by more than clocks may differ, does not move the time
-//! and, without passes, is rejected: one vehicle with a wrong clock must not make all others stale. A silence costs at
-//! most ten seconds' rounds; then time goes on at the next line. Memory is bounded by the cell and not by the recording.
+//! A line that is ahead of most of the [`LOOKAHEAD`] lines after it, by more than clocks may differ, does not move the
+//! time and, without passes, is rejected: one vehicle with a wrong clock must not make all others stale. A silence
+//! costs at most ten seconds' rounds; then time goes on at the next line. Memory is bounded by the cell and not by the
+//! recording.
 
 mod clock;
 mod journal;
@@ -249,9 +250,9 @@ impl Replay {
         self.cell.get_or_insert_with(|| Aggregator::new(aggregator.clone(), 1, fusion.clone(), landmarks.clone(), now))
     }
 
-    /// Closes the rounds that were due before `now`; of a silence since `before`, only those at its beginning. A round that
-    /// nobody has reported to waits for a line that comes up to half a period late, and all lines of one time go into one
-    /// round: recordings with the period of the rounds would be cut anywhere.
+    /// Closes the rounds that were due before `now`; of a silence since `before`, only those at its beginning. A round
+    /// that nobody has reported to waits for a line that comes up to half a period late, and all lines of one time go
+    /// into one round: recordings with the period of the rounds would be cut anywhere.
     fn catch_up(&mut self, before: Timestamp, now: Timestamp, output: &mut Vec<FusedLine>) {
         let period = Duration::from_secs_f64(self.config.fusion.round.period_s);
         let silent_from = before + SILENCE.max(3 * period);

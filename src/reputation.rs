@@ -93,7 +93,8 @@ impl ReputationConfig {
         check_range("memory_votes", self.memory_votes, 1.0, 1e9)
     }
 
-    /// The reputation of a vehicle with so many right and wrong votes: the mean of a Beta distribution (Jøsang, Ismail 2002).
+    /// The reputation of a vehicle with so many right and wrong votes: the mean of a Beta distribution (Jøsang, Ismail
+    /// 2002).
     pub fn mean(&self, correct: f64, incorrect: f64) -> f64 {
         (correct + self.initial * self.initial_votes) / (correct + incorrect + self.initial_votes)
     }
@@ -163,8 +164,8 @@ impl From<ReputationLedger> for Snapshot {
 }
 
 impl ReputationLedger {
-    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Any other lane gives way
-    /// to it, see [`Self::merge_entries`]; the vote is not counted where it takes all the room itself.
+    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Any other lane
+    /// gives way to it, see [`Self::merge_entries`]; the vote is not counted where it takes all the room itself.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
         let lane = (epoch, aggregator);
         let Some(record) = self.record_mut(lane, &evidence.node, Some(&evidence.label), Some(lane)) else { return };

@@ -119,8 +119,8 @@ impl RoundTrigger {
         Self { config, last_close: now, first_report: None, live: Default::default(), missing: 0, due: 0, held: false }
     }
 
-    /// Takes note of a report; true when the round closes with it, because it was the last that was waited for. A period
-    /// that is over is left to [`Self::tick`], so that of reports that come at the end of it none is cut off.
+    /// Takes note of a report; true when the round closes with it, because it was the last that was waited for. A
+    /// period that is over is left to [`Self::tick`], so that of reports that come at the end of it none is cut off.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
         self.first_report.get_or_insert(now);
         let live = &mut self.live[kind as usize];

@@ -54,8 +54,8 @@ impl Testbed {
     }
 
     /// What the vehicle's camera could read at a spot, judged by the geometry alone: the plate of an occupied spot, the
-    /// `EMPTY` placard of a free one; `None` when it is outside the image, seen from behind, too small in it, or mostly hidden. A free spot without a
-    /// placard can be seen to be free where its plate could be read.
+    /// `EMPTY` placard of a free one; `None` when it is outside the image, seen from behind, too small in it, or mostly
+    /// hidden. A free spot without a placard can be seen to be free where its plate could be read.
     pub fn sighting(&self, scene: &Scene, cav: &Cav, spot: &Spot) -> Option<Sighting> {
         let place = || Card { text: Label::default(), position: spot.occupied, facing_rad: spot.facing_rad };
         let card = spot.plate_card().or_else(|| spot.empty_card(&self.placard)).unwrap_or_else(place);

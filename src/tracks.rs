@@ -1,11 +1,12 @@
 //! Objects without a known place: followed across vehicles that move, each once, under one identity.
 //!
-//! A [`Tracker`] takes admitted reports by [`Tracker::observe`] and makes the objects of a map by [`Tracker::close`]. Within a
-//! round, reports count in the order of their capture, whatever order they came in. `docs/tracks.md` has the equations.
+//! A [`Tracker`] takes admitted reports by [`Tracker::observe`] and makes the objects of a map by [`Tracker::close`].
+//! Within a round, reports count in the order of their capture, whatever order they came in. `docs/tracks.md` has the
+//! equations.
 //!
-//! Nothing has to be known of a vehicle beforehand: how noisy its positions are, where it sees and how surely, and by how
-//! much its pose is off, are learnt from what it has in common with the others. An object is never founded on a map:
-//! maps that are received lend identities, not evidence.
+//! Nothing has to be known of a vehicle beforehand: how noisy its positions are, where it sees and how surely, and by
+//! how much its pose is off, are learnt from what it has in common with the others. An object is never founded on a
+//! map: maps that are received lend identities, not evidence.
 
 mod align;
 mod assignment;

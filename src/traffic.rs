@@ -1,10 +1,10 @@
 //! Traffic to test and tune with: what moves in a town, what its vehicles report, and what is true.
 //!
-//! Vehicles drive on a grid of roads, follow each other, stop at signals and turn; others are parked; people and bicycles
-//! go around the blocks. Some of the vehicles report what they see. Buildings and vehicles hide what is behind them; things
-//! are missed by range and occlusion; there are false alarms of one frame, some that last, and places that deceive everyone
-//! who passes; positions are noisy, and shifted and turned with the slowly changing error of the observer's pose; captures
-//! are not synchronised, and reports arrive late, out of order, or never.
+//! Vehicles drive on a grid of roads, follow each other, stop at signals and turn; others are parked; people and
+//! bicycles go around the blocks. Some of the vehicles report what they see. Buildings and vehicles hide what is behind
+//! them; things are missed by range and occlusion; there are false alarms of one frame, some that last, and places that
+//! deceive everyone who passes; positions are noisy, and shifted and turned with the slowly changing error of the
+//! observer's pose; captures are not synchronised, and reports arrive late, out of order, or never.
 //!
 //! The truth has, every tenth of a second, what any observer could see then or [`TrafficConfig::memory_s`] before, and,
 //! where poses are reported, the observers.

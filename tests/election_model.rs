@@ -1,7 +1,8 @@
 //! A model check of the election: every order of deliveries, losses, repeats, timers, crashes and restarts, to a bound.
 //!
 //! Breadth first over everything that three nodes can do from a cold start, a settled cell, a split one and a handover;
-//! then long random walks over four nodes. Every node's clock runs at its own pace, so every timeout may come too early.
+//! then long random walks over four nodes. Every node's clock runs at its own pace, so every timeout may come too
+//! early.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;

@@ -71,8 +71,8 @@ fn traffic_is_tracked_better_than_late_fusion_does_it() {
 const FLOOR_TOWN: [f64; 2] = [82.0, 70.0];
 const FLOOR_TWO: [f64; 2] = [88.0, 76.0];
 
-/// Of cars that drive, over the second half: mean error of velocity in metres per second, share of those whose heading is not
-/// known to 0.15 rad, and mean error of length in metres, where it is known.
+/// Of cars that drive, over the second half: mean error of velocity in metres per second, share of those whose heading
+/// is not known to 0.15 rad, and mean error of length in metres, where it is known.
 fn errors(said: SaidConfig) -> [f64; 3] {
     let recording = recording_of(&TrafficConfig { observers: 6, duration_s: 8.0, said, ..TrafficConfig::default() });
     let frames = &recording.truth.frames;

@@ -1,6 +1,7 @@
 //! What an idle cell's membership costs: packets and processor time of each node, all in this one process.
 //!
-//! The goals are 60 packets/s and 1.5 % of a core. `NODES` (32) nodes gossip on loopback without multicast for `SECONDS` (10), after they have all met.
+//! The goals are 60 packets/s and 1.5 % of a core. `NODES` (32) nodes gossip on loopback without multicast for
+//! `SECONDS` (10), after they have all met.
 
 #[path = "../../benches/figures.rs"]
 mod figures;

@@ -1,5 +1,5 @@
-//! Measures a live cell from outside: how long reports take to come back as maps and as verdicts, beside the bare broker,
-//! and how many vehicles it carries.
+//! Measures a live cell from outside: how long reports take to come back as maps and as verdicts, beside the bare
+//! broker, and how many vehicles it carries.
 //!
 //! ```text
 //! driver ── on schedule ──> vehicles ── votes, reports ─> broker ──> aggregator ── map, verdicts ─────> broker ──> vehicles

@@ -7,9 +7,9 @@
 //! ```
 //!
 //! A broker that cannot start is an answer to whoever asked, not a failure of the actor: the node decides whether
-//! another address, an external broker or giving up is right. One that ended by itself, or hangs, ends the actor as soon as
-//! anyone asks how it is, so that the node starts both anew. One that hangs keeps its port, so that the node then ends: only
-//! a new process is rid of it.
+//! another address, an external broker or giving up is right. One that ended by itself, or hangs, ends the actor as
+//! soon as anyone asks how it is, so that the node starts both anew. One that hangs keeps its port, so that the node
+//! then ends: only a new process is rid of it.
 
 #![deny(clippy::indexing_slicing)]
 
@@ -62,7 +62,8 @@ pub enum BrokerHealth {
     Stopped,
     /// Accepts clients at this address.
     Serving(SocketAddr),
-    /// Was started, but has ended by itself or hangs; a node without its broker must not lead. The actor ends with this answer.
+    /// Was started, but has ended by itself or hangs; a node without its broker must not lead. The actor ends with this
+    /// answer.
     Dead,
 }
 

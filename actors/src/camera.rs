@@ -187,7 +187,8 @@ pub fn detector(
 ) -> anyhow::Result<DetectorArguments> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let source = camera.source.clone();
-    let patience = Duration::from_secs_f64(camera.capture.stall_timeout_s);
+    // Somewhat less than the capture waits, so that OpenCV gives up by itself and leaves no thread behind.
+    let patience = Duration::from_secs_f64(0.8 * camera.capture.stall_timeout_s);
     let lens = camera.optics.lens().context("key `camera.optics.calibration`")?;
     Ok(DetectorArguments {
         open: Arc::new(move || source.open(patience)),

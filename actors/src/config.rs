@@ -2,6 +2,8 @@
 //!
 //! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
 
+mod extraction;
+
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -12,9 +14,10 @@ use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::names::NodeName;
 use ecod::wire::Role;
 use figment::Figment;
-use figment::providers::{Env, Format, Serialized, Toml};
+use figment::providers::{Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
+use self::extraction::{environment, extract};
 use crate::broker::BrokerConfig;
 #[cfg(feature = "camera")]
 use crate::camera::CameraConfig;
@@ -37,8 +40,9 @@ pub struct NodeConfig {
     pub cell: NodeName,
     /// What the node is meant to do. Default `auto`.
     pub role: Role,
-    /// Where the embedded broker of a node that may lead listens. Default port 8883 on all interfaces with `[tls]`; without,
-    /// port 1883 on 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says otherwise.
+    /// Where the embedded broker of a node that may lead listens. Default port 8883 on all interfaces with `[tls]`;
+    /// without, port 1883 on 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says
+    /// otherwise.
     pub listen: Option<SocketAddr>,
     /// Directory for what survives a restart: reputations and the highest term of leadership. Default
     /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
@@ -152,8 +156,7 @@ impl NodeConfig {
     /// [`LoadError`] naming the file, or the key, the value and what is allowed.
     pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
         std::fs::metadata(file).map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
-        let figment = Figment::from(Serialized::defaults(Self::default())).merge(Toml::file_exact(file));
-        let config: Self = figment.extract().map_err(|errors| LoadError::Malformed(describe(errors)))?;
+        let config = extract(Figment::from(Serialized::defaults(Self::default())).merge(Toml::file_exact(file)))?;
         config.fusion.validate().map_err(|error| error.within("fusion"))?;
         LandmarkConfig::validate_all(&config.landmarks)?;
         Ok(config)
@@ -281,101 +284,12 @@ impl NodeConfig {
     }
 }
 
-const ENVIRONMENT_PREFIX: &str = "ECOD_";
-
 /// The machine's name without its domain, as far as names of nodes may have its characters.
 fn host_name() -> Option<NodeName> {
     let system = rustix::system::uname();
     let host = system.nodename().to_str().ok()?.split('.').next()?;
     let allowed = |c: char| if c.is_ascii_alphanumeric() || c == '_' { c } else { '-' };
     NodeName::new(host.chars().map(allowed).collect::<String>()).ok()
-}
-
-fn environment() -> Env {
-    Env::prefixed(ENVIRONMENT_PREFIX).split("__")
-}
-
-/// Reads the configuration. Values from the environment are guessed to be numbers, lists and so on by their looks;
-/// where a key does not want what was guessed, the value is taken as the text that it is.
-fn extract(mut figment: Figment) -> Result<NodeConfig, LoadError> {
-    let mut as_guessed: Option<figment::Error> = None;
-    loop {
-        let errors = match figment.extract() {
-            Ok(config) => return Ok(config),
-            Err(errors) => errors,
-        };
-        // Wrong as text too: the first error is the one to tell of.
-        if let Some(first) = as_guessed.take_if(|first| first.path == errors.path) {
-            return Err(LoadError::Malformed(describe(first)));
-        }
-        match guessed_wrong(&figment, &errors) {
-            Some((key, text)) => figment = figment.merge(Serialized::default(&key, text)),
-            None => return Err(LoadError::Malformed(describe(errors))),
-        }
-        as_guessed = Some(errors);
-    }
-}
-
-/// The key and the text of a value from the environment that was taken for something else than text.
-fn guessed_wrong(figment: &Figment, error: &figment::Error) -> Option<(String, String)> {
-    let key = error.path.join(".");
-    if !from_environment(error) || figment.find_value(&key).ok()?.as_str().is_some() {
-        return None;
-    }
-    let (_, text) = environment().iter().find(|(name, _)| *name == key)?;
-    Some((key, text))
-}
-
-fn from_environment(error: &figment::Error) -> bool {
-    error.metadata.as_ref().is_some_and(|metadata| metadata.name.contains("environment variable"))
-}
-
-/// Keys whose values are shown to nobody.
-const SECRETS: [&str; 2] = ["password", "key"];
-
-/// Every error with its key and where it was read, and without any secret.
-fn describe(errors: figment::Error) -> String {
-    let describe = |error: figment::Error| {
-        let key = error.path.join(".");
-        let origin = match &error.metadata {
-            Some(_) if from_environment(&error) => {
-                format!(" in the environment variable {ENVIRONMENT_PREFIX}{}", error.path.join("__").to_uppercase())
-            }
-            Some(metadata) => {
-                let place = metadata.source.as_ref().map_or_else(String::new, |source| format!(" {source}"));
-                format!(" in {}{place}", metadata.name)
-            }
-            None => String::new(),
-        };
-        let reason = match &error.kind {
-            figment::error::Kind::InvalidType(..) | figment::error::Kind::InvalidValue(..)
-                if SECRETS.iter().any(|secret| key.ends_with(secret)) =>
-            {
-                "must be text in quotes".to_owned()
-            }
-            figment::error::Kind::Message(text) if text == "invalid socket address syntax" => {
-                "must be an IP address and a port, such as 0.0.0.0:1883".to_owned()
-            }
-            kind => without_secrets(&kind.to_string()),
-        };
-        // Without a key, the file itself cannot be read as TOML.
-        if key.is_empty() {
-            format!("configuration{origin}: {reason}")
-        } else {
-            format!("configuration key `{key}`{origin}: {reason}")
-        }
-    };
-    errors.into_iter().map(describe).collect::<Vec<_>>().join("\n")
-}
-
-/// Errors in the syntax of TOML quote the line that they are about.
-fn without_secrets(text: &str) -> String {
-    let hide = |line: &str, secret: &str| match line.split_once(secret) {
-        Some((before, after)) if after.contains('=') => format!("{before}{secret} = ***"),
-        _ => line.to_owned(),
-    };
-    let lines = text.lines().map(|line| SECRETS.iter().fold(line.to_owned(), |line, secret| hide(&line, secret)));
-    lines.collect::<Vec<_>>().join("\n")
 }
 
 #[cfg(test)]
@@ -433,6 +347,22 @@ mod tests {
             ("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"***\"", ["`mqtt.password`", "not printed", "***"]),
         ] {
             let error = load(toml).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[cfg(feature = "camera")]
+    #[test]
+    fn errors_name_the_key_of_a_table_that_has_a_kind() {
+        let source = "[camera.detector]\nkind = \"placard\"\n[camera.source]\n";
+        for (toml, parts) in [
+            ("kind = \"v4l2\"\nwidth = \"wide\"\nheight = 480", ["`camera.source.width`", "\"wide\"", "u32"]),
+            ("kind = \"v4l2\"\nheight = 480\nwidht = 640", ["`camera.source.widht`", "unknown field", "`width`"]),
+            ("kind = \"url\"\nurl = 7", ["`camera.source.url`", "7", "string"]),
+            ("kind = \"url\"", ["`camera.source`", "missing field", "`url`"]),
+            ("kind = \"eye\"\nwidth = 640", ["`camera.source`", "eye", "`v4l2`"]),
+        ] {
+            let error = load(&format!("{source}{toml}")).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
         }
     }

@@ -93,11 +93,11 @@ pub enum Event {
     ClientUntrusted,
     /// A client of the embedded broker began with something else than a login, or left during it.
     ClientMalformed,
-    /// A client of the embedded broker was not let in: as many as allowed are connected, in all or of its certificate or
-    /// address.
+    /// A client of the embedded broker was not let in: as many as allowed are connected, in all or of its certificate
+    /// or address.
     ClientsFull,
-    /// A client of the embedded broker spoke in another's name, or said more than may be said or kept: its login or message
-    /// was refused.
+    /// A client of the embedded broker spoke in another's name, or said more than may be said or kept: its login or
+    /// message was refused.
     ClientDenied,
     /// A client of the embedded broker was cut off: its certificate was revoked or expired.
     ClientExpelled,

@@ -1,7 +1,7 @@
 //! What a node needs of its machine, looked at one by one before the node runs.
 //!
-//! Nothing is changed: ports are opened and closed again, files are made beside others and removed, a broker is connected
-//! to and left. While the node itself runs, its own ports are in use, which is said.
+//! Nothing is changed: ports are opened and closed again, files are made beside others and removed, a broker is
+//! connected to and left. While the node itself runs, its own ports are in use, which is said.
 
 #[cfg(feature = "camera")]
 mod camera;
@@ -60,7 +60,7 @@ pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
     #[cfg(feature = "camera")]
     findings.extend(camera::examine(config).await);
     findings.extend(network::broker(config).await);
-    findings.extend(network::gossip(config));
+    findings.push(network::gossip(config));
     #[cfg(feature = "camera")]
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));

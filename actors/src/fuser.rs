@@ -207,8 +207,8 @@ impl FuserState {
         }
     }
 
-    /// Keeps the map that was admitted last. While nobody is known to lead, the gate admits any epoch: one that the election
-    /// does not know is nobody's to go on from.
+    /// Keeps the map that was admitted last. While nobody is known to lead, the gate admits any epoch: one that the
+    /// election does not know is nobody's to go on from.
     fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
         if self.aggregator.leads().is_none() && map.epoch <= *self.term.borrow() {
             self.last_map = Some((map, received_at));

@@ -66,8 +66,8 @@ pub enum GatewayMessage {
         /// Brokers to which all vehicles send.
         addresses: Vec<BrokerAddress>,
     },
-    /// Take reports from every broker, to be looked at, or no longer so; whoever wants them asks again from time to time,
-    /// as a gateway that is started anew has forgotten it.
+    /// Take reports from every broker, to be looked at, or no longer so; whoever wants them asks again from time to
+    /// time, as a gateway that is started anew has forgotten it.
     WatchReports {
         /// Whether they are wanted.
         wanted: bool,

@@ -8,8 +8,8 @@
 //! ```
 //!
 //! A cell has a CA of its own, so that a certificate of another cell is worth nothing here. A certificate's common name
-//! is the node's name. One for a node that may lead also bears [`BROKER_NAME`], which is what clients look for: a vehicle
-//! that never leads cannot pose as a broker, and addresses may change.
+//! is the node's name. One for a node that may lead also bears [`BROKER_NAME`], which is what clients look for: a
+//! vehicle that never leads cannot pose as a broker, and addresses may change.
 
 mod authority;
 mod broker_trust;

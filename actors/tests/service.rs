@@ -85,8 +85,8 @@ fn free_port() -> u16 {
     UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
-/// The watchdog of a follower is fed while rounds of a live aggregator come, and of the aggregator while it leads; both say
-/// how they are, and the end is told.
+/// The watchdog of a follower is fed while rounds of a live aggregator come, and of the aggregator while it leads; both
+/// say how they are, and the end is told.
 #[test]
 fn the_watchdog_is_fed_while_rounds_flow_and_only_then() {
     let gossip = format!("127.0.0.1:{}", free_port());

@@ -1,8 +1,8 @@
 //! What is done elsewhere with the same reports: one vehicle alone, all together, and late fusion.
 //!
 //! Late fusion as OPV2V and V2V4Real have it: what all vehicles found, with non-maximum suppression by score, here by
-//! centre distance. Identities come from a tracker as plain as AB3DMOT's (Weng et al., IROS 2020): a constant velocity and
-//! the nearest detection.
+//! centre distance. Identities come from a tracker as plain as AB3DMOT's (Weng et al., IROS 2020): a constant velocity
+//! and the nearest detection.
 
 use std::collections::BTreeMap;
 use std::time::Duration;

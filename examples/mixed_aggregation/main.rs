@@ -2,11 +2,11 @@
 //!
 //! `cargo run --example mixed_aggregation`
 //!
-//! All nodes run in this process, each on a runtime of its own and with its own broker and sockets on loopback. Shutting a
-//! runtime down ends a node as SIGKILL ends a process: its connections break, and nobody is told. The vehicles have no
-//! cameras; what they would see is published through their gateways ten times a second. Figures are from the maps that
-//! the nodes accepted, as their map logs tell. The program fails unless the cell is served by one leader after every
-//! step, and nobody accepts a superseded map.
+//! All nodes run in this process, each on a runtime of its own and with its own broker and sockets on loopback.
+//! Shutting a runtime down ends a node as SIGKILL ends a process: its connections break, and nobody is told. The
+//! vehicles have no cameras; what they would see is published through their gateways ten times a second. Figures are
+//! from the maps that the nodes accepted, as their map logs tell. The program fails unless the cell is served by one
+//! leader after every step, and nobody accepts a superseded map.
 
 mod cell;
 
@@ -24,8 +24,8 @@ use cell::{Cell, Record};
 /// The places of the cell and metres east; nobody is at the last.
 const PLACES: [(&str, f64); 3] = [("slot-0", 0.0), ("slot-1", 3.0), ("slot-2", 6.0)];
 
-/// What each vehicle reads at which places; all have all places in view, and noether misreads the first: without euclid,
-/// the map cannot tell who is right.
+/// What each vehicle reads at which places; all have all places in view, and noether misreads the first: without
+/// euclid, the map cannot tell who is right.
 const SEEN: [(&str, &[(usize, &str)]); 3] = [
     ("euclid", &[(0, "ABC123"), (1, "XYZ789")]),
     ("gauss", &[(0, "ABC123"), (1, "XYZ789")]),

@@ -2,9 +2,9 @@
 //!
 //! `cargo run --example split_heal`
 //!
-//! A simulation: election, aggregator and ledger of each vehicle are those that a node runs, and what travels is encoded
-//! and decoded, but time is a number and the network a queue, so that every run is the same. Cells of real processes
-//! are split by `make trials`, in network namespaces.
+//! A simulation: election, aggregator and ledger of each vehicle are those that a node runs, and what travels is
+//! encoded and decoded, but time is a number and the network a queue, so that every run is the same. Cells of real
+//! processes are split by `make trials`, in network namespaces.
 //!
 //! Euclid and gauss see slot-0, noether and turing slot-1, and all read a sign, which turing gets wrong. The program
 //! fails unless, in the end, one leads and every ledger holds the evidence of both sides once.

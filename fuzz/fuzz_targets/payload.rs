@@ -1,4 +1,5 @@
-//! Every payload in every encoding. What is taken can be sent on: it is taken again, unchanged where nothing is rounded.
+//! Every payload in every encoding. What is taken can be sent on: it is taken again, unchanged where nothing is
+//! rounded.
 //!
 //! The first byte of an input chooses the payload, the rest is what came from the network.
 

@@ -39,8 +39,8 @@ impl Algorithms {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionConfig {
-    /// Which algorithms run: `pace`, `vote` or `both`, the default: PACE, and VOTE from the first vote on. Reports for one
-    /// that does not run are rejected.
+    /// Which algorithms run: `pace`, `vote` or `both`, the default: PACE, and VOTE from the first vote on. Reports for
+    /// one that does not run are rejected.
     pub algorithms: Algorithms,
     /// Which reports are fresh enough.
     pub window: WindowConfig,

@@ -50,8 +50,8 @@ impl Following {
         self.rhythm().map_or(silent_at, |gap| silent_at.min(self.direct_at + gap * 3 / 2))
     }
 
-    /// From when on more than a round is missing: the leader missed two beats and published no round, does not hear this
-    /// node, or was given up by the membership.
+    /// From when on more than a round is missing: the leader missed two beats and published no round, does not hear
+    /// this node, or was given up by the membership.
     fn silent_at(&self, config: &ElectionConfig) -> Timestamp {
         if self.given_up {
             return self.direct_at;

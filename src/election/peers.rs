@@ -178,8 +178,8 @@ impl Peers {
             .filter_map(|(name, peer)| Some((name, peer.standing?)))
     }
 
-    /// The leader's successors: heard lately and fit, the best first. Who was given up has to have been heard within the
-    /// beats that a standby may miss: the membership may hear less than the election does.
+    /// The leader's successors: heard lately and fit, the best first. Who was given up has to have been heard within
+    /// the beats that a standby may miss: the membership may hear less than the election does.
     pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
         let silence = self.patience / 4;
         let given_up = |name: &NodeName| {

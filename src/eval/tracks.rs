@@ -4,8 +4,8 @@
 //! precision at four distances and by the best F1; then, at a threshold on the confidence, by MODA and MODP, CLEAR MOT,
 //! IDF1 and HOTA. Definitions and sources stand with each part; `docs/evaluation.md` has them together.
 //!
-//! Call [`TrackEvaluation::map`] with every map of a replay, in order, then [`TrackEvaluation::result`]. Output of other
-//! programs is judged by [`score`].
+//! Call [`TrackEvaluation::map`] with every map of a replay, in order, then [`TrackEvaluation::result`]. Output of
+//! other programs is judged by [`score`].
 
 mod clear;
 mod hota;
@@ -36,8 +36,8 @@ pub const AP_DISTANCES_M: [f64; 4] = [0.5, 1.0, 2.0, 4.0];
 /// Distance in metres up to which an object can be taken for a true one, in all but average precision and HOTA.
 pub const MATCH_DISTANCE_M: f64 = 2.0;
 
-/// Distance in metres at which two places are no longer similar at all; HOTA averages over distances below it. At half of
-/// it the similarity 1 − d/d₀ is 0.5, the usual threshold, at [`MATCH_DISTANCE_M`].
+/// Distance in metres at which two places are no longer similar at all; HOTA averages over distances below it. At half
+/// of it the similarity 1 − d/d₀ is 0.5, the usual threshold, at [`MATCH_DISTANCE_M`].
 pub const ZERO_DISTANCE_M: f64 = 2.0 * MATCH_DISTANCE_M;
 
 /// Confidence from which an object counts when nobody chooses.
@@ -103,7 +103,8 @@ pub struct TrackScores {
     pub at_default: ThresholdScores,
 }
 
-/// What holds for the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes together.
+/// What holds for the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes
+/// together.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThresholdScores {
     /// The threshold.

@@ -93,7 +93,11 @@ impl LandmarkIndex {
     /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
     /// with where objects stand.
     pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
-        self.candidates(label, *point, *covariance, *gate).min_by(Candidate::compare)
+        // A fold from nothing: `min_by` steps to the first candidate, which keeps the search from becoming plain loops.
+        self.candidates(label, *point, *covariance, *gate).fold(None, |best, candidate| match best {
+            Some(best) if candidate.compare(&best) != Ordering::Less => Some(best),
+            _ => Some(candidate),
+        })
     }
 
     /// All landmarks that explain a detection, as for [`Self::best`], in no particular order.

@@ -47,8 +47,8 @@ where
         return wishes;
     }
     contested.dedup();
-    // All that could be displaced: whoever wants a contested place, the other places that these could take, whoever wants
-    // those, and so on. Everyone else keeps the place wanted, the best there is.
+    // All that could be displaced: whoever wants a contested place, the other places that these could take, whoever
+    // wants those, and so on. Everyone else keeps the place wanted, the best there is.
     let mut reached: HashSet<Place> = contested.iter().copied().collect();
     let mut contestants = Vec::new();
     while let Some(place) = contested.pop() {

@@ -59,7 +59,8 @@ pub enum JournalEvent {
 pub struct RerunSummary {
     /// Reports in it.
     pub reports: u64,
-    /// Reports that were not used, by reason; a live aggregator that has two ways to hear of the same report rejects many.
+    /// Reports that were not used, by reason; a live aggregator that has two ways to hear of the same report rejects
+    /// many.
     pub rejected: BTreeMap<RejectReason, u64>,
     /// Entries and reports that were lost.
     pub missing: u64,

@@ -15,9 +15,9 @@ const DENSE: u64 = 4;
 
 /// A vehicle's counts in one lane when it had a multiple of [`SPACING`] votes there, by that multiple.
 ///
-/// Of marks that lie n back, those at multiples of the greatest power of two up to n/2 are kept: two for every doubling,
-/// so that where the votes of any span began is known to within half of it. What is kept only shrinks as the latest mark
-/// rises: to merge and then drop is a join.
+/// Of marks that lie n back, those at multiples of the greatest power of two up to n/2 are kept: two for every
+/// doubling, so that where the votes of any span began is known to within half of it. What is kept only shrinks as the
+/// latest mark rises: to merge and then drop is a join.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Marks(BTreeMap<u64, Counts>);
 

@@ -10,8 +10,8 @@ use crate::wire::LedgerEntry;
 /// Most lanes that are kept: the latest.
 pub const MAX_LANES: usize = 64;
 
-/// Most counts and marks that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its own and
-/// later ones are left, unless it is of the present leader's lane, to which later ones give way too.
+/// Most counts and marks that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its
+/// own and later ones are left, unless it is of the present leader's lane, to which later ones give way too.
 pub const MAX_ENTRIES: usize = 65_536;
 
 /// Which count: what an entry is about, without the numbers.
@@ -94,8 +94,8 @@ impl ReputationLedger {
         Some(lane.entry(node.clone()).or_default())
     }
 
-    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false where only those are left
-    /// that do not give way to it.
+    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false where only those are
+    /// left that do not give way to it.
     pub(super) fn make_room(&mut self, lane: Lane<'_>, present: Option<Lane<'_>>) -> bool {
         let is_full = |ledger: &Self| {
             ledger.entries >= MAX_ENTRIES || (ledger.lane(lane).is_none() && ledger.lanes() >= MAX_LANES)

@@ -1,4 +1,5 @@
-//! The intersection of the paper's VOTE testbed: what the vehicles' detectors said, frame by frame, and what stood there.
+//! The intersection of the paper's VOTE testbed: what the vehicles' detectors said, frame by frame, and what stood
+//! there.
 //!
 //! Files are in inches, degrees and shares of the image, and converted while being read.
 

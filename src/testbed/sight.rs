@@ -10,8 +10,8 @@ use crate::geometry::{Pose, wrap_angle};
 const NEAR_M: f64 = 1e-3;
 /// Columns by which the shown part of a code is measured.
 const PROBES: u32 = 41;
-/// Least width of a code in the image at which it may be read: a bit more than a pixel for each of the 21 modules of the
-/// smallest code, which no sampling of fewer can tell apart.
+/// Least width of a code in the image at which it may be read: a bit more than a pixel for each of the 21 modules of
+/// the smallest code, which no sampling of fewer can tell apart.
 const LEGIBLE_PX: f64 = 25.0;
 /// Part of a code that must be shown: error correction level M restores 15 % of the code words, but a finder pattern
 /// that is cut is not restored.

@@ -160,7 +160,8 @@ fn a_spot_is_seen_from_the_front_and_whole() {
 fn a_parked_vehicle_hides_what_is_behind_it() {
     let cover = |y: f64| seen(&json!([spot(0, 16.0, 0.0, None), spot(1, 8.0, y, Some("A"))]))[0];
     assert!(!cover(0.0));
-    // Seen from the origin, the code of the sign ends at a slope of 0.0497, the plate before it begins at (y - 1.375) / 8.
+    // Seen from the origin, the code of the sign ends at a slope of 0.0497, the plate before it begins at (y - 1.375) /
+    // 8.
     assert!(!cover(1.6), "covers a quarter of the code");
     assert!(cover(2.1), "passes beside");
     let camera = Pose::new(0.0, 0.0, 0.0);

@@ -1,9 +1,9 @@
 //! By how much a vehicle's positions are off, from what others see of the same objects.
 //!
-//! The error is an offset and a rotation, small and changing slowly: a Gauss-Markov process of three states with a known
-//! spread at rest, so that what all vehicles are off by together, which nobody can see, decays. Every round is one step of
-//! an extended Kalman filter in information form over all pairs, reweighted against wrong ones by Cauchy's function (Holland, Welsch,
-//! "Robust regression using iteratively reweighted least-squares", 1977).
+//! The error is an offset and a rotation, small and changing slowly: a Gauss-Markov process of three states with a
+//! known spread at rest, so that what all vehicles are off by together, which nobody can see, decays. Every round is
+//! one step of an extended Kalman filter in information form over all pairs, reweighted against wrong ones by Cauchy's
+//! function (Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
 
 use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
 

@@ -2,8 +2,8 @@
 //!
 //! Nobody says which detections are real. But what is real is detected again at the next look, and what is not, less
 //! so, and the part that comes again rises with the confidence in much the same way for whatever detector: where
-//! [`EVEN_REHITS`] of the detections come again, about half are real. That confidence is found from rates by confidence, and the spread
-//! of the confidences above it gives their scale.
+//! [`EVEN_REHITS`] of the detections come again, about half are real. That confidence is found from rates by
+//! confidence, and the spread of the confidences above it gives their scale.
 
 /// Part of the detections that come again among those of which half are real.
 const EVEN_REHITS: f64 = 0.62;

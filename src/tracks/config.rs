@@ -56,7 +56,8 @@ pub struct TracksConfig {
     pub min_confidence: f64,
     /// Distance in metres from a vehicle's pose within which it sees itself, and others see it. Default 1.5.
     pub vehicle_radius_m: f64,
-    /// What a vehicle is called that nobody else has seen. Default `car`: the label that the cell's detectors give vehicles.
+    /// What a vehicle is called that nobody else has seen. Default `car`: the label that the cell's detectors give
+    /// vehicles.
     pub vehicle_label: Label,
     /// Whether offsets and rotations of vehicles' poses are estimated and corrected. Default true.
     pub align: bool,

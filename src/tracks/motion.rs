@@ -4,8 +4,8 @@
 //! "Estimation with Applications to Tracking and Navigation", 2001, section 6.2.2). The covariance is split in two
 //! (Julier, Uhlmann, "General decentralized data fusion with covariance intersection", 2001, section 12.4): the part
 //! that is independent from one report to the next shrinks as reports come in, by Joseph's form, which holds for any
-//! gain. The part that may be common to them in any way, such as an error of a vehicle's pose, never shrinks below
-//! what the best of the reports has: of errors of standard deviations b₁, b₂ that are weighted by k and 1−k, the standard
+//! gain. The part that may be common to them in any way, such as an error of a vehicle's pose, never shrinks below what
+//! the best of the reports has: of errors of standard deviations b₁, b₂ that are weighted by k and 1−k, the standard
 //! deviation is at most k·b₁ + (1−k)·b₂, whatever their correlation.
 
 use nalgebra::{Matrix2, Vector2};
@@ -108,7 +108,8 @@ impl Motion {
     }
 
     /// Takes a measurement in. One taken before the state's time is held against where the object was then (Bar-Shalom,
-    /// "Update with out-of-sequence measurements in tracking", 2002, with the process noise in between counted in full).
+    /// "Update with out-of-sequence measurements in tracking", 2002, with the process noise in between counted in
+    /// full).
     pub(super) fn update(&mut self, at: Timestamp, seen: &Measurement, density: f64) {
         self.predict(at, density);
         let dt = self.seconds_to(at).min(0.0);
@@ -126,8 +127,9 @@ impl Motion {
         self.common_m = (1.0 - share) * self.common_m + share * seen.common_m;
     }
 
-    /// Takes in what the velocity was at `at`, not after the state, of standard deviation `sigma_mps` in each direction. As
-    /// errors of all that is said of it may be the same, the velocity is never better known for it than one says.
+    /// Takes in what the velocity was at `at`, not after the state, of standard deviation `sigma_mps` in each
+    /// direction. As errors of all that is said of it may be the same, the velocity is never better known for it than
+    /// one says.
     pub(super) fn update_velocity(&mut self, at: Timestamp, velocity: Vector2<f64>, sigma_mps: f64, density: f64) {
         let stated = sigma_mps * sigma_mps + density * self.seconds_to(at).abs();
         let known = self.vv.trace() / 2.0;

@@ -1,4 +1,5 @@
-//! What becomes of one report: detections are matched to objects, the rest found new ones, and what is overlooked counts.
+//! What becomes of one report: detections are matched to objects, the rest found new ones, and what is overlooked
+//! counts.
 
 use std::time::Duration;
 

@@ -1,9 +1,9 @@
 //! Which vehicles can be believed: who asserts objects that others see, and who invents or hides them.
 //!
-//! Every [`SETTLED_AFTER`] of looks, what a vehicle said of an object is held against what the others say of it, its own
-//! word left out. Where they agree that the object is there, to have detected it is right; to have overlooked it all
-//! along is wrong if most vehicles detect what is so far away. Where at least two of them look and agree that nothing is
-//! there, to have detected it is wrong. One word against another settles nothing.
+//! Every [`SETTLED_AFTER`] of looks, what a vehicle said of an object is held against what the others say of it, its
+//! own word left out. Where they agree that the object is there, to have detected it is right; to have overlooked it
+//! all along is wrong if most vehicles detect what is so far away. Where at least two of them look and agree that
+//! nothing is there, to have detected it is wrong. One word against another settles nothing.
 
 use std::collections::BTreeMap;
 use std::time::Duration;

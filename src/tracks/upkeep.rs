@@ -1,4 +1,5 @@
-//! What happens to the objects between reports: those that turn out to be one are joined, those that are gone forgotten.
+//! What happens to the objects between reports: those that turn out to be one are joined, those that are gone
+//! forgotten.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -114,8 +115,8 @@ impl Tracker {
         }
     }
 
-    /// Takes over the objects of another aggregator's map, received at `now`: its identities for those known by another,
-    /// and those unknown, on its word, which fades.
+    /// Takes over the objects of another aggregator's map, received at `now`: its identities for those known by
+    /// another, and those unknown, on its word, which fades.
     pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
         self.index(now);
         let stated: BTreeSet<Uuid> = map.objects.iter().map(|object| object.id).collect();

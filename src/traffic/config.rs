@@ -30,8 +30,8 @@ pub struct TrafficConfig {
     pub warm_up_s: f64,
     /// The observers drive one behind the other and on the same route. Default false.
     pub convoy: bool,
-    /// All observers capture at the same moments and reports arrive at once. Default false: each has a phase of its own, and
-    /// reports take their time.
+    /// All observers capture at the same moments and reports arrive at once. Default false: each has a phase of its
+    /// own, and reports take their time.
     pub synchronous: bool,
     /// Seconds for which an object that nobody can see any more still belongs to the truth. Default 1.
     pub memory_s: f64,

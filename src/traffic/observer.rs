@@ -1,9 +1,9 @@
 //! What one vehicle makes of what it could see.
 //!
-//! Whether something is found depends on range, on how much of it is hidden, on its class, and on a quality of each pair of
-//! observer and object that changes within a second: misses come in runs. Confidences follow the same quality, so those of
-//! what is hardly seen look like those of what is not there. Of an object that is partly hidden, the middle of what is
-//! seen is reported.
+//! Whether something is found depends on range, on how much of it is hidden, on its class, and on a quality of each
+//! pair of observer and object that changes within a second: misses come in runs. Confidences follow the same quality,
+//! so those of what is hardly seen look like those of what is not there. Of an object that is partly hidden, the middle
+//! of what is seen is reported.
 
 use nalgebra::{Point2, Vector2};
 

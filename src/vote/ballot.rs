@@ -38,8 +38,8 @@ pub(super) struct Cast {
     pub(super) compared: bool,
 }
 
-/// What one vehicle stated lately on one landmark: the weight of its votes for each label, fading. One frame in which an
-/// object was taken for another does not change the vehicle's vote.
+/// What one vehicle stated lately on one landmark: the weight of its votes for each label, fading. One frame in which
+/// an object was taken for another does not change the vehicle's vote.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Recent {
     labels: [(LabelIndex, f64); 3],

@@ -27,8 +27,8 @@ pub struct VoteConfig {
     pub weighted: WeightedConfig,
     /// Most landmarks; an open cell forgets the oldest beyond it. Default 1024. Bounds memory.
     pub max_landmarks: usize,
-    /// Most vehicles; beyond it, long silent ones make room, or else reports of others are rejected. Default 256. Bounds
-    /// memory.
+    /// Most vehicles; beyond it, long silent ones make room, or else reports of others are rejected. Default 256.
+    /// Bounds memory.
     pub max_vehicles: usize,
     /// Most distinct labels of the cell, in `paper` mode of a landmark. Beyond it the labels that others can best do
     /// without make room, those of who brought in the most first; in `paper` mode, whose sums never end, votes for new
@@ -123,7 +123,8 @@ pub struct WeightedConfig {
     /// Most that newcomers together weigh against the proven vehicles at a landmark; default 0.5. Bounds what an
     /// attacker gains by rejoining under new names; larger lets newcomers in sooner.
     pub newcomer_share: f64,
-    /// Probability by which a label must lead the one shown to replace it; default 0.1. More flickers less, reacts later.
+    /// Probability by which a label must lead the one shown to replace it; default 0.1. More flickers less, reacts
+    /// later.
     pub hysteresis: f64,
     /// Distance in metres beyond which a vote is ignored; default 50. What a detector tells reliably.
     pub max_range_m: f64,

@@ -193,8 +193,8 @@ impl WeightedTally {
         }
     }
 
-    /// Turns the judged votes on a landmark into fading evidence and a record; they begin to count anew. All at once: were
-    /// each settled in its turn, the first would for a while be judged by evidence that the others still lack.
+    /// Turns the judged votes on a landmark into fading evidence and a record; they begin to count anew. All at once:
+    /// were each settled in its turn, the first would for a while be judged by evidence that the others still lack.
     fn settle_all(&mut self, landmark: &LandmarkId) {
         self.uncount(landmark);
         let Some(ballot) = self.ballots.get_mut(landmark) else { return };

@@ -96,7 +96,8 @@ pub struct FusedObject {
     /// The agreed label.
     #[cbor(n(1), with = "Text")]
     pub label: Label,
-    /// How far the entry may be relied on, 0 to 1: the probability that the object is there, and within 1.5 m of the position.
+    /// How far the entry may be relied on, 0 to 1: the probability that the object is there, and within 1.5 m of the
+    /// position.
     #[cbor(n(2), with = "Half")]
     pub confidence: f64,
     /// East in metres.

@@ -66,8 +66,8 @@ fn a_silent_leader_is_replaced_in_400_ms() {
     report("silent", &mut gaps, 400 * MS);
 }
 
-/// Whoever a split cuts off from the leader is served by a leader of its own within 400 ms, wherever the standby is; and
-/// the sides become one without a quarrel.
+/// Whoever a split cuts off from the leader is served by a leader of its own within 400 ms, wherever the standby is;
+/// and the sides become one without a quarrel.
 #[test]
 fn a_side_without_the_leader_has_its_own_in_400_ms() {
     let mut gaps = Vec::new();

@@ -17,7 +17,8 @@ pub(super) const OUT: &str = "ecod/bench/out";
 /// Where the answers are.
 pub(super) const BACK: &str = "ecod/bench/back";
 
-/// Answers once all vehicles have sent, with a map's and a verdict's bytes; has a thread of its own, as the aggregator has, and ends when dropped.
+/// Answers once all vehicles have sent, with a map's and a verdict's bytes; has a thread of its own, as the aggregator
+/// has, and ends when dropped.
 #[derive(Debug)]
 pub(super) struct Echo {
     _stop: oneshot::Sender<()>,

@@ -49,8 +49,8 @@ pub fn landmarks() -> Vec<LandmarkConfig> {
     (0..32).map(|index| LandmarkConfig::at(format!("slot-{index}"), 3.0 * f64::from(index), 0.0)).collect()
 }
 
-/// What one vehicle says of ten neighbouring locations: an object at each, and that all were in view. In a cell that has no
-/// locations, objects stand where [`landmarks`] are.
+/// What one vehicle says of ten neighbouring locations: an object at each, and that all were in view. In a cell that
+/// has no locations, objects stand where [`landmarks`] are.
 pub(super) fn report(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport {
     let spots = spots(vehicle, landmarks);
     let object = |spot: &LandmarkConfig| PerceivedObject {

@@ -56,7 +56,8 @@ const OUT: &str = "ecod/bench/out";
 const BACK: &str = "ecod/bench/back";
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Measures with two bare MQTT 3.1.1 clients, in nanoseconds from when a message was handed to its client to when it was back.
+/// Measures with two bare MQTT 3.1.1 clients, in nanoseconds from when a message was handed to its client to when it
+/// was back.
 ///
 /// # Errors
 /// [`TwoHopError`] when the broker cannot be reached or loses messages.

@@ -138,8 +138,8 @@ impl Arrivals {
         }
     }
 
-    /// Verdicts came: if not of an earlier round than the last map that answered, they answer what it did. They leave the
-    /// aggregator after the map of their round, by the same way.
+    /// Verdicts came: if not of an earlier round than the last map that answered, they answer what it did. They leave
+    /// the aggregator after the map of their round, by the same way.
     fn verdict(&mut self, round: u64, at: Instant) {
         let [answered, open] = &mut self.open;
         if round >= self.answered_in && *open < *answered {

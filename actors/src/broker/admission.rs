@@ -58,7 +58,8 @@ pub(super) struct Rate {
 pub(super) enum Origin {
     /// From an address that has its share.
     Address(IpAddr),
-    /// From this machine, where a whole cell may run, and nothing tells its nodes apart: only those that wait are limited.
+    /// From this machine, where a whole cell may run, and nothing tells its nodes apart: only those that wait are
+    /// limited.
     Here,
 }
 
@@ -67,8 +68,8 @@ const MAX_PENDING_EACH: usize = 32;
 const MAX_PENDING_HERE: usize = 256;
 const MAX_PENDING: usize = 1024;
 
-/// How many times the rate of a stranger an address has from which a client has logged in, and for how long after: a flood
-/// from a node's own address, such as behind address translation, is to leave something for the node.
+/// How many times the rate of a stranger an address has from which a client has logged in, and for how long after: a
+/// flood from a node's own address, such as behind address translation, is to leave something for the node.
 const KNOWN_SHARE: u32 = 10;
 const KNOWN_FOR: Duration = Duration::from_secs(3600);
 

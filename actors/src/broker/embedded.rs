@@ -95,23 +95,23 @@ pub struct BrokerConfig {
     pub max_waiting: usize,
     /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
     pub max_retained: usize,
-    /// Most bytes of all retained messages together; default 67108864. A status has some hundred, reputations some hundred
-    /// for each vehicle. What is beyond is passed on and not kept.
+    /// Most bytes of all retained messages together; default 67108864. A status has some hundred, reputations some
+    /// hundred for each vehicle. What is beyond is passed on and not kept.
     pub max_retained_bytes: usize,
-    /// Whether the broker may listen on others than loopback addresses without `[tls]`; default false. Whoever reaches it
-    /// then reads everything and may say anything in anybody's name.
+    /// Whether the broker may listen on others than loopback addresses without `[tls]`; default false. Whoever reaches
+    /// it then reads everything and may say anything in anybody's name.
     pub allow_plaintext: bool,
-    /// Milliseconds within which a client must have shown its certificate and logged in; default 5000. Shorter frees its
-    /// place sooner, longer admits slow boards and lossy networks.
+    /// Milliseconds within which a client must have shown its certificate and logged in; default 5000. Shorter frees
+    /// its place sooner, longer admits slow boards and lossy networks.
     pub handshake_timeout_ms: u64,
-    /// Connections that one address may make at once; default 64. A cell behind address translation needs two or more for
-    /// each node.
+    /// Connections that one address may make at once; default 64. A cell behind address translation needs two or more
+    /// for each node.
     pub connect_burst: u32,
     /// Connections per second that one address may make after that; default 10.
     pub connects_per_s: u32,
     /// Most messages a second of one certificate or, without certificates, of one address, or of one client of this
-    /// machine, and at once after a second of silence; default 1000. What is beyond is passed on to nobody and counted. A
-    /// node sends some tens; more lets a flood take the others' time.
+    /// machine, and at once after a second of silence; default 1000. What is beyond is passed on to nobody and counted.
+    /// A node sends some tens; more lets a flood take the others' time.
     pub max_messages_hz: u32,
 }
 
@@ -188,7 +188,8 @@ impl EmbeddedBroker {
         Self { config, guard: None, counters: Arc::default(), running: None }
     }
 
-    /// A broker that is not started, behind a gate: clients show certificates, if the guard has any, and strangers are limited.
+    /// A broker that is not started, behind a gate: clients show certificates, if the guard has any, and strangers are
+    /// limited.
     pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
         let counters = Arc::clone(&guard.counters);
         Self { config, guard: Some(guard), counters, running: None }
@@ -296,7 +297,8 @@ struct Plan {
     beats: Arc<AtomicU64>,
 }
 
-/// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made here.
+/// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made
+/// here.
 fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
     let (address, beats) = (plan.address, Arc::clone(&plan.beats));
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {

@@ -5,8 +5,8 @@
 //!                    by source     certificate of the cell                with a pass that says whose it is
 //! ```
 //!
-//! rmqtt accepts connections from nobody but a socket of its own, and knows no revocation lists; so it listens on loopback,
-//! on a port that the system draws, and takes only connections for which there is a pass.
+//! rmqtt accepts connections from nobody but a socket of its own, and knows no revocation lists; so it listens on
+//! loopback, on a port that the system draws, and takes only connections for which there is a pass.
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr};

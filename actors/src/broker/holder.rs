@@ -14,7 +14,8 @@ use crate::pki::Identity;
 pub(super) struct Holder {
     /// Absent without certificates.
     pub(super) identity: Option<Arc<Identity>>,
-    /// By what its connections count together; absent for this machine's without certificates, where a whole cell may run.
+    /// By what its connections count together; absent for this machine's without certificates, where a whole cell may
+    /// run.
     share: Option<Arc<str>>,
     /// Whether it left it to the broker to draw its client id.
     pub(super) is_nameless: bool,

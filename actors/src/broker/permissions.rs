@@ -8,8 +8,8 @@
 //! | `global_detections`, `global_verdicts`, `reputations` | who is elected; while nobody is, who may lead |
 //! | anything else | nobody |
 //!
-//! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a certificate
-//! of the cell may read everything.
+//! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a
+//! certificate of the cell may read everything.
 
 use std::fmt;
 use std::net::SocketAddr;
@@ -75,8 +75,8 @@ impl Permissions {
         self.passes.holder(address).is_some_and(allows)
     }
 
-    /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more than
-    /// the topic's receivers take, nor what is not to be retained.
+    /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more
+    /// than the topic's receivers take, nor what is not to be retained.
     fn allows(&self, holder: &Holder, topic: &str, retain: bool, bytes: usize) -> bool {
         let topic = self.topics.parse(topic);
         let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));

@@ -18,8 +18,8 @@ pub(super) struct Pulse {
 /// Time between two beats, and the least between two looks that count.
 pub(super) const PULSE: Duration = Duration::from_millis(200);
 
-/// A thread hangs after so many looks in a row without a beat, some five seconds. Looks are counted rather than time, so
-/// that nothing is missed while the whole process is stopped.
+/// A thread hangs after so many looks in a row without a beat, some five seconds. Looks are counted rather than time,
+/// so that nothing is missed while the whole process is stopped.
 const MOST_MISSED: u32 = 25;
 
 impl Pulse {

@@ -20,12 +20,12 @@ pub use log::rounds_of_log;
 /// Flags of `replay`.
 #[derive(Debug, Args)]
 pub(super) struct ReplayArguments {
-    /// Configuration of the cell, or of a node in it (TOML); without it, that of the log, or for reports alone defaults and
-    /// the locations that they name
+    /// Configuration of the cell, or of a node in it (TOML); without it, that of the log, or for reports alone defaults
+    /// and the locations that they name
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A log (MCAP), a directory of one node's logs, or reports, one JSON object a line in the order of arrival; `-` for
-    /// standard input; may be given several times for logs
+    /// A log (MCAP), a directory of one node's logs, or reports, one JSON object a line in the order of arrival; `-`
+    /// for standard input; may be given several times for logs
     #[arg(long, value_name = "FILE", required = true)]
     input: Vec<PathBuf>,
     /// Where maps and verdicts are written, one JSON object a line; `-` for standard output

@@ -59,8 +59,8 @@ pub struct RunArguments {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     map_log: Option<PathBuf>,
-    /// Where the web page with the cell, metrics and health is served: 127.0.0.1:8080 if nothing is said, or a free port
-    /// if that is taken; other addresses than loopback need `dashboard.token`
+    /// Where the web page with the cell, metrics and health is served: 127.0.0.1:8080 if nothing is said, or a free
+    /// port if that is taken; other addresses than loopback need `dashboard.token`
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1)]
     #[serde(skip)]
     dashboard: Option<Option<SocketAddr>>,

@@ -39,8 +39,8 @@ pub(super) struct TestbedArguments {
     /// Write the vehicles' reports on recorded detections to this file, as `replay` reads them
     #[arg(long, value_name = "FILE")]
     pub(super) reports: Option<PathBuf>,
-    /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded detections, fewer verdicts of
-    /// the recording, or of the generated scenes if only they are chosen
+    /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded detections, fewer verdicts
+    /// of the recording, or of the generated scenes if only they are chosen
     #[arg(long, value_name = "PCT")]
     pub(super) at_least: Option<f64>,
     /// The same of the occupied spots alone; as `--at-least` if not given
@@ -74,11 +74,12 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
         let bar = progress(frames, &scene.name);
         results.push(trial.run(|| bar.inc(1)).with_context(|| format!("scene {}", scene.name))?);
         bar.finish_and_clear();
+        // After each scene: what was judged stays, whatever becomes of the rest.
+        if let Some(out) = &arguments.out {
+            write_json(out, &Results { scenes: &results })?;
+        }
     }
     print(&table(&results).to_string())?;
-    if let Some(out) = &arguments.out {
-        write_json(out, &Results { scenes: &results })?;
-    }
     let least = arguments.at_least.unwrap_or(0.0);
     let least_occupied = arguments.occupied_at_least.unwrap_or(least);
     for scene in &results {

@@ -13,13 +13,14 @@ use crate::gateway::Secret;
 pub struct DashboardConfig {
     /// Whether the page is served; default true. Without, nothing listens, and metrics and health are not there either.
     pub enabled: bool,
-    /// Where the page is served, port 0 for a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a free port
-    /// if that is taken, as by another node of the machine. An address that other machines reach needs a token.
+    /// Where the page is served, port 0 for a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a free
+    /// port if that is taken, as by another node of the machine. An address that other machines reach needs a token.
     pub listen: Option<SocketAddr>,
     /// What who looks has to know, at least 12 characters. Default none, which only a loopback address allows. Give it as
     /// `ECOD_DASHBOARD__TOKEN` rather than in a file that others read.
     pub token: Option<Secret>,
-    /// Most pictures of the cell a second that browsers get; default 10. Less costs less, more shows more of a fast cell.
+    /// Most pictures of the cell a second that browsers get; default 10. Less costs less, more shows more of a fast
+    /// cell.
     pub max_rate_hz: f64,
     /// Most connections at a time; default 64. A browser's tab takes one for as long as it is open.
     pub max_connections: usize,

@@ -40,8 +40,8 @@ pub struct Sighting {
     pub report: Arc<ObjectReport>,
 }
 
-/// Most vehicles and most nodes that are kept. Further ones are shown in place of vehicles that have been silent, and of
-/// nodes that are offline or, if none is, spoke longest ago.
+/// Most vehicles and most nodes that are kept. Further ones are shown in place of vehicles that have been silent, and
+/// of nodes that are offline or, if none is, spoke longest ago.
 pub const MAX_SHOWN: usize = 256;
 
 /// From when on a vehicle that does not report gives way to another.

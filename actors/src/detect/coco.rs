@@ -26,9 +26,9 @@ pub struct CocoConfig {
     /// ONNX file with the inputs and outputs of the built-in weights; default none: the built-in weights.
     pub model: Option<PathBuf>,
     /// Least confidence of a detection; default 0.4. Less finds more, also what is not there.
-    pub threshold: f32,
+    pub threshold: f64,
     /// Overlap (intersection over union) from which two boxes of one class are the same object; default 0.5.
-    pub max_overlap: f32,
+    pub max_overlap: f64,
     /// Whether to look at four overlapping quarters of the image besides the whole; default false. Finds objects of
     /// half the size and takes five times as long.
     pub tiling: bool,
@@ -46,8 +46,8 @@ impl CocoConfig {
     /// # Errors
     /// [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("threshold", self.threshold.into(), f64::from(0.01f32), 1.0)?;
-        check_range("max_overlap", self.max_overlap.into(), 0.0, 1.0)
+        check_range("threshold", self.threshold, 0.01, 1.0)?;
+        check_range("max_overlap", self.max_overlap, 0.0, 1.0)
     }
 }
 
@@ -133,7 +133,7 @@ impl CocoDetector {
             .filter_map(|((anchor, offsets), scores)| {
                 let (class, score) = best_class(scores)?;
                 let bounds = anchor.decode(offsets);
-                (score >= self.config.threshold).then_some(Candidate { class, score, bounds })
+                (f64::from(score) >= self.config.threshold).then_some(Candidate { class, score, bounds })
             })
             .collect())
     }
@@ -177,7 +177,7 @@ impl CocoDetector {
             let scores: Vector<f32> = of_class.iter().map(|c| c.score).collect();
             let mut kept = Vector::<i32>::new();
             let CocoConfig { threshold, max_overlap, .. } = self.config;
-            dnn::nms_boxes_f64(&boxes, &scores, threshold, max_overlap, &mut kept, 1.0, 0)?;
+            dnn::nms_boxes_f64(&boxes, &scores, threshold as f32, max_overlap as f32, &mut kept, 1.0, 0)?;
             detections.extend(kept.iter().filter_map(|index| of_class.get(index as usize)).map(|c| Detection {
                 label: label.into(),
                 confidence: f64::from(c.score).clamp(0.0, 1.0),

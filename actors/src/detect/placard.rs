@@ -74,8 +74,8 @@ const CONFIDENCES: (f64, f64) = (0.5, 0.99);
 /// says how far to trust its corners: it rises from 0.5 for modules of one pixel along the code's shortest side to 0.99
 /// for modules of four pixels.
 ///
-/// The lower right corner has no finder pattern and is extrapolated by the decoder: in codes of version 1 it is typically
-/// off by 0.45 modules, the other corners by 0.2.
+/// The lower right corner has no finder pattern and is extrapolated by the decoder: in codes of version 1 it is
+/// typically off by 0.45 modules, the other corners by 0.2.
 ///
 /// Texts that could not be a label are left out: empty, longer than 64 bytes, not UTF-8, or with control characters.
 pub struct PlacardDetector {

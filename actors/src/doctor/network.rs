@@ -35,54 +35,36 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
         });
     }
     if config.may_lead() && plane.embedded {
-        let address = config.broker_listen();
-        findings.push(match TcpListener::bind(address) {
-            Ok(_) => Finding::fine("broker port", format!("{address} is free")),
-            Err(error) => not_bound("broker port", address, &error, "listen"),
-        });
+        let port = Port { check: "broker port", address: config.broker_listen(), key: "listen" };
+        findings.push(port.of(TcpListener::bind(port.address)));
     }
     findings
 }
 
 /// The port on which the node gossips.
-pub(super) fn gossip(config: &NodeConfig) -> Option<Finding> {
-    let check = "gossip port";
+pub(super) fn gossip(config: &NodeConfig) -> Finding {
     let membership = &config.membership;
     let ip = if membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
     let address = membership.bind.unwrap_or(SocketAddr::from((ip, DEFAULT_PORT)));
-    Some(match UdpSocket::bind(address) {
-        Ok(_) => Finding::fine(check, format!("{address} is free")),
-        Err(error) if membership.bind.is_none() => Finding::doubtful(
-            check,
-            format!("{address}: {}, a free one will be taken", words(&error)),
-            "set `membership.bind` if others have this node as a seed",
-        ),
-        Err(error) => not_bound(check, address, &error, "membership.bind"),
-    })
+    let port = Port { check: "gossip port", address, key: "membership.bind" };
+    let bound = UdpSocket::bind(address);
+    if membership.bind.is_some() { port.of(bound) } else { port.or_another(bound, "others have this node as a seed") }
 }
 
 /// The port on which a vehicle that moves is told its poses.
 #[cfg(feature = "camera")]
 pub(super) fn poses(config: &NodeConfig) -> Option<Finding> {
-    let (check, address) = ("pose port", config.pose.listen?);
-    Some(match UdpSocket::bind(address) {
-        Ok(_) => Finding::fine(check, format!("{address} is free")),
-        Err(error) => not_bound(check, address, &error, "pose.listen"),
-    })
+    let port = Port { check: "pose port", address: config.pose.listen?, key: "pose.listen" };
+    Some(port.of(UdpSocket::bind(port.address)))
 }
 
 /// The address of the dashboard, unless it is switched off.
 pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
-    let (check, listen) = ("dashboard", config.dashboard.listen);
-    let address = listen.unwrap_or(DEFAULT_ADDRESS);
-    config.dashboard.enabled.then(|| match TcpListener::bind(address) {
-        Ok(_) => Finding::fine(check, format!("{address} is free")),
-        Err(error) if listen.is_none() => Finding::doubtful(
-            check,
-            format!("{address}: {}, a free one will be taken", words(&error)),
-            "set `dashboard.listen` if its address has to be known",
-        ),
-        Err(error) => not_bound(check, address, &error, "dashboard.listen"),
+    let listen = config.dashboard.listen;
+    let port = Port { check: "dashboard", address: listen.unwrap_or(DEFAULT_ADDRESS), key: "dashboard.listen" };
+    config.dashboard.enabled.then(|| {
+        let bound = TcpListener::bind(port.address);
+        if listen.is_some() { port.of(bound) } else { port.or_another(bound, "its address has to be known") }
     })
 }
 
@@ -90,20 +72,43 @@ pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
 #[cfg(feature = "foxglove")]
 pub(super) fn live(config: &NodeConfig) -> Option<Finding> {
     let port = config.record.as_ref().and_then(|record| record.live_port)?;
-    let (check, address) = ("live port", SocketAddr::from(([127, 0, 0, 1], port)));
-    Some(match TcpListener::bind(address) {
-        Ok(_) => Finding::fine(check, format!("{address} is free")),
-        Err(error) => not_bound(check, address, &error, "record.live_port"),
-    })
+    let port =
+        Port { check: "live port", address: SocketAddr::from(([127, 0, 0, 1], port)), key: "record.live_port" };
+    Some(port.of(TcpListener::bind(port.address)))
 }
 
-fn not_bound(check: &'static str, address: SocketAddr, error: &io::Error, key: &str) -> Finding {
-    let fix = match error.kind() {
-        io::ErrorKind::AddrNotAvailable => format!("set `{key}` to an address of this machine, or 0.0.0.0 for all"),
-        io::ErrorKind::PermissionDenied => format!("set `{key}` to a port from 1024"),
-        _ => format!("stop what uses it, perhaps this node itself, or set `{key}` to another"),
-    };
-    Finding::broken(check, format!("{address}: {}", words(error)), fix)
+/// An address that the node binds, and the key that says which.
+#[derive(Clone, Copy)]
+struct Port {
+    check: &'static str,
+    address: SocketAddr,
+    key: &'static str,
+}
+
+impl Port {
+    /// What became of binding it.
+    fn of<T>(self, bound: io::Result<T>) -> Finding {
+        let Self { check, address, key } = self;
+        let Err(error) = bound else { return Finding::fine(check, format!("{address} is free")) };
+        let fix = match error.kind() {
+            io::ErrorKind::AddrNotAvailable => format!("set `{key}` to an address of this machine, or 0.0.0.0 for all"),
+            io::ErrorKind::PermissionDenied => format!("set `{key}` to a port from 1024"),
+            _ => format!("stop what uses it, perhaps this node itself, or set `{key}` to another"),
+        };
+        Finding::broken(check, format!("{address}: {}", words(&error)), fix)
+    }
+
+    /// The same where a free port does as well, unless `wanted` is so.
+    fn or_another<T>(self, bound: io::Result<T>, wanted: &str) -> Finding {
+        let Self { check, address, key } = self;
+        match bound {
+            Err(error) => {
+                let seen = format!("{address}: {}, a free one will be taken", words(&error));
+                Finding::doubtful(check, seen, format!("set `{key}` if {wanted}"))
+            }
+            Ok(_) => self.of(bound),
+        }
+    }
 }
 
 /// Whether a datagram to the group comes back.

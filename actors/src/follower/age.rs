@@ -9,8 +9,8 @@ use ecod::time::Timestamp;
 /// What a driver was to be told longer ago than this is not told any more.
 const MAX_AGE: Duration = Duration::from_secs(1);
 
-/// How long the rounds of a leadership whose first came when a node had long heard none must come as slowly as they were
-/// made: what waited for the node comes faster.
+/// How long the rounds of a leadership whose first came when a node had long heard none must come as slowly as they
+/// were made: what waited for the node comes faster.
 const LEARNING: Duration = Duration::from_millis(150);
 
 /// Tells rounds that have just been made from those that waited.
@@ -53,9 +53,9 @@ impl LeadersDelay {
 }
 
 impl Age {
-    /// Whether a round of `epoch`, which the gate has admitted, spent no more than [`MAX_AGE`] in queues: a node that was
-    /// stopped, or a link that was, finds the rounds of that time waiting. The first round of a leadership is fresh, since
-    /// its clock is not known, but after such a time.
+    /// Whether a round of `epoch`, which the gate has admitted, spent no more than [`MAX_AGE`] in queues: a node that
+    /// was stopped, or a link that was, finds the rounds of that time waiting. The first round of a leadership is
+    /// fresh, since its clock is not known, but after such a time.
     pub(super) fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
         if self.newest_at.replace(received_at).is_some_and(|newest_at| received_at.since(newest_at) > MAX_AGE) {
             self.resumed_at = Some(received_at);

@@ -1,5 +1,5 @@
-//! The gate of one topic: what was superseded does not pass, and neither does who was not elected, but nobody is shut out
-//! for good.
+//! The gate of one topic: what was superseded does not pass, and neither does who was not elected, but nobody is shut
+//! out for good.
 
 use std::time::Duration;
 
@@ -10,23 +10,23 @@ use tokio::sync::watch;
 
 use crate::leader_election::Leadership;
 
-/// How long the newest message outranks others after it came: one from a stranger with a huge epoch silences the elected
-/// leader, or where there is no election whoever publishes, for no longer than this.
+/// How long the newest message outranks others after it came: one from a stranger with a huge epoch silences the
+/// elected leader, or where there is no election whoever publishes, for no longer than this.
 pub(super) const MEMORY: Duration = Duration::from_secs(3);
 
-/// How long the elected leader may be silent before another with a later epoch is believed to have taken over: the word of
-/// its election may have been lost.
+/// How long the elected leader may be silent before another with a later epoch is believed to have taken over: the word
+/// of its election may have been lost.
 const SILENCE: Duration = Duration::from_millis(250);
 
 /// How long one with a later epoch is believed while the election names another: the word may be under way.
 const CREDIT: Duration = Duration::from_millis(500);
 
-/// How many terms above the highest known the next leader's is: one that was started anew skips the term that it may have
-/// used before.
+/// How many terms above the highest known the next leader's is: one that was started anew skips the term that it may
+/// have used before.
 const TERMS_AHEAD: u64 = 2;
 
-/// How many rounds the standby that takes over may be ahead of the elected's last. One that stands by since it was found
-/// leading on its own counts its own rounds, and is still to be told to follow.
+/// How many rounds the standby that takes over may be ahead of the elected's last. One that stands by since it was
+/// found leading on its own counts its own rounds, and is still to be told to follow.
 const CATCH_UP: u64 = 16;
 
 /// Why a message did not pass.
@@ -68,7 +68,8 @@ struct Stranger {
 }
 
 impl Gate {
-    /// A gate that refuses terms below `least_term` at first, and later than the one after `known_term` for a while.
+    /// A gate that refuses terms below `least_term` at first, and while nobody is known to lead also those below
+    /// `known_term` or more than [`TERMS_AHEAD`] above it, until they were published for a while.
     pub(super) fn new(least_term: u64, known_term: Option<watch::Receiver<u64>>) -> Self {
         let gate = EpochGate::new(least_term);
         Self { gate, known_term, newest_at: None, elected: None, others_since: None, overruled: None, stranger: None }
@@ -90,9 +91,9 @@ impl Gate {
         }
     }
 
-    /// Whether an epoch that nobody vouches for is not to be believed yet. The election hears of terms from those who know
-    /// the cell's key, at the latest when the next leader beats, and of a term that is over it knows; only who publishes
-    /// on and on without any election is believed without, and of several the first.
+    /// Whether an epoch that nobody vouches for is not to be believed yet. The election hears of terms from those who
+    /// know the cell's key, at the latest when the next leader beats, and of a term that is over it knows; only who
+    /// publishes on and on without any election is believed without, and of several the first.
     fn is_strange(&mut self, epoch: &Epoch, received_at: Timestamp) -> bool {
         let Some(known_term) = self.known_term.as_ref().map(|known| *known.borrow()) else { return false };
         let vouched = known_term..=known_term.saturating_add(TERMS_AHEAD);
@@ -112,7 +113,8 @@ impl Gate {
         }
     }
 
-    /// The elected is heard even after somebody else with a later epoch, unless that one is likely to be the next elected.
+    /// The elected is heard even after somebody else with a later epoch, unless that one is likely to be the next
+    /// elected.
     fn admit_elected(&mut self, epoch: &Epoch, round: u64, received_at: Timestamp) -> Result<(), Refusal> {
         if self.elected.as_ref().is_some_and(|(last, last_round, _)| last == epoch && round <= *last_round) {
             return Err(Refusal::Repeated);

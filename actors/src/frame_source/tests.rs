@@ -1,7 +1,9 @@
+use std::io::{BufRead, BufReader, Write};
+use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::time::Duration;
 
-use opencv::core::{CV_8UC3, Mat, MatTraitConst, Scalar, Size, Vec3b};
+use opencv::core::{CV_8UC3, Mat, MatTraitConst, Scalar, Size, Vec3b, Vector};
 use opencv::imgcodecs;
 use opencv::prelude::*;
 use opencv::videoio::VideoWriter;
@@ -115,6 +117,61 @@ fn a_pipeline_gives_frames() {
     assert_eq!(seen.len(), 3);
     assert!(seen.iter().all(|value| *value > 230), "{seen:?}");
     assert!(matches!(end, FrameError::Lost { .. }), "a live source does not end: {end}");
+}
+
+/// A network camera on a free port that answers whoever asks as `answer` does; its address.
+fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'static) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://user:secret@{}/stream", listener.local_addr().unwrap());
+    std::thread::spawn(move || {
+        for visitor in listener.incoming() {
+            // One that hangs up is none of the camera's business.
+            let _ = visitor.and_then(&answer);
+        }
+    });
+    url
+}
+
+/// Motion JPEG over HTTP, the way cheap network cameras speak.
+fn motion_jpeg(mut visitor: TcpStream) -> std::io::Result<()> {
+    let request = BufReader::new(visitor.try_clone()?);
+    let lines: Vec<String> = request.lines().map_while(Result::ok).take_while(|line| !line.is_empty()).collect();
+    if !lines.iter().any(|line| line.starts_with("Authorization: Basic ")) {
+        return write!(visitor, "HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"camera\"\r\n\r\n");
+    }
+    write!(visitor, "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=frame\r\n\r\n")?;
+    for value in (0..25).map(|number| 50 + 4 * number) {
+        let mut jpeg = Vector::<u8>::new();
+        imgcodecs::imencode_def(".jpg", &gray(value), &mut jpeg).unwrap();
+        write!(visitor, "--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", jpeg.len())?;
+        visitor.write_all(jpeg.as_slice())?;
+        write!(visitor, "\r\n")?;
+    }
+    Ok(())
+}
+
+#[test]
+fn a_network_camera_gives_frames_until_it_hangs_up() {
+    let url = network_camera(motion_jpeg);
+    let mut source = open(&format!("kind = 'url'\nurl = '{url}'")).unwrap();
+    let (seen, end) = play(source.as_mut());
+    assert!(seen.len() > 20 && seen.is_sorted() && seen[0].abs_diff(50) <= 4, "{seen:?}");
+    let FrameError::Lost { origin, .. } = end else { panic!("a live source does not end: {end}") };
+    assert!(origin.ends_with("/stream") && !origin.contains("secret"), "{origin}");
+}
+
+#[test]
+fn a_network_camera_that_says_nothing_is_given_up_in_time() {
+    let held = std::sync::Mutex::new(Vec::new());
+    let url = network_camera(move |visitor| {
+        held.lock().unwrap().push(visitor);
+        Ok(())
+    });
+    let source: SourceConfig = toml::from_str(&format!("kind = 'url'\nurl = '{url}'")).unwrap();
+    let asked = Instant::now();
+    let error = source.open(Duration::from_millis(300)).err().expect("nothing comes").to_string();
+    assert!(asked.elapsed() < Duration::from_secs(30), "it has a limit of its own");
+    assert!(error.starts_with("cannot open http://127.0.0.1") && !error.contains("secret"), "{error}");
 }
 
 #[test]

@@ -25,8 +25,9 @@ pub struct MqttConfig {
     pub user: Option<String>,
     /// Password; default none. Never printed.
     pub password: Option<Secret>,
-    /// PEM file with the certificates of those who may have signed the external broker's; default none: it is spoken to in
-    /// plaintext. The host in `broker` must be a name in its certificate. A node with `[tls]` shows its own certificate.
+    /// PEM file with the certificates of those who may have signed the external broker's; default none: it is spoken to
+    /// in plaintext. The host in `broker` must be a name in its certificate. A node with `[tls]` shows its own
+    /// certificate.
     pub ca: Option<PathBuf>,
     /// Whether payloads are signed by the cell's key, and others not taken; default false. For an external broker that
     /// others use too; the same on every node. Programs that only look on have to skip the signature.
@@ -48,8 +49,9 @@ pub struct MqttConfig {
     pub send_queue: usize,
     /// Most decoded messages that receivers may be behind; default 1024. When full, new ones are dropped and counted.
     pub inbox: usize,
-    /// Most reports a second of one vehicle and kind, shares of evidence of one candidate, and statuses of one node, and at
-    /// once after a second of silence; default 100. What is beyond is not decoded and counted by node. More lets one node take the others' time.
+    /// Most reports a second of one vehicle and kind, shares of evidence of one candidate, and statuses of one node,
+    /// and at once after a second of silence; default 100. What is beyond is not decoded and counted by node. More lets
+    /// one node take the others' time.
     pub max_report_hz: u32,
     /// Largest report or status in bytes that is decoded; default 262144.
     pub max_payload_bytes: usize,

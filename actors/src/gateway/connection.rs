@@ -79,7 +79,8 @@ impl ConnectionError {
         }
     }
 
-    /// Why the broker took the connection and then refused the node, in its own words, or why this node does not trust it.
+    /// Why the broker took the connection and then refused the node, in its own words, or why this node does not trust
+    /// it.
     pub(super) fn refusal(&self) -> Option<String> {
         if let Some(reason) = self.mistrust() {
             return Some(reason);

@@ -20,8 +20,8 @@ use crate::throttles::Throttles;
 
 /// A checked message of the cell, or news about a link.
 ///
-/// The same message may arrive over several links. Who drops the second: the report window, by node and capture time; receivers
-/// of maps, verdicts and reputations, by epoch and round; a status says the same twice.
+/// The same message may arrive over several links. Who drops the second: the report window, by node and capture time;
+/// receivers of maps, verdicts and reputations, by epoch and round; a status says the same twice.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Incoming {
     /// A vehicle's report; only candidates for aggregation get these, and nodes that watch.
@@ -308,19 +308,41 @@ mod tests {
     use super::*;
     use crate::counters::Shed;
 
+    /// The edge's, for so many undelivered messages and reports a second.
+    fn inbox(
+        (capacity, max_report_hz): (usize, u32),
+        counters: &Arc<Counters>,
+        receiver: impl Fn(Delivery) + Send + Sync + 'static,
+    ) -> Inbox {
+        Inbox::new(
+            (NodeName::from_static("edge"), Uuid::nil()),
+            Topics::new(&NodeName::from_static("lot")),
+            (Limits::default(), None),
+            (capacity, max_report_hz),
+            Arc::clone(counters),
+            Arc::new(receiver),
+        )
+    }
+
+    /// One of 30 reports a second that counts what it delivers by the node that `node_of` names.
+    fn counting(
+        counters: &Arc<Counters>,
+        node_of: impl Fn(&Incoming) -> &NodeName + Send + Sync + 'static,
+    ) -> (Inbox, impl Fn(&'static str) -> u64) {
+        let taken = Arc::new(Mutex::new(BTreeMap::<NodeName, u64>::new()));
+        let receiver = Arc::clone(&taken);
+        let inbox = inbox((16, 30), counters, move |delivery| {
+            *receiver.lock().unwrap().entry(node_of(&delivery.message).clone()).or_default() += 1;
+        });
+        (inbox, move |node| taken.lock().unwrap()[&NodeName::from_static(node)])
+    }
+
     #[test]
     fn a_full_inbox_drops_and_counts_until_a_receiver_catches_up() {
         let counters = Arc::new(Counters::default());
         let held = Arc::new(Mutex::new(Vec::new()));
         let receiver = Arc::clone(&held);
-        let inbox = Inbox::new(
-            (NodeName::new("edge").unwrap(), Uuid::nil()),
-            Topics::new(&NodeName::new("lot").unwrap()),
-            (Limits::default(), None),
-            (2, 100),
-            Arc::clone(&counters),
-            Arc::new(move |delivery| receiver.lock().unwrap().push(delivery)),
-        );
+        let inbox = inbox((2, 100), &counters, move |delivery| receiver.lock().unwrap().push(delivery));
         let payload = |aggregator: &str| {
             let aggregator = NodeName::new(aggregator).ok();
             let reputations =
@@ -347,19 +369,10 @@ mod tests {
     #[test]
     fn one_vehicle_that_floods_is_cut_down_and_counted_and_others_are_not() {
         let counters = Arc::new(Counters::default());
-        let taken = Arc::new(Mutex::new(BTreeMap::<NodeName, u64>::new()));
-        let receiver = Arc::clone(&taken);
-        let inbox = Inbox::new(
-            (NodeName::new("edge").unwrap(), Uuid::nil()),
-            Topics::new(&NodeName::new("lot").unwrap()),
-            (Limits::default(), None),
-            (16, 30),
-            Arc::clone(&counters),
-            Arc::new(move |delivery| {
-                let Incoming::Report { report, .. } = delivery.message else { return };
-                *receiver.lock().unwrap().entry(report.node.clone()).or_default() += 1;
-            }),
-        );
+        let (inbox, taken) = counting(&counters, |message| match message {
+            Incoming::Report { report, .. } => &report.node,
+            other => panic!("{other:?}"),
+        });
         for ms in 0..1000 {
             let accept = |node: &str| {
                 let report = ObjectReport::new(NodeName::new(node).unwrap(), ms, Timestamp(ms));
@@ -373,28 +386,18 @@ mod tests {
                 accept("euclid");
             }
         }
-        let [mallory, euclid] =
-            ["mallory", "euclid"].map(NodeName::from_static).map(|node| taken.lock().unwrap()[&node]);
-        assert_eq!((mallory, euclid), (59, 10), "a second's worth at once, then 30 a second");
-        let shed = Shed { reason: ShedReason::ReportThrottled, source: "mallory".into(), times: 10_000 - mallory };
+        assert_eq!(["mallory", "euclid"].map(taken), [59, 10], "a second's worth at once, then 30 a second");
+        let shed = Shed { reason: ShedReason::ReportThrottled, source: "mallory".into(), times: 10_000 - 59 };
         assert_eq!(counters.all_shed(), [shed]);
     }
+
     #[test]
     fn statuses_of_one_node_beyond_measure_reach_nobody() {
         let counters = Arc::new(Counters::default());
-        let taken = Arc::new(Mutex::new(BTreeMap::<NodeName, u64>::new()));
-        let receiver = Arc::clone(&taken);
-        let inbox = Inbox::new(
-            (NodeName::new("edge").unwrap(), Uuid::nil()),
-            Topics::new(&NodeName::new("lot").unwrap()),
-            (Limits::default(), None),
-            (16, 30),
-            Arc::clone(&counters),
-            Arc::new(move |delivery| {
-                let Incoming::Status(status) = delivery.message else { return };
-                *receiver.lock().unwrap().entry(status.node.clone()).or_default() += 1;
-            }),
-        );
+        let (inbox, taken) = counting(&counters, |message| match message {
+            Incoming::Status(status) => &status.node,
+            other => panic!("{other:?}"),
+        });
         let accept = |node: &'static str, ms: u64| {
             let status = NodeStatus::starting(NodeName::from_static(node), Uuid::max(), Role::Auto, "0.1.0");
             let topic = format!("ecod/v1/lot/nodes/{node}");
@@ -406,8 +409,7 @@ mod tests {
                 accept("euclid", ms);
             }
         }
-        let taken = ["mallory", "euclid"].map(NodeName::from_static).map(|node| taken.lock().unwrap()[&node]);
-        assert_eq!(taken, [59, 4], "a second's worth at once, then 30 a second");
+        assert_eq!(["mallory", "euclid"].map(taken), [59, 4], "a second's worth at once, then 30 a second");
         let shed = Shed { reason: ShedReason::StatusThrottled, source: "mallory".into(), times: 1000 - 59 };
         assert_eq!(counters.all_shed(), [shed]);
     }

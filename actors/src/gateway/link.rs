@@ -89,8 +89,8 @@ impl Link {
         Self { broker, state: LinkState::Down, client: None, hearing, silence, abort, task: Some(task) }
     }
 
-    /// Notes a message that the broker should pass back to this node, whether or not there was room for it; true when the
-    /// broker seems stalled.
+    /// Notes a message that the broker should pass back to this node, whether or not there was room for it; true when
+    /// the broker seems stalled.
     pub(super) fn misses_echo(&mut self, now: Timestamp) -> bool {
         let is_stalled = self.silence.note_sent(self.hearing.packets(), now);
         if is_stalled {
@@ -117,11 +117,12 @@ impl Drop for Link {
     }
 }
 
-/// Waits before the first attempts after a session broke, for the quickest word of whether the broker's process is gone:
-/// a process that ends may still have the port for a moment when its connections break.
+/// Waits before the first attempts after a session broke, for the quickest word of whether the broker's process is
+/// gone: a process that ends may still have the port for a moment when its connections break.
 const BREAK_CHECKS: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
 
-/// A session shorter than this earns no such attempts, or a broker that ends every session would be tried without pause.
+/// A session shorter than this earns no such attempts, or a broker that ends every session would be tried without
+/// pause.
 const SHORTEST_USE: Duration = Duration::from_millis(200);
 
 struct Task {
@@ -202,8 +203,8 @@ impl Task {
         if !self.tell(LinkNews::Accepted(client)) {
             return Ok(());
         }
-        // Pings alone make something come in every keep-alive; longer silence is a connection that hangs. What is sent is no
-        // sign of life, and a poll that takes longer was held up on this side.
+        // Pings alone make something come in every keep-alive; longer silence is a connection that hangs. What is sent
+        // is no sign of life, and a poll that takes longer was held up on this side.
         let patience = 2 * config.keep_alive();
         let mut silent = Duration::ZERO;
         let accepted = Instant::now();

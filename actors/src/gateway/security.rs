@@ -77,7 +77,8 @@ impl Security {
         }
     }
 
-    /// Whether an envelope of another's making is shut, and one's own holds the payload; only built for the fuzz targets.
+    /// Whether an envelope of another's making is shut, and one's own holds the payload; only built for the fuzz
+    /// targets.
     #[cfg(fuzzing)]
     pub fn keeps_shut(&self, topic: &str, bytes: &[u8]) -> bool {
         let Some(key) = &self.signing else { return false };
@@ -91,8 +92,8 @@ impl Security {
     }
 }
 
-/// Signs payloads for brokers that others use too: HMAC-SHA256 by a key that is derived from the cell's, over the length of
-/// the topic, the topic and the payload.
+/// Signs payloads for brokers that others use too: HMAC-SHA256 by a key that is derived from the cell's, over the
+/// length of the topic, the topic and the payload.
 ///
 /// ```text
 /// | ec | tag (32) | payload |

@@ -1,7 +1,7 @@
 //! Whether a broker that takes what is sent passes it on.
 //!
-//! A broker that hangs, or whose answers do not arrive, keeps its connections: for seconds nothing but the missing echo of
-//! this node's own messages tells. Messages are counted beside the time, so that a node that was stopped itself, and
+//! A broker that hangs, or whose answers do not arrive, keeps its connections: for seconds nothing but the missing echo
+//! of this node's own messages tells. Messages are counted beside the time, so that a node that was stopped itself, and
 //! sent nothing meanwhile, does not blame its broker.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};

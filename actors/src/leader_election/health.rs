@@ -104,8 +104,8 @@ impl HealthMonitor {
         self.load_percent = load_percent().unwrap_or(0);
     }
 
-    /// The parts as the election wants to know them. A node that uses an external broker, its own, or both, needs one of
-    /// them. A stalled link is none, but in a leader with `no_other` to lead, which would only make way for nobody.
+    /// The parts as the election wants to know them. A node that uses an external broker, its own, or both, needs one
+    /// of them. A stalled link is none, but in a leader with `no_other` to lead, which would only make way for nobody.
     pub(super) fn health(&self, plane: &DataPlane, brokers: &Brokers, no_other: bool, period: Duration) -> Health {
         let external = self.is_up(plane.external.as_ref(), no_other);
         let embedded = plane.embedded && self.probe.broker_serves;
@@ -120,8 +120,8 @@ impl HealthMonitor {
         }
     }
 
-    /// Whether members on other machines are reached: by the node's own broker, unless it is `private` to this machine, or
-    /// by an external one for as long as there is a link to it.
+    /// Whether members on other machines are reached: by the node's own broker, unless it is `private` to this machine,
+    /// or by an external one for as long as there is a link to it.
     pub(super) fn reaches_others(&self, plane: &DataPlane, private: bool, no_other: bool) -> bool {
         !private || self.is_up(plane.external.as_ref(), no_other)
     }

@@ -34,8 +34,8 @@ pub(super) struct Routes {
     wanted: BTreeSet<BrokerAddress>,
 }
 
-/// How long a link outlives its use: a new leader serves vehicles that are not yet connected to its broker by way of the
-/// old one's.
+/// How long a link outlives its use: a new leader serves vehicles that are not yet connected to its broker by way of
+/// the old one's.
 const LINGER: Duration = Duration::from_secs(2);
 
 impl Routes {

@@ -18,9 +18,9 @@ pub const DEFAULT_PORT: u16 = 17_884;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MembershipConfig {
-    /// The cell's key: 64 hexadecimal digits (best, such as from `openssl rand -hex 32`), or a passphrase of at least 12
-    /// characters. Default none: anyone can take part, and the node gossips on loopback only unless `bind` is set. Never
-    /// printed.
+    /// The cell's key: 64 hexadecimal digits (best, such as from `openssl rand -hex 32`), or a passphrase of at least
+    /// 12 characters. Default none: anyone can take part, and the node gossips on loopback only unless `bind` is set.
+    /// Never printed.
     pub key: Option<Secret>,
     /// A file that holds the key; white space around it is left out. Default none. Excludes `key`.
     pub key_file: Option<PathBuf>,
@@ -45,9 +45,9 @@ pub struct MembershipConfig {
     pub suspect_ms: u64,
     /// Time between two spreads of news, in ms. Default 50; nothing is sent when there is none.
     pub gossip_ms: u64,
-    /// Time between two greetings, in ms: to every seed that is not there, and to the multicast group, to that ten times as
-    /// rarely in company. Default 500, and at most half of the election's `join_ms`, for a seed that returns to hear of its
-    /// cell before it leads on its own. Shorter heals split cells sooner and costs packets.
+    /// Time between two greetings, in ms: to every seed that is not there, and to the multicast group, to that ten
+    /// times as rarely in company. Default 500, and at most half of the election's `join_ms`, for a seed that returns
+    /// to hear of its cell before it leads on its own. Shorter heals split cells sooner and costs packets.
     pub hello_ms: u64,
     /// Most nodes that are known at a time. Default 256.
     pub max_peers: usize,

@@ -24,8 +24,8 @@ pub(super) struct NodeId {
 }
 
 impl NodeId {
-    /// The node as others are told, where it is seen at `address`. A broker on another machine's loopback is none: there,
-    /// this machine would find its own.
+    /// The node as others are told, where it is seen at `address`. A broker on another machine's loopback is none:
+    /// there, this machine would find its own.
     pub(super) fn member(&self, address: Option<SocketAddr>) -> Member {
         let gossip = address.unwrap_or(self.gossip);
         let reached = |ip: IpAddr| if ip.is_unspecified() { gossip.ip() } else { ip };

@@ -10,8 +10,8 @@ use tokio::net::lookup_host;
 
 use super::MembershipMessage;
 
-/// Resolves the seeds anew for ever, sooner if one could not be resolved, and tells the membership. A seed that cannot be
-/// resolved is logged once, until it can.
+/// Resolves the seeds anew for ever, sooner if one could not be resolved, and tells the membership. A seed that cannot
+/// be resolved is logged once, until it can.
 pub(super) async fn resolve(seeds: Vec<String>, ipv4: bool, membership: ActorRef<MembershipMessage>) {
     let mut retry = RETRY_MIN;
     let mut unresolved = BTreeSet::new();

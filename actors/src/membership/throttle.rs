@@ -7,8 +7,8 @@ use ecod::time::Timestamp;
 
 use super::key::SessionId;
 
-/// Limits answers to all strangers together and to each session, so that one recorded greeting, sent over and over, does
-/// not use up what is meant for others.
+/// Limits answers to all strangers together and to each session, so that one recorded greeting, sent over and over,
+/// does not use up what is meant for others.
 #[derive(Debug, Clone)]
 pub(super) struct Answers {
     all: Throttle,

@@ -259,8 +259,8 @@ impl Assembly {
         Ok(id)
     }
 
-    /// The broker behind its gate: also where only this machine reaches it, who connects and says nothing would hold the
-    /// node's file descriptors.
+    /// The broker behind its gate: also where only this machine reaches it, who connects and says nothing would hold
+    /// the node's file descriptors.
     fn embedded_broker(&self) -> EmbeddedBroker {
         let (config, listen) = (self.config.broker(), self.config.broker_listen());
         let credentials = self.security.credentials.clone();

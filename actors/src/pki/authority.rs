@@ -131,8 +131,8 @@ impl Authority {
         Ok(Self { directory: directory.into(), register })
     }
 
-    /// Makes a key and a certificate for a node, `nodes/<node>.key` and `nodes/<node>.pem`, in place of earlier ones, which
-    /// stay valid until they expire or are revoked.
+    /// Makes a key and a certificate for a node, `nodes/<node>.key` and `nodes/<node>.pem`, in place of earlier ones,
+    /// which stay valid until they expire or are revoked.
     ///
     /// # Errors
     /// [`AuthorityError`] when the name cannot have one or a file cannot be written.

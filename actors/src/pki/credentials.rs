@@ -115,8 +115,9 @@ impl Credentials {
     }
 }
 
-/// How a node connects to a broker that is none of the cell's, and goes on trusting it: its certificate must be signed by one
-/// of those in `ca` and bear the name under which it is configured. The node shows its own certificate, if it has one.
+/// How a node connects to a broker that is none of the cell's, and goes on trusting it: its certificate must be signed
+/// by one of those in `ca` and bear the name under which it is configured. The node shows its own certificate, if it
+/// has one.
 ///
 /// # Errors
 /// [`CredentialsError`] naming the file.

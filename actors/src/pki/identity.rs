@@ -62,8 +62,8 @@ impl Identity {
         self.expires
     }
 
-    /// Whether the holder may have a client of this name: its own, or that of an observer which shares its certificate. An
-    /// observer has a status and nothing else to say: one certificate is one vehicle.
+    /// Whether the holder may have a client of this name: its own, or that of an observer which shares its certificate.
+    /// An observer has a status and nothing else to say: one certificate is one vehicle.
     pub fn speaks_for(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
     }

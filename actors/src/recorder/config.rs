@@ -27,8 +27,8 @@ pub struct RecordConfig {
     pub queue: usize,
     /// Whether scenes and transforms are written that Foxglove and Lichtblick draw; default true. They double the log.
     pub drawable: bool,
-    /// Whether a node that never leads takes all reports of its cell to record them; default false. A node that may lead
-    /// takes them anyway.
+    /// Whether a node that never leads takes all reports of its cell to record them; default false. A node that may
+    /// lead takes them anyway.
     pub reports: bool,
     /// Pictures of the camera a second, as JPEG; default 0, none. Each has some 50 to 100 kB at 640x480.
     pub camera_hz: f64,

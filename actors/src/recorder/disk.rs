@@ -15,8 +15,8 @@ pub const EXTENSION: &str = "mcap";
 /// Most files that one second gives a name to.
 const NAMES_A_SECOND: u32 = 1000;
 
-/// Creates the file of a log that begins `at`, such as `euclid-20261121T100500Z-000.mcap`. By name they are in the order
-/// of time.
+/// Creates the file of a log that begins `at`, such as `euclid-20261121T100500Z-000.mcap`. By name they are in the
+/// order of time.
 ///
 /// # Errors
 /// What the operating system said, and when there is less room than `min_free` bytes.

@@ -1,6 +1,7 @@
 //! What is recorded, live for Foxglove and Lichtblick on this machine.
 //!
-//! The protocol knows no passwords: the server is reached from this machine only. A viewer that is too slow loses messages.
+//! The protocol knows no passwords: the server is reached from this machine only. A viewer that is too slow loses
+//! messages.
 
 use std::collections::HashMap;
 use std::sync::Arc;

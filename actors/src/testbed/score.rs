@@ -45,8 +45,9 @@ impl Score {
     }
 }
 
-/// Whether what a map says of a spot is right; `None` when it does not know. A plate must be read to the letter. A free spot
-/// must be said to be empty: by its placard's text, or without a placard by vehicles that looked and found nothing.
+/// Whether what a map says of a spot is right; `None` when it does not know. A plate must be read to the letter. A free
+/// spot must be said to be empty: by its placard's text, or without a placard by vehicles that looked and found
+/// nothing.
 pub(super) fn is_right(testbed: &Testbed, spot: &Spot, state: &LandmarkState) -> Option<bool> {
     match (&state.label, &spot.truth) {
         (Some(label), Some(truth)) => Some(label == truth),

@@ -10,7 +10,8 @@ fn gray(image: &Mat, x: usize, y: usize) -> f64 {
     f64::from(image.data_bytes().unwrap()[3 * (y * columns + x)])
 }
 
-/// A camera at the origin that looks along +x at one placard, `x_in` ahead and facing `yaw_deg`, and at what stands before it.
+/// A camera at the origin that looks along +x at one placard, `x_in` ahead and facing `yaw_deg`, and at what stands
+/// before it.
 fn lot(x_in: f64, yaw_deg: f64, before: &str) -> Testbed {
     let (sin, cos) = yaw_deg.to_radians().sin_cos();
     let (x, y) = (x_in - 3.5 * cos, 1.0 - 3.5 * sin);
@@ -43,7 +44,8 @@ fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
         let camera = &testbed.camera.intrinsics;
         let card = &testbed.cards(&testbed.scenes[0])[1];
         let half_m = testbed.placard.qr_width_m / 2.0;
-        // Finder patterns are dark at the upper corners and lower left; each edge is met in the middle of the outer ring.
+        // Finder patterns are dark at the upper corners and lower left; each edge is met in the middle of the outer
+        // ring.
         for (right, up) in [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0)] {
             let project = |right_m: f64, up_m: f64| {
                 let (sin, cos) = card.facing_rad.sin_cos();

@@ -110,7 +110,8 @@ async fn finger(browser: &Browser) {
     browser.look(1440, 900, "light").await;
 }
 
-/// The map moves by keys and has a table in its place; everything that is pressed or scrolled can be reached and has a name.
+/// The map moves by keys and has a table in its place; everything that is pressed or scrolled can be reached and has a
+/// name.
 async fn keyboard_and_table(browser: &Browser) {
     let place = "Number(document.querySelector('#map .place').getAttribute('x'))";
     browser.evaluate("document.querySelector('#map').focus()").await;

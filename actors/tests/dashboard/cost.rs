@@ -20,8 +20,8 @@ async fn usage(page: SocketAddr) -> [f64; 2] {
     })
 }
 
-/// An edge without camera that gets 32 reports of each kind ten times a second, with nobody looking and with one browser.
-/// The figures are of use from an optimised build only.
+/// An edge without camera that gets 32 reports of each kind ten times a second, with nobody looking and with one
+/// browser. The figures are of use from an optimised build only.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "a measurement: make test-dashboard"]
 async fn what_a_node_costs_with_32_vehicles() {

@@ -78,8 +78,8 @@ impl Browser {
         }
     }
 
-    /// Draws a finger over the screen, from a place in CSS pixels by so many of them to the right and down, and lets it rest
-    /// there, so that the page does not go on by itself.
+    /// Draws a finger over the screen, from a place in CSS pixels by so many of them to the right and down, and lets it
+    /// rest there, so that the page does not go on by itself.
     pub(crate) async fn swipe(&self, from: [f64; 2], by: [f64; 2]) {
         self.chromium("Emulation.setTouchEmulationEnabled", json!({ "enabled": true })).await;
         for (kind, share) in [("touchStart", 0.0), ("touchMove", 0.5), ("touchMove", 1.0), ("touchMove", 1.0)] {

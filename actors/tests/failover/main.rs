@@ -18,7 +18,8 @@ use ecod_actors::leader_election::Position;
 use cell::Cell;
 use path::Path;
 
-/// A cell of an edge and three vehicles finds together by one seed, goes on without the edge, and gives it the lead back.
+/// A cell of an edge and three vehicles finds together by one seed, goes on without the edge, and gives it the lead
+/// back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn maps_go_on_without_the_edge_and_with_it_again() {
     let mut cell = Cell::default();

@@ -13,8 +13,8 @@ use serde_json::{Value, json};
 /// 2024-11-21 02:00:00 UTC, in microseconds.
 const BEGIN_US: u64 = 1_732_154_400_000_000;
 
-/// Ten seconds of a cell that euclid and gauss report to: a round every 100 ms, 20 ms after the oldest capture and 5 ms on
-/// its way, by the edge until it is lost, and from 400 ms later by gauss.
+/// Ten seconds of a cell that euclid and gauss report to: a round every 100 ms, 20 ms after the oldest capture and 5 ms
+/// on its way, by the edge until it is lost, and from 400 ms later by gauss.
 fn write_log(path: &Path) {
     let mut writer: Writer<_> = WriteOptions::new().create(File::create(path).unwrap()).unwrap();
     let fusion = serde_json::to_string(&ReplayConfig::default().fusion).unwrap();

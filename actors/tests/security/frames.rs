@@ -64,8 +64,8 @@ async fn until(what: &str, mut holds: impl FnMut() -> bool) {
     }
 }
 
-/// Stands between two nodes and sends every datagram for the first three times; the second knows the first by its address
-/// only.
+/// Stands between two nodes and sends every datagram for the first three times; the second knows the first by its
+/// address only.
 async fn repeat(towards: SocketAddr, relay: UdpSocket) {
     let behind = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
     let (mut there, mut back) = ([0; 2048], [0; 2048]);

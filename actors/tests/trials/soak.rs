@@ -1,5 +1,5 @@
-//! Everything at once, for as long as wanted: each minute something seeded goes wrong, and all must be well again before
-//! the minute is over, with nothing growing.
+//! Everything at once, for as long as wanted: each minute something seeded goes wrong, and all must be well again
+//! before the minute is over, with nothing growing.
 //!
 //! `make soak` runs it: `MINUTES=n` (default 30), `NODES=n` (default 32) and `SEED=n` (default 1). The summary is printed
 //! and written to `target/soak.json`; the files of a soak that went wrong are kept.

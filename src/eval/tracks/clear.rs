@@ -1,8 +1,8 @@
 //! CLEAR MOT (Bernardin and Stiefelhagen, EURASIP J. Image and Video Processing 2008) and the detection accuracy and
 //! precision that go with it (Kasturi et al., IEEE TPAMI 2009).
 //!
-//! In every frame, pairs that matched in the frame before and are still near enough match again; the others match so that
-//! the sum of their similarities is greatest. A true object that matches another identity than the last time it
+//! In every frame, pairs that matched in the frame before and are still near enough match again; the others match so
+//! that the sum of their similarities is greatest. A true object that matches another identity than the last time it
 //! matched is a switch. Equal to `trackeval.metrics.CLEAR` at a threshold of 0.5, a frame in which nothing was said
 //! included: it ends no pair.
 

@@ -45,7 +45,8 @@ fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
     assert_eq!(empty.at_default.false_alarms, 1);
 }
 
-/// Two objects in one frame; of three said the best and the last are right: precision 1, 1/2, 2/3 at recall 1/2, 1/2, 1.
+/// Two objects in one frame; of three said the best and the last are right: precision 1, 1/2, 2/3 at recall 1/2, 1/2,
+/// 1.
 #[test]
 fn average_precision_is_that_worked_out_by_hand() {
     let frame = Frame {

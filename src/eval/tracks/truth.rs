@@ -76,8 +76,8 @@ enum Id {
 }
 
 impl TrackTruth {
-    /// Whether a truth file is of objects that move, as opposed to locations: its `frames` is a list, empty or of objects
-    /// with a time or with objects.
+    /// Whether a truth file is of objects that move, as opposed to locations: its `frames` is a list, empty or of
+    /// objects with a time or with objects.
     pub fn is_in(text: &str) -> bool {
         #[derive(Deserialize)]
         struct Probe {

@@ -20,8 +20,8 @@ fn whoever_invents_or_hides_objects_loses_its_standing() {
     assert_eq!(invented, 0, "nobody believes a liar");
 }
 
-/// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that says
-/// as much; of many others that nothing is known of.
+/// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
+/// says as much; of many others that nothing is known of.
 #[test]
 fn a_liar_that_was_silent_is_still_a_liar() {
     let mut tracker = tracker();

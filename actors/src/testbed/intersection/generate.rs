@@ -1,9 +1,9 @@
 //! Scenes like a recorded one, with the mistakes that its detectors made.
 //!
 //! A generated scene has the recorded vehicles and objects, moved a little, with the objects' places exchanged. For
-//! every object in a vehicle's view, one recorded view of such an object, by any vehicle, is chosen; what was found of it,
-//! in frames drawn at random, is put where the object stands now: label, confidence, apparent size and error of bearing
-//! stay as recorded. What a vehicle found elsewhere is added as it was. Objects do not hide each other.
+//! every object in a vehicle's view, one recorded view of such an object, by any vehicle, is chosen; what was found of
+//! it, in frames drawn at random, is put where the object stands now: label, confidence, apparent size and error of
+//! bearing stay as recorded. What a vehicle found elsewhere is added as it was. Objects do not hide each other.
 
 use std::ops::RangeInclusive;
 
