@@ -77,6 +77,9 @@ pub struct Tracker {
     /// Tracks by place, in cells of the gate's size and in large ones.
     near: Grid,
     wide: Grid,
+    /// When they were there, and how fast the fastest of them goes.
+    indexed_at: Timestamp,
+    fastest_mps: f64,
     /// By a vehicle's number, the track that it is.
     own: HashMap<u32, u32>,
     pending: Vec<(Timestamp, ObjectReport)>,
@@ -97,6 +100,8 @@ impl Tracker {
             near: Grid::new(config.gate_m),
             wide: Grid::new(WIDE_M.max(config.gate_m)),
             config,
+            indexed_at: Timestamp(0),
+            fastest_mps: 0.0,
             own: HashMap::new(),
             sources: Vec::new(),
             numbers: HashMap::new(),
@@ -177,9 +182,12 @@ impl Tracker {
         let mut pending = std::mem::take(&mut self.pending);
         pending.sort_by(|(a, x), (b, y)| (a, &x.node, x.seq).cmp(&(b, &y.node, y.seq)));
         let oldest_capture = pending.first().map(|(at, _)| *at);
-        self.index(pending.last().map_or(now, |(at, _)| *at));
+        self.index(pending.first().map_or(now, |(at, _)| *at));
         let mut pairs = Vec::new();
         for (at, report) in &pending {
+            if self.drift_m(*at) > self.config.gate_m / 2.0 {
+                self.index(*at);
+            }
             let number = self.number_of(&report.node, *at);
             let Some(mut source) = self.sources[number as usize].take() else { continue };
             let mut taking = Taking { number, source: &mut source, report, at: *at, pairs: Vec::new() };

@@ -135,19 +135,26 @@ impl View {
     /// Looks after which older ones are forgotten.
     const MEMORY: f32 = 400.0;
 
-    /// Takes note of where a report comes from.
-    pub(super) fn observe(&mut self, report: &ObjectReport) {
+    /// Distance in metres that no vehicle comes from one report to the next.
+    const JUMP_M: f64 = 500.0;
+
+    /// Takes note of where a report comes from; true if the vehicle is somewhere else all at once.
+    pub(super) fn observe(&mut self, report: &ObjectReport) -> bool {
         self.pose = report.pose.map(Pose::from);
         self.stated = report.view;
         let count = report.objects.len() as f64;
         let sum: Vector2<f64> = report.objects.iter().map(|object| Vector2::new(object.x_m, object.y_m)).sum();
-        self.centre = match (self.pose, self.centre) {
-            (Some(pose), _) => Some(pose.position.coords),
-            (None, before) if report.objects.is_empty() => before,
-            (None, None) => Some(sum / count),
-            (None, Some(before)) => Some(before + (sum / count - before) * 0.2),
+        let middle = (count > 0.0).then(|| sum / count);
+        let Some(here) = self.pose.map(|pose| pose.position.coords).or(middle).or(self.centre) else { return false };
+        let has_jumped = self.centre.is_some_and(|before| (here - before).norm() > Self::JUMP_M);
+        if has_jumped {
+            (self.farthest_m, self.directions) = (0.0, [0.0; Self::DIRECTIONS]);
+        }
+        let centre = match self.centre {
+            Some(before) if self.pose.is_none() && !has_jumped => before + (here - before) * 0.2,
+            _ => here,
         };
-        let Some(centre) = self.centre else { return };
+        self.centre = Some(centre);
         self.farthest_m *= 0.995;
         self.directions.iter_mut().for_each(|count| *count *= 0.99);
         for object in &report.objects {
@@ -155,6 +162,7 @@ impl View {
             self.farthest_m = self.farthest_m.max(offset.norm());
             self.directions[self.direction(&offset)] += 1.0;
         }
+        has_jumped
     }
 
     /// The pose, or the middle of what it sees.

@@ -7,7 +7,7 @@ use nalgebra::{Matrix2, Vector2};
 use uuid::Uuid;
 
 use super::Tracker;
-use super::align::Pair;
+use super::align::{Alignment, Pair};
 use super::assignment::{Pairing, assign};
 use super::calibration::log_odds;
 use super::config::TracksConfig;
@@ -65,7 +65,9 @@ impl Tracker {
     pub(super) fn take(&mut self, taking: &mut Taking<'_>) {
         let Taking { source, report, at, .. } = taking;
         source.last_report = source.last_report.max(*at);
-        source.view.observe(report);
+        if source.view.observe(report) {
+            source.alignment = Alignment::new(*at, &self.spread());
+        }
         if let Some(centre) = source.view.centre() {
             source.alignment.turn_about(centre);
         }
@@ -100,7 +102,7 @@ impl Tracker {
         let reach_m = 2.0 * self.config.vehicle_radius_m;
         let offset = |track: u32| (self.tracks[track as usize].motion.position_at(at) - measurement.position).norm();
         let unclaimed = || {
-            let around = self.near.around(&measurement.position, reach_m);
+            let around = self.near.around(&measurement.position, reach_m + self.drift_m(at));
             around.filter(|track| self.tracks[*track as usize].vehicle.is_none() && offset(*track) <= reach_m)
         };
         let known = self.own.get(&number).copied();
@@ -127,7 +129,9 @@ impl Tracker {
             track.motion = Motion::new(at, &measurement, self.config.speed_mps);
         }
         track.refresh(at);
-        track.witness(number, at).hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
+        if let Some(witness) = track.witness(number, at) {
+            witness.hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
+        }
     }
 
     /// The report's detections, corrected; those of the vehicle itself are left out.
@@ -150,10 +154,11 @@ impl Tracker {
     fn associate(&self, number: u32, seen: &[Seen<'_>], at: Timestamp) -> Vec<Pairing> {
         let gate = self.config.gate();
         let density = self.config.density();
+        let reach_m = self.config.gate_m + self.drift_m(at);
         let mut pairings = Vec::with_capacity(2 * seen.len());
         for (detection, seen) in seen.iter().enumerate() {
             let alone = seen.measurement.independent.trace() / 2.0 + self.config.common_m.powi(2);
-            for candidate in self.near.around(&seen.measurement.position, self.config.gate_m) {
+            for candidate in self.near.around(&seen.measurement.position, reach_m) {
                 let track = &self.tracks[candidate as usize];
                 if track.vehicle == Some(number) {
                     continue;
@@ -204,7 +209,7 @@ impl Tracker {
         let last = track.witnesses.iter().find(|witness| witness.source == number && witness.was_hit);
         let last = last.map(|witness| witness.log_odds);
         let was_hit = last.is_some();
-        if track.hits >= SURE_HITS && (is_confirmed || was_hit) {
+        if track.hits >= SURE_HITS && (is_confirmed || was_hit) && track.hears(number, at) {
             source.view.learn(&seen.reported, was_hit, true);
         }
         track.motion.update(at, &seen.measurement, density);
@@ -213,9 +218,10 @@ impl Tracker {
             source.calibration.learn(log_odds, true);
         }
         let nats = source.calibration.nats(seen.object.confidence);
-        let witness = track.witness(number, at);
-        witness.hit(at, seen.measurement.position, nats, rates, true);
-        witness.log_odds = log_odds(seen.object.confidence);
+        if let Some(witness) = track.witness(number, at) {
+            witness.hit(at, seen.measurement.position, nats, rates, true);
+            witness.log_odds = log_odds(seen.object.confidence);
+        }
         self.settle(taking, index, &seen.reported);
     }
 
@@ -223,11 +229,13 @@ impl Tracker {
     fn look(&mut self, taking: &mut Taking<'_>) {
         let (number, at) = (taking.number, taking.at);
         let Some(centre) = taking.source.view.centre() else { return };
-        let candidates: Vec<u32> = self.wide.around(&centre, taking.source.view.reach_m()).collect();
+        let reach_m = taking.source.view.reach_m() + self.drift_m(at);
+        let candidates: Vec<u32> = self.wide.around(&centre, reach_m).collect();
         for candidate in candidates {
             let track = &mut self.tracks[candidate as usize];
             let witness = track.witnesses.iter().find(|witness| witness.source == number);
-            if track.vehicle == Some(number) || witness.is_some_and(|witness| witness.last_look >= at) {
+            let is_done = witness.map_or(!track.hears(number, at), |witness| witness.last_look >= at);
+            if track.vehicle == Some(number) || is_done {
                 continue;
             }
             let position = track.motion.position_at(at);
@@ -243,7 +251,9 @@ impl Tracker {
             if track.hits >= SURE_HITS && (is_confirmed || was_hit) {
                 view.learn(&position, was_hit, false);
             }
-            track.witness(number, at).miss(at, rates);
+            if let Some(witness) = track.witness(number, at) {
+                witness.miss(at, rates);
+            }
             if knew_it {
                 track.overlooked(at, dt_s, rates.of(was_hit));
             }
@@ -279,9 +289,10 @@ impl Tracker {
         let mut track = Track::new(founding_id(taking.report, seen.index), at, &seen.measurement, &self.config);
         describe(&mut track, taking.source, seen, at, &self.config);
         let nats = taking.source.calibration.nats(seen.object.confidence);
-        let witness = track.witness(number, at);
-        witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
-        witness.log_odds = log_odds(seen.object.confidence);
+        if let Some(witness) = track.witness(number, at) {
+            witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
+            witness.log_odds = log_odds(seen.object.confidence);
+        }
         self.add(track);
     }
 }

@@ -11,6 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use uuid::Uuid;
 
 use super::motion::{Measurement, Motion};
+use super::source::View;
 use super::*;
 use crate::geometry::Covariance;
 use crate::wire::{FieldOfView, GlobalMap, SCHEMA_VERSION, WirePose};
@@ -185,16 +186,22 @@ fn a_heading_about_due_east_is_not_averaged_to_west() {
 
 #[test]
 fn a_late_report_is_used_within_the_bound_and_counted_beyond() {
+    for frame_m in [1.5, 2.8] {
+        a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m);
+    }
+}
+
+fn a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m: f64) {
     let mut on_time = tracker();
     let mut late = tracker();
     for frame in 0..30 {
-        let x_m = frame as f64 * 1.5;
+        let x_m = frame as f64 * frame_m;
         for tracker in [&mut on_time, &mut late] {
             tracker.observe(&report("euclid", frame, vec![car(x_m, 0.0)]), at(frame));
         }
         on_time.observe(&report("gauss", frame, vec![car(x_m, 0.0)]), at(frame));
         if frame >= 3 {
-            late.observe(&report("gauss", frame - 3, vec![car(x_m - 4.5, 0.0)]), at(frame - 3));
+            late.observe(&report("gauss", frame - 3, vec![car(x_m - 3.0 * frame_m, 0.0)]), at(frame - 3));
         }
         on_time.close(at(frame));
         late.close(at(frame));
@@ -205,6 +212,19 @@ fn a_late_report_is_used_within_the_bound_and_counted_beyond() {
     assert_eq!(b.objects[0].contributors.len(), 2);
     late.observe(&report("gauss", 20, vec![car(0.0, 0.0)]), at(20));
     assert_eq!(late.losses().late, 1);
+}
+
+#[test]
+fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
+    let mut view = View::default();
+    let place = |x_m: f64| vec![car(x_m - 20.0, 0.0), car(x_m + 20.0, 0.0)];
+    for frame in 0..10 {
+        assert!(!view.observe(&report("euclid", frame, place(0.0))));
+    }
+    assert!(view.observe(&report("euclid", 10, place(5_000.0))));
+    assert!((view.reach_m() - 20.0).abs() < 1e-9, "{}", view.reach_m());
+    assert!(view.rates_at(&Vector2::new(4_990.0, 0.0)).is_some());
+    assert!(view.rates_at(&Vector2::new(10.0, 0.0)).is_none());
 }
 
 /// Twelve parked cars seen by both, `gauss` off by an offset and a rotation; returns the last round.

@@ -1,5 +1,7 @@
 //! One object that is followed.
 
+use std::time::Duration;
+
 use nalgebra::Vector2;
 use smallvec::SmallVec;
 use uuid::Uuid;
@@ -12,8 +14,11 @@ use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
 use crate::wire::{FusedObject, PerceivedObject};
 
-/// Vehicles that an object can be known from at once; the one that looked longest ago makes room.
+/// Vehicles that an object can be known from at once; whoever has not looked for [`SEAT_KEPT`] makes room.
 const MAX_WITNESSES: usize = 32;
+
+/// Were the others to make room for newcomers, none of more than 32 would stay for long enough to be judged.
+const SEAT_KEPT: Duration = Duration::from_secs(1);
 
 /// Probability of a label that was never read, for the association.
 pub(super) const OTHER_LABEL: f64 = 0.02;
@@ -74,22 +79,32 @@ impl Track {
         }
     }
 
-    /// The vehicle's part in it, made if there is none.
-    pub(super) fn witness(&mut self, source: u32, at: Timestamp) -> &mut Witness {
-        let index = match self.witnesses.iter().position(|witness| witness.source == source) {
-            Some(index) => index,
-            None if self.witnesses.len() < MAX_WITNESSES => {
-                self.witnesses.push(Witness::new(source, at));
-                self.witnesses.len() - 1
-            }
-            None => {
-                let looks = self.witnesses.iter().map(|witness| witness.last_look);
-                let (oldest, _) = looks.enumerate().min_by_key(|(_, look)| *look).unwrap_or_default();
-                self.witnesses[oldest] = Witness::new(source, at);
-                oldest
-            }
+    /// Where the vehicle's part in it is or could be; `None` while there are enough others.
+    fn seat(&self, source: u32, at: Timestamp) -> Option<usize> {
+        let held = self.witnesses.iter().position(|witness| witness.source == source);
+        let free = || Some(self.witnesses.len()).filter(|count| *count < MAX_WITNESSES);
+        let left = || {
+            let looks = self.witnesses.iter().map(|witness| witness.last_look).enumerate();
+            let (oldest, look) = looks.min_by_key(|(_, look)| *look)?;
+            (at.since(look) > SEAT_KEPT).then_some(oldest)
         };
-        &mut self.witnesses[index]
+        held.or_else(free).or_else(left)
+    }
+
+    /// Whether the vehicle's word about it is kept.
+    pub(super) fn hears(&self, source: u32, at: Timestamp) -> bool {
+        self.seat(source, at).is_some()
+    }
+
+    /// The vehicle's part in it, made if there is none and room for one.
+    pub(super) fn witness(&mut self, source: u32, at: Timestamp) -> Option<&mut Witness> {
+        let seat = self.seat(source, at)?;
+        match self.witnesses.get_mut(seat) {
+            None => self.witnesses.push(Witness::new(source, at)),
+            Some(witness) if witness.source != source => *witness = Witness::new(source, at),
+            Some(_) => {}
+        }
+        self.witnesses.get_mut(seat)
     }
 
     /// Takes over what a detection says beside its place.
@@ -228,7 +243,7 @@ impl Track {
         let moving = self.hits > 1;
         FusedObject {
             contributors: self
-                .seen_by(now - std::time::Duration::from_secs_f64(config.life_s))
+                .seen_by(now - Duration::from_secs_f64(config.life_s))
                 .filter_map(|witness| name(witness.source))
                 .collect(),
             existence: Some(believed(there)),

@@ -35,6 +35,7 @@ impl Tracker {
             return None;
         }
         let index = self.tracks.len();
+        self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
         self.near.insert(&position, index as u32);
         self.wide.insert(&position, index as u32);
         self.tracks.push(track);
@@ -43,6 +44,8 @@ impl Tracker {
 
     /// Indexes the objects where they are at `at`.
     pub(super) fn index(&mut self, at: Timestamp) {
+        self.indexed_at = at;
+        self.fastest_mps = self.tracks.iter().map(|track| track.motion.velocity.norm()).fold(0.0, f64::max);
         self.near.clear();
         self.wide.clear();
         self.own.clear();
@@ -52,6 +55,11 @@ impl Tracker {
             self.near.insert(&position, index as u32);
             self.wide.insert(&position, index as u32);
         }
+    }
+
+    /// How far any object may be at `at` from where it is indexed.
+    pub(super) fn drift_m(&self, at: Timestamp) -> f64 {
+        self.fastest_mps * (at.micros_from(self.indexed_at) as f64 * 1e-6).abs()
     }
 
     /// Joins objects that are one: near each other, and never told apart by one vehicle in one frame. The older stays.

@@ -9,6 +9,9 @@ use ecod::time::Timestamp;
 /// What a driver was to be told longer ago than this is not told any more.
 const MAX_AGE: Duration = Duration::from_secs(1);
 
+/// So what waited for longer than this is not: how long the way itself takes nobody knows, only how much longer than at best.
+const MAX_WAIT: Duration = Duration::from_millis(900);
+
 /// How long the rounds of a leadership whose first came when a node had long heard none must come as slowly as they
 /// were made: what waited for the node comes faster.
 const LEARNING: Duration = Duration::from_millis(150);
@@ -53,7 +56,7 @@ impl LeadersDelay {
 }
 
 impl Age {
-    /// Whether a round of `epoch`, which the gate has admitted, spent no more than [`MAX_AGE`] in queues: a node that
+    /// Whether a round of `epoch`, which the gate has admitted, spent no more than [`MAX_WAIT`] in queues: a node that
     /// was stopped, or a link that was, finds the rounds of that time waiting. The first round of a leadership is
     /// fresh, since its clock is not known, but after such a time.
     pub(super) fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
@@ -64,7 +67,7 @@ impl Age {
         let has_waited = self.resumed_at.is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_AGE);
         let mut delay = known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
         let waited = delay.observe(fused_at, received_at);
-        let is_fresh = delay.is_learnt && waited <= MAX_AGE;
+        let is_fresh = delay.is_learnt && waited <= MAX_WAIT;
         self.delay = Some((epoch.clone(), delay));
         is_fresh
     }
@@ -91,7 +94,7 @@ mod tests {
             }
             // Stopped for three seconds, the node finds thirty rounds.
             let fresh: Vec<_> = (20..50).filter(|n| age.is_fresh(&epoch, ms(ahead + 100 * n), ms(5002))).collect();
-            assert_eq!(fresh, Vec::from_iter(40..50));
+            assert_eq!(fresh, Vec::from_iter(41..50));
         }
     }
 

@@ -23,6 +23,22 @@ fn whoever_invents_or_hides_objects_loses_its_standing() {
 /// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
 /// says as much; of many others that nothing is known of.
 #[test]
+fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
+    let mut tracker = tracker();
+    let mut judged = BTreeSet::new();
+    let mut contributors = 0;
+    for frame in 0..40 {
+        for vehicle in 0..50 {
+            tracker.observe(&report(&format!("v{vehicle:02}"), frame, vec![car(0.0, 0.0)]), at(frame));
+        }
+        let round = tracker.close(at(frame));
+        contributors = round.objects[0].contributors.len();
+        judged.extend(round.evidence.into_iter().filter(|word| word.correct).map(|word| word.node));
+    }
+    assert_eq!((judged.len(), contributors), (32, 32));
+}
+
+#[test]
 fn a_liar_that_was_silent_is_still_a_liar() {
     let mut tracker = tracker();
     liars(&mut tracker);
