@@ -105,6 +105,9 @@ export function nodes({ nodes, node, leadership }) {
 }
 
 /// What counts as left out, beside payloads that were rejected, in words.
+/// Copies of what was taken, as come by a second broker, are not left out.
+const COPIES = "out_of_order";
+
 const DROPS = {
   publish_refused: "not sent: link down or full", publish_too_large: "not sent: too large", inbox_full: "dropped: node too far behind",
   name_conflict: "another node has this name", disconnected: "link lost", connect_failed: "link not established", broker_refused: "refused by a broker",
@@ -115,7 +118,7 @@ const DROPS = {
 const earlier = new Map();
 
 export function drops({ counters, now_us }) {
-  const rejected = Object.entries(counters.rejects).map(([reason, count]) => [`rejected: ${reason.replaceAll("_", " ")}`, count]);
+  const rejected = Object.entries(counters.rejects).filter(([reason]) => reason !== COPIES).map(([reason, count]) => [`rejected: ${reason.replaceAll("_", " ")}`, count]);
   const shed = Object.entries(counters.shed).map(([reason, count]) => [`overload: ${reason.replaceAll("_", " ")}`, count]);
   const events = Object.entries(DROPS).map(([event, words]) => [words, counters.events[event] ?? 0]);
   const all = [...rejected, ...shed, ...events].filter(([, count]) => count > 0);
