@@ -360,7 +360,7 @@ mod tests {
             ("kind = \"v4l2\"\nheight = 480\nwidht = 640", ["`camera.source.widht`", "unknown field", "`width`"]),
             ("kind = \"url\"\nurl = 7", ["`camera.source.url`", "7", "string"]),
             ("kind = \"url\"", ["`camera.source`", "missing field", "`url`"]),
-            ("kind = \"eye\"\nwidth = 640", ["`camera.source`", "eye", "`v4l2`"]),
+            ("kind = \"eye\"\nwidth = 640", ["`camera.source.kind`", "eye", "`v4l2`"]),
         ] {
             let error = load(&format!("{source}{toml}")).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");

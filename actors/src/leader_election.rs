@@ -171,7 +171,7 @@ impl Actor for LeaderElection {
             LeaderElectionMessage::Membership { event } => driver.take_event(event).await?,
             LeaderElectionMessage::LinkChanged { broker, state } => driver.take_link(&broker, state).await?,
             LeaderElectionMessage::TakeStatus { delivery } => {
-                if let Incoming::Status(status) = &delivery.message {
+                if let Incoming::Status { status, .. } = &delivery.message {
                     driver.take_status(status).await?;
                 }
             }

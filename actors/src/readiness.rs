@@ -6,6 +6,7 @@ use std::time::Duration;
 use ecod::epoch::Epoch;
 use ecod::time::Timestamp;
 use ecod::vote::VoteMode;
+use ecod::wire::Verdicts;
 use ractor::{Message, RpcReplyPort};
 use serde::Serialize;
 use tokio::sync::watch;
@@ -13,7 +14,7 @@ use tokio::sync::watch;
 use crate::broker::{BrokerHealth, BrokerMessage};
 use crate::clock;
 use crate::config::NodeConfig;
-use crate::follower::Newest;
+use crate::follower::{Newest, Received, ReceivedMap};
 use crate::gateway::{BrokerAddress, GatewayMessage, LinkState};
 use crate::leader_election::{DataPlane, Leadership};
 use crate::seat::Seat;
@@ -89,18 +90,21 @@ impl Vitals {
         self.plane.external.as_ref().is_some_and(up) || (self.plane.embedded && probe.broker_serves)
     }
 
-    /// The newest round accepted, be it a map or verdicts: its epoch and when it came.
+    /// The newest round accepted: its epoch and when it came.
     fn last_round(&self) -> Option<(Epoch, Timestamp)> {
-        let map =
-            self.newest.map.borrow().as_ref().map(|received| {
-                (Epoch::new(received.map.epoch, received.map.aggregator.clone()), received.received_at)
-            });
-        let verdicts = self.newest.verdicts.borrow().as_ref().map(|received| {
-            let verdicts = &received.message;
-            (Epoch::new(verdicts.epoch, verdicts.aggregator.clone()), received.received_at)
-        });
-        map.into_iter().chain(verdicts).max_by_key(|(_, received_at)| *received_at)
+        newest_round(self.newest.map.borrow().as_ref(), self.newest.verdicts.borrow().as_ref())
     }
+}
+
+/// The epoch of the newest round, be it a map or verdicts, and when it came.
+pub fn newest_round(map: Option<&ReceivedMap>, verdicts: Option<&Received<Verdicts>>) -> Option<(Epoch, Timestamp)> {
+    let map =
+        map.map(|received| (Epoch::new(received.map.epoch, received.map.aggregator.clone()), received.received_at));
+    let verdicts = verdicts.map(|received| {
+        let verdicts = &received.message;
+        (Epoch::new(verdicts.epoch, verdicts.aggregator.clone()), received.received_at)
+    });
+    map.into_iter().chain(verdicts).max_by_key(|(_, received_at)| *received_at)
 }
 
 async fn ask<M: Message, T: Send + 'static>(seat: &Seat<M>, question: impl FnOnce(RpcReplyPort<T>) -> M) -> Option<T> {

@@ -13,14 +13,13 @@ use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
+use crate::config::NodeConfig;
 use crate::counters::CounterSnapshot;
 use crate::follower::{Received, ReceivedMap};
 use crate::leader_election::Leadership;
 use crate::membership::Member;
 use crate::node::NodeHandle;
-
-/// Age beyond which a map is no longer to be relied on.
-const STALE: Duration = Duration::from_secs(1);
+use crate::readiness::{newest_round, patience};
 
 /// Leaderships that are remembered.
 const HISTORY: usize = 5;
@@ -30,11 +29,13 @@ const HISTORY: usize = 5;
 pub struct View {
     /// The cell's name.
     pub cell: NodeName,
+    /// Age beyond which a round is no longer to be relied on, where rounds come by themselves.
+    pub patience: Option<Duration>,
     /// The present time.
     pub now: Timestamp,
     /// Who leads.
     pub leadership: Leadership,
-    /// Leaderships whose maps came, and since when; the newest last.
+    /// Leaderships whose rounds came, and since when; the newest last.
     pub history: VecDeque<(Epoch, Timestamp)>,
     /// The other nodes.
     pub members: Vec<Member>,
@@ -51,11 +52,12 @@ pub struct View {
 }
 
 impl View {
-    /// What `node` knows; `before` hands on the history.
-    pub fn of(node: &NodeHandle, cell: &NodeName, before: Option<Self>, now: Timestamp) -> Self {
+    /// What `node` knows of the cell of this configuration; `before` hands on the history.
+    pub fn of(node: &NodeHandle, config: &NodeConfig, before: Option<Self>, now: Timestamp) -> Self {
         let (history, scroll) = before.map(|before| (before.history, before.scroll)).unwrap_or_default();
         let mut view = Self {
-            cell: cell.clone(),
+            cell: config.cell.clone(),
+            patience: patience(config),
             now,
             leadership: node.leadership().borrow().clone(),
             history,
@@ -70,20 +72,19 @@ impl View {
         view
     }
 
-    /// Takes note of who made the newest map.
+    /// Takes note of who made the newest round.
     fn remember(&mut self) {
-        let Some(received) = &self.map else { return };
-        let epoch = Epoch::new(received.map.epoch, received.map.aggregator.clone());
+        let Some((epoch, received_at)) = self.newest_round() else { return };
         if self.history.back().is_none_or(|(newest, _)| *newest != epoch) {
-            self.history.push_back((epoch, received.received_at));
+            self.history.push_back((epoch, received_at));
         }
         while self.history.len() > HISTORY {
             self.history.pop_front();
         }
     }
 
-    fn age(&self) -> Option<Duration> {
-        self.map.as_ref().map(|received| self.now.since(received.received_at))
+    fn newest_round(&self) -> Option<(Epoch, Timestamp)> {
+        newest_round(self.map.as_ref(), self.verdicts.as_ref())
     }
 }
 
@@ -111,10 +112,12 @@ fn summary(view: &View) -> Paragraph<'_> {
         }
         _ => Span::from("nobody leads").bold().red(),
     };
-    let freshness = match view.age() {
-        Some(age) if age <= STALE => Span::from(format!("map {} ms old", age.as_millis())).green(),
-        Some(age) => Span::from(format!("STALE: no map for {}", span(age))).bold().red(),
-        None => Span::from("no map yet").yellow(),
+    let freshness = match view.newest_round().map(|(_, received_at)| view.now.since(received_at)) {
+        Some(age) if view.patience.is_some_and(|patience| age > patience) => {
+            Span::from(format!("STALE: no round for {}", span(age))).bold().red()
+        }
+        Some(age) => Span::from(format!("newest round {} ms old", age.as_millis())).green(),
+        None => Span::from("no round yet").yellow(),
     };
     let before: Vec<_> = view.history.iter().rev().skip(1).map(|(epoch, _)| epoch.to_string()).collect();
     let before = if before.is_empty() { String::new() } else { format!("  before: {}", before.join(", ")) };
@@ -276,6 +279,7 @@ mod tests {
         let epoch = Epoch::new(4, name("euclid"));
         let mut view = View {
             cell: name("lot-1"),
+            patience: Some(Duration::from_secs(3)),
             now,
             leadership: Leadership { position: Position::Following, epoch: Some(epoch), standby: Some(name("gauss")) },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
@@ -309,7 +313,7 @@ mod tests {
             "cell lot-1",
             "euclid leads in term 4",
             "next gauss",
-            "map 200 ms old",
+            "newest round 200 ms old",
             "slot-0",
             "car",
             "0.93",
@@ -325,11 +329,31 @@ mod tests {
     }
 
     #[test]
-    fn an_old_map_is_not_passed_off_as_fresh() {
-        assert!(shown(&mut view(Timestamp(12_000_000)), 100, 30).contains("STALE: no map for 5 s"));
+    fn an_old_round_is_not_passed_off_as_fresh() {
+        assert!(shown(&mut view(Timestamp(10_000_000)), 100, 30).contains("newest round 3000 ms old"));
+        assert!(shown(&mut view(Timestamp(12_000_000)), 100, 30).contains("STALE: no round for 5 s"));
+        let mut by_packets = View { patience: None, ..view(Timestamp(12_000_000)) };
+        assert!(shown(&mut by_packets, 100, 30).contains("newest round 5000 ms old"));
         let mut alone = View { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
         let text = shown(&mut alone, 100, 30);
-        assert!(text.contains("nobody leads") && text.contains("no map yet"), "{text}");
+        assert!(text.contains("nobody leads") && text.contains("no round yet"), "{text}");
+    }
+
+    #[test]
+    fn a_cell_that_only_votes_has_ages_and_history_by_its_verdicts() {
+        let verdicts: Verdicts = serde_json::from_value(serde_json::json!({
+            "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0, "verdicts": []
+        }))
+        .unwrap();
+        let verdicts = Some(Received { received_at: Timestamp(6_900_000), message: Arc::new(verdicts) });
+        let history = [(Epoch::new(3, name("edge")), Timestamp(0))].into();
+        for (now_us, freshness) in [(7_200_000, "newest round 300 ms old"), (12_000_000, "STALE: no round for 5 s")] {
+            let (verdicts, history) = (verdicts.clone(), VecDeque::clone(&history));
+            let mut voting = View { map: None, verdicts, history, ..view(Timestamp(now_us)) };
+            voting.remember();
+            let text = shown(&mut voting, 100, 30);
+            assert!(text.contains(freshness) && text.contains("before: edge@3"), "{text}");
+        }
     }
 
     #[test]

@@ -22,6 +22,17 @@ fn the_example_edge_aggregates_for_the_network() {
     assert!(edge.mqtt.broker.is_none());
 }
 
+/// `doctor`, which systemd does not start, looks at the directory that the service writes.
+#[test]
+fn the_packaged_node_names_the_directory_of_its_service() {
+    let node = load("../../packaging/debian/node.toml");
+    let unit = include_str!("../../packaging/systemd/ecod-node.service");
+    let directory = node.state_dir.expect("none is named");
+    let name = directory.strip_prefix("/var/lib").unwrap().display().to_string();
+    let has = |line: String| unit.lines().any(|found| found == line);
+    assert!(has(format!("StateDirectory={name}")) && has(format!("WorkingDirectory={}", directory.display())));
+}
+
 #[cfg(feature = "camera")]
 #[test]
 fn the_example_vehicles_fit_the_example_edge() {

@@ -10,6 +10,7 @@ use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind, KeyModifiers
 use super::Failure;
 use super::run::ObserverArguments;
 use crate::clock;
+use crate::config::NodeConfig;
 use crate::node::{self, NodeHandle};
 use crate::top::{View, draw};
 
@@ -33,20 +34,15 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
     }
     let mut config = arguments.observer.load("top")?;
     config.record = None;
-    let cell = config.cell.clone();
     let runtime = tokio::runtime::Runtime::new().context("no threads for the node")?;
-    let node = runtime.block_on(node::start(config)).map_err(|error| anyhow!(error))?;
-    let shown = ratatui::run(|terminal| show(terminal, &node, &cell));
+    let node = runtime.block_on(node::start(config.clone())).map_err(|error| anyhow!(error))?;
+    let shown = ratatui::run(|terminal| show(terminal, &node, &config));
     runtime.block_on(node.stop());
     Ok(shown.context("the terminal cannot be drawn")?)
 }
 
-fn show(
-    terminal: &mut ratatui::DefaultTerminal,
-    node: &NodeHandle,
-    cell: &ecod::names::NodeName,
-) -> std::io::Result<()> {
-    let mut view = View::of(node, cell, None, clock::now());
+fn show(terminal: &mut ratatui::DefaultTerminal, node: &NodeHandle, config: &NodeConfig) -> std::io::Result<()> {
+    let mut view = View::of(node, config, None, clock::now());
     loop {
         terminal.draw(|frame| draw(frame, &mut view))?;
         if event::poll(PERIOD)?
@@ -65,6 +61,6 @@ fn show(
                 _ => view.scroll,
             };
         }
-        view = View::of(node, cell, Some(view), clock::now());
+        view = View::of(node, config, Some(view), clock::now());
     }
 }

@@ -82,10 +82,10 @@ impl Access {
         }
     }
 
-    /// The cookie of whoever knows the token.
+    /// The cookie of whoever knows the token; a browser also shows it when a link of elsewhere leads here.
     pub(super) fn cookie(&self) -> Option<HeaderValue> {
         let Token { cookie_name, cookie, .. } = self.token.as_ref()?;
-        HeaderValue::from_str(&format!("{cookie_name}={cookie}; Path=/; HttpOnly; SameSite=Strict")).ok()
+        HeaderValue::from_str(&format!("{cookie_name}={cookie}; Path=/; HttpOnly; SameSite=Lax")).ok()
     }
 }
 
@@ -116,7 +116,7 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The token in an address; it is made of characters that stand for themselves, or it is given in a header.
+/// The token in an address; it is made of characters that stand for themselves there.
 fn token_in(uri: &Uri) -> Option<&str> {
     uri.query()?.split('&').find_map(|pair| pair.strip_prefix("token="))
 }

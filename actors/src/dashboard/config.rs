@@ -16,8 +16,8 @@ pub struct DashboardConfig {
     /// Where the page is served, port 0 for a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a free
     /// port if that is taken, as by another node of the machine. An address that other machines reach needs a token.
     pub listen: Option<SocketAddr>,
-    /// What who looks has to know, at least 12 characters. Default none, which only a loopback address allows. Give it as
-    /// `ECOD_DASHBOARD__TOKEN` rather than in a file that others read.
+    /// What who looks has to know, at least 12 characters that stand for themselves in an address. Default none, which
+    /// only a loopback address allows. Give it as `ECOD_DASHBOARD__TOKEN` rather than in a file that others read.
     pub token: Option<Secret>,
     /// Most pictures of the cell a second that browsers get; default 10. Less costs less, more shows more of a fast
     /// cell.
@@ -31,6 +31,9 @@ pub const DEFAULT_ADDRESS: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Add
 
 /// The shortest token.
 const MIN_TOKEN_BYTES: usize = 12;
+
+/// What a browser changes or cuts off in `/?token=…`, beside what is no visible ASCII.
+const NOT_IN_TOKENS: [char; 7] = ['"', '#', '%', '&', '\'', '<', '>'];
 
 impl Default for DashboardConfig {
     fn default() -> Self {
@@ -49,6 +52,12 @@ impl DashboardConfig {
         match (&self.token, self.listen) {
             (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => {
                 Err(ConfigError::new("token", "a short text", format!("at least {MIN_TOKEN_BYTES} characters")))
+            }
+            (Some(token), _)
+                if !token.reveal().chars().all(|c| c.is_ascii_graphic() && !NOT_IN_TOKENS.contains(&c)) =>
+            {
+                let allowed = "visible ASCII without \" # % & ' < >, as it is also given in an address";
+                Err(ConfigError::new("token", "a text with other characters", allowed))
             }
             (None, Some(address)) if self.enabled && !address.ip().is_loopback() => {
                 Err(ConfigError::new("token", "nothing", format!("a secret, as other machines reach {address}")))
@@ -73,9 +82,14 @@ mod tests {
         validate("[::1]:8080", None).unwrap();
         for address in ["0.0.0.0:8080", "10.0.0.2:8080", "[::]:8080"] {
             assert_eq!(validate(address, None).unwrap_err().key, "token", "{address}");
-            validate(address, Some("a long enough token")).unwrap();
+            validate(address, Some("a-long-enough-token")).unwrap();
         }
-        assert_eq!(validate("127.0.0.1:8080", Some("short")).unwrap_err().key, "token");
+        for token in
+            ["short", "with a space in it", "a&b&c&d&e&f&g", "100%-certain-token", "number#1-token", "zwölf-zeichen"]
+        {
+            assert_eq!(validate("127.0.0.1:8080", Some(token)).unwrap_err().key, "token", "{token}");
+        }
+        validate("127.0.0.1:8080", Some("q0Zk/8+d=~Tx:1!")).unwrap();
         let listen = "0.0.0.0:8080".parse().ok();
         DashboardConfig { enabled: false, listen, ..DashboardConfig::default() }.validate().unwrap();
     }

@@ -1,7 +1,7 @@
 //! What passes through the node and is not kept elsewhere: the latest reports of each vehicle, what nodes say of
 //! themselves.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -11,7 +11,7 @@ use ecod::time::Timestamp;
 use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind};
 use serde::Serialize;
 
-use crate::gateway::Incoming;
+use crate::gateway::{BrokerAddress, Incoming, LinkState};
 
 /// Written on the links' tasks and read by the dashboard; the later replaces the earlier, so that neither waits for the
 /// other.
@@ -25,7 +25,17 @@ pub struct Feed {
 #[derive(Debug, Default)]
 struct Held {
     sightings: BTreeMap<(NodeName, ReportKind), Sighting>,
-    statuses: BTreeMap<NodeName, (Timestamp, Arc<NodeStatus>)>,
+    statuses: BTreeMap<NodeName, Told>,
+}
+
+/// What a node said of itself last, or a broker of it.
+#[derive(Debug, Clone)]
+pub(super) struct Told {
+    /// The status.
+    pub status: Arc<NodeStatus>,
+    /// The brokers that passed on what it said, while the links to them hold.
+    pub via: BTreeSet<BrokerAddress>,
+    at: Timestamp,
 }
 
 /// A vehicle's latest report of a kind.
@@ -59,11 +69,19 @@ impl Feed {
                     (received_at.since(oldest.received_at) > SILENCE).then(|| key.clone())
                 });
             }
-            Incoming::Status(status) => {
-                let told = (received_at, Arc::clone(status));
-                put(&mut self.held().statuses, status.node.clone(), told, |held| {
-                    let rank = |(at, status): &(Timestamp, Arc<NodeStatus>)| (status.state != NodeState::Offline, *at);
+            Incoming::Status { status, via: broker } => {
+                let mut held = self.held();
+                let mut via = held.statuses.remove(&status.node).map(|told| told.via).unwrap_or_default();
+                via.insert(broker.clone());
+                let told = Told { status: Arc::clone(status), via, at: received_at };
+                put(&mut held.statuses, status.node.clone(), told, |held| {
+                    let rank = |told: &Told| (told.status.state != NodeState::Offline, told.at);
                     held.iter().min_by_key(|(_, told)| rank(told)).map(|(name, _)| name.clone())
+                });
+            }
+            Incoming::Link { broker, state: LinkState::Down | LinkState::Refused } => {
+                self.held().statuses.values_mut().for_each(|told| {
+                    told.via.remove(broker);
                 });
             }
             _ => {}
@@ -92,8 +110,8 @@ impl Feed {
     }
 
     /// What nodes said of themselves last.
-    pub(super) fn statuses(&self) -> BTreeMap<NodeName, Arc<NodeStatus>> {
-        self.held().statuses.iter().map(|(name, (_, status))| (name.clone(), Arc::clone(status))).collect()
+    pub(super) fn statuses(&self) -> BTreeMap<NodeName, Told> {
+        self.held().statuses.clone()
     }
 
     fn held(&self) -> MutexGuard<'_, Held> {
@@ -134,6 +152,10 @@ mod tests {
         Incoming::Report { kind: ReportKind::Detections, report: Arc::new(report) }
     }
 
+    fn broker(address: &str) -> BrokerAddress {
+        address.parse().unwrap()
+    }
+
     #[test]
     fn the_latest_report_is_kept_and_strangers_find_no_room() {
         let feed = Feed::default();
@@ -157,7 +179,7 @@ mod tests {
         let feed = Feed::default();
         let status = |node: String, state| {
             let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
-            Incoming::Status(Arc::new(NodeStatus { state, ..starting }))
+            Incoming::Status { status: Arc::new(NodeStatus { state, ..starting }), via: broker("10.0.0.2:1883") }
         };
         for n in 0..MAX_SHOWN {
             let state = if n % 2 == 0 { NodeState::Following } else { NodeState::Offline };

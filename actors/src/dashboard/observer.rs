@@ -1,10 +1,12 @@
 //! Looks on as the node goes, keeps the history, and makes pictures for whoever looks.
 
+use std::collections::BTreeSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::epoch::Epoch;
+use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use tokio::sync::watch;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
@@ -41,6 +43,8 @@ struct Made {
 struct Seen {
     history: History,
     probe: Probe,
+    /// Nodes that answer, and those that did and of which brokers tell.
+    met: BTreeSet<NodeName>,
 }
 
 /// How often the parts are asked how they are.
@@ -130,7 +134,7 @@ impl Observer {
             verdicts: sources.vitals.newest.verdicts.borrow().clone().map(Stamped::from),
             reputations: sources.vitals.newest.reputations.borrow().clone().map(Stamped::from),
             vehicles: sources.feed.sightings_since(now - FORGET_AFTER),
-            nodes: nodes(sources),
+            nodes: nodes(sources, &seen.met, seen.probe.links.as_ref()),
             links: links.collect(),
             counters: sources.counters.snapshot(),
         }
@@ -171,9 +175,11 @@ impl Observer {
         let mut leadership = self.sources.vitals.leadership.clone();
         let mut maps = self.sources.vitals.newest.map.subscribe();
         let mut verdicts = self.sources.vitals.newest.verdicts.subscribe();
+        let mut members = self.sources.members.clone();
         let mut samples = ticks(SAMPLE_PERIOD);
         let (mut next_picture, mut changed, mut pictured) = (Instant::now(), true, Instant::now());
         self.note_leadership();
+        self.note_members();
         loop {
             let due = if changed { next_picture } else { (pictured + HEARTBEAT).max(next_picture) };
             tokio::select! {
@@ -188,6 +194,10 @@ impl Observer {
                 }
                 Ok(()) = verdicts.changed() => {
                     self.note_verdicts();
+                    changed = true;
+                }
+                Ok(()) = members.changed() => {
+                    self.note_members();
                     changed = true;
                 }
                 _ = samples.tick() => self.sample(),
@@ -214,6 +224,13 @@ impl Observer {
     fn note_leadership(&self) {
         let leadership = self.sources.vitals.leadership.borrow().clone();
         self.seen().history.note_leadership(&leadership, clock::now());
+    }
+
+    fn note_members(&self) {
+        let told = self.sources.feed.statuses();
+        let mut seen = self.seen();
+        seen.met.retain(|name| told.contains_key(name));
+        seen.met.extend(self.sources.members.borrow().iter().map(|member| member.name.clone()));
     }
 
     fn note_map(&self) {

@@ -1,19 +1,24 @@
 //! The picture of a cell that browsers get: everything the page shows, as one JSON object.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ecod::names::{LandmarkId, NodeName};
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, Reputations, Role, Verdicts};
+use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
 use serde::Serialize;
 
-use super::feed::{MAX_SHOWN, Sighting};
+use super::feed::{MAX_SHOWN, Sighting, Told};
 use super::sources::Sources;
 use crate::counters::CounterSnapshot;
 use crate::follower::Received;
+use crate::gateway::{BrokerAddress, LinkState};
 use crate::leader_election::{Leadership, Position};
+use crate::membership::Member;
 use crate::readiness::Readiness;
+
+/// How the link to each broker is.
+pub(super) type Links = BTreeMap<BrokerAddress, LinkState>;
 
 /// Version of [`Picture`] and of the other answers of the API.
 pub(super) const API_VERSION: u32 = 1;
@@ -98,7 +103,7 @@ pub(super) struct NodeEntry {
     pub name: NodeName,
     /// Its role.
     pub role: Role,
-    /// Whether it answers, or a broker has not said otherwise.
+    /// Whether it answers; of a node that never has, whether a broker to which there is a link says that it is there.
     pub alive: bool,
     /// What it said it does.
     pub state: Option<NodeState>,
@@ -140,9 +145,9 @@ impl LeadershipFacts {
     }
 }
 
-/// This node, those that answer, and those that only brokers tell of.
-pub(super) fn nodes(sources: &Sources) -> Vec<NodeEntry> {
-    let mut statuses = sources.feed.statuses();
+/// This node, those that answer, and those that only brokers tell of; `met` are names of nodes that have answered at some
+/// time, `links` how the links are, if the gateway tells.
+pub(super) fn nodes(sources: &Sources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
     let own = &sources.node;
     let leading = sources.vitals.leadership.borrow().is_leading();
     let me = NodeEntry {
@@ -153,26 +158,91 @@ pub(super) fn nodes(sources: &Sources) -> Vec<NodeEntry> {
         fit: None,
         version: Some(own.version.to_owned()),
     };
-    let mut nodes = vec![me];
-    for member in sources.members.borrow().iter().take(MAX_SHOWN) {
-        let status = statuses.remove(&member.name);
-        nodes.push(NodeEntry {
-            name: member.name.clone(),
-            role: member.role,
-            alive: true,
-            state: status.as_ref().map(|status| status.state),
-            fit: status.as_ref().and_then(|status| status.fit),
-            version: status.map(|status| status.version.clone()),
-        });
-    }
-    nodes.extend(statuses.into_values().filter(|status| status.node != own.name).map(|status| NodeEntry {
-        name: status.node.clone(),
-        role: status.role,
-        alive: status.state != NodeState::Offline,
-        state: Some(status.state),
-        fit: status.fit,
-        version: Some(status.version.clone()),
-    }));
+    let mut nodes = others(&sources.members.borrow(), sources.feed.statuses(), met, links);
+    nodes.retain(|node| node.name != own.name);
+    nodes.push(me);
     nodes.sort_by(|a, b| a.name.cmp(&b.name));
     nodes
+}
+
+/// A node that has answered is there while it does; of one that never has, a broker's word counts while it is heard.
+fn others(
+    members: &[Member],
+    mut statuses: BTreeMap<NodeName, Told>,
+    met: &BTreeSet<NodeName>,
+    links: Option<&Links>,
+) -> Vec<NodeEntry> {
+    let entry = |name: &NodeName, role, alive, status: Option<&NodeStatus>| NodeEntry {
+        name: name.clone(),
+        role,
+        alive,
+        state: status.map(|status| status.state),
+        fit: status.and_then(|status| status.fit),
+        version: status.map(|status| status.version.clone()),
+    };
+    let (shown, further) = members.split_at(members.len().min(MAX_SHOWN));
+    let mut nodes = Vec::new();
+    for Member { name, role, .. } in shown {
+        let told = statuses.remove(name);
+        nodes.push(entry(name, *role, true, told.as_ref().map(|told| &*told.status)));
+    }
+    let is_heard = |broker: &BrokerAddress| {
+        links.is_none_or(|links| matches!(links.get(broker), Some(LinkState::Up | LinkState::Stalled)))
+    };
+    for Told { status, via, .. } in statuses.values() {
+        let name = &status.node;
+        let is_told = status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_heard);
+        let alive = is_told || further.iter().any(|member| member.name == *name);
+        nodes.push(entry(name, status.role, alive, Some(status)));
+    }
+    nodes
+}
+
+#[cfg(test)]
+mod tests {
+    use uuid::Uuid;
+
+    use super::*;
+    use crate::dashboard::feed::Feed;
+    use crate::gateway::Incoming;
+
+    #[test]
+    fn who_no_longer_answers_or_is_only_known_from_a_lost_broker_is_gone() {
+        let name = NodeName::from_static;
+        let (edge, euclid): (BrokerAddress, BrokerAddress) =
+            ("10.0.0.2:1883".parse().unwrap(), "10.0.0.3:1883".parse().unwrap());
+        let member = Member {
+            name: name("euclid"),
+            run: 0,
+            gossip: "10.0.0.3:17884".parse().unwrap(),
+            broker: None,
+            role: Role::Auto,
+        };
+        let feed = Feed::default();
+        let say = |node, via: &BrokerAddress| {
+            let status = NodeStatus::starting(name(node), Uuid::nil(), Role::Cav, "0.1.0");
+            feed.note(&Incoming::Status { status: Arc::new(status), via: via.clone() }, Timestamp(1));
+        };
+        for node in ["edge", "euclid", "plain"] {
+            say(node, &edge);
+        }
+        say("both", &edge);
+        say("both", &euclid);
+        let alive = |members: &[Member], links: &Links| {
+            let met = [name("edge"), name("euclid")].into();
+            let nodes = others(members, feed.statuses(), &met, Some(links));
+            nodes.into_iter().filter(|node| node.alive).map(|node| node.name.to_string()).collect::<Vec<_>>()
+        };
+        let up = [(edge.clone(), LinkState::Up), (euclid.clone(), LinkState::Up)].into();
+        assert_eq!(alive(std::slice::from_ref(&member), &up), ["euclid", "both", "plain"], "the edge does not answer");
+        let left = [(euclid.clone(), LinkState::Up)].into();
+        assert_eq!(alive(std::slice::from_ref(&member), &left), ["euclid", "both"], "the link was given up");
+        feed.note(&Incoming::Link { broker: edge, state: LinkState::Refused }, Timestamp(2));
+        assert_eq!(
+            alive(&[member], &up),
+            ["euclid", "both"],
+            "what a broker said before it was lost is not its word now"
+        );
+        assert_eq!(alive(&[], &up), ["both"]);
+    }
 }

@@ -40,7 +40,12 @@ pub enum Incoming {
     /// A part of another candidate's evidence; only candidates get these.
     Ledger(Arc<LedgerShare>),
     /// What another node says about itself, or its broker about it.
-    Status(Arc<NodeStatus>),
+    Status {
+        /// The status.
+        status: Arc<NodeStatus>,
+        /// The broker that passed it on.
+        via: BrokerAddress,
+    },
     /// A link changed.
     Link {
         /// The broker at its other end.
@@ -138,10 +143,10 @@ impl Inbox {
         *self.subscriber.write().unwrap_or_else(PoisonError::into_inner) = subscriber;
     }
 
-    /// Deals with one packet; a payload that cannot be used is counted by its reason.
-    pub(super) fn accept(&self, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Outcome {
+    /// Deals with one packet of a broker; a payload that cannot be used is counted by its reason.
+    pub(super) fn accept(&self, via: &BrokerAddress, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Outcome {
         self.counters.count(Event::Received);
-        match self.read(topic, payload, received_at) {
+        match self.read(via, topic, payload, received_at) {
             Ok(Read::Message(message)) => {
                 self.deliver(message, received_at);
                 Outcome::Done
@@ -186,7 +191,13 @@ impl Inbox {
         subscriber(delivery);
     }
 
-    fn read(&self, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Result<Read, RejectReason> {
+    fn read(
+        &self,
+        via: &BrokerAddress,
+        topic: &[u8],
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> Result<Read, RejectReason> {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
         let payload = match &self.signing {
             // Nothing is what takes a retained message back; it says nothing that could be signed.
@@ -206,7 +217,7 @@ impl Inbox {
                 }
                 Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?))
             }
-            Topic::Nodes(node) => return self.read_status(&node, payload, received_at),
+            Topic::Nodes(node) => return self.read_status(via, &node, payload, received_at),
             Topic::GlobalDetections => {
                 let map: GlobalMap = decode(payload, &self.limits)?;
                 if map.aggregator == self.node {
@@ -255,7 +266,13 @@ impl Inbox {
         Ok(Read::Message(Incoming::Report { kind, report }))
     }
 
-    fn read_status(&self, node: &NodeName, payload: &[u8], received_at: Timestamp) -> Result<Read, RejectReason> {
+    fn read_status(
+        &self,
+        via: &BrokerAddress,
+        node: &NodeName,
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> Result<Read, RejectReason> {
         if payload.is_empty() {
             return Ok(Read::Cleared);
         }
@@ -271,7 +288,7 @@ impl Inbox {
             (true, NodeState::Offline) => Read::OwnDeath,
             (true, NodeState::Following | NodeState::Aggregating) if status.id == self.run => Read::OwnStatus,
             (true, NodeState::Following | NodeState::Aggregating) => Read::Namesake(status.id),
-            (false, _) => Read::Message(Incoming::Status(Arc::new(status))),
+            (false, _) => Read::Message(Incoming::Status { status: Arc::new(status), via: via.clone() }),
         })
     }
 }
@@ -324,6 +341,10 @@ mod tests {
         )
     }
 
+    fn broker() -> BrokerAddress {
+        "10.0.0.2:1883".parse().unwrap()
+    }
+
     /// One of 30 reports a second that counts what it delivers by the node that `node_of` names.
     fn counting(
         counters: &Arc<Counters>,
@@ -349,8 +370,9 @@ mod tests {
                 Reputations { schema: 1, aggregator, epoch: 1, round: 1, reputations: Default::default() };
             encode(&reputations, Encoding::Json)
         };
-        let accept_from =
-            |aggregator: &str, at| inbox.accept(b"ecod/v1/lot/reputations", &payload(aggregator), Timestamp(at));
+        let accept_from = |aggregator: &str, at| {
+            inbox.accept(&broker(), b"ecod/v1/lot/reputations", &payload(aggregator), Timestamp(at))
+        };
         let accept = |at| accept_from("gauss", at);
         for at in 1..=5 {
             assert_eq!(accept(at), Outcome::Done);
@@ -377,7 +399,7 @@ mod tests {
             let accept = |node: &str| {
                 let report = ObjectReport::new(NodeName::new(node).unwrap(), ms, Timestamp(ms));
                 let topic = format!("ecod/v1/lot/detections/{node}");
-                inbox.accept(topic.as_bytes(), &encode(&report, Encoding::Json), Timestamp(ms * 1000))
+                inbox.accept(&broker(), topic.as_bytes(), &encode(&report, Encoding::Json), Timestamp(ms * 1000))
             };
             for _ in 0..10 {
                 accept("mallory");
@@ -395,13 +417,13 @@ mod tests {
     fn statuses_of_one_node_beyond_measure_reach_nobody() {
         let counters = Arc::new(Counters::default());
         let (inbox, taken) = counting(&counters, |message| match message {
-            Incoming::Status(status) => &status.node,
+            Incoming::Status { status, .. } => &status.node,
             other => panic!("{other:?}"),
         });
         let accept = |node: &'static str, ms: u64| {
             let status = NodeStatus::starting(NodeName::from_static(node), Uuid::max(), Role::Auto, "0.1.0");
             let topic = format!("ecod/v1/lot/nodes/{node}");
-            inbox.accept(topic.as_bytes(), &encode(&status, Encoding::Json), Timestamp(ms * 1000))
+            inbox.accept(&broker(), topic.as_bytes(), &encode(&status, Encoding::Json), Timestamp(ms * 1000))
         };
         for ms in 0..1000 {
             accept("mallory", ms);

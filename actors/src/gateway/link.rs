@@ -222,19 +222,21 @@ impl Task {
                 self.tell(LinkNews::Answered);
             }
             match packet {
-                Packet::Message { topic, payload } => match inbox.accept(&topic, &payload, clock::now()) {
-                    Outcome::DeclaredOffline => {
-                        self.tell(LinkNews::DeclaredOffline);
+                Packet::Message { topic, payload } => {
+                    match inbox.accept(&self.broker, &topic, &payload, clock::now()) {
+                        Outcome::DeclaredOffline => {
+                            self.tell(LinkNews::DeclaredOffline);
+                        }
+                        Outcome::Namesake(run) => {
+                            self.tell(LinkNews::Namesake(run));
+                        }
+                        Outcome::OwnStatus => {
+                            heard_itself = true;
+                            self.told.take_if(|told| told == NOT_HEARD);
+                        }
+                        Outcome::Done => {}
                     }
-                    Outcome::Namesake(run) => {
-                        self.tell(LinkNews::Namesake(run));
-                    }
-                    Outcome::OwnStatus => {
-                        heard_itself = true;
-                        self.told.take_if(|told| told == NOT_HEARD);
-                    }
-                    Outcome::Done => {}
-                },
+                }
                 Packet::Denied(refused) => {
                     let name = |(index, reason): (usize, String)| {
                         format!("{} ({reason})", setup.filters.get(index).map_or("?", String::as_str))

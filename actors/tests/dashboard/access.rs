@@ -24,7 +24,7 @@ async fn without_the_token_nothing_but_health_is_told() {
     let signed_in = get(page, "/?token=correct-horse-battery").await;
     assert_eq!((signed_in.status, signed_in.header("location")), (303, Some("/")));
     let cookie = signed_in.header("set-cookie").unwrap();
-    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"), "{cookie}");
+    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Lax"), "{cookie}");
     let cookie = ("Cookie", cookie.split(';').next().unwrap());
     assert_eq!(get_with(page, "/api/picture", &[host, cookie]).await.status, 200);
     assert_eq!(get(page, "/?token=wrong-horse-battery").await.status, 401);

@@ -4,8 +4,10 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
+use ecod_actors::gateway::Secret;
 
-use crate::cell::Vehicles;
+use crate::cell::{self, Vehicles, config};
+use crate::http::Events;
 use crate::processes::{Place, free_places, start};
 use crate::webdriver::Browser;
 
@@ -26,7 +28,7 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     let mut edge = start("edge", Role::Edge, at_edge, &places, directory.path());
     let _euclid = start("euclid", Role::Auto, at_euclid, &places, directory.path());
     let _gauss = start("gauss", Role::Auto, at_gauss, &places, directory.path());
-    let _vehicles = Vehicles::start(&places.map(|place| place.broker), 4, 12);
+    let vehicles = Vehicles::start(&places.map(|place| place.broker), 4, 12);
 
     let browser = Browser::start().await;
     browser.look(1440, 900, "light").await;
@@ -68,6 +70,8 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     finger(&browser).await;
     assert_eq!(browser.complaints().await, Vec::<String>::new());
 
+    drop(vehicles);
+    browser.until("document.querySelector('#latency').textContent === '–'").await;
     drop(_euclid);
     browser.until("document.querySelector('#state').classList.contains('stale')").await;
     browser.until("!document.querySelector('#notice').hidden && document.body.classList.contains('stale-data')").await;
@@ -75,11 +79,50 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     assert!(age.as_str().unwrap().ends_with(" s old"), "{age}");
     let said = browser.evaluate("document.querySelector('#state-text').textContent").await;
     assert_eq!(said, "Connection lost", "and nothing that changes every second");
+    let chart = browser.evaluate("Number(getComputedStyle(document.querySelector('#latency-chart')).opacity)").await;
+    assert!(chart.as_f64().unwrap() < 1.0, "{chart}");
     browser.screenshot(&pictures.join("stale.png")).await;
     let _euclid = start("euclid", Role::Auto, at_euclid, &places, directory.path());
     browser.until("document.querySelector('#state').classList.contains('live')").await;
     browser.quit().await;
     println!("pictures of the page: {}", pictures.display());
+}
+
+/// A page of elsewhere may lead to one with a token. A page for which there is no live connection left follows slowly, and
+/// says so until others are closed.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
+    const LIVE: &str = "document.querySelector('#state')?.classList.contains('live') === true";
+    let browser = Browser::start().await;
+    let mut guarded = config("euclid", Role::Auto, 1);
+    guarded.dashboard.token = Some(Secret::new("correct-horse-battery"));
+    let (node, page) = cell::start(guarded).await;
+    let link = format!("data:text/html,<a href='http://{page}/?token=correct-horse-battery'>the lot</a>");
+    browser.open(&link).await;
+    browser.evaluate("document.querySelector('a').click()").await;
+    browser.until(LIVE).await;
+    assert_eq!(browser.evaluate("location.search").await, "");
+    node.stop().await;
+
+    let mut crowded = config("gauss", Role::Auto, 1);
+    (crowded.dashboard.max_connections, crowded.dashboard.max_rate_hz) = (16, 1.0);
+    let (node, page) = cell::start(crowded).await;
+    let mut others = Vec::new();
+    for _ in 0..8 {
+        others.push(Events::open(page).await);
+        others.last_mut().unwrap().next().await;
+    }
+    browser.open(&format!("http://{page}/")).await;
+    browser.until(LIVE).await;
+    let is_told = "/no room for another live page/.test(document.querySelector('#notice').textContent)";
+    browser.until(is_told).await;
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert_eq!(browser.evaluate(&format!("{LIVE} && {is_told}")).await, true);
+    drop(others);
+    browser.until(&format!("{LIVE} && document.querySelector('#notice').hidden")).await;
+    browser.quit().await;
+    node.stop().await;
 }
 
 /// A finger scrolls past the whole map, and moves one that is zoomed; all of it is shown again by Fit.

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 
 use ecod::wire::Role;
+use ecod_actors::counters::Event;
+use serde_json::Value;
 
 use crate::cell::{Vehicles, config, start, until};
 use crate::http::get;
@@ -69,6 +71,55 @@ async fn metrics_say_what_the_node_does() {
     }
     drop(vehicles);
     node.stop().await;
+}
+
+/// What is summed over nodes must be summed over those of one cell.
+#[test]
+fn the_dashboard_of_grafana_shows_one_cell_at_a_time() {
+    let text = include_str!("../../../packaging/grafana/ecod.json");
+    let dashboard: Value = serde_json::from_str(text).unwrap();
+    let variables = dashboard["templating"]["list"].as_array().unwrap();
+    let variable = |name: &str| variables.iter().find(|variable| variable["name"] == name).unwrap();
+    assert_eq!(
+        (&variable("cell")["multi"], &variable("cell")["includeAll"]),
+        (&Value::from(false), &Value::from(false))
+    );
+    assert!(variable("instance")["query"]["query"].as_str().unwrap().contains(r#"cell="$cell""#));
+    let targets = dashboard["panels"].as_array().unwrap().iter().flat_map(|panel| panel["targets"].as_array().unwrap());
+    let asked =
+        targets.chain(dashboard["annotations"]["list"].as_array().unwrap()).map(|it| it["expr"].as_str().unwrap());
+    let asked: Vec<_> = asked.collect();
+    assert!(asked.len() > 20, "{asked:?}");
+    for expression in asked {
+        let (series, chosen) =
+            (expression.matches('{').count(), expression.matches(r#"instance=~"$instance""#).count());
+        assert!(series > 0 && series == chosen, "{expression}");
+    }
+}
+
+/// The page has words for everything that is counted and is not as it should be.
+#[test]
+fn every_count_of_something_left_out_is_on_the_page() {
+    const USUAL: [Event; 14] = [
+        Event::Published,
+        Event::Received,
+        Event::Echo,
+        Event::Connected,
+        Event::MapAccepted,
+        Event::Repeated,
+        Event::ReportOvertaken,
+        Event::VerdictsAccepted,
+        Event::ReputationsAccepted,
+        Event::LedgerMerged,
+        Event::ReputationsSaved,
+        Event::Recorded,
+        Event::RoundDue,
+        Event::FrameDetected,
+    ];
+    let page = include_str!("../../src/dashboard/page/tables.js");
+    for event in Event::ALL.into_iter().filter(|event| !USUAL.contains(event)) {
+        assert!(page.contains(&format!(" {}: \"", event.as_str())), "{event:?}");
+    }
 }
 
 /// The metrics that a file asks for.

@@ -1,10 +1,18 @@
 //! What browsers are sent.
 
-use ecod::wire::Role;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use ecod::names::NodeName;
+use ecod::wire::{Encoding, NodeStatus, Role, encode};
+use rumqttc::{AsyncClient, MqttOptions, QoS};
 use serde_json::Value;
+use tokio::task::JoinSet;
+use uuid::Uuid;
 
 use crate::cell::{Vehicles, config, join, start, until};
-use crate::http::{Events, get};
+use crate::http::{Events, get, try_request};
+use crate::processes::{self, Place, free_places};
 
 fn sees(picture: &Value, vehicle: &str) -> bool {
     picture["vehicles"].as_array().unwrap().iter().any(|sighting| sighting["report"]["node"] == vehicle)
@@ -35,6 +43,41 @@ async fn pictures_follow_the_cell_on_every_node() {
     cav.stop().await;
 }
 
+/// Neither the edge nor a plain client can be told of any more by the broker that died with the edge.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_leader_that_dies_with_the_only_broker_is_gone_and_so_is_who_only_it_told_of() {
+    let directory = tempfile::tempdir().unwrap();
+    let places: [Place; 2] = free_places();
+    let mut edge = processes::start("edge", Role::Edge, places[0], &places, directory.path());
+    let _cav = processes::start("euclid", Role::Cav, places[1], &places, directory.path());
+    let mut plain = JoinSet::new();
+    plain.spawn(say_there_is("plain", places[0].broker));
+    let are_alive = |names: [&'static str; 2], wanted: bool| async move {
+        let asked = try_request(places[1].page, "GET", "/api/picture", &[("Host", "localhost")], "").await;
+        let Ok(picture) = asked.map(|answer| answer.json()) else { return false };
+        let node = |name| picture["nodes"].as_array().unwrap().iter().find(|node| node["name"] == name);
+        names.into_iter().all(|name| node(name).is_some_and(|node| node["alive"] == wanted))
+    };
+    until("both are there", || are_alive(["edge", "plain"], true)).await;
+    edge.0.kill().unwrap();
+    until("both are gone", || are_alive(["edge", "plain"], false)).await;
+}
+
+/// A client that does not gossip leaves its status with a broker.
+async fn say_there_is(name: &'static str, broker: SocketAddr) {
+    let name = NodeName::from_static(name);
+    let status = NodeStatus::starting(name.clone(), Uuid::from_u128(1), Role::Cav, "0.1.0");
+    let options = MqttOptions::new(name.as_str(), broker.ip().to_string(), broker.port());
+    let (client, mut events) = AsyncClient::new(options, 4);
+    let topic = format!("ecod/v1/lot/nodes/{name}");
+    client.try_publish(topic, QoS::AtLeastOnce, true, encode(&status, Encoding::Json)).unwrap();
+    loop {
+        if events.poll().await.is_err() {
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    }
+}
+
 /// A vehicle's report reaches a node that only follows while someone looks there, and no longer.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_follower_takes_reports_only_while_it_is_looked_at() {
@@ -53,7 +96,7 @@ async fn a_follower_takes_reports_only_while_it_is_looked_at() {
     drop(events);
     until("reports are no longer taken", || async {
         let before = reports().await;
-        tokio::time::sleep(std::time::Duration::from_millis(500)).await;
+        tokio::time::sleep(Duration::from_millis(500)).await;
         reports().await == before
     })
     .await;

@@ -114,7 +114,7 @@ impl Node {
 
     pub(crate) async fn next_state_of(&mut self, node: &str) -> NodeState {
         self.next(|message| match message {
-            Incoming::Status(status) if status.node.as_str() == node => Some(status.state),
+            Incoming::Status { status, .. } if status.node.as_str() == node => Some(status.state),
             _ => None,
         })
         .await

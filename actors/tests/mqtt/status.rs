@@ -88,7 +88,7 @@ async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
     euclid.kill().await;
     let epoch = watcher
         .next(|message| match message {
-            Incoming::Status(status) if status.state == NodeState::Offline => Some(status.epoch),
+            Incoming::Status { status, .. } if status.state == NodeState::Offline => Some(status.epoch),
             _ => None,
         })
         .await;

@@ -1,6 +1,6 @@
 // Small line charts: time to the right, the newest at the edge.
 
-import { keyed, set, svg, text } from "./dom.js";
+import { clock, keyed, set, svg, text } from "./dom.js";
 
 const SPAN_US = 600e6;
 const PAD = { left: 34, right: 8, top: 8, bottom: 18 };
@@ -25,7 +25,7 @@ export function chart(frame, { lines, now, floor = 0, ceiling = null, names = fa
     set(g.lastChild, { x: PAD.left - 6, y: y(level) + 4, "text-anchor": "end" });
     text(g.lastChild, trim(level) + (level === top ? unit : ""));
   });
-  const ends = [[start, `${Math.max(1, Math.round((now - start) / 60e6))} min ago`, "start"], [now, "now", "end"]];
+  const ends = [[start, `${Math.max(1, Math.round((now - start) / 60e6))} min earlier`, "start"], [now, clock(now), "end"]];
   keyed(group(picture, "times"), ends, (end) => end[2], () => svg("text"), (element, [at, name, anchor]) => {
     set(element, { x: x(at), y: height - 3, "text-anchor": anchor });
     text(element, name);

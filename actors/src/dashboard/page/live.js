@@ -2,6 +2,7 @@
 
 /// A longer silence means that the connection is lost: the node sends at least one picture a second.
 const SILENCE_MS = 3000;
+/// How often history is asked for, and pictures where they do not come by themselves.
 const HISTORY_MS = 2000;
 
 export class Live {
@@ -9,6 +10,8 @@ export class Live {
   history = { reigns: [], samples: [], failovers: 0 };
   landmarks = [];
   refused = false;
+  /// Whether the node has no room for another live page; it is then asked now and then.
+  crowded = false;
   #source = null;
   #heard = 0;
 
@@ -38,14 +41,29 @@ export class Live {
     if (this.#source) return;
     this.#source = new EventSource("/api/events");
     this.#source.addEventListener("picture", (event) => {
-      const picture = JSON.parse(event.data);
-      const restarted = this.picture?.node.started_at_us !== picture.node.started_at_us;
-      this.picture = picture;
-      this.#heard = performance.now();
-      this.refused = false;
-      if (restarted) this.#restart();
-      this.onPicture();
+      [this.refused, this.crowded] = [false, false];
+      this.#take(JSON.parse(event.data));
     });
+    this.#source.addEventListener("error", () => this.#ask());
+  }
+
+  #take(picture) {
+    const restarted = this.picture?.node.started_at_us !== picture.node.started_at_us;
+    this.picture = picture;
+    this.#heard = performance.now();
+    if (restarted) this.#restart();
+    this.onPicture();
+  }
+
+  /// Whether the browser gave up: the node answered, but not with pictures.
+  get #closed() {
+    return this.#source?.readyState === EventSource.CLOSED;
+  }
+
+  async #ask() {
+    const picture = this.#closed && (await this.#get("/api/picture"));
+    this.crowded = this.#closed && Boolean(picture);
+    if (this.crowded) this.#take(picture);
   }
 
   #close() {
@@ -53,10 +71,10 @@ export class Live {
     this.#source = null;
   }
 
-  /// A browser gives up on some errors, and does not notice every lost connection.
+  /// A browser does not notice every lost connection.
   #check() {
     const silent = performance.now() - this.#heard > 2 * SILENCE_MS;
-    if (!document.hidden && (this.#source?.readyState === EventSource.CLOSED || (silent && this.picture && Math.random() < 0.1))) {
+    if (!document.hidden && silent && this.picture && Math.random() < 0.1) {
       this.#close();
       this.#follow();
     }
@@ -71,6 +89,10 @@ export class Live {
 
   async #refresh() {
     if (document.hidden) return;
+    if (this.#closed) {
+      this.#close();
+      this.#follow();
+    }
     const since = this.history.samples.at(-1)?.at_us ?? 0;
     const news = await this.#get(`/api/history?since=${since}`);
     if (!news) return;

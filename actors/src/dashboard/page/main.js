@@ -96,7 +96,8 @@ function drawState() {
   document.body.classList.toggle("stale-data", stale);
   const notice = live.refused ? "This page needs the node's token: open it with ?token= and the token."
     : picture && !live.connected ? "The node does not answer. What is shown is what it said last."
-    : stale ? `What is shown may be out of date: ${picture.readiness.reason}.` : "";
+    : stale ? `What is shown may be out of date: ${picture.readiness.reason}.`
+    : live.crowded ? "The node has no room for another live page: this one follows every two seconds." : "";
   text(byId("notice"), notice);
   byId("notice").hidden = notice === "";
   announce(picture);

@@ -30,11 +30,12 @@ export function tiles({ leadership, map, verdicts }, now, perSecond) {
 }
 
 export function latency(samples) {
-  const last = samples.filter((sample) => sample.latency_p50_ms !== null).slice(-5);
+  const begin = samples.at(-1).at_us - 10e6;
+  const last = samples.filter((sample) => sample.at_us > begin && sample.latency_p50_ms !== null);
   const middle = last.map((sample) => sample.latency_p50_ms).sort((a, b) => a - b)[last.length >> 1];
   const most = Math.max(...last.map((sample) => sample.latency_max_ms));
   text(byId("latency"), last.length ? milliseconds(middle) : "–");
-  text(byId("latency-more"), last.length ? `median of 10 s, at most ${milliseconds(most)}` : "oldest capture in the map");
+  text(byId("latency-more"), last.length ? `median of 10 s, at most ${milliseconds(most)}` : "no capture in 10 s");
 }
 
 export function places(scene) {
@@ -104,10 +105,16 @@ export function nodes({ nodes, node, leadership }) {
   text(byId("nodes-count"), `${nodes.filter((entry) => entry.alive).length} of ${nodes.length} there`);
 }
 
+/// Copies of what was taken, as come by a second broker, are not left out.
+const COPIES = "out_of_order";
+
 /// What counts as left out, beside payloads that were rejected, in words.
 const DROPS = {
   publish_refused: "not sent: link down or full", publish_too_large: "not sent: too large", inbox_full: "dropped: node too far behind",
   name_conflict: "another node has this name", disconnected: "link lost", connect_failed: "link not established", broker_refused: "refused by a broker",
+  client_throttled: "client kept out: connects too often", client_timed_out: "client kept out: no login in time", client_untrusted: "client kept out: no valid certificate",
+  client_malformed: "client kept out: no login", clients_full: "client kept out: no room", client_denied: "client may not do or say that", client_expelled: "client cut off: certificate revoked or expired",
+  record_failed: "log not written", record_dropped: "not in the log",
   vote_ignored: "vote for nothing", report_late: "too late for tracks", object_refused: "no room for tracks", reputations_not_saved: "reputations not saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
   detection_unplaced: "detection not placed", pose_rejected: "pose not taken", frame_without_pose: "frame without a pose", browser_refused: "browser refused", browser_throttled: "browser slowed down", dashboard_not_bound: "page's address not free",
 };
@@ -115,7 +122,7 @@ const DROPS = {
 const earlier = new Map();
 
 export function drops({ counters, now_us }) {
-  const rejected = Object.entries(counters.rejects).map(([reason, count]) => [`rejected: ${reason.replaceAll("_", " ")}`, count]);
+  const rejected = Object.entries(counters.rejects).filter(([reason]) => reason !== COPIES).map(([reason, count]) => [`rejected: ${reason.replaceAll("_", " ")}`, count]);
   const shed = Object.entries(counters.shed).map(([reason, count]) => [`overload: ${reason.replaceAll("_", " ")}`, count]);
   const events = Object.entries(DROPS).map(([event, words]) => [words, counters.events[event] ?? 0]);
   const all = [...rejected, ...shed, ...events].filter(([, count]) => count > 0);

@@ -124,7 +124,7 @@ impl Assembly {
                     recording.link(broker, *state, at);
                     election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
                 }
-                Incoming::Status(status) => {
+                Incoming::Status { status, .. } => {
                     recording.status(status, at);
                     election.send(LeaderElectionMessage::TakeStatus { delivery })
                 }
