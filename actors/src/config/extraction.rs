@@ -93,7 +93,8 @@ fn describe(errors: figment::Error) -> String {
 /// The key that is wrong in a table that its `kind` tells apart: serde reads such a table from a buffer and forgets where it
 /// was. It is the one without which the error is another.
 fn key_in_table(error: &figment::Error, figment: &Figment) -> Option<String> {
-    let keys = figment.find_value(&error.path.join(".")).ok()?.into_dict().filter(|table| table.contains_key("kind"))?;
+    let keys =
+        figment.find_value(&error.path.join(".")).ok()?.into_dict().filter(|table| table.contains_key("kind"))?;
     let error_without = |key: &String| {
         let mut root: Dict = figment.extract().ok()?;
         let table = error.path.iter().try_fold(&mut root, |table, level| match table.get_mut(level) {

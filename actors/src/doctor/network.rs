@@ -72,8 +72,7 @@ pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
 #[cfg(feature = "foxglove")]
 pub(super) fn live(config: &NodeConfig) -> Option<Finding> {
     let port = config.record.as_ref().and_then(|record| record.live_port)?;
-    let port =
-        Port { check: "live port", address: SocketAddr::from(([127, 0, 0, 1], port)), key: "record.live_port" };
+    let port = Port { check: "live port", address: SocketAddr::from(([127, 0, 0, 1], port)), key: "record.live_port" };
     Some(port.of(TcpListener::bind(port.address)))
 }
 
