@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check live-check asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -52,11 +52,11 @@ test: PACKAGES += mosquitto mosquitto-clients
 test: setup ## all tests
 	cargo test --locked
 
-test-dashboard: PACKAGES += chromium chromium-driver prometheus
+test-dashboard: PACKAGES += chromium chromium-driver
 test-dashboard: setup monitoring ## the page in a real browser, with pictures in target/dashboard; installs Chromium
 	cargo test --locked -p ecod-actors --test dashboard -- --ignored --nocapture
 
-monitoring: ## check the rules for Prometheus, where promtool is there
+monitoring: ## check the rules for Prometheus; takes promtool out of Debian's package if it is not installed
 	packaging/check-monitoring
 
 sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of SEED=n
@@ -93,10 +93,14 @@ recording-check: setup ## prove that the Python reader of MCAP reads what nodes 
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap
 	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --nocapture python
 
+live-check: setup ## record with the feature foxglove, and look on as Foxglove does
+	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test recording
+
 fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each; TARGETS=payload,... runs those only
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
 
-asyncapi-check: ## validate docs/asyncapi.yaml by the parser of its standard, where npm is there
+asyncapi-check: PACKAGES := ca-certificates npm
+asyncapi-check: setup ## validate docs/asyncapi.yaml by the parser of its standard; installs npm
 	packaging/check-asyncapi
 
 python-check: PACKAGES += mosquitto-clients python3-venv

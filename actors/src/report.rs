@@ -2,14 +2,18 @@
 //!
 //! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`].
 
+mod accuracy;
+mod losses;
 mod page;
 mod plot;
 mod series;
+pub(crate) mod tracks;
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use ecod::epoch::Epoch;
+use ecod::eval::tracks::{TrackEvaluation, TrackTruth};
 use ecod::eval::{Evaluation, Truth};
 use ecod::landmark::{Landmark, LandmarkIndex};
 use ecod::names::NodeName;
@@ -20,9 +24,10 @@ use ecod::wire::{GlobalMap, ObjectReport, ReportKind, Reputations, Verdicts};
 use crate::recorder::{
     CounterReading, Identity, LeadershipChange, LogError, LogEvent, LogMessage, LogReader, SchemaName,
 };
+use losses::Losses;
 use series::Samples;
 
-/// What is gathered of a log.
+/// What is gathered of a log; by default, nothing yet.
 #[derive(Debug, Default)]
 pub struct Report {
     identity: Option<Identity>,
@@ -37,9 +42,9 @@ pub struct Report {
     vehicles: BTreeMap<NodeName, Vehicle>,
     entries: u64,
     reputations: BTreeMap<NodeName, Samples>,
-    counters: Option<(CounterReading, CounterReading)>,
-    losses: Samples,
+    losses: Losses,
     evaluation: Option<Evaluation>,
+    tracks: Option<TrackEvaluation>,
 }
 
 /// The rounds of one kind as the recording node took them.
@@ -76,9 +81,16 @@ struct Vehicle {
 }
 
 impl Report {
-    /// Nothing read yet; with `truth`, maps and verdicts are judged by it.
-    pub fn new(truth: Option<Truth>) -> Self {
-        Self { evaluation: truth.map(Evaluation::new), ..Self::default() }
+    /// Judges maps and verdicts by what stands at each location.
+    #[must_use]
+    pub fn judged_by(self, truth: Truth) -> Self {
+        Self { evaluation: Some(Evaluation::new(truth)), ..self }
+    }
+
+    /// Judges the objects of maps by where they really were.
+    #[must_use]
+    pub fn judged_by_tracks(self, truth: TrackTruth) -> Self {
+        Self { tracks: Some(TrackEvaluation::new(truth)), ..self }
     }
 
     /// Takes in a file; what cannot be used is named on the page and left out.
@@ -117,11 +129,13 @@ impl Report {
     }
 
     fn meet(&mut self, identity: &Identity) {
-        if let Some(known) = self.identity.replace(identity.clone()) {
-            if known.node != identity.node {
-                self.problems.push(format!("logs of {} and {} are mixed", known.node, identity.node));
-            }
-        } else if let Some(evaluation) = self.evaluation.take() {
+        if let Some(known) = self.identity.replace(identity.clone())
+            && known.node != identity.node
+        {
+            self.problems.push(format!("logs of {} and {} are mixed", known.node, identity.node));
+        }
+        // Each file may have been written under another configuration.
+        if let Some(evaluation) = self.evaluation.take() {
             let landmarks: Vec<_> = identity.landmarks.iter().map(Landmark::from).collect();
             let gate = identity.fusion.pace.gate();
             self.evaluation = Some(evaluation.with_landmarks(LandmarkIndex::new(landmarks, gate.radius_m), gate));
@@ -166,11 +180,15 @@ impl Report {
     fn map(&mut self, at: Timestamp, map: GlobalMap) {
         self.maps.note(at, map.oldest_capture_us, map.fused_at_us);
         self.reign(at, Epoch::new(map.epoch, map.aggregator.clone()));
-        for entry in map.landmarks.iter().filter(|entry| entry.label.is_some()) {
+        let labelled = map.landmarks.iter().filter(|entry| entry.label.is_some()).map(|entry| &entry.contributors);
+        for contributors in labelled.chain(map.objects.iter().map(|object| &object.contributors)) {
             self.entries += 1;
-            for node in &entry.contributors {
+            for node in contributors {
                 self.vehicles.entry(node.clone()).or_default().contributed += 1;
             }
+        }
+        if let Some(tracks) = &mut self.tracks {
+            tracks.map(&map);
         }
         if let Some(evaluation) = &mut self.evaluation {
             evaluation.fused(&FusedLine::Map(map));
@@ -194,10 +212,7 @@ impl Report {
     }
 
     fn counters(&mut self, reading: CounterReading) {
-        let lost: u64 = page::losses(&reading).map(|(_, times)| times).sum();
-        self.losses.push(reading.at_us, lost as f64);
-        let first = self.counters.take().map_or_else(|| reading.clone(), |(first, _)| first);
-        self.counters = Some((first, reading));
+        self.losses.note(self.identity.as_ref().map(|identity| identity.run), reading);
     }
 
     fn reign(&mut self, at: Timestamp, epoch: Epoch) {

@@ -1,7 +1,8 @@
 //! The journal of an aggregator: what it was told and when, from which it is run again to the last bit.
 //!
 //! Call [`Rerun::entry`] and [`Rerun::report`] in the order in which the aggregator was told; out come the maps and
-//! verdicts that it made. That holds from a [`JournalEvent::Start`] on, with the same configuration and version. After
+//! verdicts that it made. That holds from a [`JournalEvent::Start`] on, with the same configuration and version; where
+//! the journal of another run of the node follows, call [`Rerun::restart`] first. After
 //! [`JournalEvent::Continue`] or [`JournalEvent::Missing`] the rounds are the same but may rest on less evidence.
 
 use std::collections::BTreeMap;
@@ -83,6 +84,11 @@ impl Rerun {
     /// Nothing has happened yet; `fusion` is taken as valid.
     pub fn new(fusion: FusionConfig, landmarks: Vec<Landmark>) -> Self {
         Self { fusion, landmarks, aggregator: None, summary: RerunSummary::default() }
+    }
+
+    /// What comes is of another run of the node, under this configuration; `fusion` is taken as valid.
+    pub fn restart(&mut self, fusion: FusionConfig, landmarks: Vec<Landmark>) {
+        (self.fusion, self.landmarks, self.aggregator) = (fusion, landmarks, None);
     }
 
     /// Takes the next entry.

@@ -1,11 +1,12 @@
 //! `ecod-node report`: a log as one page.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::eval::Truth;
+use ecod::eval::tracks::TrackTruth;
 
 use super::Failure;
 use super::replay::log_files;
@@ -17,7 +18,7 @@ pub(super) struct ReportArguments {
     /// Logs of one node (MCAP) in order, or the directory that they are in
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
-    /// What really stands at each location (JSON, or CSV with the columns item,truth)
+    /// What really stands at each location (JSON, or CSV with the columns item,truth), or where all objects were (JSON)
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// The page that is written (HTML)
@@ -27,11 +28,7 @@ pub(super) struct ReportArguments {
 
 pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
     let ReportArguments { logs, truth, output } = arguments;
-    let truth = truth.as_ref().map(|path| {
-        let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-        Truth::parse(&text).with_context(|| format!("truth {}", path.display()))
-    });
-    let mut report = Report::new(truth.transpose().map_err(Failure::usage)?);
+    let mut report = truth.as_deref().map_or_else(|| Ok(Report::default()), judged_by).map_err(Failure::usage)?;
     for file in log_files(logs)? {
         report.file(&file).map_err(|error| anyhow!(error))?;
     }
@@ -42,4 +39,15 @@ pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
         return Err(anyhow!("there is nothing in the log").into());
     }
     Ok(fs::write(output, report.page()).with_context(|| format!("cannot write {}", output.display()))?)
+}
+
+/// A report that judges by the truth in this file.
+fn judged_by(path: &Path) -> anyhow::Result<Report> {
+    let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let truth = || format!("truth {}", path.display());
+    Ok(if TrackTruth::is_in(&text) {
+        Report::default().judged_by_tracks(TrackTruth::parse(&text).with_context(truth)?)
+    } else {
+        Report::default().judged_by(Truth::parse(&text).with_context(truth)?)
+    })
 }

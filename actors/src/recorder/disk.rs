@@ -21,7 +21,6 @@ const NAMES_A_SECOND: u32 = 1000;
 /// # Errors
 /// What the operating system said, and when there is less room than `min_free` bytes.
 pub(super) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) -> io::Result<(PathBuf, File)> {
-    fs::create_dir_all(dir)?;
     check_room(dir, min_free)?;
     let seconds = i64::try_from(at.micros() / 1_000_000).unwrap_or_default();
     let time = DateTime::from_timestamp(seconds, 0).unwrap_or_default().format("%Y%m%dT%H%M%SZ");

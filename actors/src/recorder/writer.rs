@@ -115,7 +115,11 @@ impl LogWriter {
     }
 
     fn begin(&mut self, entry: &Entry) -> McapResult<LogFile> {
-        let (path, file) = disk::create(&self.config.dir, &self.identity.node, entry.at, self.config.min_free_bytes())?;
+        let (dir, node) = (&self.config.dir, &self.identity.node);
+        std::fs::create_dir_all(dir)?;
+        // First, as it may make the room that there must be.
+        disk::prune(dir, node, self.config.max_old_bytes())?;
+        let (path, file) = disk::create(dir, node, entry.at, self.config.min_free_bytes())?;
         let mut file = LogFile::begin(path, file, &self.identity)?;
         let Standing { runs, leads, next_round } = self.recording.standing().clone();
         if runs && !matches!(entry.item, Item::Journal(JournalEvent::Start { .. })) {
@@ -152,9 +156,6 @@ impl LogWriter {
         if is_full && let Some(Err(error)) = self.file.take().map(LogFile::finish) {
             self.failed(&error);
         }
-        if is_full && let Err(error) = disk::prune(&self.config.dir, &self.identity.node, self.config.max_old_bytes()) {
-            self.failed(&error.into());
-        }
     }
 
     /// Counts a failure, and leaves file and disk alone for a while.
@@ -190,12 +191,46 @@ mod tests {
     use crate::counters::Counters;
     use crate::recorder::{LogReader, files};
 
+    const NODE: NodeName = NodeName::from_static("cav");
+
+    fn writer(config: RecordConfig, counters: &Arc<Counters>) -> LogWriter {
+        let identity = Identity::of(&NodeConfig::default(), &NODE, Uuid::nil());
+        LogWriter::new(config, identity, Recording::new(Arc::clone(counters)))
+    }
+
+    #[test]
+    fn the_limit_holds_for_nodes_that_never_fill_a_file_and_makes_room_on_a_full_disk() {
+        let directory = tempfile::tempdir().unwrap();
+        for second in 0..40 {
+            let (path, _) = disk::create(directory.path(), &NODE, Timestamp(second * 1_000_000), 0).unwrap();
+            std::fs::write(path, vec![0; 100_000]).unwrap();
+        }
+        let kept = || files(directory.path()).unwrap();
+        let config = |min_free_mb| RecordConfig {
+            max_file_mb: 1,
+            max_total_mb: 3,
+            min_free_mb,
+            ..RecordConfig::new(directory.path())
+        };
+        let counters = Arc::new(Counters::default());
+        let entry = Entry { at: Timestamp(100_000_000), item: Item::Counters(counters.snapshot()) };
+        let all = kept();
+        writer(config(1_000_000_000), &counters).take(&entry);
+        assert_eq!(counters.events(Event::RecordFailed), 1);
+        assert_eq!(kept(), all[20..], "the oldest are gone, though there is still no room for another");
+        for starts in 1..=3 {
+            writer(config(0), &counters).take(&entry);
+            assert_eq!(counters.events(Event::Recorded), starts);
+            let bytes: u64 = kept().iter().map(|path| path.metadata().unwrap().len()).sum();
+            assert!(bytes <= 3_000_000, "{bytes} bytes after {starts} starts");
+        }
+    }
+
     #[test]
     fn a_disk_that_fills_up_while_a_file_is_written_ends_the_file_in_order() {
         let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
         let config = RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path()) };
-        let identity = Identity::of(&NodeConfig::default(), &NodeName::from_static("cav"), Uuid::nil());
-        let mut writer = LogWriter::new(config, identity, Recording::new(Arc::clone(&counters)));
+        let mut writer = writer(config, &counters);
         let entry = |ms: u64| Entry { at: Timestamp(ms * 1000), item: Item::Counters(counters.snapshot()) };
         writer.take(&entry(1));
         writer.flush();

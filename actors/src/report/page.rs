@@ -3,14 +3,11 @@
 use std::fmt::{Display, Write};
 
 use chrono::DateTime;
-use ecod::eval::Scores;
 use ecod::time::Timestamp;
 
 use super::plot::{Axis, Curve, Plot, bars, class};
 use super::series::{distribution, quantile};
-use super::{Report, Rounds};
-use crate::counters::Event;
-use crate::recorder::CounterReading;
+use super::{Report, Rounds, accuracy};
 
 /// How finely time is shown.
 const PARTS: usize = 700;
@@ -18,33 +15,11 @@ const PARTS: usize = 700;
 /// Most curves of a plot; a table has all.
 const MOST_CURVES: usize = 12;
 
-/// Counted events that mean that something was lost.
-const LOSSES: [Event; 11] = [
-    Event::PublishRefused,
-    Event::PublishTooLarge,
-    Event::InboxFull,
-    Event::RecordDropped,
-    Event::FrameFailed,
-    Event::FrameSkipped,
-    Event::SourceFailed,
-    Event::DetectionUnplaced,
-    Event::PoseRejected,
-    Event::FrameWithoutPose,
-    Event::ReputationsNotSaved,
-];
-
-/// Counts of what was lost or refused; copies that came a second way are neither.
-pub(super) fn losses(reading: &CounterReading) -> impl Iterator<Item = (&str, u64)> {
-    let is_loss = |name: &str| LOSSES.iter().any(|event| event.as_str() == name);
-    let events = reading.events.iter().filter(move |(name, _)| is_loss(name));
-    let rejects = reading.rejects.iter().filter(|(name, _)| *name != "out_of_order");
-    events.chain(rejects).chain(&reading.shed).map(|(name, times)| (name.as_str(), *times))
-}
-
 /// Writes the page.
 pub(super) fn write(report: &Report) -> String {
     let sections = [
-        accuracy(report),
+        accuracy::of_locations(report),
+        accuracy::of_tracks(report),
         leadership(report),
         latency(report),
         gaps(report),
@@ -85,36 +60,6 @@ fn problems(report: &Report) -> String {
     }
     let items: String = report.problems.iter().map(|problem| format!("<li>{}</li>\n", escape(problem))).collect();
     format!("<section class=\"warning\">\n<h2>Not used</h2>\n<ul>\n{items}</ul>\n</section>\n")
-}
-
-fn accuracy(report: &Report) -> String {
-    let Some(result) = report.evaluation.as_ref().map(ecod::eval::Evaluation::result) else { return String::new() };
-    let percent = |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{share:.1}"));
-    let row = |name: &str, scores: &Scores| {
-        let shares = [
-            scores.accuracy_pct,
-            scores.coverage_pct,
-            scores.labelled_accuracy_pct,
-            scores.rounds.accuracy_pct,
-            scores.majority_accuracy_pct,
-        ];
-        let cells = [name.to_owned(), scores.lines.to_string(), scores.items.to_string()];
-        cells.into_iter().chain(shares.map(percent)).collect::<Vec<_>>()
-    };
-    let judged = [("PACE", &result.pace), ("VOTE", &result.vote)];
-    let rows: Vec<_> = judged.iter().filter_map(|(name, scores)| Some(row(name, scores.as_ref()?))).collect();
-    let head = ["", "rounds", "items", "accuracy %", "coverage %", "labelled %", "all rounds %", "majority %"];
-    let mut text = table(&head, &rows);
-    for (name, scores) in judged.iter().filter_map(|(name, scores)| Some((name, scores.as_ref()?))) {
-        let alone: Vec<_> = scores.vehicles.iter().collect();
-        let shares: Vec<_> =
-            alone.iter().filter_map(|(node, alone)| Some((node.to_string(), alone.accuracy_pct?))).collect();
-        if !shares.is_empty() {
-            let title = format!("{name}: accuracy of every vehicle alone");
-            text += &format!("<h3>{title}</h3>\n{}", drawing(&bars(&title, &shares)));
-        }
-    }
-    section("Accuracy", "Judged by the truth that was given; an item is a location while its truth stays.", &text)
 }
 
 fn leadership(report: &Report) -> String {
@@ -222,27 +167,25 @@ fn coverage(report: &Report) -> String {
         .collect();
     let head = ["vehicle", "reports", "a second", "objects each", "entries contributed to"];
     let text = if report.entries == 0 { String::new() } else { drawing(&bars("coverage per vehicle", &shares)) };
-    let about = "Share of the labelled entries of all maps that rest on a vehicle's detections; reports of all kinds, as \
-                 often as they came.";
+    let about = "Share of the objects and labelled locations of all maps that rest on a vehicle's detections; reports of \
+                 all kinds, as often as they came.";
     section("Coverage", about, &(text + &table(&head, &rows)))
 }
 
 fn drops(report: &Report) -> String {
-    let Some((first, last)) = &report.counters else { return String::new() };
-    let before = |name: &str| losses(first).find(|(other, _)| *other == name).map_or(0, |(_, times)| times);
-    let rows: Vec<_> = losses(last)
-        .filter_map(|(name, times)| {
-            let lost = times.saturating_sub(before(name));
-            (lost > 0).then(|| vec![name.replace('_', " "), lost.to_string()])
-        })
-        .collect();
+    let losses = &report.losses;
+    if !losses.are_known() {
+        return String::new();
+    }
+    let row = |(name, times): (&String, &u64)| vec![name.replace('_', " "), times.to_string()];
+    let rows: Vec<_> = losses.by_reason().iter().map(row).collect();
     if rows.is_empty() {
         return section("Drops", "Nothing was lost or refused while this was recorded.", "");
     }
-    let points = report.losses.points(report.first.unwrap_or_default(), seconds(report), PARTS);
-    let curve = Curve { name: "lost or refused since the node began".into(), points };
+    let points = losses.over_time().points(report.first.unwrap_or_default(), seconds(report), PARTS);
+    let curve = Curve { name: "lost or refused so far".into(), points };
     let text = shown(&over_time(report, "drops", "lost or refused", vec![curve])) + &table(&["reason", "times"], &rows);
-    section("Drops", "What this node lost or refused, by reason.", &text)
+    section("Drops", "What this node lost or refused while this was recorded, by reason.", &text)
 }
 
 fn over_time<'a>(report: &Report, title: &'a str, y_label: &'a str, curves: Vec<Curve>) -> Plot<'a> {
@@ -264,7 +207,7 @@ fn shown(plot: &Plot<'_>) -> String {
     format!("<figure>\n{}<ul class=\"legend\">\n{keys}</ul>\n</figure>\n", drawing(&plot.draw()))
 }
 
-fn drawing(picture: &str) -> String {
+pub(super) fn drawing(picture: &str) -> String {
     format!("<div class=\"drawing\">{picture}</div>\n")
 }
 
@@ -276,11 +219,11 @@ fn quantiles(name: &str, values: &[f64]) -> Vec<String> {
     [name.to_owned(), values.len().to_string()].into_iter().chain(shares.map(ms)).collect()
 }
 
-fn section(title: &str, about: &str, content: &str) -> String {
+pub(super) fn section(title: &str, about: &str, content: &str) -> String {
     format!("<section>\n<h2>{title}</h2>\n<p>{about}</p>\n{content}</section>\n")
 }
 
-fn table(head: &[&str], rows: &[Vec<String>]) -> String {
+pub(super) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
     let mut text = String::new();
     let cell = |text: &mut String, tag: &str, content: &str| {
         // Writing to a string does not fail.

@@ -85,10 +85,15 @@ impl Cell {
 
     /// Starts a node on a runtime of its own; the first is the seed of the others.
     pub(crate) async fn start(&mut self, node: &str, role: Role) {
-        let config = self.config(node, role);
+        self.start_with(self.config(node, role)).await;
+    }
+
+    /// The same with another configuration.
+    pub(crate) async fn start_with(&mut self, config: NodeConfig) {
+        let node = config.name.as_ref().unwrap().to_string();
         let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
         let handle = runtime.spawn(node::start(config)).await.unwrap().unwrap();
-        self.nodes.insert(node.to_owned(), (handle, runtime));
+        self.nodes.insert(node, (handle, runtime));
     }
 
     /// Ends all tasks of a node where they are.

@@ -12,11 +12,16 @@ use tempfile::TempDir;
 
 /// A log of two reports, with this version and one more channel.
 fn log(version: u64) -> Vec<u8> {
+    log_with(&[("log", &version.to_string())])
+}
+
+/// The same with other metadata.
+fn log_with(changes: &[(&str, &str)]) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     let mut writer: Writer<_> = WriteOptions::new().compression(None).create(&mut bytes).unwrap();
     let fusion = serde_json::to_string(&ReplayConfig::default().fusion).unwrap();
     let metadata = [
-        ("log", version.to_string()),
+        ("log", "1".into()),
         ("node", "gauss".into()),
         ("cell", "cell".into()),
         ("run", uuid::Uuid::nil().to_string()),
@@ -24,7 +29,8 @@ fn log(version: u64) -> Vec<u8> {
         ("fusion", fusion),
         ("landmarks", "[]".into()),
     ];
-    let metadata: BTreeMap<_, _> = metadata.map(|(key, value)| (key.to_owned(), value)).into();
+    let mut metadata: BTreeMap<_, _> = metadata.map(|(key, value)| (key.to_owned(), value)).into();
+    metadata.extend(changes.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())));
     writer.write_metadata(&Metadata { name: "ecod.log".into(), metadata }).unwrap();
     let mut channel = |schema: &str, topic: &str| {
         let schema = writer.add_schema(schema, "jsonschema", b"{}").unwrap();
@@ -91,6 +97,25 @@ fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
         let reader = ecod_actors::recorder::LogReader::open(&file(&folder, "any.mcap", &whole[..length])).unwrap();
         assert!(reader.take(1000).count() < 1000, "cut at {length}, reading ends");
     }
+}
+
+#[test]
+fn another_version_or_configuration_further_on_is_told_of_and_used_from_there() {
+    let folder = TempDir::new().unwrap();
+    let one = file(&folder, "one.mcap", &log(1));
+    let run = uuid::Uuid::from_u128(1).to_string();
+    let moved = [("run", &*run), ("version", "0.0.1"), ("landmarks", r#"[{"id":"slot-0","x_m":1.5,"y_m":2.0}]"#)];
+    let other = file(&folder, "other.mcap", &log_with(&moved));
+    let ((_, alone, _), (_, other_alone, _)) = (replay(&[&one]), replay(&[&other]));
+    let (code, lines, said) = replay(&[&one, &other]);
+    assert_eq!((code, lines), (0, alone + other_alone), "{said}");
+    assert_eq!(said.matches("2 lines, 2 used").count(), 2, "{said}");
+    for part in ["other.mcap was written by version 0.0.1", "other.mcap is of a run under another configuration"] {
+        assert_eq!(said.matches(part).count(), 1, "{said}");
+    }
+    let same = file(&folder, "same.mcap", &log_with(&[("run", &run)]));
+    let (_, _, said) = replay(&[&one, &same]);
+    assert!(said.contains("4 lines") && !said.contains("another configuration"), "{said}");
 }
 
 #[test]

@@ -14,6 +14,7 @@ use std::collections::BTreeMap;
 use std::process::Command;
 use std::time::Duration;
 
+use ecod::landmark::LandmarkConfig;
 use ecod::replay::FusedLine;
 use ecod::wire::Role;
 use ecod_actors::recorder::SchemaName;
@@ -81,6 +82,34 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
         eprintln!("{node}: {} recorded, {} made again", own.len(), again.len());
     }
     assert!(leaders.contains(&"edge") && leaders.contains(&&*substitute), "{leaders:?}");
+}
+
+/// What is edited between two runs of a node holds for the second alone, also when both are made again.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_run_is_made_again_under_its_own_configuration() {
+    let mut cell = Cell::default();
+    cell.start("edge", Role::Edge).await;
+    cell.start("euclid", Role::Cav).await;
+    cell.served_by("edge").await;
+    cell.drive(Duration::from_secs(1)).await;
+    cell.kill("edge");
+    let mut config = cell.config("edge", Role::Edge);
+    config.landmarks.push(LandmarkConfig::at("slot-2", 6.0, 1.0));
+    cell.start_with(config).await;
+    cell.served_by("edge").await;
+    cell.drive(Duration::from_secs(2)).await;
+    let directory = cell.stop().await;
+
+    let dir = directory.path().join("edge");
+    let own = by_key(&Log::read(&dir).fused());
+    let (again, said) = replay(&dir);
+    let again = by_key(&again);
+    for (key, line) in &own {
+        assert_eq!(again.get(key), Some(line), "{key:?}\n{said}");
+    }
+    let of_second_run = own.values().filter(|line| line.contains("slot-2")).count();
+    assert!(of_second_run > 5 && of_second_run < own.len(), "{of_second_run} of {}", own.len());
+    assert!(!said.contains("missing") && !said.contains("middle"), "{said}");
 }
 
 /// An observer's log has what all of the cell said, and the reports in it can be fused.

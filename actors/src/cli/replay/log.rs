@@ -72,19 +72,30 @@ impl<'a> LogReplay<'a> {
     }
 
     fn meet(&mut self, identity: Identity, file: &Path) -> Result<Vec<FusedLine>, Failure> {
-        match &self.identity {
-            Some(known) if known.node != identity.node => {
-                let (one, other) = (&known.node, &identity.node);
-                let what = format!("{} is of node {other}, files before it of {one}", file.display());
-                return Err(Failure::usage(anyhow!("{what}: give the files of one node at a time")));
+        let known = self.identity.take();
+        if let Some(known) = &known
+            && known.node != identity.node
+        {
+            let (one, other) = (&known.node, &identity.node);
+            let what = format!("{} is of node {other}, files before it of {one}", file.display());
+            return Err(Failure::usage(anyhow!("{what}: give the files of one node at a time")));
+        }
+        let (file, version) = (file.display(), &identity.version);
+        if version != env!("CARGO_PKG_VERSION") && known.as_ref().is_none_or(|known| known.version != *version) {
+            eprintln!("{file} was written by version {version}: rounds may differ from what that version made of it");
+        }
+        let identity = self.identity.insert(identity);
+        let Some(known) = known.filter(|known| known.run != identity.run) else { return Ok(Vec::new()) };
+        let is_as_before = (&known.fusion, &known.landmarks) == (&identity.fusion, &identity.landmarks);
+        let config = self.config();
+        match &mut self.machine {
+            Machine::Journal(rerun) => rerun.restart(config.fusion, config.landmarks),
+            Machine::Reports(replay) if self.cell.is_none() && !is_as_before => {
+                eprintln!("{file} is of a run under another configuration: from there on reports are fused anew");
+                return Ok(end(std::mem::replace(&mut **replay, Replay::new(config))));
             }
-            Some(_) => return Ok(Vec::new()),
-            None => {}
+            Machine::Reports(_) | Machine::Undecided => {}
         }
-        if identity.version != env!("CARGO_PKG_VERSION") {
-            eprintln!("written by version {}: rounds may differ from what that version made of it", identity.version);
-        }
-        self.identity = Some(identity);
         Ok(Vec::new())
     }
 
@@ -116,11 +127,7 @@ impl<'a> LogReplay<'a> {
     /// A journal precedes the reports that it is about.
     fn rerun(&mut self) -> Option<&mut Rerun> {
         if matches!(self.machine, Machine::Undecided) {
-            let (fusion, landmarks) = match (self.cell, &self.identity) {
-                (Some(cell), _) => (cell.fusion.clone(), cell.landmarks.clone()),
-                (None, Some(identity)) => (identity.fusion.clone(), landmarks(identity)),
-                (None, None) => (ReplayConfig::default().fusion, Vec::new()),
-            };
+            let ReplayConfig { fusion, landmarks, .. } = self.config();
             self.machine = Machine::Journal(Box::new(Rerun::new(fusion, landmarks)));
         }
         if let Machine::Journal(rerun) = &mut self.machine { Some(rerun) } else { None }
@@ -128,20 +135,24 @@ impl<'a> LogReplay<'a> {
 
     fn machine(&mut self) -> &mut Machine {
         if matches!(self.machine, Machine::Undecided) {
-            let mut config = match (self.cell, &self.identity) {
-                (Some(cell), _) => cell.clone(),
-                (None, Some(identity)) => ReplayConfig {
-                    aggregator: identity.node.clone(),
-                    fusion: identity.fusion.clone(),
-                    landmarks: landmarks(identity),
-                    ..ReplayConfig::default()
-                },
-                (None, None) => ReplayConfig::default(),
-            };
-            (config.passes, config.limits) = (self.passes, LIMITS);
-            self.machine = Machine::Reports(Box::new(Replay::new(config)));
+            self.machine = Machine::Reports(Box::new(Replay::new(self.config())));
         }
         &mut self.machine
+    }
+
+    /// What the present run is run again under.
+    fn config(&self) -> ReplayConfig {
+        let config = match (self.cell, &self.identity) {
+            (Some(cell), _) => cell.clone(),
+            (None, Some(identity)) => ReplayConfig {
+                aggregator: identity.node.clone(),
+                fusion: identity.fusion.clone(),
+                landmarks: identity.landmarks.iter().map(Landmark::from).collect(),
+                ..ReplayConfig::default()
+            },
+            (None, None) => ReplayConfig::default(),
+        };
+        ReplayConfig { passes: self.passes, limits: LIMITS, ..config }
     }
 
     fn finish(self, sink: &mut dyn Write, output: &Path) -> Result<(), Failure> {
@@ -151,9 +162,7 @@ impl<'a> LogReplay<'a> {
         match self.machine {
             Machine::Undecided => eprintln!("there is no report and no journal in the log"),
             Machine::Reports(replay) => {
-                let (lines, summary) = replay.finish();
-                write_all(sink, &lines, output)?;
-                report(&summary);
+                write_all(sink, &end(*replay), output)?;
             }
             Machine::Journal(rerun) => say(&rerun),
         }
@@ -171,6 +180,13 @@ pub fn rounds_of_log(file: &Path) -> Vec<FusedLine> {
         rounds.extend(machine.finish().0);
     }
     rounds
+}
+
+/// The last that comes of reports, and what became of them.
+fn end(replay: Replay) -> Vec<FusedLine> {
+    let (lines, summary) = replay.finish();
+    report(&summary);
+    lines
 }
 
 fn say(rerun: &Rerun) {
@@ -201,8 +217,4 @@ fn read_report(message: &LogMessage) -> Result<(ReportKind, ObjectReport), Rejec
         _ => return Err(RejectReason::UnknownTopic),
     };
     Ok((kind, decode(&message.json, &LIMITS)?))
-}
-
-fn landmarks(identity: &Identity) -> Vec<Landmark> {
-    identity.landmarks.iter().map(Landmark::from).collect()
 }
