@@ -143,7 +143,7 @@ impl Gate {
         let (shared, current) = (Arc::clone(&self.shared), self.current.as_ref().map(watch::Sender::subscribe));
         tokio::spawn(async move {
             if let Err(turned_away) = shared.serve(stream, from, current, ticket).await {
-                shared.counters.count(turned_away.event());
+                turned_away.event().into_iter().for_each(|event| shared.counters.count(event));
                 tracing::debug!(%from, %turned_away, "client turned away");
             }
         });
@@ -163,6 +163,8 @@ impl Gate {
 /// Why a client was not let in, or not any longer.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum TurnedAway {
+    #[error("left without a word, as nodes do that only look whether a broker is there")]
+    Left,
     #[error("no login in time")]
     TimedOut,
     #[error("no login before many others of its address wanted one")]
@@ -182,14 +184,15 @@ pub(super) enum TurnedAway {
 }
 
 impl TurnedAway {
-    fn event(&self) -> Event {
+    fn event(&self) -> Option<Event> {
         match self {
-            Self::TimedOut => Event::ClientTimedOut,
-            Self::Displaced => Event::ClientThrottled,
-            Self::Untrusted(_) => Event::ClientUntrusted,
-            Self::Malformed | Self::Lost(_) => Event::ClientMalformed,
-            Self::Full | Self::Crowded => Event::ClientsFull,
-            Self::Expelled(_) => Event::ClientExpelled,
+            Self::Left => None,
+            Self::TimedOut => Some(Event::ClientTimedOut),
+            Self::Displaced => Some(Event::ClientThrottled),
+            Self::Untrusted(_) => Some(Event::ClientUntrusted),
+            Self::Malformed | Self::Lost(_) => Some(Event::ClientMalformed),
+            Self::Full | Self::Crowded => Some(Event::ClientsFull),
+            Self::Expelled(_) => Some(Event::ClientExpelled),
         }
     }
 }
@@ -213,6 +216,9 @@ impl Shared {
         let mut stream = Box::pin(TimeoutStream::new(stream));
         stream.as_mut().set_write_timeout_pinned(Some(WRITE_PATIENCE));
         let login = async {
+            if !matches!(stream.get_ref().peek(&mut [0]).await, Ok(1)) {
+                return Err(TurnedAway::Left);
+            }
             let (mut stream, certificates) = match &current {
                 Some(current) => {
                     let server = Arc::clone(&current.borrow().server);

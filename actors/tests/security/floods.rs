@@ -139,6 +139,19 @@ async fn what_is_no_mqtt_ends_its_own_connection_only() {
 }
 
 #[tokio::test]
+async fn who_only_looks_whether_a_broker_is_there_is_not_counted_as_kept_out() {
+    let mut cell = Cell::start().await;
+    for _ in 0..3 {
+        let mut stream = knock(cell.address).await;
+        stream.shutdown().await.unwrap();
+        closed(&mut stream).await;
+    }
+    cell.honest_traffic_goes_on().await;
+    let counted = [Event::ClientUntrusted, Event::ClientMalformed].map(|event| cell.counters.events(event));
+    assert_eq!(counted, [0, 0]);
+}
+
+#[tokio::test]
 async fn a_packet_that_is_too_large_ends_its_own_connection_only() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
