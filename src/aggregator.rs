@@ -194,16 +194,30 @@ impl Aggregator {
     pub fn refine(&mut self, passes: u32, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let verdicts = self.vote.as_mut()?.refine(passes);
+        Some(self.in_a_round_of_its_own(epoch, verdicts, now))
+    }
+
+    /// Judges the packet that was begun in VOTE's `paper` mode, in a round of its own, as no frame will complete it; for
+    /// the end of a recording. `None` if no packet was begun, or without leadership.
+    pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
+        let epoch = self.leads.clone()?;
+        let by_packets = self.by_packets;
+        let vote = self.vote.as_mut().filter(|vote| by_packets && vote.is_packet_begun())?;
+        let verdicts = vote.close(now).verdicts;
+        Some(self.in_a_round_of_its_own(epoch, verdicts, now))
+    }
+
+    fn in_a_round_of_its_own(&mut self, epoch: Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {
         let round = self.next_round;
         self.next_round = round.saturating_add(1);
-        Some(Verdicts {
+        Verdicts {
             schema: SCHEMA_VERSION,
             aggregator: epoch.leader,
             epoch: epoch.term,
             round,
             fused_at_us: now,
             verdicts,
-        })
+        }
     }
 
     /// How far VOTE trusts each vehicle by what it has seen itself.

@@ -91,6 +91,7 @@ pub struct Confusion {
 pub struct Evaluation {
     truth: Truth,
     cell: Option<(LandmarkIndex, Gate)>,
+    synonyms: BTreeMap<Label, Label>,
     pace: Tally,
     vote: Tally,
 }
@@ -113,13 +114,20 @@ struct Last {
 impl Evaluation {
     /// Nothing read yet.
     pub fn new(truth: Truth) -> Self {
-        Self { truth, cell: None, pace: Tally::default(), vote: Tally::default() }
+        Self { truth, cell: None, synonyms: BTreeMap::new(), pace: Tally::default(), vote: Tally::default() }
     }
 
     /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
     #[must_use]
     pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: Gate) -> Self {
         self.cell = Some((landmarks, gate));
+        self
+    }
+
+    /// Translates votes by the cell's synonyms, as VOTE does where a location has none of its own.
+    #[must_use]
+    pub fn with_synonyms(mut self, synonyms: BTreeMap<Label, Label>) -> Self {
+        self.synonyms = synonyms;
         self
     }
 
@@ -139,15 +147,15 @@ impl Evaluation {
 
     /// Counts one report's votes, at the time of its capture.
     pub fn report(&mut self, kind: ReportKind, report: &ObjectReport) {
-        let votes = match kind {
-            ReportKind::Detections => &mut self.pace.votes,
-            ReportKind::VoteDetections => &mut self.vote.votes,
+        let (votes, synonyms) = match kind {
+            ReportKind::Detections => (&mut self.pace.votes, None),
+            ReportKind::VoteDetections => (&mut self.vote.votes, Some(&self.synonyms)),
         };
         for object in &report.objects {
             let place = self.cell.as_ref().and_then(|(landmarks, gate)| votes::place(object, landmarks, gate));
             let Some(id) = object.landmark.as_ref().or(place.map(|landmark| &landmark.id)) else { continue };
-            let synonym = place.and_then(|place| place.synonyms.iter().find(|synonym| synonym.from == object.label));
-            let label = synonym.map_or(&object.label, |synonym| &synonym.label);
+            let synonym = place.and_then(|place| place.synonym(&object.label));
+            let label = synonym.or_else(|| synonyms?.get(&object.label)).unwrap_or(&object.label);
             if let Some((span, truth)) = self.truth.at(id, report.captured_at_us) {
                 votes.count(&report.node, (id.clone(), span), label, self.truth.accepts(truth, Some(label)));
             }

@@ -6,6 +6,7 @@ mod index;
 
 use nalgebra::Point2;
 
+pub(crate) use config::check_synonyms;
 pub use config::{LandmarkConfig, VacancyConfig};
 pub use index::{Candidate, Gate, LandmarkIndex};
 
@@ -24,6 +25,13 @@ pub struct Landmark {
     pub vacancy: Option<VacancySign>,
     /// Labels that count as one: each of these is taken for `label`.
     pub synonyms: Vec<Synonym>,
+}
+
+impl Landmark {
+    /// The label that another one counts as here, if it does.
+    pub fn synonym(&self, label: &Label) -> Option<&Label> {
+        self.synonyms.iter().find(|synonym| synonym.from == *label).map(|synonym| &synonym.label)
+    }
 }
 
 /// A fixed sign behind a location, such as a card that reads `EMPTY`; any object before it outweighs it.

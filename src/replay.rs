@@ -27,6 +27,7 @@ use crate::landmark::Landmark;
 use crate::names::{LandmarkId, NodeName};
 use crate::time::Timestamp;
 use crate::tracks::TracksLosses;
+use crate::vote::MAX_LABELS;
 use crate::wire::{Limits, ObjectReport, RejectReason, ReportKind};
 use clock::VirtualClock;
 use line::Line;
@@ -37,7 +38,8 @@ pub const LOOKAHEAD: usize = 64;
 /// Most locations that an open cell learns for PACE; they are never forgotten.
 const MAX_LEARNT: usize = 4096;
 
-/// Most locations that an open cell keeps for VOTE unless its configuration says otherwise: nobody floods a file.
+/// Most locations that an open cell keeps for VOTE unless its configuration says otherwise: nobody floods a file. For the
+/// same reason its labels are only limited by their numbers, and the objects of a report by the length of its line.
 const MAX_VOTED_ON: usize = 1_000_000;
 
 /// Longer than any recording, in seconds.
@@ -67,11 +69,12 @@ impl Default for ReplayConfig {
         let mut fusion = FusionConfig::default();
         fusion.vote.max_landmarks = MAX_VOTED_ON;
         fusion.vote.max_vehicles = fusion.window.max_vehicles;
+        fusion.vote.max_labels = MAX_LABELS;
         Self {
             aggregator: NodeName::from_static("replay"),
             fusion,
             landmarks: Vec::new(),
-            limits: Limits::default(),
+            limits: Limits { objects: usize::MAX, ..Limits::default() },
             passes: None,
         }
     }
@@ -86,7 +89,7 @@ pub struct Summary {
     pub rejected: BTreeMap<RejectReason, Rejections>,
     /// Lines that were used and whose own time is before that of a line before them.
     pub late: u64,
-    /// Objects of used lines that voted for nothing; see [`crate::vote`].
+    /// Objects of used lines that voted for nothing or whose votes had to make room; see [`crate::vote`].
     pub ignored_votes: u64,
     /// Used lines of which only tracking made use, because later ones of their vehicles came before.
     pub overtaken: u64,
@@ -138,7 +141,8 @@ impl Replay {
             let FusionConfig { algorithms, window, vote, .. } = &mut config.fusion;
             *algorithms = Algorithms::Vote;
             (vote.weighted.freshness_s, vote.weighted.hysteresis) = (FOREVER_S, 0.0);
-            vote.max_landmarks = MAX_VOTED_ON;
+            vote.weighted.smoothing_share = 0.0;
+            (vote.max_landmarks, vote.max_labels) = (MAX_VOTED_ON, MAX_LABELS);
             vote.max_vehicles = vote.max_vehicles.max(window.max_vehicles);
         }
         Self {
@@ -179,22 +183,26 @@ impl Replay {
         self.reject(self.number, RejectReason::TooLarge);
     }
 
-    /// Takes the lines that were read ahead and closes the last round.
+    /// Takes the lines that were read ahead, closes the last round, and judges what VOTE's `paper` mode has of a packet.
     pub fn finish(mut self) -> (Vec<FusedLine>, Summary) {
         let mut output = Vec::new();
         while !self.ahead.is_empty() {
             output.append(&mut self.next());
         }
+        let mut end = self.clock.now();
         if self.pending
             && let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline)
         {
+            end = deadline;
             self.tick(deadline, &mut output);
         }
-        if let (Some(passes), Some(cell)) = (self.config.passes, &mut self.cell) {
-            output.extend(cell.refine(passes, self.clock.now()).map(FusedLine::Verdicts));
-            self.summary.written += output.len() as u64;
-        }
-        if let Some(cell) = &self.cell {
+        if let Some(cell) = &mut self.cell {
+            let last = match self.config.passes {
+                Some(passes) => cell.refine(passes, self.clock.now()),
+                None => cell.end_packet(end),
+            };
+            self.summary.written += u64::from(last.is_some());
+            output.extend(last.map(FusedLine::Verdicts));
             self.summary.ignored_votes = cell.ignored_votes();
             self.summary.overtaken = cell.overtaken();
             self.summary.tracks = cell.tracks_losses();

@@ -4,10 +4,10 @@
 //! round; [`Vote::refine`] goes over the stored votes again. Equal calls give equal results.
 //!
 //! What is not counted, without error: objects at unknown landmarks of a closed cell, without a landmark, of zero
-//! confidence, or beyond the maximum range; they show in [`Vote::ignored`]. A report of which neither `seq` nor capture
-//! time is newer than the last of its vehicle is rejected, unless the vehicle's clock was set back. Of several objects
-//! that one report has at one landmark, the most confident votes in `weighted` mode; in `paper` mode all do, as in the
-//! paper's sum.
+//! confidence, or beyond the maximum range; they show in [`Vote::ignored`], as do votes for a label that had to make room
+//! for others. A report of which neither `seq` nor capture time is newer than the last of its vehicle is rejected, unless
+//! the vehicle's clock was set back. Of several objects that one report has at one landmark, the most confident votes in
+//! `weighted` mode; in `paper` mode all do, as in the paper's sum.
 
 mod ballot;
 mod calibration;
@@ -23,7 +23,7 @@ mod weighted;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-pub use config::{PaperConfig, VoteConfig, VoteMode, WeightedConfig};
+pub use config::{MAX_LABELS, PaperConfig, VoteConfig, VoteMode, WeightedConfig};
 pub use paper::{PaperTally, REPUTATION_RANGE};
 pub use visibility::{falling as falling_visibility, paper as paper_visibility};
 
@@ -191,8 +191,8 @@ impl Vote {
         }
         let place = known.and_then(Option::as_ref);
         let position = place.map_or(Point2::new(object.x_m, object.y_m), |l| l.position);
-        let synonym = place.and_then(|l| l.synonyms.iter().find(|s| s.from == object.label));
-        let label = synonym.map_or(object.label.clone(), |s| s.label.clone());
+        let synonym = place.and_then(|place| place.synonym(&object.label));
+        let label = synonym.or_else(|| self.config.synonyms.get(&object.label)).unwrap_or(&object.label).clone();
         let geometry = pose.map(|p| p.range_bearing(&position));
         if geometry.is_some_and(|(distance, _)| distance > self.max_range_m()) {
             return false;
@@ -200,7 +200,7 @@ impl Vote {
         match &mut self.tally {
             Tally::Paper(tally) if !tally.has_room_for(landmark, &label, self.config.max_labels) => return false,
             Tally::Paper(_) => {}
-            Tally::Weighted(tally) => tally.make_room_for(&label, self.config.max_labels),
+            Tally::Weighted(tally) => self.ignored += tally.make_room_for(&label, self.config.max_labels) as u64,
         }
         if known.is_none() {
             self.open_landmark(landmark);
@@ -242,6 +242,11 @@ impl Vote {
     /// Whether a vehicle has sent a packet's worth of frames since the last verdict (`paper` mode).
     pub fn is_packet_complete(&self) -> bool {
         self.heard.values().any(|h| h.frames >= self.config.paper.frames_per_verdict)
+    }
+
+    /// Whether any vehicle has sent a frame since the last verdict (`paper` mode).
+    pub fn is_packet_begun(&self) -> bool {
+        self.heard.values().any(|h| h.frames > 0)
     }
 
     /// Ends the round: judges what changed.
@@ -305,7 +310,8 @@ impl Vote {
         }
     }
 
-    /// Objects that voted for nothing so far; see the module's documentation.
+    /// Objects that voted for nothing so far, or whose votes were forgotten with their labels; see the module's
+    /// documentation.
     pub fn ignored(&self) -> u64 {
         self.ignored
     }

@@ -2,11 +2,13 @@
 
 use std::time::Duration;
 
+use ecod::landmark::{Landmark, Synonym};
 use ecod::names::NodeName;
 use ecod::reputation::{Evidence, ReputationLedger};
 use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, PerceivedObject};
+use nalgebra::Point2;
 
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 const ROUND: Duration = Duration::from_millis(500);
@@ -92,5 +94,38 @@ fn a_ledger_full_of_labels_leaves_room_for_the_cells_own() {
         vote.adopt(&ledger);
         ["a", "b"].iter().for_each(|node| say(&mut vote, node, 1, &[vote_for("x", "zebra")]));
         assert_eq!(vote.close(START + ROUND).verdicts[0].label.as_deref(), Some("zebra"));
+    }
+}
+
+#[test]
+fn votes_that_leave_with_their_labels_are_counted() {
+    let mut vote = Vote::new(VoteConfig { max_labels: 8, ..VoteConfig::default() }, Vec::new());
+    say(&mut vote, "a", 1, &inventions(1, 20));
+    let lost = vote.close(START + ROUND).verdicts.iter().filter(|verdict| verdict.label.is_none()).count();
+    assert!(lost >= 12, "{lost} of 20 labels lost");
+    assert_eq!(vote.ignored(), lost as u64);
+}
+
+#[test]
+fn synonyms_of_the_cell_hold_everywhere_and_a_landmarks_own_go_first() {
+    for mode in [VoteMode::Weighted, VoteMode::Paper] {
+        let synonyms = [("vase".into(), "sports ball".into())].into();
+        let config = VoteConfig { mode, synonyms, ..VoteConfig::default() };
+        let landmark = |id: &str, own: &[(&str, &str)]| Landmark {
+            id: id.into(),
+            position: Point2::origin(),
+            facing_rad: None,
+            vacancy: None,
+            synonyms: own.iter().map(|&(from, label)| Synonym { from: from.into(), label: label.into() }).collect(),
+        };
+        let known = vec![landmark("x", &[("vase", "bottle")]), landmark("y", &[("mug", "cup")])];
+        for landmarks in [known, Vec::new()] {
+            let own = if landmarks.is_empty() { "sports ball" } else { "bottle" };
+            let mut vote = Vote::new(config.clone(), landmarks);
+            say(&mut vote, "a", 1, &[vote_for("x", "vase"), vote_for("y", "vase")]);
+            let verdicts = vote.close(START + ROUND).verdicts;
+            let labels: Vec<_> = verdicts.iter().map(|verdict| verdict.label.as_deref()).collect();
+            assert_eq!(labels, [Some(own), Some("sports ball")], "{mode:?}");
+        }
     }
 }

@@ -104,3 +104,15 @@ fn reports_that_name_no_location_are_placed_and_translated_as_in_the_cell() {
     let pace = evaluation.result().pace.unwrap();
     assert_eq!((pace.vehicles[&unnamed.node].votes, pace.majority_accuracy_pct), (1, Some(100.0)));
 }
+
+#[test]
+fn votes_are_translated_by_the_cells_synonyms_without_known_locations_too() {
+    let truth = Truth::parse(r#"{"ball": "sports ball"}"#).unwrap();
+    let mut evaluation = Evaluation::new(truth).with_synonyms([("vase".into(), "sports ball".into())].into());
+    for kind in [ReportKind::VoteDetections, ReportKind::Detections] {
+        evaluation.report(kind, &report("v", 1, &[("ball", "vase")]));
+    }
+    let EvalResult { pace, vote } = evaluation.result();
+    assert_eq!(vote.unwrap().majority_accuracy_pct, Some(100.0));
+    assert_eq!(pace.unwrap().majority_accuracy_pct, Some(0.0), "PACE knows no synonyms");
+}

@@ -16,13 +16,13 @@ const VACANT: &str = "EMPTY";
 /// As JSON, `{"landmarks": {…}}` or the inner object alone, each location with one of
 ///
 /// ```text
-/// "ABCD123"                                                   this label
+/// "ABCD123"                                                   this label; a number or truth value is its text
 /// null                                                        nothing: null, or a label of "empty", is right
 /// ["vase", "sports ball"]                                     any of these
 /// [{"from_us": 0, "label": "cup"}, {"from_us": 17, "label": null}]   changes with time
 /// ```
 ///
-/// and optionally `"empty": ["EMPTY"]`, the labels that say that nothing is there; or as CSV with the header
+/// and optionally `"empty": ["EMPTY"]`, the labels that say that nothing is there; or as CSV (RFC 4180) with the header
 /// `item,truth`, of which an empty truth is null.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Truth {
@@ -91,19 +91,24 @@ impl Truth {
     }
 
     fn from_csv(text: &str) -> Result<Self, TruthError> {
-        let mut rows = text.lines().map(|line| line.trim_end_matches('\r')).filter(|line| !line.is_empty());
-        let header = rows.next().unwrap_or_default();
-        if header.split(',').map(str::trim).ne(["item", "truth"]) {
-            let found: String = header.chars().take(MAX_NAME_BYTES).collect();
+        let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).flexible(true).from_reader(text.as_bytes());
+        let broken = |error: csv::Error| TruthError::NeitherForm(error.to_string());
+        if !table.headers().map_err(broken)?.iter().eq(["item", "truth"]) {
+            let found: String = text.lines().next().unwrap_or_default().chars().take(MAX_NAME_BYTES).collect();
             return Err(TruthError::NeitherForm(format!("the first line is {found:?}")));
         }
         let mut landmarks: BTreeMap<LandmarkId, Vec<Span>> = BTreeMap::new();
-        for row in rows {
-            let (item, truth) = row.split_once(',').ok_or_else(|| location(row, "has no second column"))?;
-            let truth = Some(truth.trim()).filter(|truth| !truth.is_empty()).map(Label::new);
+        for row in table.records() {
+            let row = row.map_err(broken)?;
+            let item = row.get(0).unwrap_or_default();
+            let truth = match row.len() {
+                2 => Some(&row[1]).filter(|truth| !truth.is_empty()).map(Label::new),
+                0 | 1 => return Err(location(item, "has no second column")),
+                _ => return Err(location(item, "has more than two columns: quote what has a comma in it")),
+            };
             let span = vec![Span { from: Timestamp(0), accepted: vec![truth] }];
-            if landmarks.insert(name(item.trim())?, span.clone()).is_some_and(|earlier| earlier != span) {
-                return Err(location(item.trim(), "is given twice and differs"));
+            if landmarks.insert(name(item)?, span.clone()).is_some_and(|earlier| earlier != span) {
+                return Err(location(item, "is given twice and differs"));
             }
         }
         Ok(Self { landmarks, empty: BTreeSet::from([Label::new_static(VACANT)]) })
@@ -152,6 +157,7 @@ fn accepted(landmark: &str, value: &Value) -> Result<Vec<Option<Label>>, TruthEr
     let one = |value: &Value| match value {
         Value::Null => Ok(None),
         Value::String(label) => Ok(Some(Label::new(label))),
+        Value::Number(_) | Value::Bool(_) => Ok(Some(Label::new(value.to_string()))),
         other => Err(location(landmark, format!("has {other} where a label or null is expected"))),
     };
     match value {
@@ -198,7 +204,12 @@ mod tests {
         assert!(
             right(&truth, "d", 19, Some("cup")) && right(&truth, "d", 20, None) && right(&truth, "d", 20, Some("hole"))
         );
-        assert_eq!(Truth::parse("\u{feff}{\"a\": \"1\", \"b\": \"2\"}"), Truth::parse("item,truth\r\na,1\r\nb,2\r\n"));
+        let table = Truth::parse("item,truth\r\na,1\r\nb,2\r\n");
+        assert_eq!(Truth::parse("\u{feff}{\"a\": \"1\", \"b\": \"2\"}"), table);
+        assert_eq!(Truth::parse("{\"a\": 1, \"b\": [2]}"), table);
+        assert!(right(&Truth::parse("{\"a\": true}").unwrap(), "a", 0, Some("true")));
+        let quoted = Truth::parse("item, truth\n\"a, b\",\"say \"\"cup\"\"\"\n\nc,\n").unwrap();
+        assert!(right(&quoted, "a, b", 0, Some("say \"cup\"")) && right(&quoted, "c", 0, None));
         let other = Truth::parse(r#"{"landmarks": {"a": null}, "empty": "free"}"#).unwrap();
         assert!(right(&other, "a", 0, Some("free")) && !right(&other, "a", 0, Some("EMPTY")));
     }
@@ -213,7 +224,8 @@ mod tests {
             ("item,truth\n", "names no location"),
             ("item,truth\na", "`a` has no second column"),
             ("item,truth\na,1\na,2", "`a` is given twice"),
-            (r#"{"a": 3}"#, "`a` has 3"),
+            ("item,truth\na,1,2", "`a` has more than two columns"),
+            (r#"{"a": {}}"#, "`a` has {}"),
             (r#"{"a": []}"#, "`a` is an empty list"),
             (r#"{"a": [{"from_us": 2, "label": "x"}, {"from_us": 2, "label": "y"}]}"#, "`a` goes back in time"),
             (r#"{"a": [{"from_us": -2, "label": "x"}]}"#, "`a` cannot be read"),

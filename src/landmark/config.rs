@@ -37,6 +37,11 @@ fn check_label(key: &str, text: &str) -> Result<(), ConfigError> {
     if is_label(text) { Ok(()) } else { Err(ConfigError::new(key, format!("{text:?}"), allowed)) }
 }
 
+/// Checks the labels of a list of synonyms.
+pub(crate) fn check_synonyms(synonyms: &BTreeMap<Label, Label>) -> Result<(), ConfigError> {
+    synonyms.iter().flat_map(|(other, label)| [other, label]).try_for_each(|label| check_label("synonyms", label))
+}
+
 /// A vacancy sign.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -61,10 +66,7 @@ impl LandmarkConfig {
     /// [`ConfigError`] naming the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_label("id", &self.id)?;
-        self.synonyms.iter().try_for_each(|(other, label)| {
-            check_label("synonyms", other)?;
-            check_label("synonyms", label)
-        })?;
+        check_synonyms(&self.synonyms)?;
         check_range("x_m", self.x_m, -1e8, 1e8)?;
         check_range("y_m", self.y_m, -1e8, 1e8)?;
         check_range("facing_deg", self.facing_deg.unwrap_or(0.0), -360.0, 360.0)?;

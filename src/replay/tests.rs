@@ -1,5 +1,6 @@
 use super::*;
 use crate::testbed::Testbed;
+use crate::vote::VoteMode;
 use crate::wire::{Encoding, PerceivedObject, WirePose, encode};
 
 const START: u64 = 1_700_000_000_000_000;
@@ -276,4 +277,57 @@ fn a_replay_is_what_a_live_aggregator_made_of_the_same_reports() {
     let (output, summary) = replay(config.clone(), lines);
     assert!(summary.rejected.is_empty() && output.len() > 100);
     assert_eq!(output, live(&config, &reports));
+}
+
+#[test]
+fn with_passes_the_last_answer_counts_once_and_whole() {
+    let config = ReplayConfig { passes: Some(10), ..ReplayConfig::default() };
+    let answers = |labels: &[&str]| {
+        let others = vote_line(&report("b", 0, &[("y", "cup"), ("z", "mouse")]));
+        let lines = labels.iter().map(|label| vote_line(&report("a", 0, &[("x", label)])));
+        let (output, _) = replay(config.clone(), [others].into_iter().chain(lines));
+        let FusedLine::Verdicts(verdicts) = &output[0] else { panic!("{output:?}") };
+        let verdict = &verdicts.verdicts[0];
+        assert_eq!((verdict.landmark.as_str(), verdict.label.as_deref()), ("x", Some("mouse")), "{labels:?}");
+        verdict.score
+    };
+    let once = answers(&["mouse"]);
+    for labels in [&["cup", "mouse"][..], &["cup", "cup", "mouse"], &["mouse", "mouse"]] {
+        let score = answers(labels);
+        assert!((score - once).abs() < 1e-9, "{labels:?}: {score} instead of {once}");
+    }
+}
+
+#[test]
+fn a_packet_that_the_end_cuts_short_is_judged_in_paper_mode() {
+    let mut config = ReplayConfig::default();
+    config.fusion.vote.mode = VoteMode::Paper;
+    for frames in [3, 5, 7] {
+        let lines = (1..=frames).map(|frame| vote_line(&report("a", frame * 100, &[("x", "cup")])));
+        let (output, summary) = replay(config.clone(), lines);
+        let verdicts = |line: &FusedLine| if let FusedLine::Verdicts(v) = line { Some(v.clone()) } else { None };
+        let verdicts: Vec<_> = output.iter().filter_map(verdicts).collect();
+        assert_eq!(
+            (verdicts.len() as u64, summary.written),
+            (frames.div_ceil(5), frames.div_ceil(5)),
+            "{frames} frames"
+        );
+        let sums: Vec<_> = verdicts.iter().map(|v| v.verdicts[0].votes["cup"]).collect();
+        let all: f64 = (0..frames).map(|frame| 0.9 * if frame < 5 { 0.5 } else { 0.51 }).sum();
+        assert!((sums[sums.len() - 1] - all).abs() < 1e-9, "{sums:?} instead of {all}");
+        assert!(verdicts.is_sorted_by_key(|v| (v.round, v.fused_at_us)));
+    }
+}
+
+#[test]
+fn neither_labels_nor_objects_of_one_report_are_too_many_for_a_recording() {
+    let names: Vec<_> = (0..1500).map(|n| (format!("item-{n}"), format!("label-{n}"))).collect();
+    let votes: Vec<_> = names.iter().map(|(item, label)| (item.as_str(), label.as_str())).collect();
+    for passes in [None, Some(2)] {
+        let config = ReplayConfig { passes, ..ReplayConfig::default() };
+        let (output, summary) = replay(config, [vote_line(&report("a", 0, &votes))]);
+        assert_eq!((rejected(&summary), summary.ignored_votes), (vec![], 0));
+        let labels = verdict_labels(&output);
+        assert!(names.iter().all(|(item, label)| labels[item].as_ref() == Some(label)));
+    }
 }

@@ -94,6 +94,8 @@ pub(super) struct Ballot {
     /// Whether votes and posterior are in the live evidence at present.
     pub(super) counted: bool,
     pub(super) shown: Option<LabelIndex>,
+    /// When it is next searched for votes that are past.
+    pub(super) due: Option<Timestamp>,
 }
 
 impl Ballot {
@@ -163,16 +165,19 @@ impl Ballot {
         }
     }
 
-    /// Share of each label in the weighted votes.
+    /// Share of each label in the weighted votes; equal ones if all who voted waver, so that no vote weighs anything.
     pub(super) fn majority(&self) -> Vec<(LabelIndex, f64)> {
         let total: f64 = self.casts.iter().map(|c| c.weight * c.own).sum();
+        let candidates = self.candidates();
+        let equal = 1.0 / candidates.len() as f64;
         let of_label = |label| self.casts.iter().filter(move |c| c.label == label);
         let share = |label| of_label(label).map(|c| c.weight * c.own).sum::<f64>() / total;
-        self.candidates().into_iter().map(|label| (label, share(label))).collect()
+        candidates.into_iter().map(|label| (label, if total > 0.0 { share(label) } else { equal })).collect()
     }
 
-    /// Forgets labels with the votes for them; not while it is counted.
-    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
+    /// Forgets labels with the votes for them, and returns how many these were; not while it is counted.
+    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
+        let votes = self.casts.len();
         self.casts.retain(|cast| !is_gone(cast.label));
         self.posterior.retain(|(label, _)| !is_gone(*label));
         self.shown = self.shown.filter(|label| !is_gone(*label));
@@ -182,6 +187,7 @@ impl Ballot {
         } else {
             self.posterior.clear();
         }
+        votes - self.casts.len()
     }
 
     /// Whether several vehicles voted, so that they can judge each other.

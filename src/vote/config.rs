@@ -1,8 +1,15 @@
 //! Settings of VOTE.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
+use crate::landmark::check_synonyms;
+use crate::names::Label;
+
+/// Most labels that a cell can tell apart.
+pub const MAX_LABELS: usize = 65_535;
 
 /// How votes become verdicts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -34,6 +41,10 @@ pub struct VoteConfig {
     /// without make room, those of who brought in the most first; in `paper` mode, whose sums never end, votes for new
     /// ones are ignored. Default 256. Bounds memory.
     pub max_labels: usize,
+    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
+    /// Default: none.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub synonyms: BTreeMap<Label, Label>,
 }
 
 impl Default for VoteConfig {
@@ -45,6 +56,7 @@ impl Default for VoteConfig {
             max_landmarks: 1024,
             max_vehicles: 256,
             max_labels: 256,
+            synonyms: BTreeMap::new(),
         }
     }
 }
@@ -57,7 +69,8 @@ impl VoteConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("max_landmarks", self.max_landmarks as f64, 1.0, 1e6)?;
         check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e5)?;
-        check_range("max_labels", self.max_labels as f64, 1.0, 65_535.0)?;
+        check_range("max_labels", self.max_labels as f64, 1.0, MAX_LABELS as f64)?;
+        check_synonyms(&self.synonyms)?;
         self.paper.validate().map_err(|e| e.within("paper"))?;
         self.weighted.validate().map_err(|e| e.within("weighted"))
     }
@@ -102,6 +115,10 @@ pub struct WeightedConfig {
     /// Seconds that a vote counts; default 2. Longer survives gaps, shorter follows change. A vehicle adds to its
     /// evidence about a landmark once in so many seconds however fast it publishes.
     pub freshness_s: f64,
+    /// Part of `freshness_s` in which what a vehicle stated on a landmark fades to 1/e in its present vote; default 0.5.
+    /// More lets fewer frames through in which an object was taken for another, and is slower to notice another object;
+    /// 0 takes its last statement alone, as it must be where who states something else corrects himself.
+    pub smoothing_share: f64,
     /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion against its own record of one
     /// class; default 5. Less learns classes faster from noise.
     pub class_prior_votes: f64,
@@ -143,6 +160,7 @@ impl Default for WeightedConfig {
     fn default() -> Self {
         Self {
             freshness_s: 2.0,
+            smoothing_share: 0.5,
             class_prior_votes: 5.0,
             vehicle_prior_votes: 8.0,
             assumed_accuracy: 0.7,
@@ -165,6 +183,7 @@ impl Default for WeightedConfig {
 impl WeightedConfig {
     fn validate(&self) -> Result<(), ConfigError> {
         check_range("freshness_s", self.freshness_s, 1e-3, 1e12)?;
+        check_range("smoothing_share", self.smoothing_share, 0.0, 10.0)?;
         check_range("class_prior_votes", self.class_prior_votes, 1e-3, 1e6)?;
         check_range("vehicle_prior_votes", self.vehicle_prior_votes, 1e-3, 1e6)?;
         check_range("assumed_accuracy", self.assumed_accuracy, 0.5, 0.999)?;
@@ -180,5 +199,20 @@ impl WeightedConfig {
         check_range("visibility_at_max_range", self.visibility_at_max_range, 1e-3, 1.0)?;
         check_range("revisit_votes", self.revisit_votes, 0.0, 1e6)?;
         check_range("calibration_votes", self.calibration_votes, 1e-3, 1e9)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn synonyms_are_written_as_they_are_read_and_only_labels_are_taken() {
+        let config: VoteConfig = toml::from_str("synonyms = { vase = \"sports ball\" }").unwrap();
+        assert_eq!(config.synonyms["vase"], "sports ball");
+        assert_eq!(config.validate(), Ok(()));
+        assert_eq!(toml::from_str::<VoteConfig>(&toml::to_string(&config).unwrap()), Ok(config));
+        let nameless = VoteConfig { synonyms: [("vase".into(), "".into())].into(), ..VoteConfig::default() };
+        assert!(nameless.validate().unwrap_err().to_string().contains("synonyms"));
     }
 }

@@ -3,6 +3,8 @@
 mod adopt;
 mod refine;
 mod room;
+#[cfg(test)]
+mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -19,9 +21,6 @@ use crate::names::{Label, LandmarkId, NodeName};
 use crate::reputation::Evidence;
 use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
-
-/// Time, in parts of the freshness, in which what a vehicle stated on a landmark fades to 1/e for its present vote.
-const RECENT_PART: f64 = 0.5;
 
 /// A statement counts this much at least among the vehicle's own.
 const LEAST_WEIGHT: f64 = 0.01;
@@ -41,6 +40,7 @@ pub(super) struct WeightedTally {
     labels: Labels,
     ballots: BTreeMap<LandmarkId, Ballot>,
     touched: BTreeSet<LandmarkId>,
+    /// When which landmark is due, each once at most.
     expiries: BTreeSet<(Timestamp, LandmarkId)>,
     revisit_after: Option<LandmarkId>,
     fresh_votes: usize,
@@ -76,7 +76,9 @@ impl WeightedTally {
     pub(super) fn forget(&mut self, landmark: &LandmarkId) {
         let everything = |_: &Cast| true;
         self.retire(landmark, everything);
-        self.ballots.remove(landmark);
+        if let Some(due) = self.ballots.remove(landmark).and_then(|ballot| ballot.due) {
+            self.expiries.remove(&(due, landmark.clone()));
+        }
         self.touched.remove(landmark);
     }
 
@@ -118,7 +120,8 @@ impl WeightedTally {
         let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
         let mut recent = earlier.map_or_else(Recent::default, |earlier| earlier.recent);
         let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
-        let kept = (-age_s / (self.config.freshness_s * RECENT_PART)).exp();
+        let fading_s = self.config.freshness_s * self.config.smoothing_share;
+        let kept = if fading_s > 0.0 { (-age_s / fading_s).exp() } else { 0.0 };
         let stated_most = recent.state(label, (confidence * visibility).max(LEAST_WEIGHT), kept);
         let (label, confidence, visibility) = match earlier {
             Some(earlier) if stated_most != label => (earlier.label, earlier.confidence, earlier.visibility),
@@ -160,9 +163,22 @@ impl WeightedTally {
             Ok(place) => ballot.casts[place] = cast,
             Err(place) => ballot.casts.insert(place, cast),
         }
-        self.expiries.insert((at + freshness, landmark.clone()));
+        if ballot.due.is_none_or(|due| due > at + freshness) {
+            self.look_again(landmark);
+        }
         self.touched.insert(landmark.clone());
         self.fresh_votes += 1;
+    }
+
+    /// Makes a landmark due when the oldest of its votes will be past.
+    fn look_again(&mut self, landmark: &LandmarkId) {
+        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
+        let oldest = ballot.casts.iter().map(|cast| cast.at).min();
+        let due = oldest.map(|at| at + Duration::from_secs_f64(self.config.freshness_s));
+        if let Some(before) = std::mem::replace(&mut ballot.due, due) {
+            self.expiries.remove(&(before, landmark.clone()));
+        }
+        self.expiries.extend(due.map(|due| (due, landmark.clone())));
     }
 
     /// Takes a landmark's votes out of the live evidence until it is judged again.
@@ -230,6 +246,7 @@ impl WeightedTally {
             }
             self.expiries.pop_first();
             self.retire(&landmark, |cast| cast.at + freshness <= now);
+            self.look_again(&landmark);
         }
     }
 

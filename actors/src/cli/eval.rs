@@ -62,7 +62,8 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     }
     let config = cell(arguments.config.as_deref())?;
     let truth = Truth::parse(&text).with_context(|| format!("truth {}", path.display()));
-    let mut evaluation = Evaluation::new(truth.map_err(Failure::usage)?);
+    let synonyms = config.fusion.vote.synonyms.clone();
+    let mut evaluation = Evaluation::new(truth.map_err(Failure::usage)?).with_synonyms(synonyms);
     if !config.landmarks.is_empty() {
         let gate = config.fusion.pace.gate();
         evaluation = evaluation.with_landmarks(LandmarkIndex::new(config.landmarks.clone(), gate.radius_m), gate);

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::replay::{FusedLine, Rejections, Replay, ReplayConfig, Summary};
+use ecod::wire::Limits;
 
 use super::Failure;
 use crate::config::NodeConfig;
@@ -121,7 +122,8 @@ pub(super) fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
     let node = NodeConfig::load_cell(path).map_err(Failure::usage)?;
     let default = ReplayConfig::default();
     Ok(ReplayConfig {
-        limits: node.mqtt.limits(),
+        // Of a line, its length alone is limited.
+        limits: Limits { objects: default.limits.objects, ..node.mqtt.limits() },
         landmarks: node.landmarks(),
         aggregator: node.name.unwrap_or(default.aggregator),
         fusion: node.fusion,
@@ -164,7 +166,7 @@ fn report(summary: &Summary) {
     }
     for (what, number) in [
         ("used although earlier than a line before", *late),
-        ("objects that voted for nothing", *ignored_votes),
+        ("objects that voted for nothing, or whose labels had to make room", *ignored_votes),
         ("used for tracks alone, overtaken by a later report of the vehicle", *overtaken),
         ("reports too late for tracks", tracks.late),
         ("new objects refused by tracks", tracks.refused),

@@ -38,10 +38,10 @@ impl WeightedTally {
         number
     }
 
-    /// Forgets labels, with the votes for them, if one more would be more than `most`.
-    pub(in super::super) fn make_room_for(&mut self, label: &Label, most: usize) {
+    /// Forgets labels, with the votes for them, if one more would be more than `most`; returns how many votes.
+    pub(in super::super) fn make_room_for(&mut self, label: &Label, most: usize) -> usize {
         if self.labels.has_room_for(label, most) {
-            return;
+            return 0;
         }
         let gone = self.labels.make_room(&self.model.support());
         let is_gone = |label: LabelIndex| gone.contains(&label);
@@ -49,10 +49,11 @@ impl WeightedTally {
             ballot.casts.iter().any(|cast| is_gone(cast.label)) || ballot.posterior.iter().any(|(l, _)| is_gone(*l))
         };
         let landmarks: Vec<_> = self.ballots.iter().filter(|(_, b)| has_gone(b)).map(|(l, _)| l.clone()).collect();
+        let mut forgotten = 0;
         for landmark in landmarks {
             // Not settled: the other votes would become evidence more often than by their age.
             self.uncount(&landmark);
-            self.ballots.get_mut(&landmark).into_iter().for_each(|ballot| ballot.forget_labels(is_gone));
+            forgotten += self.ballots.get_mut(&landmark).map_or(0, |ballot| ballot.forget_labels(is_gone));
             self.touched.insert(landmark);
         }
         for ballot in self.ballots.values_mut() {
@@ -60,5 +61,6 @@ impl WeightedTally {
         }
         self.model.forget_labels(&gone);
         self.dependence.forget_labels(&gone);
+        forgotten
     }
 }
