@@ -138,7 +138,8 @@ impl Report {
         if let Some(evaluation) = self.evaluation.take() {
             let landmarks: Vec<_> = identity.landmarks.iter().map(Landmark::from).collect();
             let gate = identity.fusion.pace.gate();
-            self.evaluation = Some(evaluation.with_landmarks(LandmarkIndex::new(landmarks, gate.radius_m), gate));
+            let evaluation = evaluation.with_landmarks(LandmarkIndex::new(landmarks, gate.radius_m), gate);
+            self.evaluation = Some(evaluation.with_synonyms(identity.fusion.vote.synonyms.clone()));
         }
     }
 
