@@ -197,8 +197,8 @@ impl Aggregator {
         Some(self.in_a_round_of_its_own(epoch, verdicts, now))
     }
 
-    /// Judges the packet that was begun in VOTE's `paper` mode, in a round of its own, as no frame will complete it; for
-    /// the end of a recording. `None` if no packet was begun, or without leadership.
+    /// Judges the packet that was begun in VOTE's `paper` mode, in a round of its own, as no frame will complete it;
+    /// for the end of a recording. `None` if no packet was begun, or without leadership.
     pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let by_packets = self.by_packets;

@@ -38,8 +38,8 @@ pub const LOOKAHEAD: usize = 64;
 /// Most locations that an open cell learns for PACE; they are never forgotten.
 const MAX_LEARNT: usize = 4096;
 
-/// Most locations that an open cell keeps for VOTE unless its configuration says otherwise: nobody floods a file. For the
-/// same reason its labels are only limited by their numbers, and the objects of a report by the length of its line.
+/// Most locations that an open cell keeps for VOTE unless its configuration says otherwise: nobody floods a file. For
+/// the same reason its labels are only limited by their numbers, and the objects of a report by the length of its line.
 const MAX_VOTED_ON: usize = 1_000_000;
 
 /// Longer than any recording, in seconds.
@@ -183,7 +183,8 @@ impl Replay {
         self.reject(self.number, RejectReason::TooLarge);
     }
 
-    /// Takes the lines that were read ahead, closes the last round, and judges what VOTE's `paper` mode has of a packet.
+    /// Takes the lines that were read ahead, closes the last round, and judges what VOTE's `paper` mode has of a
+    /// packet.
     pub fn finish(mut self) -> (Vec<FusedLine>, Summary) {
         let mut output = Vec::new();
         while !self.ahead.is_empty() {

@@ -190,9 +190,13 @@ impl Tracker {
             }
             let number = self.number_of(&report.node, *at);
             let Some(mut source) = self.sources[number as usize].take() else { continue };
-            let mut taking = Taking { number, source: &mut source, report, at: *at, pairs: Vec::new() };
+            let mut taking = Taking { number, source: &mut source, report, at: *at, has_jumped: false, pairs: Vec::new() };
             self.take(&mut taking);
-            pairs.push((number, *at, taking.pairs));
+            let Taking { has_jumped, pairs: of_report, .. } = taking;
+            if has_jumped {
+                pairs.retain(|(other, ..)| *other != number);
+            }
+            pairs.push((number, *at, of_report));
             self.sources[number as usize] = Some(source);
             self.fused_until = self.fused_until.max(*at);
         }

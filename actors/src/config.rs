@@ -358,7 +358,8 @@ mod tests {
         for (toml, parts) in [
             ("kind = \"v4l2\"\nwidth = \"wide\"\nheight = 480", ["`camera.source.width`", "\"wide\"", "u32"]),
             ("kind = \"v4l2\"\nheight = 480\nwidht = 640", ["`camera.source.widht`", "unknown field", "`width`"]),
-            ("kind = \"url\"\nurl = 7", ["`camera.source.url`", "7", "string"]),
+            ("kind = \"url\"\nurl = 7", ["`camera.source.url`", "text", "quotes"]),
+            ("kind = \"testbed\"\nscenes = \"a\"\ncav = \"b\"", ["`camera.source`", "missing field", "`scene`"]),
             ("kind = \"url\"", ["`camera.source`", "missing field", "`url`"]),
             ("kind = \"eye\"\nwidth = 640", ["`camera.source.kind`", "eye", "`v4l2`"]),
         ] {
@@ -393,6 +394,19 @@ mod tests {
         for key in ["4711471147114711", "\"4711471147114711"] {
             let error = load(&format!("role = \"edge\"\n[membership]\nkey = {key}")).unwrap_err().to_string();
             assert!(error.contains("key") && !error.contains("4711"), "{error}");
+        }
+    }
+
+    #[test]
+    fn no_error_shows_a_token_or_the_login_of_a_camera() {
+        for toml in [
+            "[dashboard]\ntoken = 4711",
+            "[dashboard]\ntoken = \"4711",
+            "[camera.source]\nkind = \"url\"\nurl = [\"rtsp://u:4711@camera\"]",
+            "[camera.source]\nkind = \"url\"\nurl = \"rtsp://u:4711@camera",
+        ] {
+            let error = load(toml).unwrap_err().to_string();
+            assert!(!error.contains("4711"), "{error}");
         }
     }
 

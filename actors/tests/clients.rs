@@ -89,8 +89,8 @@ fn feed(python: &str, broker: SocketAddr, arguments: &[&str], lines: &[&str]) ->
     example.wait_with_output().unwrap()
 }
 
-/// The example reports what a detector writes and prints maps and verdicts with it; lines that are no frames it skips and
-/// names.
+/// The example reports what a detector writes and prints maps and verdicts with it; lines that are no frames it skips
+/// and names.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_python_example_feeds_a_cell_and_prints_what_it_agrees_on() {
     let Some(python) = python() else { return };

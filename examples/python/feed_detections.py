@@ -110,6 +110,22 @@ class CellContext(ssl.SSLContext):
         return super().wrap_socket(*args, **{**kwargs, "server_hostname": self.broker_name})
 
 
+def context(given):
+    """TLS by the files that were given."""
+    tls = CellContext(ssl.PROTOCOL_TLS_CLIENT)
+    tls.broker_name = given.broker_name
+    try:
+        tls.load_verify_locations(given.ca)
+    except OSError as error:
+        sys.exit(f"cannot use {given.ca}: {error}")
+    try:
+        if given.cert:
+            tls.load_cert_chain(given.cert, given.key)
+    except OSError as error:
+        sys.exit(f"cannot use {given.cert} with {given.key}: {error}")
+    return tls
+
+
 def frame_of(line):
     """The frame in a line of input; ValueError where there is none."""
     frame = json.loads(line)
@@ -146,6 +162,8 @@ def arguments():
     parser.add_argument("--key", metavar="FILE", help="the key of --cert (PEM)")
     parser.add_argument("--broker-name", default=BROKER_NAME, help="name in the broker's certificate (default: %(default)s)")
     given = parser.parse_args()
+    if not given.broker.rpartition(":")[2].isdigit():
+        parser.error(f"--broker is HOST:PORT, not {given.broker}")
     if (given.cert or given.key) and not (given.ca and given.cert and given.key):
         parser.error("--ca, --cert and --key go together")
     return given
@@ -155,16 +173,11 @@ def main():
     given = arguments()
     host, _, port = given.broker.rpartition(":")
     vehicle = Vehicle(given.cell, given.node, given.pose)
+    if given.user:
+        vehicle.client.username_pw_set(given.user, given.password)
+    if given.ca:
+        vehicle.client.tls_set_context(context(given))
     try:
-        if given.user:
-            vehicle.client.username_pw_set(given.user, given.password)
-        if given.ca:
-            tls = CellContext(ssl.PROTOCOL_TLS_CLIENT)
-            tls.broker_name = given.broker_name
-            tls.load_verify_locations(given.ca)
-            if given.cert:
-                tls.load_cert_chain(given.cert, given.key)
-            vehicle.client.tls_set_context(tls)
         vehicle.client.connect(host, int(port))
     except OSError as error:
         sys.exit(f"cannot reach {given.broker}: {error}")

@@ -36,6 +36,8 @@ pub(super) struct Taking<'a> {
     pub(super) source: &'a mut Source,
     pub(super) report: &'a ObjectReport,
     pub(super) at: Timestamp,
+    /// Whether the vehicle is somewhere else all at once, and nothing is known of its alignment any more.
+    pub(super) has_jumped: bool,
     /// What the vehicle's alignment is estimated from.
     pub(super) pairs: Vec<Pair>,
 }
@@ -65,7 +67,8 @@ impl Tracker {
     pub(super) fn take(&mut self, taking: &mut Taking<'_>) {
         let Taking { source, report, at, .. } = taking;
         source.last_report = source.last_report.max(*at);
-        if source.view.observe(report) {
+        taking.has_jumped = source.view.observe(report);
+        if taking.has_jumped {
             source.alignment = Alignment::new(*at, &self.spread());
         }
         if let Some(centre) = source.view.centre() {
@@ -129,6 +132,7 @@ impl Tracker {
             track.motion = Motion::new(at, &measurement, self.config.speed_mps);
         }
         track.refresh(at);
+        self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
         if let Some(witness) = track.witness(number, at) {
             witness.hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
         }
@@ -214,6 +218,7 @@ impl Tracker {
         }
         track.motion.update(at, &seen.measurement, density);
         describe(track, source, seen, at, config);
+        self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
         if let Some(log_odds) = last {
             source.calibration.learn(log_odds, true);
         }

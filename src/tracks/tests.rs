@@ -227,6 +227,22 @@ fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
     assert!(view.rates_at(&Vector2::new(10.0, 0.0)).is_none());
 }
 
+#[test]
+fn what_a_vehicle_was_off_by_says_nothing_of_where_it_has_jumped_to() {
+    let mut tracker = tracker();
+    let place = |x_m: f64| (0..4).map(|n| car(x_m + 10.0 * f64::from(n), 0.0)).collect::<Vec<_>>();
+    for frame in 0..30 {
+        tracker.observe(&report("euclid", frame, place(0.0)), at(frame));
+        tracker.observe(&report("gauss", frame, place(0.5)), at(frame));
+        tracker.close(at(frame));
+    }
+    tracker.observe(&report("euclid", 30, place(0.0)), at(30));
+    tracker.observe(&report("gauss", 30, place(0.5)), at(30));
+    tracker.observe(&report("gauss", 31, place(5_000.0)), at(31));
+    let corrections = tracker.close(at(31)).pose_corrections;
+    assert!(corrections.contains_key(&name("euclid")) && !corrections.contains_key(&name("gauss")), "{corrections:?}");
+}
+
 /// Twelve parked cars seen by both, `gauss` off by an offset and a rotation; returns the last round.
 fn misaligned(config: TracksConfig) -> TracksRound {
     let mut rng = ChaCha8Rng::seed_from_u64(3);

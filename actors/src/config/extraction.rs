@@ -53,7 +53,7 @@ fn from_environment(error: &figment::Error) -> bool {
 }
 
 /// Keys whose values are shown to nobody.
-const SECRETS: [&str; 2] = ["password", "key"];
+const SECRETS: [&str; 4] = ["password", "key", "token", "url"];
 
 /// Every error with its key and where it was read, and without any secret.
 fn describe(errors: figment::Error) -> String {
@@ -90,9 +90,12 @@ fn describe(errors: figment::Error) -> String {
     errors.into_iter().map(describe).collect::<Vec<_>>().join("\n")
 }
 
-/// The key that is wrong in a table that its `kind` tells apart: serde reads such a table from a buffer and forgets where it
-/// was. It is the one without which the error is another.
+/// The key that is wrong in a table that its `kind` tells apart: serde reads such a table from a buffer and forgets
+/// where it was. It is the one without which the error is another.
 fn key_in_table(error: &figment::Error, figment: &Figment) -> Option<String> {
+    if matches!(error.kind, figment::error::Kind::MissingField(_)) {
+        return None;
+    }
     let keys =
         figment.find_value(&error.path.join(".")).ok()?.into_dict().filter(|table| table.contains_key("kind"))?;
     let error_without = |key: &String| {

@@ -145,8 +145,8 @@ impl LeadershipFacts {
     }
 }
 
-/// This node, those that answer, and those that only brokers tell of; `met` are names of nodes that have answered at some
-/// time, `links` how the links are, if the gateway tells.
+/// This node, those that answer, and those that only brokers tell of; `met` are names of nodes that have answered at
+/// some time, `links` how the links are, if the gateway tells.
 pub(super) fn nodes(sources: &Sources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
     let own = &sources.node;
     let leading = sources.vitals.leadership.borrow().is_leading();

@@ -9,7 +9,8 @@ use ecod::time::Timestamp;
 /// What a driver was to be told longer ago than this is not told any more.
 const MAX_AGE: Duration = Duration::from_secs(1);
 
-/// So what waited for longer than this is not: how long the way itself takes nobody knows, only how much longer than at best.
+/// So what waited for longer than this is not: how long the way itself takes nobody knows, only how much longer than at
+/// best.
 const MAX_WAIT: Duration = Duration::from_millis(900);
 
 /// How long the rounds of a leadership whose first came when a node had long heard none must come as slowly as they

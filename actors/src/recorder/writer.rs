@@ -117,8 +117,10 @@ impl LogWriter {
     fn begin(&mut self, entry: &Entry) -> McapResult<LogFile> {
         let (dir, node) = (&self.config.dir, &self.identity.node);
         std::fs::create_dir_all(dir)?;
-        // First, as it may make the room that there must be.
-        disk::prune(dir, node, self.config.max_old_bytes())?;
+        // First, as it may make the room that there must be; what cannot be deleted does not end the log.
+        if let Err(error) = disk::prune(dir, node, self.config.max_old_bytes()) {
+            tracing::warn!(dir = %dir.display(), %error, "old logs cannot be deleted");
+        }
         let (path, file) = disk::create(dir, node, entry.at, self.config.min_free_bytes())?;
         let mut file = LogFile::begin(path, file, &self.identity)?;
         let Standing { runs, leads, next_round } = self.recording.standing().clone();

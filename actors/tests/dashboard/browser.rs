@@ -88,8 +88,8 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     println!("pictures of the page: {}", pictures.display());
 }
 
-/// A page of elsewhere may lead to one with a token. A page for which there is no live connection left follows slowly, and
-/// says so until others are closed.
+/// A page of elsewhere may lead to one with a token. A page for which there is no live connection left follows slowly,
+/// and says so until others are closed.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {

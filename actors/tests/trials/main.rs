@@ -1,9 +1,9 @@
 //! Failover as vehicles see it: cells of real processes, killed, stopped, cut off and starved, again and again.
 //!
-//! Here are two harnesses. `make soak` runs the one in `soak`. `make trials` runs the other; `TRIALS=n` is the number of
-//! trials of each scenario and cell size (default 20), `SCENARIOS=a,b` and `NODES=2,5` run those only. What cannot be run
-//! on this machine is skipped and said to be. The results are printed and written to `target/trials.json`; the files of a
-//! trial that went wrong are kept.
+//! Here are two harnesses. `make soak` runs the one in `soak`. `make trials` runs the other; `TRIALS=n` is the number
+//! of trials of each scenario and cell size (default 20), `SCENARIOS=a,b` and `NODES=2,5` run those only. What cannot
+//! be run on this machine is skipped and said to be. The results are printed and written to `target/trials.json`; the
+//! files of a trial that went wrong are kept.
 
 mod analysis;
 mod cell;

@@ -20,8 +20,6 @@ fn whoever_invents_or_hides_objects_loses_its_standing() {
     assert_eq!(invented, 0, "nobody believes a liar");
 }
 
-/// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
-/// says as much; of many others that nothing is known of.
 #[test]
 fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
     let mut tracker = tracker();
@@ -38,6 +36,8 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
     assert_eq!((judged.len(), contributors), (32, 32));
 }
 
+/// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
+/// says as much; of many others that nothing is known of.
 #[test]
 fn a_liar_that_was_silent_is_still_a_liar() {
     let mut tracker = tracker();

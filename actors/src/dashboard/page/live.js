@@ -27,7 +27,7 @@ export class Live {
 
   /// Whether pictures come.
   get connected() {
-    return performance.now() - this.#heard < SILENCE_MS;
+    return performance.now() - this.#heard < SILENCE_MS + (this.crowded ? HISTORY_MS : 0);
   }
 
   /// The node's time now, in microseconds, as far as the last picture tells.
