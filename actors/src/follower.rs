@@ -313,10 +313,10 @@ mod tests {
             assert_eq!(follower.take_map(&map(7, round, at(round)), at(round)), Ok(()));
         }
         let resumed = at(40);
-        for round in 10..30 {
+        for round in 10..31 {
             assert_eq!(follower.take_map(&map(7, round, at(round)), resumed), Err(Refusal::Stale), "round {round}");
         }
-        assert_eq!(follower.take_map(&map(7, 30, at(30)), resumed), Ok(()));
+        assert_eq!(follower.take_map(&map(7, 31, at(31)), resumed), Ok(()));
     }
 
     #[test]
