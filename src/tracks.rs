@@ -33,7 +33,7 @@ use crate::names::NodeName;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{FusedObject, ObjectReport, PerceivedObject, PoseCorrection};
-use align::{Alignment, Spread};
+use align::{Alignment, Pair, Spread};
 use grid::Grid;
 use source::Source;
 use taking::Taking;
@@ -183,14 +183,15 @@ impl Tracker {
         pending.sort_by(|(a, x), (b, y)| (a, &x.node, x.seq).cmp(&(b, &y.node, y.seq)));
         let oldest_capture = pending.first().map(|(at, _)| *at);
         self.index(pending.first().map_or(now, |(at, _)| *at));
-        let mut pairs = Vec::new();
+        let mut pairs: Vec<(u32, Timestamp, Vec<Pair>)> = Vec::new();
         for (at, report) in &pending {
             if self.drift_m(*at) > self.config.gate_m / 2.0 {
                 self.index(*at);
             }
             let number = self.number_of(&report.node, *at);
             let Some(mut source) = self.sources[number as usize].take() else { continue };
-            let mut taking = Taking { number, source: &mut source, report, at: *at, has_jumped: false, pairs: Vec::new() };
+            let mut taking =
+                Taking { number, source: &mut source, report, at: *at, has_jumped: false, pairs: Vec::new() };
             self.take(&mut taking);
             let Taking { has_jumped, pairs: of_report, .. } = taking;
             if has_jumped {

@@ -51,6 +51,18 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     Ok(Box::new(BufReader::with_capacity(1 << 18, file)))
 }
 
+/// Checks that a file that is to be written is none of `inputs`.
+///
+/// # Errors
+/// Naming the file.
+pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<()> {
+    let ours = fs::canonicalize(path).ok();
+    if ours.is_some() && inputs.iter().any(|input| fs::canonicalize(input).ok() == ours) {
+        bail!("{} is to be both read and written", path.display());
+    }
+    Ok(())
+}
+
 /// Creates a file, or empties it; it must not be one of `inputs`, which are still to be read.
 ///
 /// # Errors
@@ -59,10 +71,7 @@ pub fn create(path: &Path, inputs: &[PathBuf]) -> anyhow::Result<Box<dyn Write>>
     if path == Path::new("-") {
         return Ok(Box::new(BufWriter::new(io::stdout().lock())));
     }
-    let ours = fs::canonicalize(path).ok();
-    if ours.is_some() && inputs.iter().any(|input| fs::canonicalize(input).ok() == ours) {
-        bail!("{} is to be both read and written", path.display());
-    }
+    check_apart(path, inputs)?;
     let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
     Ok(Box::new(BufWriter::with_capacity(1 << 18, file)))
 }

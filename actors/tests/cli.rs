@@ -165,6 +165,26 @@ fn a_node_ends_with_its_standard_input_when_told_to() {
     assert!(node.wait().unwrap().success());
 }
 
+/// OpenCV is taken down with the process; a thread that was still in it would take the process down with a signal.
+#[cfg(feature = "camera")]
+#[test]
+fn a_node_ends_well_while_its_camera_runs() {
+    let photos = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos");
+    let mut config = tempfile::NamedTempFile::new().unwrap();
+    let source = format!("kind = \"images\"\npath = {photos:?}\nfps = 500\nlooping = true");
+    let camera = format!("[camera.source]\n{source}\n[camera.detector]\nkind = \"placard\"");
+    write!(config, "role = \"cav\"\nname = \"sees\"\n[mqtt]\nbroker = \"127.0.0.1:1\"\n{camera}").unwrap();
+    for _ in 0..5 {
+        let mut node = ecod_node();
+        node.arg("--config").arg(config.path()).arg("--stop-at-eof").stdin(Stdio::piped()).stderr(Stdio::null());
+        let mut node = node.spawn().unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(500));
+        drop(node.stdin.take());
+        let status = node.wait().unwrap();
+        assert!(status.success(), "{status}");
+    }
+}
+
 #[test]
 fn a_vehicle_without_a_camera_is_told_that_it_only_follows() {
     let mut node = ecod_node();

@@ -7,6 +7,7 @@ use serde_json::Value;
 
 use crate::names::{Label, LandmarkId, MAX_NAME_BYTES};
 use crate::time::Timestamp;
+use crate::wire::is_label;
 
 /// What a sign of vacancy reads unless the file says otherwise.
 const VACANT: &str = "EMPTY";
@@ -106,6 +107,9 @@ impl Truth {
                 0 | 1 => return Err(location(item, "has no second column")),
                 _ => return Err(location(item, "has more than two columns: quote what has a comma in it")),
             };
+            if let Some(truth) = truth.as_ref().filter(|truth| !is_label(truth)) {
+                return Err(location(item, format!("is {truth:?}, no label: is a quotation mark missing?")));
+            }
             let span = vec![Span { from: Timestamp(0), accepted: vec![truth] }];
             if landmarks.insert(name(item)?, span.clone()).is_some_and(|earlier| earlier != span) {
                 return Err(location(item, "is given twice and differs"));

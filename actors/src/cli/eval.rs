@@ -55,6 +55,11 @@ enum InputLine {
 
 pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     let path = &arguments.truth;
+    if let Some(out) = &arguments.out {
+        let reports = arguments.reports.iter();
+        let inputs: Vec<_> = [path, &arguments.input].into_iter().chain(reports).collect();
+        lines::check_apart(out, &inputs).map_err(Failure::usage)?;
+    }
     let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
     let text = text.map_err(Failure::usage)?;
     if TrackTruth::is_in(&text) {

@@ -10,6 +10,7 @@ use ecod::eval::tracks::TrackTruth;
 
 use super::Failure;
 use super::replay::log_files;
+use crate::lines;
 use crate::report::Report;
 
 /// Flags of `report`.
@@ -28,8 +29,11 @@ pub(super) struct ReportArguments {
 
 pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
     let ReportArguments { logs, truth, output } = arguments;
+    let files = log_files(logs)?;
+    let inputs: Vec<_> = files.iter().chain(truth).collect();
+    lines::check_apart(output, &inputs).map_err(Failure::usage)?;
     let mut report = truth.as_deref().map_or_else(|| Ok(Report::default()), judged_by).map_err(Failure::usage)?;
-    for file in log_files(logs)? {
+    for file in files {
         report.file(&file).map_err(|error| anyhow!(error))?;
     }
     for problem in report.problems() {

@@ -130,6 +130,8 @@ pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Fail
     let served = runtime.block_on(serve(config, stop_at_eof));
     // A detector may be busy for good; whoever restarts the node must not wait for it.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
+    #[cfg(feature = "camera")]
+    crate::frame_source::capture::wait_for_readers(SHUTDOWN_TIMEOUT);
     Ok(served?)
 }
 

@@ -10,6 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
 use super::{Failure, intersection, print, write_json};
+use crate::lines;
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 use crate::testbed::trial::Trial;
@@ -41,10 +42,10 @@ pub(super) struct TestbedArguments {
     pub(super) reports: Option<PathBuf>,
     /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded detections, fewer verdicts
     /// of the recording, or of the generated scenes if only they are chosen
-    #[arg(long, value_name = "PCT")]
+    #[arg(long, value_name = "PCT", value_parser = percent)]
     pub(super) at_least: Option<f64>,
     /// The same of the occupied spots alone; as `--at-least` if not given
-    #[arg(long, value_name = "PCT")]
+    #[arg(long, value_name = "PCT", value_parser = percent)]
     pub(super) occupied_at_least: Option<f64>,
     /// Write the results to this file (JSON)
     #[arg(long, value_name = "FILE")]
@@ -57,10 +58,22 @@ pub(super) struct Results<'a, T = SceneResult> {
     pub(super) scenes: &'a [T],
 }
 
+fn percent(text: &str) -> Result<f64, String> {
+    let percent = text.parse().ok().filter(|percent| (0.0..=100.0).contains(percent));
+    percent.ok_or_else(|| "must be a number from 0 to 100".to_owned())
+}
+
 pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     let text = read_text(&arguments.scenes).map_err(Failure::usage)?;
+    if let Some(out) = &arguments.out {
+        lines::check_apart(out, &[&arguments.scenes]).map_err(Failure::usage)?;
+    }
     if serde_json::from_str(&text).is_ok_and(|file| Recording::is_recording(&file)) {
         return intersection::run(arguments, &text);
+    }
+    if arguments.reports.is_some() {
+        let scenes = arguments.scenes.display();
+        return Err(Failure::usage(anyhow!("--reports is for recorded detections, and {scenes} has scenes to render")));
     }
     let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
     let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;

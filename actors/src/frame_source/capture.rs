@@ -8,7 +8,7 @@
 //! opens the source on a new one.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -152,6 +152,33 @@ impl Drop for Capture {
     }
 }
 
+/// Readers of this process that may be in OpenCV.
+static READERS: AtomicUsize = AtomicUsize::new(0);
+
+/// Counts a reader as long as it runs.
+struct Running;
+
+impl Running {
+    fn begin() -> Self {
+        READERS.fetch_add(1, Ordering::SeqCst);
+        Self
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        READERS.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+/// Waits until no reader runs, `patience` at most: a process that ends takes down OpenCV, which must not be in use then.
+pub fn wait_for_readers(patience: Duration) {
+    let until = Instant::now() + patience;
+    while READERS.load(Ordering::SeqCst) > 0 && Instant::now() < until {
+        thread::sleep(Duration::from_millis(2));
+    }
+}
+
 /// Blocked readers from which on no new one is started.
 const MAX_LEFT_BEHIND: usize = 4;
 
@@ -221,7 +248,12 @@ impl Keeper {
         let opening = self.opening.load(Ordering::SeqCst);
         let reader = Reader { opening, current: Arc::clone(&self.opening), events: self.events.clone() };
         let open = Arc::clone(&self.open);
-        match thread::Builder::new().name("camera".into()).spawn(move || reader.run(&open)) {
+        let running = Running::begin();
+        let read = move || {
+            let _running = running;
+            reader.run(&open);
+        };
+        match thread::Builder::new().name("camera".into()).spawn(read) {
             Ok(reader) => self.left_behind.push(reader),
             Err(e) => return Outcome::Failed(FrameError::Open { origin: "a thread".into(), reason: e.to_string() }),
         }

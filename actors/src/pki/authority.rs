@@ -55,13 +55,16 @@ struct Issued {
 #[derive(Debug, thiserror::Error)]
 pub enum AuthorityError {
     /// A file could not be read or written.
-    #[error("{path}: {source}")]
+    #[error("cannot use {path}")]
     File {
         /// The file.
         path: PathBuf,
         /// What the operating system said.
         source: io::Error,
     },
+    /// There is no CA.
+    #[error("{0} has no CA: make one with `ecod-node pki init`")]
+    Missing(PathBuf),
     /// The directory has a CA already, whose certificates would all be worth nothing.
     #[error("{0} has a CA already; a new one needs an empty directory")]
     Exists(PathBuf),
@@ -125,6 +128,9 @@ impl Authority {
     /// [`AuthorityError`] when there is none.
     pub fn open(directory: &Path) -> Result<Self, AuthorityError> {
         let path = directory.join(REGISTER);
+        if !path.exists() {
+            return Err(AuthorityError::Missing(directory.into()));
+        }
         let text = read(&path)?;
         let register = serde_json::from_str(&text)
             .map_err(|error| AuthorityError::Register { path, reason: error.to_string() })?;
