@@ -111,6 +111,15 @@ struct Last {
     entry: Option<Label>,
 }
 
+impl Scores {
+    /// The shares of a summary's row in percent: accuracy, coverage, accuracy where labelled, that of all lines, and of
+    /// the majority.
+    pub fn shares_pct(&self) -> [Option<f64>; 5] {
+        let Self { accuracy_pct, coverage_pct, labelled_accuracy_pct, rounds, majority_accuracy_pct, .. } = self;
+        [*accuracy_pct, *coverage_pct, *labelled_accuracy_pct, rounds.accuracy_pct, *majority_accuracy_pct]
+    }
+}
+
 impl Evaluation {
     /// Nothing read yet.
     pub fn new(truth: Truth) -> Self {

@@ -20,14 +20,10 @@ pub(super) fn columns(rows: &[Vec<String>]) -> String {
     text
 }
 
-/// A share in percent; a dash where there is none.
-pub(super) fn percent(share: Option<f64>) -> String {
-    share.map_or_else(|| "-".into(), |share| format!("{share:.2}"))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::tracks::percent;
 
     #[test]
     fn numbers_end_in_one_column() {

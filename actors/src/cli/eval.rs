@@ -14,10 +14,11 @@ use ecod::replay::{FusedLine, ReplayConfig, read_report};
 use ecod::wire::GlobalMap;
 use serde::Deserialize;
 
-use super::columns::{columns, percent};
+use super::columns::columns;
 use super::replay::cell;
 use super::{Failure, write_json};
 use crate::lines::{self, LineRead, read_line};
+use crate::report::tracks::percent;
 
 /// Flags of `eval`.
 #[derive(Debug, Args)]
@@ -153,15 +154,8 @@ fn header(cells: &[&str]) -> Vec<String> {
 }
 
 fn summary(name: &str, scores: &Scores) -> Vec<String> {
-    let shares = [
-        scores.accuracy_pct,
-        scores.coverage_pct,
-        scores.labelled_accuracy_pct,
-        scores.rounds.accuracy_pct,
-        scores.majority_accuracy_pct,
-    ];
     let counts = vec![name.to_owned(), scores.lines.to_string(), scores.items.to_string()];
-    [counts, shares.map(percent).to_vec()].concat()
+    [counts, scores.shares_pct().map(percent).to_vec()].concat()
 }
 
 fn confusion(name: &str, scores: &Scores) -> String {

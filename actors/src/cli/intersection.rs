@@ -7,9 +7,10 @@ use ecod::names::Label;
 use ecod::testbed::Recording;
 use tracing::subscriber::NoSubscriber;
 
-use super::columns::{columns, percent};
+use super::columns::columns;
 use super::testbed::{Results, TestbedArguments, check_writable};
 use super::{Failure, print, write_json};
+use crate::report::tracks::percent;
 use crate::testbed::intersection::generate::Confusion;
 use crate::testbed::intersection::{self, IntersectionResult};
 

@@ -12,15 +12,8 @@ pub(super) fn of_locations(report: &Report) -> String {
     let Some(result) = report.evaluation.as_ref().map(Evaluation::result) else { return String::new() };
     let percent = |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{share:.1}"));
     let row = |name: &str, scores: &Scores| {
-        let shares = [
-            scores.accuracy_pct,
-            scores.coverage_pct,
-            scores.labelled_accuracy_pct,
-            scores.rounds.accuracy_pct,
-            scores.majority_accuracy_pct,
-        ];
         let cells = [name.to_owned(), scores.lines.to_string(), scores.items.to_string()];
-        cells.into_iter().chain(shares.map(percent)).collect::<Vec<_>>()
+        cells.into_iter().chain(scores.shares_pct().map(percent)).collect::<Vec<_>>()
     };
     let judged = [("PACE", &result.pace), ("VOTE", &result.vote)];
     let rows: Vec<_> = judged.iter().filter_map(|(name, scores)| Some(row(name, scores.as_ref()?))).collect();

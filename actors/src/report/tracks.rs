@@ -66,6 +66,7 @@ fn at(name: &str, best_f1_pct: Option<f64>, scores: &ThresholdScores) -> Vec<Str
     named.into_iter().chain(shares.map(percent)).chain([scores.id_switches.to_string()]).collect()
 }
 
-fn percent(share: Option<f64>) -> String {
+/// A share in percent; a dash where there is none.
+pub(crate) fn percent(share: Option<f64>) -> String {
     share.map_or_else(|| "-".into(), |share| format!("{share:.2}"))
 }
