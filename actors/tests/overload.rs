@@ -12,10 +12,17 @@ use ecod_actors::clock;
 use ecod_actors::config::NodeConfig;
 use ecod_actors::counters::ShedReason;
 use ecod_actors::node::{self, NodeHandle};
-use rumqttc::{AsyncClient, MqttOptions, QoS};
+use rumqttc::{AsyncClient, ClientError, MqttOptions, QoS};
+use tokio::sync::Mutex;
 use tokio::task::JoinSet;
 
 const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Vehicles that all send too much.
+const VEHICLES: usize = 32;
+
+/// Times and memory are those of the whole process: one test at a time.
+static ALONE: Mutex<()> = Mutex::const_new(());
 
 /// An edge with its broker and two locations three metres apart.
 async fn edge(change: impl FnOnce(&mut NodeConfig)) -> (NodeHandle, SocketAddr) {
@@ -48,13 +55,24 @@ fn connect(broker: SocketAddr, vehicle: &str, tasks: &mut JoinSet<()>) -> AsyncC
     client
 }
 
-async fn publish(client: &AsyncClient, vehicle: &str, seq: u64, x_m: f64) {
+async fn publish(client: &AsyncClient, vehicle: &str, seq: u64, x_m: f64) -> Result<(), ClientError> {
     let report = ObjectReport {
         objects: vec![PerceivedObject::new("car", 0.9, x_m, 0.0)],
         ..ObjectReport::new(NodeName::new(vehicle).unwrap(), seq, clock::now())
     };
     let topic = format!("ecod/v1/lot/detections/{vehicle}");
-    client.publish(topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json)).await.unwrap();
+    client.publish(topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json)).await
+}
+
+/// A report every `period`, for as long as the connection is served.
+async fn flood(client: AsyncClient, vehicle: String, period: Duration) {
+    let mut ticks = tokio::time::interval(period);
+    for seq in 0.. {
+        ticks.tick().await;
+        if publish(&client, &vehicle, seq, 0.0).await.is_err() {
+            break;
+        }
+    }
 }
 
 /// Times from a vehicle's report to the map that shows the east where this report has it.
@@ -64,7 +82,7 @@ async fn answer_times(edge: &NodeHandle, client: &AsyncClient, first: u64) -> Ve
         let x_m = 3.0 + 0.001 * seq as f64;
         let mut maps = edge.newest_map();
         let sent = Instant::now();
-        publish(client, "euclid", seq, x_m).await;
+        publish(client, "euclid", seq, x_m).await.unwrap();
         let shows = |received: &Option<ecod_actors::follower::ReceivedMap>| {
             received.as_ref().is_some_and(|received| (received.map.landmarks[1].x_m - x_m).abs() < 1e-4)
         };
@@ -82,17 +100,14 @@ fn shed(edge: &NodeHandle, source: &str) -> u64 {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
+    let _alone = ALONE.lock().await;
     let (edge, broker) = edge(|config| config.broker.max_messages_hz = 500).await;
     let mut tasks = JoinSet::new();
     let euclid = connect(broker, "euclid", &mut tasks);
     let quiet = answer_times(&edge, &euclid, 0).await;
 
     let mallory = connect(broker, "mallory", &mut tasks);
-    tasks.spawn(async move {
-        for seq in 0.. {
-            publish(&mallory, "mallory", seq, 0.0).await;
-        }
-    });
+    tasks.spawn(flood(mallory, "mallory".to_owned(), Duration::from_micros(10)));
     let flooded = answer_times(&edge, &euclid, 100).await;
     let [quiet_median, flooded_median] = [&quiet, &flooded].map(|times| times[times.len() / 2]);
     let left_out = shed(&edge, "mallory");
@@ -108,19 +123,13 @@ async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
-    const VEHICLES: usize = 32;
+    let _alone = ALONE.lock().await;
     let (edge, broker) = edge(|config| config.mqtt.max_report_hz = 10).await;
     let mut tasks = JoinSet::new();
     for index in 0..VEHICLES {
         let vehicle = format!("v{index}");
         let client = connect(broker, &vehicle, &mut tasks);
-        tasks.spawn(async move {
-            let mut ticks = tokio::time::interval(Duration::from_millis(10));
-            for seq in 0.. {
-                ticks.tick().await;
-                publish(&client, &vehicle, seq, 0.0).await;
-            }
-        });
+        tasks.spawn(flood(client, vehicle, Duration::from_millis(10)));
     }
     let mut maps = edge.newest_map();
     let all_report = maps.wait_for(|received| {
