@@ -14,8 +14,8 @@ use crate::leader_election::Leadership;
 /// elected leader, or where there is no election whoever publishes, for no longer than this.
 pub(super) const MEMORY: Duration = Duration::from_secs(3);
 
-/// How long the elected leader may be silent before another with a later epoch is believed to have taken over: the word
-/// of its election may have been lost.
+/// How long the elected leader may be silent, from when it is first known, before another with a later epoch is believed
+/// to have taken over: the word of its election may have been lost.
 const SILENCE: Duration = Duration::from_millis(250);
 
 /// How long one with a later epoch is believed while the election names another: the word may be under way.
@@ -49,8 +49,7 @@ pub(super) struct Gate {
     /// The highest term that the election knows; without it any is believed where nobody is known to lead.
     known_term: Option<watch::Receiver<u64>>,
     newest_at: Option<Timestamp>,
-    /// The last round of the elected, and when it came.
-    elected: Option<(Epoch, u64, Timestamp)>,
+    elected: Option<Elected>,
     /// Since when others than the elected pass.
     others_since: Option<Timestamp>,
     /// The elected epoch in which others have used up their credit.
@@ -59,12 +58,29 @@ pub(super) struct Gate {
     stranger: Option<Stranger>,
 }
 
+/// Whom the election last named.
+#[derive(Debug)]
+struct Elected {
+    epoch: Epoch,
+    last_round: Option<u64>,
+    /// When its last round came; before that, when a message first found it elected.
+    heard_at: Timestamp,
+}
+
 /// One whom no election vouches for.
 #[derive(Debug)]
 struct Stranger {
     epoch: Epoch,
     since: Timestamp,
     last: Timestamp,
+}
+
+impl Elected {
+    /// Whether its standby may have taken over. Of one term there are only rivals, that began at the same time.
+    fn is_succeeded_by(&self, epoch: &Epoch, round: u64, standby: Option<&NodeName>) -> bool {
+        let goes_on = |last| round > last && round - last <= CATCH_UP;
+        standby == Some(&epoch.leader) && epoch.term > self.epoch.term && self.last_round.is_none_or(goes_on)
+    }
 }
 
 impl Gate {
@@ -83,7 +99,13 @@ impl Gate {
         received_at: Timestamp,
         leadership: &Leadership,
     ) -> Result<(), Refusal> {
-        match leadership.epoch.as_ref().filter(|_| leadership.leader().is_some()) {
+        let elected = leadership.epoch.as_ref().filter(|_| leadership.leader().is_some());
+        if let Some(elected) =
+            elected.filter(|elected| self.elected.as_ref().is_none_or(|last| last.epoch != **elected))
+        {
+            self.elected = Some(Elected { epoch: elected.clone(), last_round: None, heard_at: received_at });
+        }
+        match elected {
             Some(elected) if elected == epoch => self.admit_elected(epoch, round, received_at),
             Some(elected) => self.admit_other(epoch, round, received_at, elected, leadership.standby.as_ref()),
             None if self.is_strange(epoch, received_at) => Err(Refusal::NotElected),
@@ -116,7 +138,7 @@ impl Gate {
     /// The elected is heard even after somebody else with a later epoch, unless that one is likely to be the next
     /// elected.
     fn admit_elected(&mut self, epoch: &Epoch, round: u64, received_at: Timestamp) -> Result<(), Refusal> {
-        if self.elected.as_ref().is_some_and(|(last, last_round, _)| last == epoch && round <= *last_round) {
+        if self.elected.as_ref().and_then(|elected| elected.last_round).is_some_and(|last| round <= last) {
             return Err(Refusal::Repeated);
         }
         let usurped = self.others_since.is_some_and(|since| received_at.since(since) >= CREDIT);
@@ -125,7 +147,7 @@ impl Gate {
             self.overruled = Some(epoch.clone());
         }
         self.admit_in_order(epoch, round, received_at, true)?;
-        self.elected = Some((epoch.clone(), round, received_at));
+        self.elected = Some(Elected { epoch: epoch.clone(), last_round: Some(round), heard_at: received_at });
         self.others_since = None;
         Ok(())
     }
@@ -139,10 +161,8 @@ impl Gate {
         standby: Option<&NodeName>,
     ) -> Result<(), Refusal> {
         if epoch > elected {
-            let heard = |(last, _, at): &&(Epoch, u64, Timestamp)| last == elected && received_at.since(*at) < SILENCE;
-            let spoken = self.elected.as_ref().filter(heard);
-            let goes_on = |last| standby == Some(&epoch.leader) && round > last && round - last <= CATCH_UP;
-            let usurps = spoken.is_some_and(|(_, last_round, _)| !goes_on(*last_round));
+            let known = self.elected.as_ref().filter(|known| received_at.since(known.heard_at) < SILENCE);
+            let usurps = known.is_some_and(|known| !known.is_succeeded_by(epoch, round, standby));
             if usurps || self.overruled.as_ref() == Some(elected) {
                 return Err(Refusal::NotElected);
             }
@@ -246,6 +266,22 @@ mod tests {
         assert_eq!(gate.admit(&lone, 9000, at(50), &leadership), Err(Refusal::NotElected), "it was alone for long");
         assert_eq!(gate.admit(&elected, 43, at(100), &leadership), Ok(()));
         assert_eq!(gate.admit(&epoch(5, "edge"), 44, at(200), &leadership), Ok(()), "it takes over");
+    }
+
+    #[test]
+    fn who_began_to_lead_at_the_same_time_as_the_elected_waits_for_its_silence() {
+        let (elected, rival) = (epoch(1, "edge"), epoch(1, "v02"));
+        for standby in [None, Some("v02")] {
+            let leadership = led_by(elected.clone(), standby);
+            let mut gate = Gate::new(0, Some(watch::channel(1).1));
+            for round in 0..3 {
+                let refused = gate.admit(&rival, round, at(100 * round), &leadership);
+                assert_eq!(refused, Err(Refusal::NotElected), "{standby:?}, round {round}");
+            }
+            assert_eq!(gate.admit(&elected, 0, at(210), &leadership), Ok(()), "its first word comes late");
+            assert_eq!(gate.admit(&rival, 3, at(300), &leadership), Err(Refusal::NotElected));
+            assert_eq!(gate.admit(&rival, 5, at(500), &leadership), Ok(()), "the elected is silent");
+        }
     }
 
     #[test]
