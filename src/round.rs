@@ -73,7 +73,12 @@ pub struct RoundTrigger {
     missing: usize,
     /// Vehicles whose report was due when the last round closed and that have not reported since.
     due: usize,
+    /// How long the present round lasts.
+    length: Duration,
+    /// Whether it lasts that long whoever has reported.
     held: bool,
+    /// Rounds of [`EARLY`] that have begun.
+    early: usize,
 }
 
 #[derive(Debug, Clone)]
@@ -96,9 +101,13 @@ pub enum FirstRound {
     AfterConnects,
 }
 
-/// How long a vehicle takes to connect to a broker that it has just heard of, and some more. A map sent before costs it
-/// a whole period.
+/// How long a vehicle takes to connect to a broker that it has just heard of, and some more. A map sent before is lost to
+/// it.
 pub const CONNECT_TIME: Duration = Duration::from_millis(25);
+
+/// How long the rounds after the first of an unplanned leadership last: a vehicle that was not connected in time waits
+/// for one of these, not for a whole period.
+const EARLY: [Duration; 2] = [CONNECT_TIME, Duration::from_millis(50)];
 
 /// Periods after which a silent vehicle is no longer waited for.
 const LIVE_PERIODS: u32 = 3;
@@ -116,7 +125,17 @@ const DUE: u32 = 2;
 impl RoundTrigger {
     /// Starts counting at `now`.
     pub fn new(config: RoundConfig, now: Timestamp) -> Self {
-        Self { config, last_close: now, first_report: None, live: Default::default(), missing: 0, due: 0, held: false }
+        Self {
+            last_close: now,
+            first_report: None,
+            live: Default::default(),
+            missing: 0,
+            due: 0,
+            length: config.period(),
+            held: false,
+            early: EARLY.len(),
+            config,
+        }
     }
 
     /// Takes note of a report; true when the round closes with it, because it was the last that was waited for. A
@@ -169,19 +188,22 @@ impl RoundTrigger {
         }
         self.last_close = now;
         self.first_report = None;
-        self.held = false;
+        self.held = self.early < EARLY.len();
+        self.length = EARLY.get(self.early).map_or(period, |&length| length.min(period));
+        self.early += usize::from(self.held);
     }
 
     /// Starts a run of rounds.
     pub fn start(&mut self, first: FirstRound, now: Timestamp) {
         let period = self.config.period();
-        let wait = match first {
+        self.length = match first {
             FirstRound::OnTime => period,
             FirstRound::Overdue => Duration::ZERO,
             FirstRound::AfterConnects => CONNECT_TIME.min(period),
         };
-        self.last_close = now + wait - period;
-        self.held = first == FirstRound::AfterConnects;
+        self.last_close = now;
+        self.held = first != FirstRound::OnTime;
+        self.early = if self.held { 0 } else { EARLY.len() };
     }
 
     /// Lets the present round last its whole period, whoever has reported.
@@ -192,7 +214,7 @@ impl RoundTrigger {
     /// When the round closes without a further report.
     pub fn deadline(&self) -> Timestamp {
         let period = self.config.period();
-        let end = self.last_close + period;
+        let end = self.last_close + self.length;
         if self.config.close == RoundClose::Periodic || self.held {
             return end;
         }
@@ -253,6 +275,24 @@ mod tests {
         assert_eq!(rounds.deadline(), at(150));
         rounds.start(FirstRound::Overdue, at(50));
         assert!(rounds.tick(at(50)));
+    }
+
+    #[test]
+    fn who_connects_late_to_an_unplanned_leader_does_not_wait_for_a_period() {
+        for (first, expected) in
+            [(FirstRound::Overdue, [50, 75, 125, 225, 325]), (FirstRound::AfterConnects, [75, 100, 150, 250, 350])]
+        {
+            for close in [RoundClose::WhenComplete, RoundClose::Periodic] {
+                let mut rounds = trigger(close);
+                rounds.start(first, at(50));
+                let closes = expected.map(|_| {
+                    let deadline = rounds.deadline();
+                    assert!(!rounds.tick(deadline - Duration::from_millis(1)) && rounds.tick(deadline));
+                    deadline
+                });
+                assert_eq!(closes, expected.map(at), "{first:?}, {close:?}");
+            }
+        }
     }
 
     #[test]

@@ -339,6 +339,36 @@ fn datagrams_arrive_with_their_sender() {
 }
 
 #[test]
+fn two_nodes_hear_each_other_as_often_as_the_network_lets_them_though_the_gossip_gives_both_up() {
+    let mut cell = Cell::of(2);
+    cell.loss_percent = 20;
+    cell.forget_events();
+    for _ in 0..1200 {
+        for (from, to) in [(1, 2), (2, 1)] {
+            let now = cell.now;
+            cell.nodes.get_mut(&from).unwrap().machine.send(&node_name(to), b"beat", now);
+        }
+        cell.run(50);
+    }
+    let mut given_up = 0;
+    for node in cell.nodes.values() {
+        given_up += node.events.iter().filter(|event| matches!(event, MembershipEvent::Down { .. })).count();
+        let heard: Vec<_> = node
+            .events
+            .iter()
+            .filter_map(|event| match event {
+                MembershipEvent::Received { received_at, .. } => Some(*received_at),
+                _ => None,
+            })
+            .collect();
+        assert!(heard.len() > 900, "{} of 1200", heard.len());
+        let silence = heard.windows(2).map(|pair| pair[1].since(pair[0])).max();
+        assert!(silence < Some(Duration::from_millis(400)), "{silence:?}");
+    }
+    assert!(given_up > 2, "{given_up} times: too few to show anything");
+}
+
+#[test]
 fn two_sides_of_a_split_meet_again() {
     let mut cell = Cell::of(6);
     cell.island = [1, 2, 3].into();
