@@ -110,7 +110,7 @@ impl Aggregator {
         self.rounds.start(first, now);
     }
 
-    /// Lets the present round last its whole period: whoever takes the lead over has that long to say so.
+    /// Lets the present round last its whole length: whoever takes the lead over has that long to say so.
     pub fn hold(&mut self) {
         self.rounds.hold();
     }

@@ -320,7 +320,9 @@ impl Election {
     }
 
     fn greet(&mut self, to: &NodeName, now: Timestamp) {
-        self.send(to, Body::Status { over: self.over.clone() }, now);
+        // Who seeks takes nothing that is lower than what it followed last.
+        let lost = if matches!(self.state, State::Seeking(_)) { self.epoch.clone() } else { None };
+        self.send(to, Body::Status { over: self.over.clone().max(lost) }, now);
     }
 
     fn send(&mut self, to: &NodeName, body: Body, now: Timestamp) {

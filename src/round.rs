@@ -1,4 +1,5 @@
-//! When a round closes: every period, or as soon as every live vehicle has reported.
+//! When a round closes: every period, or as soon as every live vehicle has reported. The first rounds of a leadership that
+//! was not handed over come in quicker succession.
 //!
 //! A vehicle that sends both kinds of reports is waited for with both.
 //!
@@ -35,7 +36,7 @@ pub struct RoundConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum RoundClose {
-    /// Nothing but the period, as in the paper. Adds up to a period of latency.
+    /// Nothing but time, as in the paper. Adds up to a period of latency.
     Periodic,
     /// Every live vehicle has reported since the last round; the period is the bound, or a tenth more while reports
     /// come in. The default.
@@ -89,11 +90,14 @@ struct Vehicle {
     due: bool,
 }
 
-/// When the first round of a leadership is due.
+/// When the first round of a leadership is due. After [`Self::Overdue`] and [`Self::AfterConnects`] a few more follow
+/// quickly.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum FirstRound {
-    /// A period from now: the round before has just been closed, by this node or one that handed over.
+    /// When it would have been anyway: the node leads on.
+    InStep,
+    /// A period from now: the round before has just been closed by the node that handed over.
     OnTime,
     /// At once: the others are connected to this node's broker and wait.
     Overdue,
@@ -107,13 +111,17 @@ pub const CONNECT_TIME: Duration = Duration::from_millis(25);
 
 /// How long the rounds after the first of an unplanned leadership last: a vehicle that was not connected in time waits
 /// for one of these, not for a whole period.
-const EARLY: [Duration; 2] = [CONNECT_TIME, Duration::from_millis(50)];
+const EARLY: [Duration; EARLY_ROUNDS] = [CONNECT_TIME, Duration::from_millis(50)];
+
+/// How many rounds follow more quickly on the first of an unplanned leadership than rounds do otherwise.
+pub const EARLY_ROUNDS: usize = 2;
 
 /// Periods after which a silent vehicle is no longer waited for.
 const LIVE_PERIODS: u32 = 3;
 
 /// Rounds close at most this many times as often as the period says, those that follow at once with the reports of
-/// vehicles that were due excepted. As a vehicle is not due again for half a period, these are few.
+/// vehicles that were due excepted, and the first of a leadership. As a vehicle is not due again for half a period, these
+/// are few.
 const MAX_RATE: u32 = 5;
 
 /// The part of a period by which its end is put off after the first report of a round.
@@ -174,7 +182,7 @@ impl RoundTrigger {
 
     fn close(&mut self, now: Timestamp) {
         let period = self.config.period();
-        // After a round that was held, whoever takes over has the word.
+        // After a round that was held, whoever takes over has the word, or others are still connecting.
         let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
         (self.missing, self.due) = (0, 0);
         for live in &mut self.live {
@@ -197,6 +205,7 @@ impl RoundTrigger {
     pub fn start(&mut self, first: FirstRound, now: Timestamp) {
         let period = self.config.period();
         self.length = match first {
+            FirstRound::InStep => return,
             FirstRound::OnTime => period,
             FirstRound::Overdue => Duration::ZERO,
             FirstRound::AfterConnects => CONNECT_TIME.min(period),
@@ -206,7 +215,7 @@ impl RoundTrigger {
         self.early = if self.held { 0 } else { EARLY.len() };
     }
 
-    /// Lets the present round last its whole period, whoever has reported.
+    /// Lets the present round last its whole length, whoever has reported.
     pub fn hold(&mut self) {
         self.held = true;
     }
@@ -269,8 +278,10 @@ mod tests {
     }
 
     #[test]
-    fn a_run_of_rounds_starts_at_once_or_a_period_later() {
+    fn a_run_of_rounds_starts_in_step_a_period_later_or_at_once() {
         let mut rounds = trigger(RoundClose::WhenComplete);
+        rounds.start(FirstRound::InStep, at(50));
+        assert_eq!(rounds.deadline(), at(100));
         rounds.start(FirstRound::OnTime, at(50));
         assert_eq!(rounds.deadline(), at(150));
         rounds.start(FirstRound::Overdue, at(50));

@@ -61,7 +61,7 @@ pub enum FuserMessage {
         /// When it is due.
         first: FirstRound,
     },
-    /// Let the present round last its whole period: another node is about to lead from the next one on.
+    /// Let the present round last its whole length: another node is about to lead from the next one on.
     HoldRound,
     /// Publish nothing more; go on fusing, to be ready.
     StopPublishing,

@@ -151,7 +151,8 @@ impl Election {
         let first = match &self.state {
             State::Seeking(seeking) if seeking.order.first() == Some(&self.id) => FirstRound::Overdue,
             State::Seeking(_) => FirstRound::AfterConnects,
-            State::Following(_) | State::Leading(_) => FirstRound::OnTime,
+            State::Following(_) => FirstRound::OnTime,
+            State::Leading(_) => FirstRound::InStep,
         };
         self.effects.push(Effect::Lead { epoch: epoch.clone(), first_round: self.round + 1, first });
         if known.as_ref() != successors.first() {

@@ -8,6 +8,7 @@ use crate::election::step::Effect;
 use crate::election::{Beat, Election, State};
 use crate::epoch::Epoch;
 use crate::names::NodeName;
+use crate::round::EARLY_ROUNDS;
 use crate::time::Timestamp;
 use crate::wire::Role;
 
@@ -20,6 +21,8 @@ pub(super) struct Following {
     every: Duration,
     /// When its last round was taken.
     round_at: Option<Timestamp>,
+    /// Gaps between its first rounds, which may be short, that were not taken for its rhythm.
+    early_gaps: usize,
     /// How far apart its rounds come, as long as they come.
     rhythm: Option<Duration>,
     /// When the leader was heard.
@@ -81,7 +84,10 @@ impl Following {
 
     /// A round of the leader's was taken. The rhythm follows a slower one at once, and a faster one in time.
     pub(super) fn take_round(&mut self, least: Duration, now: Timestamp) {
-        if let Some(last) = self.round_at.replace(now) {
+        let last = self.round_at.replace(now);
+        if last.is_some() && self.early_gaps < EARLY_ROUNDS {
+            self.early_gaps += 1;
+        } else if let Some(last) = last {
             let known = self.rhythm.unwrap_or_default();
             self.rhythm = Some(now.since(last).max(known * 7 / 8).max(least));
         }
@@ -227,6 +233,7 @@ impl Election {
             successors: beat.successors,
             every: Duration::from_millis(beat.every_ms),
             round_at: None,
+            early_gaps: 0,
             rhythm: None,
             direct_at: now,
             mutual_at: now,
@@ -249,6 +256,7 @@ impl Election {
             successors: Vec::new(),
             every: self.config.beat(),
             round_at: None,
+            early_gaps: 0,
             rhythm: None,
             direct_at: Timestamp::default(),
             mutual_at: Timestamp::default(),
@@ -284,7 +292,9 @@ impl Election {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
                 let leads = message.epoch.as_ref() == Some(&following.epoch);
-                if !leads && !matches!(message.body, Body::Beat { .. }) {
+                // Others' word of the leadership may overtake what the leader sent before.
+                let is_earlier = message.term < following.epoch.term;
+                if !leads && !is_earlier && !matches!(message.body, Body::Beat { .. }) {
                     let ended = following.epoch.clone();
                     let follows = message.epoch.clone().filter(|next| {
                         *next > ended && next.leader != message.from && next.leader != self.id && !self.is_over(next)

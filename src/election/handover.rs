@@ -75,6 +75,8 @@ impl Election {
         let least = self.config.beat();
         match &mut self.state {
             State::Following(following) if following.epoch == *epoch => following.take_round(least, now),
+            // Who has taken a round of a later leadership refuses this one's.
+            State::Leading(leading) if *epoch > leading.epoch => self.renew_later(now),
             State::Leading(leading) => {
                 if let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some()) {
                     handover.yielded = true;

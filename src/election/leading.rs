@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use crate::election::handover::Handover;
-use crate::election::message::{Body, MAX_SUCCESSORS};
+use crate::election::message::{Body, MAX_SUCCESSORS, Standing};
 use crate::election::step::Effect;
 use crate::election::{Election, State};
 use crate::epoch::Epoch;
 use crate::names::NodeName;
 use crate::time::Timestamp;
+use crate::wire::Role;
 
 /// A node that leads.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -92,11 +93,13 @@ impl Election {
         self.send(to, body, now);
     }
 
-    /// How far apart a peer's beats are.
+    /// How far apart a peer's beats are. One that is better but not yet fit is to be heard soon when it is.
     fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
+        let outranks = |standing: Standing| standing.role != Role::Cav && standing.class() < self.standing().class();
         match leading.successors.iter().position(|name| name == to) {
             Some(0) => self.config.beat(),
             Some(_) => self.config.near_beat(),
+            None if self.peers.get(to).and_then(|peer| peer.standing).is_some_and(outranks) => self.config.near_beat(),
             None => self.config.idle_beat(),
         }
     }

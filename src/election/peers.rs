@@ -195,7 +195,8 @@ impl Peers {
     /// The best peer that has been fit for `stable` and should have the lead of `leader` with `standing`.
     ///
     /// Load never takes the lead from a living leader: leading is load, and moving for it would swing. It is only
-    /// respected: among equals the lesser name is handed the lead unless it is busier.
+    /// respected: among equals the lesser name is handed the lead unless it is busier. A better one that has stood most
+    /// of its trial is waited for: the lead would move twice.
     pub(super) fn challenger(
         &self,
         leader: &NodeName,
@@ -210,7 +211,7 @@ impl Peers {
                 theirs < ours || (theirs == ours && other.load <= standing.load && name < leader)
             })
             .filter_map(|(name, other)| Some((name, other, self.table.get(name)?.fit_since? + stable)))
-            .min_by_key(|&(name, other, from)| (from > now, other.class(), name.clone()))
+            .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.class(), name.clone()))
             .map(|(name, _, from)| (name.clone(), from))
     }
 }

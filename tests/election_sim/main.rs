@@ -186,7 +186,10 @@ fn a_leader_without_broker_abdicates() {
 #[test]
 fn a_standby_that_is_gone_is_not_named() {
     for_seeds(seeds() / 10, |seed| {
-        for (fault, patience) in [(Fault::Leave as fn(usize) -> Fault, 60 * MS), (unseen_kill, 950 * MS)] {
+        // Of an unseen one, from when the leader's membership has found out, and says so within 300 ms.
+        for (fault, is_unseen, patience) in
+            [(Fault::Leave as fn(usize) -> Fault, false, 60 * MS), (unseen_kill, true, 750 * MS)]
+        {
             let mut world = cell(seed);
             world.nodes[1].config.role = Role::Auto;
             start_all(&mut world);
@@ -199,6 +202,10 @@ fn a_standby_that_is_gone_is_not_named() {
                 };
                 let Some(gone) = standby(world, leader) else { return Ok(()) };
                 world.plan(0, fault(gone));
+                world.run_for(MS);
+                while is_unseen && world.nodes[leader].known.contains(&gone) {
+                    world.run_for(10 * MS);
+                }
                 world.run_for(patience);
                 for (index, node) in world.alive() {
                     ensure(standby(world, index) != Some(gone), &format!("{} still names it", node.name))?;

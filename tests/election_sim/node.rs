@@ -5,6 +5,8 @@ use std::collections::BTreeSet;
 use ecod::election::{Election, ElectionConfig};
 use ecod::epoch::{Epoch, EpochGate};
 use ecod::names::NodeName;
+use ecod::round::{RoundClose, RoundConfig, RoundTrigger};
+use ecod::time::Timestamp;
 
 /// What can happen to a cell.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -71,6 +73,7 @@ pub(crate) struct Node {
     pub(crate) paused_until: u64,
     pub(crate) waiting: Vec<Event>,
     pub(crate) publishing: Option<(Epoch, u64)>,
+    pub(crate) rounds: RoundTrigger,
     pub(crate) gate: EpochGate,
     pub(crate) known: BTreeSet<usize>,
     pub(crate) packets: u64,
@@ -91,6 +94,10 @@ impl Node {
             paused_until: 0,
             waiting: Vec::new(),
             publishing: None,
+            rounds: RoundTrigger::new(
+                RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() },
+                Timestamp(0),
+            ),
             gate: EpochGate::default(),
             known: BTreeSet::new(),
             packets: 0,

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
 use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::epoch::{Epoch, EpochGate};
 use ecod::names::NodeName;
-use ecod::round::{CONNECT_TIME, FirstRound};
+use ecod::round::FirstRound;
 use ecod::time::Timestamp;
 use ecod::wire::{Encoding, Role};
 
@@ -15,8 +15,6 @@ use crate::random::Random;
 
 /// Microseconds in a millisecond.
 pub(crate) const MS: u64 = 1000;
-/// Time between two rounds.
-pub(crate) const PERIOD: u64 = 100 * MS;
 /// All parts work.
 pub(crate) const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 10 };
 
@@ -323,18 +321,16 @@ impl World {
 
     fn begin_to_publish(&mut self, index: usize, epoch: Epoch, first_round: u64, first: FirstRound) {
         let node = &mut self.nodes[index];
-        let renewed = node.publishing.is_some();
-        let last = node.accepted.last().map_or(0, |last| last.at);
         let term = epoch.term;
         node.publishing = Some((epoch, first_round));
-        let due = (last + PERIOD).saturating_sub(self.now);
-        let after = match first {
-            FirstRound::OnTime if !renewed => PERIOD,
-            FirstRound::OnTime | FirstRound::Overdue => due,
-            FirstRound::AfterConnects => due.max(CONNECT_TIME.as_micros() as u64),
-        };
-        let life = node.life;
-        self.push(after, Event::Publish { to: index, life, term });
+        node.rounds.start(first, Timestamp(self.now));
+        self.plan_round(index, term);
+    }
+
+    fn plan_round(&mut self, index: usize, term: u64) {
+        let node = &self.nodes[index];
+        let (life, after) = (node.life, node.rounds.deadline().since(Timestamp(self.now)));
+        self.push(after.as_micros() as u64, Event::Publish { to: index, life, term });
     }
 
     fn publish(&mut self, index: usize, term: u64) {
@@ -343,9 +339,10 @@ impl World {
         if epoch.term != term {
             return;
         }
-        let (epoch, round, life) = (epoch.clone(), *next, node.life);
+        let (epoch, round) = (epoch.clone(), *next);
         *next += 1;
-        self.push(PERIOD, Event::Publish { to: index, life, term });
+        node.rounds.tick(Timestamp(self.now));
+        self.plan_round(index, term);
         for to in 0..self.nodes.len() {
             if to != index && self.linked(index, to) {
                 let retry = if self.random.chance(self.loss_percent) { 30 * MS } else { 0 };

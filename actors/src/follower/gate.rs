@@ -14,8 +14,8 @@ use crate::leader_election::Leadership;
 /// elected leader, or where there is no election whoever publishes, for no longer than this.
 pub(super) const MEMORY: Duration = Duration::from_secs(3);
 
-/// How long the elected leader may be silent, from when it is first known, before another with a later epoch is believed
-/// to have taken over: the word of its election may have been lost.
+/// How long the elected leader may be silent, from when a message first finds it elected, before another with a later
+/// epoch is believed to have taken over: the word of its election may have been lost.
 const SILENCE: Duration = Duration::from_millis(250);
 
 /// How long one with a later epoch is believed while the election names another: the word may be under way.
@@ -162,7 +162,11 @@ impl Gate {
     ) -> Result<(), Refusal> {
         if epoch > elected {
             let known = self.elected.as_ref().filter(|known| received_at.since(known.heard_at) < SILENCE);
-            let usurps = known.is_some_and(|known| !known.is_succeeded_by(epoch, round, standby));
+            let goes_on = self.gate.latest().is_some_and(|(latest, _)| latest == epoch);
+            let usurps = known.is_some_and(|known| match known.last_round {
+                None if goes_on => false,
+                _ => !known.is_succeeded_by(epoch, round, standby),
+            });
             if usurps || self.overruled.as_ref() == Some(elected) {
                 return Err(Refusal::NotElected);
             }
@@ -282,6 +286,19 @@ mod tests {
             assert_eq!(gate.admit(&rival, 3, at(300), &leadership), Err(Refusal::NotElected));
             assert_eq!(gate.admit(&rival, 5, at(500), &leadership), Ok(()), "the elected is silent");
         }
+    }
+
+    #[test]
+    fn who_was_taken_before_the_elected_was_known_is_taken_until_the_elected_is_heard() {
+        let (elected, rival, renewed) = (epoch(1, "edge"), epoch(1, "v02"), epoch(2, "edge"));
+        let mut gate = Gate::new(0, Some(watch::channel(1).1));
+        assert_eq!(gate.admit(&rival, 1, at(0), &Leadership::default()), Ok(()));
+        let leadership = led_by(elected.clone(), None);
+        assert_eq!(gate.admit(&elected, 1, at(20), &leadership), Err(Refusal::Superseded));
+        assert_eq!(gate.admit(&rival, 2, at(100), &leadership), Ok(()), "one of both goes on");
+        let leadership = led_by(renewed.clone(), None);
+        assert_eq!(gate.admit(&renewed, 5, at(420), &leadership), Ok(()), "it leads on in a term above both");
+        assert_eq!(gate.admit(&rival, 6, at(430), &leadership), Err(Refusal::Superseded));
     }
 
     #[test]

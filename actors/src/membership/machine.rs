@@ -149,11 +149,11 @@ impl Machine {
         self.spread(at);
     }
 
-    /// Sends a datagram to a node, once; to one that the gossip has given up as well, which may hear less than those who
-    /// send.
+    /// Sends a datagram to a node, once; for a while to one that the gossip has given up as well, which may hear less than
+    /// those who send.
     pub(super) fn send(&mut self, to: &NodeName, payload: &[u8], now: Timestamp) {
         let at = self.advance(now);
-        let address = self.gossip.alive().get(to).map(|id| id.gossip).or_else(|| self.sessions.address(to));
+        let address = self.gossip.alive().get(to).map(|id| id.gossip).or_else(|| self.sessions.heard_at(to, at));
         match address {
             Some(address) if !self.left => self.post(to, address, Kind::Payload, payload, at),
             _ => self.counters.count(FrameEvent::NoSession),

@@ -135,6 +135,12 @@ impl Sessions {
         Some(self.peers.get(self.speakers.get(name)?)?.address)
     }
 
+    /// Where the speaker for a name is, if it was heard lately.
+    pub(super) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
+        let peer = self.peers.get(self.speakers.get(name)?)?;
+        (now.since(peer.heard) < FORGET_AFTER).then_some(peer.address)
+    }
+
     /// Whether a node may be greeted now that was heard of or from.
     pub(super) fn may_greet(&mut self, now: Timestamp) -> bool {
         self.greetings.allow(now) || self.throttled()
@@ -370,7 +376,7 @@ impl From<HeadError> for FrameEvent {
 const GREETINGS: u32 = 256;
 const STEADY: Duration = Duration::from_millis(10);
 
-/// A session that has been silent for so long gives way to a new one.
+/// A session that has been silent for so long gives way to a new one, and is sent to only if the gossip holds it alive.
 const FORGET_AFTER: Duration = Duration::from_secs(10);
 
 /// How long frames of a node that was restarted may be under way.
