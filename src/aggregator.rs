@@ -106,7 +106,9 @@ impl Aggregator {
     /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says.
     pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {
         self.leads = Some(epoch);
-        self.next_round = first_round;
+        // Rounds that were closed meanwhile count.
+        let least = if first == FirstRound::InStep { self.next_round } else { 0 };
+        self.next_round = first_round.max(least);
         self.rounds.start(first, now);
     }
 

@@ -39,8 +39,8 @@
 //! for a lost packet. Moreover the beat carries what a successor needs, its round and its successors, and proves that
 //! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as its
 //! cost per node does not grow with the cell; what it finds enters as [`Input::PeerAlive`] and [`Input::PeerDown`]. To
-//! keep a leader's packets few, only its standby gets every beat, its other successors every eighth, and everyone else
-//! one each `idle_beat_ms`.
+//! keep a leader's packets few, only its standby gets every beat, its other successors and better nodes that are not fit
+//! every eighth, and everyone else one each `idle_beat_ms`.
 
 #![deny(clippy::indexing_slicing)]
 
@@ -320,9 +320,7 @@ impl Election {
     }
 
     fn greet(&mut self, to: &NodeName, now: Timestamp) {
-        // Who seeks takes nothing that is lower than what it followed last.
-        let lost = if matches!(self.state, State::Seeking(_)) { self.epoch.clone() } else { None };
-        self.send(to, Body::Status { over: self.over.clone().max(lost) }, now);
+        self.send(to, Body::Status { over: self.over.clone() }, now);
     }
 
     fn send(&mut self, to: &NodeName, body: Body, now: Timestamp) {

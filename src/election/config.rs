@@ -18,7 +18,8 @@ pub struct ElectionConfig {
     pub role: Role,
     /// Preference among nodes of one role, higher leads first. Default 100.
     pub priority: u8,
-    /// Time between two beats of the leader to its standby, in ms; its other successors get every eighth. Default 50.
+    /// Time between two beats of the leader to its standby, in ms; its other successors, and better nodes that are not
+    /// fit, get every eighth. Default 50.
     /// Shorter finds a silent leader sooner and costs packets.
     pub beat_ms: u64,
     /// Time between two beats of the leader to everyone else, in ms. Default 2500. Shorter costs a large cell packets.

@@ -21,7 +21,7 @@ pub(super) struct Following {
     every: Duration,
     /// When its last round was taken.
     round_at: Option<Timestamp>,
-    /// Gaps between its first rounds, which may be short, that were not taken for its rhythm.
+    /// Short gaps between its first rounds, which were not taken for its rhythm.
     early_gaps: usize,
     /// How far apart its rounds come, as long as they come.
     rhythm: Option<Duration>,
@@ -84,12 +84,14 @@ impl Following {
 
     /// A round of the leader's was taken. The rhythm follows a slower one at once, and a faster one in time.
     pub(super) fn take_round(&mut self, least: Duration, now: Timestamp) {
-        let last = self.round_at.replace(now);
-        if last.is_some() && self.early_gaps < EARLY_ROUNDS {
-            self.early_gaps += 1;
-        } else if let Some(last) = last {
-            let known = self.rhythm.unwrap_or_default();
-            self.rhythm = Some(now.since(last).max(known * 7 / 8).max(least));
+        if let Some(last) = self.round_at.replace(now) {
+            let gap = now.since(last);
+            if gap < least * 3 / 2 && self.early_gaps < EARLY_ROUNDS {
+                self.early_gaps += 1;
+            } else {
+                let known = self.rhythm.unwrap_or_default();
+                self.rhythm = Some(gap.max(known * 7 / 8).max(least));
+            }
         }
         self.hear(now);
     }
@@ -182,7 +184,12 @@ impl Election {
                     self.follow(beat, now);
                 }
             }
-            State::Following(_) | State::Seeking(_) => self.greet(&beat.epoch.leader, now),
+            State::Following(_) => self.greet(&beat.epoch.leader, now),
+            // It is lower than what was followed last: that one is lost, and has to be outdone.
+            State::Seeking(_) => {
+                let over = self.epoch.clone().max(self.over.clone());
+                self.send(&beat.epoch.leader, Body::Status { over }, now);
+            }
         }
     }
 
@@ -293,7 +300,8 @@ impl Election {
             State::Following(following) if following.epoch.leader == message.from => {
                 let leads = message.epoch.as_ref() == Some(&following.epoch);
                 // Others' word of the leadership may overtake what the leader sent before.
-                let is_earlier = message.term < following.epoch.term;
+                let is_unheard = following.direct_at == Timestamp::default();
+                let is_earlier = is_unheard && message.term < following.epoch.term;
                 if !leads && !is_earlier && !matches!(message.body, Body::Beat { .. }) {
                     let ended = following.epoch.clone();
                     let follows = message.epoch.clone().filter(|next| {

@@ -24,8 +24,9 @@ pub(super) struct Handover {
 impl Election {
     /// Starts a handover when a better candidate has been there long enough.
     pub(super) fn start_handover(&mut self, now: Timestamp) {
-        let challenger = self.peers.challenger(&self.id, self.standing(), self.config.stable(), now);
+        let own = (&self.id, self.standing());
         let State::Leading(leading) = &mut self.state else { return };
+        let challenger = self.peers.challenger(own, leading.since, self.config.stable(), now);
         let Some((to, _)) = challenger.filter(|(_, from)| leading.handover.is_none() && now >= *from) else { return };
         leading.handover =
             Some(Handover { to: to.clone(), retry_at: now, started_at: now, ready_at: None, yielded: false });
@@ -75,8 +76,6 @@ impl Election {
         let least = self.config.beat();
         match &mut self.state {
             State::Following(following) if following.epoch == *epoch => following.take_round(least, now),
-            // Who has taken a round of a later leadership refuses this one's.
-            State::Leading(leading) if *epoch > leading.epoch => self.renew_later(now),
             State::Leading(leading) => {
                 if let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some()) {
                     handover.yielded = true;

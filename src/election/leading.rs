@@ -15,6 +15,7 @@ use crate::wire::Role;
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Leading {
     pub(super) epoch: Epoch,
+    pub(super) since: Timestamp,
     /// The epoch that this one succeeded.
     pub(super) after: Option<Epoch>,
     /// Who leads next, the standby first.
@@ -29,7 +30,7 @@ pub(super) struct Leading {
 
 impl Leading {
     pub(super) fn new(epoch: Epoch, after: Option<Epoch>, successors: Vec<NodeName>, now: Timestamp) -> Self {
-        Self { epoch, after, successors, handover: None, renew_at: None, beat_at: now, beats: 0 }
+        Self { epoch, since: now, after, successors, handover: None, renew_at: None, beat_at: now, beats: 0 }
     }
 
     pub(super) fn deadline(&self) -> Timestamp {
@@ -99,7 +100,11 @@ impl Election {
         match leading.successors.iter().position(|name| name == to) {
             Some(0) => self.config.beat(),
             Some(_) => self.config.near_beat(),
-            None if self.peers.get(to).and_then(|peer| peer.standing).is_some_and(outranks) => self.config.near_beat(),
+            None if self.peers.get(to).and_then(|peer| peer.standing).is_some_and(outranks)
+                && self.peers.hears(to, self.clock.now()) =>
+            {
+                self.config.near_beat()
+            }
             None => self.config.idle_beat(),
         }
     }

@@ -102,7 +102,8 @@ pub enum Body {
     /// "This is how I stand": a greeting, and the answer to a beat.
     #[n(0)]
     Status {
-        /// The highest epoch that the sender knows to be over, such as that of a leader whose broker refused it.
+        /// The highest epoch that the sender knows to be over, such as that of a leader whose broker refused it, or that
+        /// it has lost when it refuses a lower one's beat.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[n(0)]
         over: Option<Epoch>,

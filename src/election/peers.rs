@@ -195,22 +195,29 @@ impl Peers {
     /// The best peer that has been fit for `stable` and should have the lead of `leader` with `standing`.
     ///
     /// Load never takes the lead from a living leader: leading is load, and moving for it would swing. It is only
-    /// respected: among equals the lesser name is handed the lead unless it is busier. A better one that has stood most
-    /// of its trial is waited for: the lead would move twice.
+    /// respected: among equals the lesser name is handed the lead unless it is busier, once the leader has led `since`
+    /// long enough to know that nobody better is there. A better one that has stood most of its trial is waited for: the
+    /// lead would move twice.
     pub(super) fn challenger(
         &self,
-        leader: &NodeName,
-        standing: Standing,
+        (leader, standing): (&NodeName, Standing),
+        since: Timestamp,
         stable: Duration,
         now: Timestamp,
     ) -> Option<(NodeName, Timestamp)> {
-        self.candidates(now)
-            .filter(|(name, _)| self.hears(name, now))
+        let ours = standing.class();
+        let present = || self.candidates(now).filter(|(name, _)| self.hears(name, now));
+        let is_best = present().all(|(_, other)| other.class() >= ours);
+        present()
             .filter(|&(name, other)| {
-                let (ours, theirs) = (standing.class(), other.class());
-                theirs < ours || (theirs == ours && other.load <= standing.load && name < leader)
+                let theirs = other.class();
+                theirs < ours || (is_best && theirs == ours && other.load <= standing.load && name < leader)
             })
-            .filter_map(|(name, other)| Some((name, other, self.table.get(name)?.fit_since? + stable)))
+            .filter_map(|(name, other)| {
+                let fit_since = self.table.get(name)?.fit_since?;
+                let since = if other.class() < ours { fit_since } else { fit_since.max(since) };
+                Some((name, other, since + stable))
+            })
             .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.class(), name.clone()))
             .map(|(name, _, from)| (name.clone(), from))
     }

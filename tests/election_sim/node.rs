@@ -75,6 +75,7 @@ pub(crate) struct Node {
     pub(crate) publishing: Option<(Epoch, u64)>,
     pub(crate) rounds: RoundTrigger,
     pub(crate) gate: EpochGate,
+    pub(crate) elected_refused_since: Option<u64>,
     pub(crate) known: BTreeSet<usize>,
     pub(crate) packets: u64,
 }
@@ -99,6 +100,7 @@ impl Node {
                 Timestamp(0),
             ),
             gate: EpochGate::default(),
+            elected_refused_since: None,
             known: BTreeSet::new(),
             packets: 0,
         }

@@ -354,12 +354,24 @@ impl World {
     }
 
     fn accept(&mut self, to: usize, epoch: &Epoch, round: u64) {
+        let now = self.now;
         let node = &mut self.nodes[to];
+        let is_elected = node.election.as_ref().and_then(Election::epoch) == Some(epoch);
         if node.gate.admit(epoch, round).is_err() {
             node.stale_refused += 1;
-            return;
+            // As the gate of a real node: the elected is not refused for ever.
+            let since = is_elected.then(|| *node.elected_refused_since.get_or_insert(now));
+            if since.is_none_or(|since| now - since < 500 * MS) {
+                return;
+            }
+            node.gate = EpochGate::default();
+            node.gate.admit(epoch, round).expect("the first");
         }
-        node.accepted.push(Accepted { at: self.now, round });
-        self.handle(to, Input::Round { epoch: epoch.clone(), round });
+        node.accepted.push(Accepted { at: now, round });
+        // As in a real node: rounds of others prove nothing.
+        if is_elected {
+            node.elected_refused_since = None;
+            self.handle(to, Input::Round { epoch: epoch.clone(), round });
+        }
     }
 }

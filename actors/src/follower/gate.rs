@@ -15,7 +15,8 @@ use crate::leader_election::Leadership;
 pub(super) const MEMORY: Duration = Duration::from_secs(3);
 
 /// How long the elected leader may be silent, from when a message first finds it elected, before another with a later
-/// epoch is believed to have taken over: the word of its election may have been lost.
+/// epoch is believed to have taken over, but for its standby and who was taken before: the word of an election may have
+/// been lost.
 const SILENCE: Duration = Duration::from_millis(250);
 
 /// How long one with a later epoch is believed while the election names another: the word may be under way.
@@ -50,7 +51,7 @@ pub(super) struct Gate {
     known_term: Option<watch::Receiver<u64>>,
     newest_at: Option<Timestamp>,
     elected: Option<Elected>,
-    /// Since when others than the elected pass.
+    /// Since when others than the elected pass, or it does not.
     others_since: Option<Timestamp>,
     /// The elected epoch in which others have used up their credit.
     overruled: Option<Epoch>,
@@ -141,10 +142,12 @@ impl Gate {
         if self.elected.as_ref().and_then(|elected| elected.last_round).is_some_and(|last| round <= last) {
             return Err(Refusal::Repeated);
         }
-        let usurped = self.others_since.is_some_and(|since| received_at.since(since) >= CREDIT);
-        if usurped && self.gate.latest().is_some_and(|(latest, _)| latest > epoch) {
-            self.gate = EpochGate::default();
-            self.overruled = Some(epoch.clone());
+        if self.gate.latest().is_some_and(|(latest, _)| latest > epoch) {
+            let since = *self.others_since.get_or_insert(received_at);
+            if received_at.since(since) >= CREDIT {
+                self.gate = EpochGate::default();
+                self.overruled = Some(epoch.clone());
+            }
         }
         self.admit_in_order(epoch, round, received_at, true)?;
         self.elected = Some(Elected { epoch: epoch.clone(), last_round: Some(round), heard_at: received_at });
@@ -299,6 +302,16 @@ mod tests {
         let leadership = led_by(renewed.clone(), None);
         assert_eq!(gate.admit(&renewed, 5, at(420), &leadership), Ok(()), "it leads on in a term above both");
         assert_eq!(gate.admit(&rival, 6, at(430), &leadership), Err(Refusal::Superseded));
+    }
+
+    #[test]
+    fn the_elected_is_heard_half_a_second_after_a_later_one_that_said_one_word_only() {
+        let (elected, later) = (epoch(6, "euclid"), epoch(6, "gauss"));
+        let mut gate = Gate::new(0, Some(watch::channel(5).1));
+        assert_eq!(gate.admit(&later, 40, at(0), &Leadership::default()), Ok(()));
+        let leadership = led_by(elected.clone(), None);
+        let passes = (1..10).map(|n| gate.admit(&elected, 40 + n, at(100 * n), &leadership).is_ok());
+        assert_eq!(passes.collect::<Vec<_>>(), [[false; 5].as_slice(), &[true; 4]].concat());
     }
 
     #[test]
