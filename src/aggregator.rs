@@ -103,9 +103,14 @@ impl Aggregator {
         aggregator
     }
 
-    /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says.
+    /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says. Evidence comes of
+    /// what vehicles say from then on: what they said before may have counted in another's lane, on the other side of a
+    /// split perhaps, and is never counted twice.
     pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {
-        self.leads = Some(epoch);
+        if self.leads.replace(epoch).is_none() {
+            self.vote.iter_mut().for_each(|vote| vote.begin_record(now));
+            self.tracks.iter_mut().for_each(|tracks| tracks.begin_record(now));
+        }
         // Rounds that were closed meanwhile count.
         let least = if first == FirstRound::InStep { self.next_round } else { 0 };
         self.next_round = first_round.max(least);

@@ -87,6 +87,8 @@ pub struct Tracker {
     late: u64,
     refused: u64,
     evidence: Vec<Evidence>,
+    /// What is seen from then on becomes evidence.
+    recorded_from: Timestamp,
 }
 
 /// Side of a large cell in metres.
@@ -113,6 +115,7 @@ impl Tracker {
             late: 0,
             refused: 0,
             evidence: Vec::new(),
+            recorded_from: Timestamp(0),
         }
     }
 
@@ -165,6 +168,12 @@ impl Tracker {
                 source.standing.count(*correct, &config);
             }
         }
+    }
+
+    /// A leadership begins: what was seen before `now` is for whoever led before to settle.
+    pub(crate) fn begin_record(&mut self, now: Timestamp) {
+        self.recorded_from = now;
+        self.evidence.clear();
     }
 
     fn heard(&mut self, node: &NodeName) -> Option<&mut Source> {

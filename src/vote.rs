@@ -264,6 +264,14 @@ impl Vote {
         Round { verdicts, evidence }
     }
 
+    /// A leadership begins: what was said before `now` is no evidence that this aggregator settles, as whoever led before
+    /// does or has done so. It goes on deciding verdicts.
+    pub(crate) fn begin_record(&mut self, now: Timestamp) {
+        if let Tally::Weighted(tally) = &mut self.tally {
+            tally.begin_record(now);
+        }
+    }
+
     fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
         match &self.tally {
             Tally::Paper(tally) => tally.verdict(landmark),

@@ -148,3 +148,50 @@ fn settled_votes_become_evidence_that_another_aggregator_adopts() {
     let reputations = other.reputations();
     assert!(reputations[&NodeName::from_static("euclid")].score > reputations[&NodeName::from_static("liar")].score);
 }
+
+/// All that the cell settles of votes from `from_ms` to `until_ms` and of silence for three seconds, by vehicle.
+fn settled(cell: &mut Aggregator, nodes: &[&str], (from_ms, until_ms): (u64, u64)) -> BTreeMap<NodeName, usize> {
+    let mut settled = BTreeMap::new();
+    for step in (from_ms / 100)..(until_ms / 100 + 30) {
+        let mut closed = Vec::new();
+        if step < until_ms / 100 {
+            for node in nodes {
+                closed.extend(cell.report(VoteDetections, &report(node, "cup", step * 100), at(step * 100)).unwrap());
+            }
+        }
+        closed.extend(cell.tick(at(step * 100 + 50)));
+        for evidence in closed.into_iter().flat_map(|fused| fused.evidence) {
+            *settled.entry(evidence.node).or_default() += 1;
+        }
+    }
+    settled
+}
+
+#[test]
+fn votes_that_are_open_when_the_cell_splits_are_settled_on_one_side_only() {
+    let mut edge = leader(FusionConfig::default());
+    let mut standby = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
+    for step in 1..10u64 {
+        for node in ["euclid", "gauss"] {
+            let vote = report(node, "cup", step * 100);
+            edge.report(VoteDetections, &vote, at(step * 100)).unwrap();
+            standby.report(VoteDetections, &vote, at(step * 100)).unwrap();
+        }
+    }
+    standby.lead(Epoch::new(4, NodeName::from_static("standby")), 10, FirstRound::Overdue, at(950));
+    // Neither vehicle reaches the standby again, and one of them the edge: each has voted for less than two seconds.
+    let at_the_edge = settled(&mut edge, &["euclid"], (1000, 1500));
+    let at_the_standby = settled(&mut standby, &[], (1000, 1500));
+    assert_eq!(at_the_edge.values().copied().collect::<Vec<_>>(), [1, 1], "{at_the_edge:?}");
+    assert!(at_the_standby.is_empty(), "{at_the_standby:?}");
+}
+
+#[test]
+fn what_is_said_to_a_new_leader_is_its_evidence() {
+    let mut standby = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
+    let before = settled(&mut standby, &["euclid", "gauss"], (100, 1000));
+    assert!(before.is_empty());
+    standby.lead(Epoch::new(4, NodeName::from_static("standby")), 10, FirstRound::Overdue, at(5000));
+    let after = settled(&mut standby, &["euclid", "gauss"], (5000, 6000));
+    assert_eq!(after.values().copied().collect::<Vec<_>>(), [1, 1], "{after:?}");
+}

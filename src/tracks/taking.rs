@@ -285,7 +285,13 @@ impl Tracker {
         }
         let correct = word == Word::True;
         taking.source.standing.count(correct, &self.reputation);
-        self.evidence.push(Evidence { node: taking.source.node.clone(), label: track.label(&self.config), correct });
+        if at >= self.recorded_from {
+            self.evidence.push(Evidence {
+                node: taking.source.node.clone(),
+                label: track.label(&self.config),
+                correct,
+            });
+        }
     }
 
     /// A detection that is none of the known objects is a new one.

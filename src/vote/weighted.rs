@@ -45,6 +45,8 @@ pub(super) struct WeightedTally {
     revisit_after: Option<LandmarkId>,
     fresh_votes: usize,
     evidence: Vec<Evidence>,
+    /// Votes from then on become evidence.
+    recorded_from: Option<Timestamp>,
 }
 
 impl WeightedTally {
@@ -65,7 +67,15 @@ impl WeightedTally {
             revisit_after: None,
             fresh_votes: 0,
             evidence: Vec::new(),
+            recorded_from: None,
         }
+    }
+
+    /// See [`super::Vote::begin_record`].
+    pub(super) fn begin_record(&mut self, now: Timestamp) {
+        self.recorded_from = Some(now);
+        self.evidence.clear();
+        self.ballots.values_mut().flat_map(|ballot| &mut ballot.casts).for_each(|cast| cast.since = now);
     }
 
     pub(super) fn expect(&mut self, landmark: LandmarkId) {
@@ -225,11 +235,13 @@ impl WeightedTally {
                 let correct = ballot.shown == Some(cast.label);
                 let record = &mut self.records[cast.vehicle];
                 *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
-                self.evidence.push(Evidence {
-                    node: self.names[cast.vehicle].clone(),
-                    label: self.labels.name(cast.label).clone(),
-                    correct,
-                });
+                if self.recorded_from.is_none_or(|from| cast.at >= from) {
+                    self.evidence.push(Evidence {
+                        node: self.names[cast.vehicle].clone(),
+                        label: self.labels.name(cast.label).clone(),
+                        correct,
+                    });
+                }
             }
         }
         for cast in &mut ballot.casts {
