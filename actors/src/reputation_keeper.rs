@@ -11,12 +11,14 @@
 //!   Receivers take the larger count: shares may come late, twice, or in any order.
 //! - What is published was saved before. What an actor knew outlives it in its [`Book`]; what a node knew outlives it in
 //!   its state directory.
-//! - Whoever has led sends all it knows to a leader that it hears for the first time: when a split heals, the evidence
-//!   of both sides is kept, that of leaders who are gone too. So a leader shares even that it has none.
+//! - Whoever has led sends all it knows to a leader that it hears for the first time, and everybody, a little later, what
+//!   has not been shared since: when a split heals, the evidence of both sides is kept, that of leaders who are gone too.
+//!   So a leader shares even that it has none.
 //! - Evidence is taken of members that may lead, and of terms that the election knows; the present leader's always has room.
 
 mod book;
 mod config;
+mod owed;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -49,6 +51,7 @@ use crate::membership::Member;
 use crate::seat::Seat;
 use crate::state_file::StateFile;
 use book::Saved;
+use owed::Owed;
 
 /// What the keeper is asked to do.
 #[derive(Debug)]
@@ -128,21 +131,13 @@ pub struct ReputationKeeperState {
     has_led: bool,
     last_round: u64,
     published: Option<(Epoch, u64)>,
-    /// The leader whose shares came last.
-    heard: Option<Epoch>,
-    /// Whether it has yet to be told what this node knows.
-    owes_all: bool,
-    all_sent: Option<Timestamp>,
+    owed: Owed,
     unsaved: bool,
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
     disk_failed: bool,
     ticks: u32,
 }
-
-/// Least time between two times that everything is sent to a leader that is new: leaders may come and go fast, or only
-/// seem to.
-const ALL_PAUSE: Duration = Duration::from_secs(5);
 
 /// How long a disk may take before reputations are published unsaved.
 const WRITE_PATIENCE: Duration = Duration::from_secs(1);
@@ -203,9 +198,7 @@ impl ReputationKeeperState {
             has_led: false,
             last_round: 0,
             published: None,
-            heard: None,
-            owes_all: false,
-            all_sent: None,
+            owed: Owed::default(),
             // A run before may have left something.
             unsaved: true,
             unadopted: false,
@@ -274,6 +267,13 @@ impl ReputationKeeperState {
         let entries: Vec<_> = share.entries.iter().filter(|e| is_news(e.epoch, &e.aggregator)).cloned().collect();
         let marks: Vec<_> = share.marks.iter().filter(|m| is_news(m.epoch, &m.aggregator)).cloned().collect();
         let present = self.leads.clone().or_else(|| self.arguments.leadership.borrow().epoch.clone());
+        let leader = share.epoch.filter(|claimed| *claimed <= term).map(|term| Epoch::new(term, share.node.clone()));
+        if self.owed.is_first_of(leader, self.ticks_to_listen()) {
+            let (entries, _) = self.evidence();
+            self.owed
+                .owe_everything(self.has_led || entries.iter().any(|entry| entry.aggregator == self.arguments.name));
+        }
+        self.owed.note(&entries, &marks);
         let mut book = self.arguments.book.open();
         let present = present.as_ref();
         let changed = book.ledger.merge_entries(entries, present) | book.ledger.merge_marks(marks, present);
@@ -283,20 +283,38 @@ impl ReputationKeeperState {
             self.unsaved = true;
             self.unadopted = true;
         }
-        let leader = share.epoch.filter(|claimed| *claimed <= term).map(|term| Epoch::new(term, share.node.clone()));
-        if leader.is_some() && leader != self.heard {
-            self.heard = leader;
-            let (entries, _) = self.evidence();
-            self.owes_all = self.has_led || entries.iter().any(|entry| entry.aggregator == self.arguments.name);
-        }
         self.send_all(delivery.received_at);
     }
 
     /// Sends everything to a leader that may not have it, not too often.
     fn send_all(&mut self, now: Timestamp) {
-        if self.owes_all && self.all_sent.is_none_or(|at| now.since(at) >= ALL_PAUSE) {
-            (self.owes_all, self.all_sent) = (false, Some(now));
+        if self.owed.takes_everything(now) {
             let (entries, marks) = self.evidence();
+            self.share(&entries, &marks);
+        }
+    }
+
+    /// For how long a leader is listened to before it is told what it has not shared: it shares everything in two thirds
+    /// of that, and who comes earlier among the candidates speaks first.
+    fn ticks_to_listen(&self) -> u32 {
+        let members = self.arguments.members.borrow();
+        let earlier = members.iter().filter(|member| member.role != Role::Cav && member.name < self.arguments.name);
+        let period = self.arguments.config.ticks_per_snapshot();
+        period + period.div_ceil(2) + u32::try_from(earlier.count()).unwrap_or(u32::MAX) % period.max(1)
+    }
+
+    /// Sends the leader what nobody has shared with it.
+    fn send_owed(&mut self) {
+        if self.leads.is_some() {
+            return;
+        }
+        let Some(shared) = self.owed.tick(self.arguments.config.ticks_per_snapshot()) else { return };
+        let term = *self.arguments.term.borrow();
+        let (mut entries, mut marks) = self.arguments.book.open().ledger.beyond(shared);
+        entries.retain(|entry| entry.epoch <= term);
+        marks.retain(|mark| mark.epoch <= term);
+        if !entries.is_empty() || !marks.is_empty() {
+            tracing::info!(entries = entries.len(), "sharing evidence that the leader has not shared");
             self.share(&entries, &marks);
         }
     }
@@ -305,6 +323,7 @@ impl ReputationKeeperState {
         self.save().await;
         self.publish();
         self.send_all(clock::now());
+        self.send_owed();
         if std::mem::take(&mut self.unadopted) {
             let ledger = Arc::new(self.arguments.book.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });

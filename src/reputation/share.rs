@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use super::{Counts, Record, ReputationLedger, Vehicles};
 use crate::epoch::Epoch;
 use crate::names::{Label, NodeName};
-use crate::wire::LedgerEntry;
+use crate::wire::{LedgerEntry, LedgerMark};
 
 /// Most lanes that are kept: the latest.
 pub const MAX_LANES: usize = 64;
@@ -47,6 +47,21 @@ impl ReputationLedger {
             Some(entry(lane.term, &lane.leader, node, label, *counts))
         };
         keys.iter().filter_map(find).collect()
+    }
+
+    /// The counts and marks that `other` would learn something from.
+    pub fn beyond(&self, other: &Self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
+        let is_news = |entry: &LedgerEntry| {
+            let lane = other.lane((entry.epoch, &entry.aggregator));
+            let known = lane.and_then(|lane| lane.get(&entry.node)?.labels.get(&entry.label));
+            known.is_none_or(|known| known.correct < entry.correct || known.incorrect < entry.incorrect)
+        };
+        let is_new_mark = |mark: &LedgerMark| {
+            let lane = other.lane((mark.epoch, &mark.aggregator));
+            let known = lane.and_then(|lane| lane.get(&mark.node)).map(|record| &record.marks);
+            known.is_none_or(|known| known.would_keep(mark.number) && !known.has(mark.number))
+        };
+        (self.entries().filter(is_news).collect(), self.marks().filter(is_new_mark).collect())
     }
 
     /// Takes the larger of every count; true when that changed anything. What is beyond [`MAX_LANES`] and
@@ -173,6 +188,23 @@ mod tests {
         let changed = [EntryKey { lane, node: name("euclid"), label: "cup".into() }].into();
         copy.merge_entries(ledger.entries_of(&changed), None);
         assert_eq!(copy, ledger);
+    }
+
+    #[test]
+    fn what_another_lacks_makes_it_the_same_and_no_more() {
+        let mut ledger = ReputationLedger::default();
+        (0..200).for_each(|n| ledger.record(2, &name("edge"), &vote(n % 3 > 0)));
+        let mut other = ledger.clone();
+        (0..200).for_each(|n| ledger.record(2, &name("edge"), &vote(n % 3 > 0)));
+        ledger.record(1, &name("gauss"), &vote(true));
+        other.record(3, &name("edge"), &vote(true));
+        let (entries, marks) = ledger.beyond(&other);
+        assert_eq!(entries.len(), 2);
+        other.merge_entries(entries, None);
+        other.merge_marks(marks, None);
+        assert_eq!(ledger.beyond(&other), (Vec::new(), Vec::new()));
+        ledger.merge(&other);
+        assert_eq!(other, ledger);
     }
 
     #[test]

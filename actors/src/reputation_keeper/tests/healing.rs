@@ -60,6 +60,13 @@ impl Keeper {
         self.hand_over(Some(other)).await;
     }
 
+    /// Lets so much time pass that what the leader has not shared is sent.
+    async fn listen_out(&mut self) {
+        for _ in 0..2 * self.state.arguments.config.ticks_per_snapshot() {
+            self.state.tick().await;
+        }
+    }
+
     async fn hand_over(&mut self, mut to: Option<&mut Self>) {
         // The wire has taken what was sent before this.
         self.state.publish_share(&[], &[]);
@@ -109,12 +116,32 @@ async fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_r
 }
 
 #[tokio::test]
+async fn what_only_followers_know_of_a_leader_that_is_gone_reaches_the_next() {
+    let (mut a, mut b1, mut b2) = (Keeper::new("a").await, Keeper::new("b1").await, Keeper::new("b2").await);
+    b1.lead(2);
+    b1.record(2, "euclid");
+    b1.share_with(&mut b2).await;
+    drop(b1);
+    a.lead(3);
+    a.record(3, "gauss");
+    a.share_with(&mut b2).await;
+    b2.listen_out().await;
+    b2.hand_over(Some(&mut a)).await;
+    assert_eq!(a.vehicles(), ["euclid", "gauss"]);
+    a.share_with(&mut b2).await;
+    b2.listen_out().await;
+    b2.state.publish_share(&[], &[]);
+    assert_eq!(b2.next_share().await.entries, [], "once the leader has it, nothing more comes");
+}
+
+#[tokio::test]
 async fn who_never_led_is_silent_when_it_hears_a_leader() {
     let (mut leader, mut other) = (Keeper::new("leader").await, Keeper::new("other").await);
     leader.lead(1);
     leader.record(1, "euclid");
     leader.share_with(&mut other).await;
     assert_eq!(other.vehicles(), ["euclid"]);
+    other.listen_out().await;
     other.state.publish_share(&[], &[]);
     assert_eq!(other.next_share().await.entries, [], "nothing came before");
 }
