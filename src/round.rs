@@ -111,10 +111,10 @@ pub const CONNECT_TIME: Duration = Duration::from_millis(25);
 
 /// How long the rounds after the first of an unplanned leadership last: a vehicle that was not connected in time waits
 /// for one of these, not for a whole period.
-const EARLY: [Duration; EARLY_ROUNDS] = [CONNECT_TIME, Duration::from_millis(50)];
+const EARLY: [Duration; 2] = [CONNECT_TIME, Duration::from_millis(50)];
 
 /// How many rounds follow more quickly on the first of an unplanned leadership than rounds do otherwise.
-pub const EARLY_ROUNDS: usize = 2;
+pub const EARLY_ROUNDS: usize = EARLY.len();
 
 /// Periods after which a silent vehicle is no longer waited for.
 const LIVE_PERIODS: u32 = 3;

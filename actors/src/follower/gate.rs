@@ -49,6 +49,7 @@ pub(super) struct Gate {
     gate: EpochGate,
     /// The highest term that the election knows; without it any is believed where nobody is known to lead.
     known_term: Option<watch::Receiver<u64>>,
+    /// When the last message passed; before any has, when the first came.
     newest_at: Option<Timestamp>,
     elected: Option<Elected>,
     /// Since when others than the elected pass, or it does not.
@@ -77,10 +78,12 @@ struct Stranger {
 }
 
 impl Elected {
-    /// Whether its standby may have taken over. Of one term there are only rivals, that began at the same time.
+    /// Whether its standby may have taken over, or itself go on in a later term, as after a split has healed. Of one term
+    /// there are only rivals, that began at the same time.
     fn is_succeeded_by(&self, epoch: &Epoch, round: u64, standby: Option<&NodeName>) -> bool {
         let goes_on = |last| round > last && round - last <= CATCH_UP;
-        standby == Some(&epoch.leader) && epoch.term > self.epoch.term && self.last_round.is_none_or(goes_on)
+        let is_next = standby == Some(&epoch.leader) || self.epoch.leader == epoch.leader;
+        is_next && epoch.term > self.epoch.term && self.last_round.is_none_or(goes_on)
     }
 }
 
@@ -150,7 +153,9 @@ impl Gate {
             }
         }
         self.admit_in_order(epoch, round, received_at, true)?;
-        self.elected = Some(Elected { epoch: epoch.clone(), last_round: Some(round), heard_at: received_at });
+        if let Some(elected) = &mut self.elected {
+            (elected.last_round, elected.heard_at) = (Some(round), received_at);
+        }
         self.others_since = None;
         Ok(())
     }
@@ -189,7 +194,7 @@ impl Gate {
         received_at: Timestamp,
         may_lead: bool,
     ) -> Result<(), Refusal> {
-        let quiet = self.newest_at.is_some_and(|newest_at| received_at.since(newest_at) >= MEMORY);
+        let quiet = received_at.since(*self.newest_at.get_or_insert(received_at)) >= MEMORY;
         let mut admitted = self.gate.admit(epoch, round);
         if admitted.is_err() && quiet && may_lead {
             self.gate = EpochGate::default();
@@ -261,6 +266,24 @@ mod tests {
         let unknown = epoch(9, "gauss");
         assert_eq!(gate.admit(&unknown, 4, at(300), &after), Err(Refusal::NotElected));
         assert_eq!(gate.admit(&unknown, 5, at(500), &after), Ok(()), "the elected has fallen silent");
+    }
+
+    #[test]
+    fn the_elected_goes_on_in_a_later_term_before_word_of_it_came() {
+        let (before, renewed) = (epoch(7, "edge"), epoch(8, "edge"));
+        let leadership = led_by(before.clone(), Some("euclid"));
+        let mut gate = Gate::new(0, None);
+        assert_eq!(gate.admit(&before, 41, at(0), &leadership), Ok(()));
+        assert_eq!(gate.admit(&renewed, 42, at(100), &leadership), Ok(()));
+        assert_eq!(gate.admit(&before, 42, at(110), &leadership), Err(Refusal::Superseded));
+    }
+
+    #[test]
+    fn a_saved_term_does_not_shut_out_for_good_who_publishes_without_any_election() {
+        let (unelected, leadership) = (epoch(3, "aggregator"), Leadership::default());
+        let mut gate = Gate::new(50, Some(watch::channel(50).1));
+        let taken = |round: &u64| gate.admit(&unelected, *round, at(100 * round), &leadership).is_ok();
+        assert_eq!((0..60).find(taken), Some(35), "half a second to be believed, and three for what was saved");
     }
 
     #[test]
