@@ -306,6 +306,9 @@ const REJOIN_PERIOD: Duration = Duration::from_secs(5);
 
 /// Joins the multicast group, if there is to be one; false when that does not work here, or not yet.
 fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
+    if config.enabled && socket.address().is_ipv6() {
+        tracing::warn!("key `membership.bind`: no discovery by multicast on IPv6, which takes `membership.seeds`");
+    }
     match socket.join(config) {
         Ok(()) => true,
         Err(error) => {

@@ -25,7 +25,8 @@ pub struct MembershipConfig {
     /// A file that holds the key; white space around it is left out. Default none. Excludes `key`.
     pub key_file: Option<PathBuf>,
     /// Address and UDP port to gossip on; port 0 takes any free one. Default port 17884, or a free one if another node
-    /// of this machine has it, on all interfaces with a key and on 127.0.0.1 without.
+    /// of this machine has it, on all interfaces with a key and on 127.0.0.1 without. With an IPv6 address all of the
+    /// cell gossips by IPv6, and finds each other by `seeds` only; link-local ones (`fe80::`) do not do.
     pub bind: Option<SocketAddr>,
     /// Address at which others reach this node, if address translation hides it. Default none: that of `bind`, or what
     /// others see.

@@ -1,6 +1,6 @@
 //! Keeps the addresses of the seeds.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -11,12 +11,15 @@ use tokio::net::lookup_host;
 use super::MembershipMessage;
 
 /// Resolves the seeds anew for ever, sooner if one could not be resolved, and tells the membership. A seed that cannot
-/// be resolved is logged once, until it can.
+/// be resolved is logged once, until it can, and keeps the addresses that it had: whoever answers for names may be gone
+/// with the network.
 pub(super) async fn resolve(seeds: Vec<String>, ipv4: bool, membership: ActorRef<MembershipMessage>) {
     let mut retry = RETRY_MIN;
     let mut unresolved = BTreeSet::new();
+    let mut known = BTreeMap::new();
     loop {
-        let addresses = resolve_once(&seeds, ipv4, &mut unresolved).await;
+        resolve_once(&seeds, ipv4, &mut known, &mut unresolved).await;
+        let addresses = known.values().flatten().copied().collect();
         let complete = unresolved.is_empty();
         if membership.cast(MembershipMessage::SetSeeds { addresses }).is_err() {
             return;
@@ -30,8 +33,12 @@ pub(super) async fn resolve(seeds: Vec<String>, ipv4: bool, membership: ActorRef
 const RETRY_MIN: Duration = Duration::from_millis(500);
 const REFRESH: Duration = Duration::from_secs(30);
 
-async fn resolve_once(seeds: &[String], ipv4: bool, unresolved: &mut BTreeSet<String>) -> Vec<SocketAddr> {
-    let mut addresses = Vec::new();
+async fn resolve_once(
+    seeds: &[String],
+    ipv4: bool,
+    known: &mut BTreeMap<String, Vec<SocketAddr>>,
+    unresolved: &mut BTreeSet<String>,
+) {
     for seed in seeds {
         let family = if ipv4 { "IPv4" } else { "IPv6" };
         let found = lookup_host(seed).await.and_then(|found| {
@@ -40,7 +47,7 @@ async fn resolve_once(seeds: &[String], ipv4: bool, unresolved: &mut BTreeSet<St
         });
         match found {
             Ok(found) => {
-                addresses.extend(found);
+                known.insert(seed.clone(), found);
                 if unresolved.remove(seed) {
                     tracing::info!(%seed, "seed resolved");
                 }
@@ -51,7 +58,6 @@ async fn resolve_once(seeds: &[String], ipv4: bool, unresolved: &mut BTreeSet<St
             Err(_) => {}
         }
     }
-    addresses
 }
 
 #[cfg(test)]
@@ -62,8 +68,11 @@ mod tests {
     async fn a_seed_of_the_wrong_family_or_without_an_address_is_tried_on() {
         let seeds = ["127.0.0.1:9", "[::1]:9", "no port"].map(str::to_owned);
         let mut unresolved = BTreeSet::from(["127.0.0.1:9".to_owned()]);
-        let addresses = resolve_once(&seeds, true, &mut unresolved).await;
-        assert_eq!(addresses, ["127.0.0.1:9".parse().unwrap()]);
+        let (usual, before): (SocketAddr, SocketAddr) =
+            ("127.0.0.1:9".parse().unwrap(), "192.0.2.1:9".parse().unwrap());
+        let mut known = BTreeMap::from([("no port".to_owned(), vec![before])]);
+        resolve_once(&seeds, true, &mut known, &mut unresolved).await;
+        assert_eq!(known.into_values().flatten().collect::<Vec<_>>(), [usual, before], "what was known once stays");
         assert_eq!(unresolved, BTreeSet::from(["[::1]:9", "no port"].map(str::to_owned)));
     }
 }
