@@ -1,23 +1,29 @@
 //! The node's clock: Unix microseconds that never go backwards.
 
 use std::sync::OnceLock;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use ecod::time::Timestamp;
+use rustix::time::{ClockId, Timespec, clock_gettime};
 
 /// The present time.
 ///
-/// The wall clock is read once, at the first call; from then on time passes by the monotonic clock. A step of the wall
-/// clock after that (NTP's first synchronisation, a daylight change by hand) is therefore not followed until the node
+/// The wall clock is read once, at the first call; from then on time passes by the monotonic clock that goes on while
+/// the machine is suspended. A step of the wall clock after that (NTP's first synchronisation, a daylight change by hand) is therefore not followed until the node
 /// restarts; aggregators estimate each vehicle's offset, so that a
 /// constant error up to their `max_clock_offset_s` does not matter to them.
 pub fn now() -> Timestamp {
-    static ANCHOR: OnceLock<(Instant, Timestamp)> = OnceLock::new();
+    static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();
     let (started, wall) = ANCHOR.get_or_init(|| {
         let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        (Instant::now(), Timestamp::default() + since_epoch)
+        (since_boot(), Timestamp::default() + since_epoch)
     });
-    *wall + started.elapsed()
+    *wall + since_boot().saturating_sub(*started)
+}
+
+fn since_boot() -> Duration {
+    let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Boottime);
+    Duration::new(u64::try_from(tv_sec).unwrap_or_default(), u32::try_from(tv_nsec).unwrap_or_default())
 }
 
 #[cfg(test)]

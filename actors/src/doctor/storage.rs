@@ -47,7 +47,7 @@ pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
         Some(dir) => findings.push(directory("state directory", dir, LITTLE, "state_dir")),
         None if config.may_lead() => findings.push(Finding::doubtful(
             "state directory",
-            "none: reputations end with the node",
+            "none: reputations, and the terms in which this node has led, end with it",
             "set `state_dir`",
         )),
         None => {}

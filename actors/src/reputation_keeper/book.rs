@@ -87,7 +87,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments) {
         return;
     }
     let Some(file) = &arguments.file else {
-        tracing::info!("no state directory: reputations end with the node");
+        tracing::warn!("no `state_dir`: reputations, and the terms in which this node has led, end with it");
         return;
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
