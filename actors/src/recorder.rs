@@ -23,6 +23,7 @@ mod pictures;
 mod reader;
 mod recording;
 mod scribe;
+mod viewers;
 mod writer;
 
 use std::sync::Arc;

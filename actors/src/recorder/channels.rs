@@ -10,10 +10,11 @@ use ecod::epoch::Epoch;
 use ecod::names::NodeName;
 use ecod::replay::JournalEntry;
 use ecod::time::Timestamp;
-use schemars::{JsonSchema, Schema, schema_for};
+use schemars::{JsonSchema, Schema};
 use serde::{Deserialize, Serialize};
 
 use super::foxglove;
+use super::viewers::schema_of;
 use crate::leader_election::{Leadership, Position};
 
 /// A channel's schema by its name in the log.
@@ -89,23 +90,23 @@ impl SchemaName {
         Self::ALL.into_iter().find(|schema| schema.as_str() == name)
     }
 
-    /// The JSON Schema of its messages.
+    /// The JSON Schema of its messages, as viewers read it.
     pub(super) fn json_schema(self) -> Schema {
         use ecod::wire;
         match self {
-            Self::ObjectReport => schema_for!(wire::ObjectReport),
-            Self::GlobalMap => schema_for!(wire::GlobalMap),
-            Self::Verdicts => schema_for!(wire::Verdicts),
-            Self::Reputations => schema_for!(wire::Reputations),
-            Self::LedgerShare => schema_for!(wire::LedgerShare),
-            Self::NodeStatus => schema_for!(wire::NodeStatus),
-            Self::Leadership => schema_for!(LeadershipChange),
-            Self::Counters => schema_for!(CounterReading),
-            Self::JournalEntry => schema_for!(JournalEntry),
-            Self::SceneUpdate => schema_for!(foxglove::SceneUpdate),
-            Self::FrameTransform => schema_for!(foxglove::FrameTransform),
-            Self::Log => schema_for!(foxglove::Log),
-            Self::CompressedImage => schema_for!(foxglove::CompressedImage),
+            Self::ObjectReport => schema_of::<wire::ObjectReport>(),
+            Self::GlobalMap => schema_of::<wire::GlobalMap>(),
+            Self::Verdicts => schema_of::<wire::Verdicts>(),
+            Self::Reputations => schema_of::<wire::Reputations>(),
+            Self::LedgerShare => schema_of::<wire::LedgerShare>(),
+            Self::NodeStatus => schema_of::<wire::NodeStatus>(),
+            Self::Leadership => schema_of::<LeadershipChange>(),
+            Self::Counters => schema_of::<CounterReading>(),
+            Self::JournalEntry => schema_of::<JournalEntry>(),
+            Self::SceneUpdate => schema_of::<foxglove::SceneUpdate>(),
+            Self::FrameTransform => schema_of::<foxglove::FrameTransform>(),
+            Self::Log => schema_of::<foxglove::Log>(),
+            Self::CompressedImage => schema_of::<foxglove::CompressedImage>(),
         }
     }
 }

@@ -3,10 +3,12 @@
 //!
 //! The fixed frame is `map`: east, north, up in metres. Every vehicle that reports its pose has a frame of its name.
 
+use std::borrow::Cow;
+
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, WirePose};
-use schemars::JsonSchema;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Serialize;
 
 /// The frame of the cell.
@@ -14,6 +16,7 @@ const MAP: &str = "map";
 
 /// A point in time or a span.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, JsonSchema)]
+#[schemars(title = "time")]
 pub(super) struct Time {
     sec: u64,
     nsec: u32,
@@ -56,6 +59,7 @@ pub(super) struct Color {
 
 /// `foxglove.FrameTransform`.
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
+#[schemars(title = "foxglove.FrameTransform")]
 pub(super) struct FrameTransform {
     timestamp: Time,
     parent_frame_id: &'static str,
@@ -64,28 +68,56 @@ pub(super) struct FrameTransform {
     rotation: Quaternion,
 }
 
-/// `foxglove.Log`; level 2 is information, 3 a warning.
+/// `foxglove.Log`.
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
+#[schemars(title = "foxglove.Log")]
 pub(super) struct Log {
     pub(super) timestamp: Time,
-    pub(super) level: u8,
+    pub(super) level: Level,
     pub(super) message: String,
     pub(super) name: String,
     pub(super) file: String,
     pub(super) line: u32,
 }
 
+/// How much an entry of the log matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(into = "u8")]
+pub(super) enum Level {
+    Info = 2,
+    Warning = 3,
+}
+
+impl From<Level> for u8 {
+    fn from(level: Level) -> Self {
+        level as Self
+    }
+}
+
+impl JsonSchema for Level {
+    fn schema_name() -> Cow<'static, str> {
+        "LogLevel".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({ "oneOf": [{ "title": "INFO", "const": 2 }, { "title": "WARNING", "const": 3 }] })
+    }
+}
+
 /// `foxglove.CompressedImage`; `data` is in base64.
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
+#[schemars(title = "foxglove.CompressedImage")]
 pub(super) struct CompressedImage {
     pub(super) timestamp: Time,
     pub(super) frame_id: NodeName,
+    #[schemars(extend("contentEncoding" = "base64"))]
     pub(super) data: String,
     pub(super) format: &'static str,
 }
 
 /// `foxglove.SceneUpdate`.
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
+#[schemars(title = "foxglove.SceneUpdate")]
 pub(super) struct SceneUpdate {
     deletions: [(); 0],
     entities: Vec<SceneEntity>,
@@ -96,6 +128,7 @@ struct SceneEntity {
     timestamp: Time,
     frame_id: &'static str,
     id: String,
+    #[schemars(title = "duration")]
     lifetime: Time,
     frame_locked: bool,
     metadata: Vec<KeyValue>,

@@ -11,7 +11,7 @@ use mcap::McapResult;
 use serde::Serialize;
 
 use super::channels::{CounterReading, LeadershipChange, SchemaName};
-use super::foxglove::{CompressedImage, FrameTransform, Log, SceneUpdate};
+use super::foxglove::{CompressedImage, FrameTransform, Level, Log, SceneUpdate};
 use super::recording::{Entry, Item};
 use crate::gateway::LinkState;
 
@@ -43,10 +43,6 @@ pub(super) struct Scribe {
     /// Reused for every message.
     json: Vec<u8>,
 }
-
-/// Levels of `foxglove.Log`.
-const INFO: u8 = 2;
-const WARNING: u8 = 3;
 
 impl Scribe {
     pub(super) fn new(node: NodeName, drawable: bool) -> Self {
@@ -80,10 +76,10 @@ impl Scribe {
             Item::Leadership(leadership) => {
                 let change = LeadershipChange::new(self.node.clone(), at, leadership);
                 self.put(SchemaName::Leadership, "node/leadership", at, at, &change, to)?;
-                self.say(INFO, at, || change.in_words(), to)
+                self.say(Level::Info, at, || change.in_words(), to)
             }
             Item::Link { broker, state } => {
-                let level = if *state == LinkState::Up { INFO } else { WARNING };
+                let level = if *state == LinkState::Up { Level::Info } else { Level::Warning };
                 self.say(level, at, || format!("link to {broker} is {state:?}").to_lowercase(), to)
             }
             Item::Counters(snapshot) => {
@@ -122,7 +118,7 @@ impl Scribe {
 
     fn say(
         &mut self,
-        level: u8,
+        level: Level,
         at: Timestamp,
         message: impl FnOnce() -> String,
         to: &mut impl Sink,
