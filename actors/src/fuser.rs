@@ -199,7 +199,7 @@ impl FuserState {
         self.recording.report(*kind, report, delivery.received_at);
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
-            Ok(fused) => self.publish(fused),
+            Ok(fused) => self.publish(fused, delivery.received_at),
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
                 self.counters.reject(reason);
@@ -237,7 +237,7 @@ impl FuserState {
         if command != Command::Tick || now >= self.aggregator.deadline() {
             let fused = self.aggregator.command(&command, now);
             self.recording.journal(now, JournalEvent::Command(command));
-            self.publish(fused);
+            self.publish(fused, now);
         }
     }
 
@@ -256,9 +256,9 @@ impl FuserState {
         }
     }
 
-    fn publish(&self, fused: Option<Fused>) {
+    fn publish(&self, fused: Option<Fused>, now: Timestamp) {
         let Some(Fused { epoch, round, map, verdicts, evidence, reputations }) = fused else { return };
-        self.recording.round(round);
+        self.recording.round(round, now);
         let has_verdicts = verdicts.is_some();
         if let Some(map) = map {
             self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });

@@ -18,6 +18,8 @@ use super::scribe::{Message, Sink};
 pub(super) struct LogFile {
     writer: Writer<BufWriter<File>>,
     path: PathBuf,
+    /// Whether any message is in the file for good.
+    holds: bool,
     opened: Instant,
     channels: HashMap<(SchemaName, String), Channel>,
 }
@@ -28,8 +30,12 @@ struct Channel {
 }
 
 impl LogFile {
-    /// Begins a file that tells who writes it.
-    pub(super) fn begin(path: PathBuf, file: File, identity: &Identity) -> McapResult<Self> {
+    /// Begins a file that tells who writes it; where that fails, there is none.
+    pub(super) fn begin(path: &Path, file: File, identity: &Identity) -> McapResult<Self> {
+        Self::introduce(path.into(), file, identity).inspect_err(|_| remove(path))
+    }
+
+    fn introduce(path: PathBuf, file: File, identity: &Identity) -> McapResult<Self> {
         let options = WriteOptions::new()
             .profile("")
             .library(concat!("ecod-node ", env!("CARGO_PKG_VERSION")))
@@ -39,7 +45,7 @@ impl LogFile {
         let mut writer = options.create(BufWriter::with_capacity(1 << 16, file))?;
         writer.write_metadata(&Metadata { name: Identity::RECORD.into(), metadata: identity.to_map() })?;
         writer.flush()?;
-        Ok(Self { writer, path, opened: Instant::now(), channels: HashMap::new() })
+        Ok(Self { writer, path, holds: false, opened: Instant::now(), channels: HashMap::new() })
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -53,6 +59,7 @@ impl LogFile {
     /// Closes the chunk and hands all bytes to the operating system; says how large the file is.
     pub(super) fn flush(&mut self) -> McapResult<u64> {
         self.writer.flush()?;
+        self.holds |= !self.channels.is_empty();
         Ok(std::fs::metadata(&self.path)?.len())
     }
 
@@ -63,9 +70,18 @@ impl LogFile {
         Ok(())
     }
 
-    /// Leaves the file as it is, such as when the disk takes no more.
+    /// Leaves the file as it is, such as when the disk takes no more; a file that holds nothing is removed.
     pub(super) fn abandon(self) {
         drop(self.writer.into_inner().into_parts());
+        if !self.holds {
+            remove(&self.path);
+        }
+    }
+}
+
+fn remove(path: &Path) {
+    if let Err(error) = std::fs::remove_file(path) {
+        tracing::debug!(file = %path.display(), %error, "a log that holds nothing cannot be removed");
     }
 }
 
@@ -94,4 +110,39 @@ impl Sink for LogFile {
 /// Unix nanoseconds; the log's times are exact microseconds.
 fn nanoseconds(at: Timestamp) -> u64 {
     at.micros().saturating_mul(1000)
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::names::NodeName;
+    use uuid::Uuid;
+
+    use super::*;
+    use crate::config::NodeConfig;
+
+    #[test]
+    fn a_file_that_holds_nothing_is_not_left_behind() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("cav.mcap");
+        let identity = Identity::of(&NodeConfig::default(), &NodeName::from_static("cav"), Uuid::nil());
+        let json = br#"{"at_us":0,"event":{"missing":{"entries":1}}}"#;
+        let (at, made_at) = (Timestamp(0), Timestamp(0));
+        let message = Message { schema: SchemaName::JournalEntry, topic: "node/journal", at, made_at, json };
+
+        File::create_new(&path).unwrap();
+        let refusing = File::open(&path).unwrap();
+        assert!(LogFile::begin(&path, refusing, &identity).is_err());
+        assert!(!path.exists(), "the disk took nothing at all");
+
+        let mut file = LogFile::begin(&path, File::create_new(&path).unwrap(), &identity).unwrap();
+        file.put(message).unwrap();
+        file.abandon();
+        assert!(!path.exists(), "the disk took no whole chunk");
+
+        let mut file = LogFile::begin(&path, File::create_new(&path).unwrap(), &identity).unwrap();
+        file.put(message).unwrap();
+        file.flush().unwrap();
+        file.abandon();
+        assert!(path.exists(), "the disk took a message");
+    }
 }

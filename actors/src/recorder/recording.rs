@@ -48,6 +48,11 @@ pub(super) enum Item {
 }
 
 impl Item {
+    /// Whether there is anything of it in the log.
+    pub(super) fn is_written(&self) -> bool {
+        !matches!(self, Self::Round(_))
+    }
+
     /// Whether the aggregator cannot be run again exactly without it.
     pub(super) fn is_of_journal(&self) -> bool {
         matches!(self, Self::Report { .. } | Self::Journal(_))
@@ -92,8 +97,8 @@ impl Recording {
     }
 
     /// The aggregator made this round.
-    pub fn round(&self, round: u64) {
-        self.put(Timestamp::default(), Item::Round(round));
+    pub fn round(&self, round: u64, at: Timestamp) {
+        self.put(at, Item::Round(round));
     }
 
     /// A map that the node took.
@@ -136,14 +141,14 @@ impl Recording {
         let Some(queue) = &*queue else { return };
         let is_of_journal = item.is_of_journal();
         if queue.try_send(Entry { at, item }).is_err() {
-            self.lost(is_of_journal);
+            self.lost(1, u64::from(is_of_journal));
         }
     }
 
-    /// Counts an entry that is not in the log.
-    pub(super) fn lost(&self, is_of_journal: bool) {
-        self.0.counters.count(Event::RecordDropped);
-        self.0.missing.fetch_add(u64::from(is_of_journal), Ordering::Relaxed);
+    /// Counts entries that are not in the log, and those of the journal that the log is to tell of.
+    pub(super) fn lost(&self, entries: u64, of_journal: u64) {
+        self.0.counters.add(Event::RecordDropped, entries);
+        self.0.missing.fetch_add(of_journal, Ordering::Relaxed);
     }
 
     /// Journal entries that were lost since the last call.
