@@ -11,6 +11,7 @@ mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
 mod logging;
+mod logs;
 mod pki;
 mod record;
 mod replay;

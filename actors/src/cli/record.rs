@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
+use ecod::names::NodeName;
 
 use super::Failure;
 use super::run::{ObserverArguments, run_node};
@@ -19,9 +20,12 @@ pub(super) struct RecordArguments {
     dir: Option<PathBuf>,
 }
 
+/// Whose log it is, unless the observer is given a name.
+const NAME: NodeName = NodeName::from_static("recorder");
+
 /// Records until SIGINT or SIGTERM.
 pub(super) fn run(arguments: &RecordArguments) -> Result<(), Failure> {
-    let mut config = arguments.observer.load("recorder")?;
+    let mut config = arguments.observer.load(NAME.as_str())?;
     let configured = config.record.take();
     let record = match (&arguments.dir, configured) {
         (Some(dir), Some(record)) => RecordConfig { dir: dir.clone(), ..record },
@@ -31,6 +35,8 @@ pub(super) fn run(arguments: &RecordArguments) -> Result<(), Failure> {
     };
     // A node goes on without its log; an observer that records has nothing else to do.
     std::fs::create_dir_all(&record.dir).with_context(|| format!("cannot record in {}", record.dir.display()))?;
-    config.record = Some(RecordConfig { reports: true, ..record });
+    // The name of the process would make every run a log of its own, that none after it deletes or goes on with.
+    let name = Some(arguments.observer.name().cloned().unwrap_or(NAME));
+    config.record = Some(RecordConfig { name, reports: true, ..record });
     run_node(config, false)
 }

@@ -11,9 +11,10 @@ use ecod::replay::{FusedLine, Rejections, Replay, ReplayConfig, Summary};
 use ecod::wire::Limits;
 
 use super::Failure;
+use super::logs::{Logs, NodeArguments};
 use crate::config::NodeConfig;
 use crate::lines::{self, LineRead, read_line};
-use crate::recorder::{self, LogReader};
+use crate::recorder::LogReader;
 use log::LogReplay;
 #[cfg(fuzzing)]
 pub use log::rounds_of_log;
@@ -25,10 +26,12 @@ pub(super) struct ReplayArguments {
     /// and the locations that they name
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A log (MCAP), a directory of one node's logs, or reports, one JSON object a line in the order of arrival; `-`
+    /// A log (MCAP), a directory of logs, or reports, one JSON object a line in the order of arrival; `-`
     /// for standard input; may be given several times for logs
     #[arg(long, value_name = "FILE", required = true)]
     input: Vec<PathBuf>,
+    #[command(flatten)]
+    node: NodeArguments,
     /// Where maps and verdicts are written, one JSON object a line; `-` for standard output
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
@@ -38,55 +41,34 @@ pub(super) struct ReplayArguments {
 }
 
 pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
-    let ReplayArguments { config, input, output, passes } = arguments;
+    let ReplayArguments { config, input, node, output, passes } = arguments;
     let given = config.as_deref().map(|path| cell(Some(path))).transpose()?;
-    let kind = input_kind(input)?;
-    let mut sink = lines::create(output, input).map_err(Failure::usage)?;
-    match kind {
-        InputKind::Lines(input) => {
-            let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
-            replay_lines(Replay::new(config.clone()), &config, input, &mut sink, output)?;
-        }
-        InputKind::Log(files) => LogReplay::new(given.as_ref(), *passes).run(&files, &mut sink, output)?,
+    if let Some(lines) = input_of_lines(input, node)? {
+        let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
+        let mut sink = lines::create(output, input).map_err(Failure::usage)?;
+        replay_lines(Replay::new(config.clone()), &config, lines, &mut sink, output)?;
+        return Ok(flush(&mut sink).with_context(|| cannot_write(output))?);
     }
+    let Logs { files, unusable } = Logs::find(input, node)?;
+    if let (Some(unusable), None) = (unusable, &given) {
+        let why = anyhow!("{:#}: say by --config how its reports are fused", anyhow!(unusable));
+        return Err(Failure::usage(why));
+    }
+    let mut sink = lines::create(output, &files).map_err(Failure::usage)?;
+    LogReplay::new(given.as_ref(), *passes).run(&files, &mut sink, output)?;
     Ok(flush(&mut sink).with_context(|| cannot_write(output))?)
 }
 
-/// What is to be replayed.
-enum InputKind<'a> {
-    /// A file of lines, or standard input.
-    Lines(&'a Path),
-    /// The files of a log.
-    Log(Vec<PathBuf>),
-}
-
-/// Looks into the inputs; a directory stands for the log files in it.
-fn input_kind(inputs: &[PathBuf]) -> Result<InputKind<'_>, Failure> {
-    if let [input] = inputs
-        && (input == Path::new("-") || (!input.is_dir() && !LogReader::recognises(input).map_err(Failure::usage)?))
-    {
-        return Ok(InputKind::Lines(input));
+/// The file of lines, or standard input, that is to be replayed; none if these are logs.
+fn input_of_lines<'a>(inputs: &'a [PathBuf], node: &NodeArguments) -> Result<Option<&'a Path>, Failure> {
+    let [input] = inputs else { return Ok(None) };
+    if input != Path::new("-") && (input.is_dir() || LogReader::recognises(input).map_err(Failure::usage)?) {
+        return Ok(None);
     }
-    Ok(InputKind::Log(log_files(inputs)?))
-}
-
-/// The files of logs that are given by themselves or by their directories.
-pub(super) fn log_files(inputs: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
-    let mut files = Vec::new();
-    for input in inputs {
-        if input.is_dir() {
-            let found = recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
-            files.extend(found.map_err(Failure::usage)?);
-        } else if LogReader::recognises(input).map_err(Failure::usage)? {
-            files.push(input.clone());
-        } else {
-            return Err(Failure::usage(anyhow!("{} is not a log", input.display())));
-        }
+    if node.node.is_some() {
+        return Err(Failure::usage(anyhow!("{} is not a log: --node chooses among logs", input.display())));
     }
-    if files.is_empty() {
-        return Err(Failure::usage(anyhow!("there is no log in the directory {}", inputs[0].display())));
-    }
-    Ok(files)
+    Ok(Some(input))
 }
 
 fn replay_lines(

@@ -9,7 +9,7 @@ use ecod::eval::Truth;
 use ecod::eval::tracks::TrackTruth;
 
 use super::Failure;
-use super::replay::log_files;
+use super::logs::{Logs, NodeArguments};
 use crate::lines;
 use crate::report::Report;
 
@@ -19,6 +19,8 @@ pub(super) struct ReportArguments {
     /// Logs of one node (MCAP) in order, or the directory that they are in
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
+    #[command(flatten)]
+    node: NodeArguments,
     /// What really stands at each location (JSON, or CSV with the columns item,truth), or where all objects were (JSON)
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
@@ -28,8 +30,8 @@ pub(super) struct ReportArguments {
 }
 
 pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
-    let ReportArguments { logs, truth, output } = arguments;
-    let files = log_files(logs)?;
+    let ReportArguments { logs, node, truth, output } = arguments;
+    let files = Logs::find(logs, node)?.files;
     let inputs: Vec<_> = files.iter().chain(truth).collect();
     lines::check_apart(output, &inputs).map_err(Failure::usage)?;
     let mut report = truth.as_deref().map_or_else(|| Ok(Report::default()), judged_by).map_err(Failure::usage)?;

@@ -195,6 +195,11 @@ pub(super) struct ObserverArguments {
 }
 
 impl ObserverArguments {
+    /// The name that the observer was given.
+    pub(super) fn name(&self) -> Option<&NodeName> {
+        self.name.as_ref()
+    }
+
     /// Whose configuration this is.
     fn holder(&self) -> Result<Option<NodeName>, Failure> {
         let run = RunArguments { config: self.config.clone(), cell: self.cell.clone(), ..RunArguments::default() };

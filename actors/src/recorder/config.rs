@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
+use ecod::names::NodeName;
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
@@ -14,6 +15,9 @@ use serde::{Deserialize, Deserializer, Serialize};
 pub struct RecordConfig {
     /// Directory of the log; it is made when it is not there. Required.
     pub dir: PathBuf,
+    /// Whose log it is said to be; default the node's. Observers are named for their process, their logs are not.
+    #[serde(skip)]
+    pub name: Option<NodeName>,
     /// A file is closed and the next begun when it has as many megabytes; default 256. Smaller files lose less to a
     /// broken disk and copy sooner, larger ones are fewer.
     pub max_file_mb: u64,
@@ -44,6 +48,7 @@ impl RecordConfig {
     pub fn new(dir: impl Into<PathBuf>) -> Self {
         Self {
             dir: dir.into(),
+            name: None,
             max_file_mb: 256,
             max_file_s: 3600,
             max_total_mb: 4096,
@@ -125,6 +130,7 @@ impl From<Table> for RecordConfig {
             #[cfg(feature = "foxglove")]
             live_port: table.live_port,
             dir: default.dir,
+            name: None,
         }
     }
 }

@@ -48,11 +48,12 @@ impl Identity {
     /// Name of the metadata record.
     pub const RECORD: &'static str = "ecod.log";
 
-    /// Who this node is.
+    /// Who this node is, or is said to be in its log.
     pub fn of(config: &NodeConfig, node: &NodeName, run: Uuid) -> Self {
+        let named = config.record.as_ref().and_then(|record| record.name.as_ref());
         Self {
             log: Self::VERSION,
-            node: node.clone(),
+            node: named.unwrap_or(node).clone(),
             cell: config.cell.clone(),
             run,
             version: env!("CARGO_PKG_VERSION").into(),
@@ -80,6 +81,11 @@ impl Identity {
     /// The version that a record claims to have, if it says so.
     pub(super) fn version_in(map: &BTreeMap<String, String>) -> Option<u64> {
         map.get("log")?.parse().ok()
+    }
+
+    /// Whose log it is, whatever else the record has.
+    pub(super) fn node_in(map: &BTreeMap<String, String>) -> Option<NodeName> {
+        NodeName::new(map.get("node")?).ok()
     }
 
     /// Reads the record's content.

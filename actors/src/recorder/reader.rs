@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
+use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use mcap::McapError;
 use mcap::records::{Record, op};
@@ -67,7 +68,7 @@ pub enum LogError {
         source: McapError,
     },
     /// A later version of the program wrote it.
-    #[error("{path} has version {found} of the log, this program knows {known}: what it does not know is left out", known = Identity::VERSION)]
+    #[error("{path} has version {found} of the log, this program knows {known}", known = Identity::VERSION)]
     Newer {
         /// The file.
         path: PathBuf,
@@ -91,6 +92,7 @@ pub struct LogReader {
     reader: LinearReader,
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Channel>,
+    node: Option<NodeName>,
     /// Whether the data section was read to its end.
     complete: bool,
     ended: bool,
@@ -132,10 +134,16 @@ impl LogReader {
             reader: LinearReader::new_with_options(options),
             schemas: HashMap::new(),
             channels: HashMap::new(),
+            node: None,
             complete: false,
             ended: false,
             unknown: BTreeMap::new(),
         })
+    }
+
+    /// Whose log it is, as far as it was read; also where nothing else of its identity can be used.
+    pub fn node(&self) -> Option<&NodeName> {
+        self.node.as_ref()
     }
 
     /// Messages that were passed over because their schema is not known here, by its name.
@@ -199,8 +207,9 @@ impl LogReader {
         }
     }
 
-    fn identity(&self, map: &BTreeMap<String, String>) -> Result<LogEvent, LogError> {
+    fn identity(&mut self, map: &BTreeMap<String, String>) -> Result<LogEvent, LogError> {
         let path = self.path.clone();
+        self.node = Identity::node_in(map);
         match Identity::version_in(map) {
             Some(found) if found > Identity::VERSION => Err(LogError::Newer { path, found }),
             _ => match Identity::from_map(map) {

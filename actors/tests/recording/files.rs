@@ -79,10 +79,6 @@ fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
     assert!(code == 0 && lines > 10 && said.contains("2 lines, 2 used"), "{code} {lines} {said}");
     assert!(said.contains("1 messages of \"ecod.Tea\" are not known"), "{said}");
 
-    let (code, _, said) = replay(&[&file(&folder, "newer.mcap", &log(7))]);
-    assert!(code == 0 && said.contains("newer.mcap has version 7 of the log, this program knows 1"), "{said}");
-    assert!(said.contains("2 lines, 2 used"), "{said}");
-
     let second = whole.windows(8).rposition(|bytes| bytes == b"captured").unwrap();
     let (code, lines, said) = replay(&[&file(&folder, "cut.mcap", &whole[..second])]);
     assert!(code == 0 && lines > 0 && said.contains("cut.mcap was not finished"), "{code} {lines} {said}");
@@ -96,6 +92,60 @@ fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
     for length in 0..whole.len() {
         let reader = ecod_actors::recorder::LogReader::open(&file(&folder, "any.mcap", &whole[..length])).unwrap();
         assert!(reader.take(1000).count() < 1000, "cut at {length}, reading ends");
+    }
+}
+
+/// Reports that are fused in another way than they were are no replay: what cannot be known has to be said.
+#[test]
+fn a_log_whose_configuration_cannot_be_read_is_replayed_only_under_one_that_is_given() {
+    let folder = TempDir::new().unwrap();
+    let unknown = r#"{"later_key": 1}"#;
+    let config = file(&folder, "cell.toml", b"cell = \"cell\"\n");
+    for (name, bytes, why) in [
+        ("newer.mcap", log(7), "newer.mcap has version 7 of the log, this program knows 1"),
+        ("unknown.mcap", log_with(&[("fusion", unknown)]), "metadata `fusion` of the log cannot be used"),
+    ] {
+        let log = file(&folder, name, &bytes);
+        let output = file(&folder, "rounds.jsonl", b"of an earlier replay");
+        let run = |more: &[&Path]| {
+            let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+            command.arg("replay").arg("--input").arg(&log).arg("--output").arg(&output).args(more);
+            let run = command.output().unwrap();
+            (run.status.code().unwrap(), String::from_utf8(run.stderr).unwrap())
+        };
+        let (code, said) = run(&[]);
+        assert!(code == 2 && said.contains(why) && said.contains("--config"), "{code} {said}");
+        assert_eq!(std::fs::read(&output).unwrap(), b"of an earlier replay");
+        let (code, said) = run(&[Path::new("--config"), &config]);
+        assert!(code == 0 && said.contains(why) && said.contains("2 lines, 2 used"), "{code} {said}");
+    }
+}
+
+#[test]
+fn of_several_nodes_logs_in_one_directory_one_is_chosen() {
+    let folder = TempDir::new().unwrap();
+    let logs = TempDir::new().unwrap();
+    let [run, other_run] = [1, 2].map(|number| uuid::Uuid::from_u128(number).to_string());
+    file(&logs, "edge-1.mcap", &log_with(&[("node", "edge")]));
+    file(&logs, "gauss-1.mcap", &log_with(&[("run", &run)]));
+    file(&logs, "gauss-2.mcap", &log_with(&[("run", &other_run)]));
+    let ecod = |command: &str, input: &str, output: &str, more: &[&str]| {
+        let output = file(&folder, output, b"of before");
+        let mut run = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+        run.arg(command).args(input.split_whitespace()).arg(logs.path()).arg("--output").arg(&output).args(more);
+        let run = run.output().unwrap();
+        let said = String::from_utf8(run.stderr).unwrap();
+        (run.status.code().unwrap(), said, std::fs::read_to_string(&output).unwrap())
+    };
+    for (command, input, output) in [("replay", "--input", "rounds.jsonl"), ("report", "", "report.html")] {
+        let (code, said, written) = ecod(command, input, output, &[]);
+        assert!(code == 2 && said.contains("several nodes, edge, gauss: choose one by --node"), "{code} {said}");
+        assert_eq!(written, "of before");
+        let (code, said, _) = ecod(command, input, output, &["--node", "euclid"]);
+        assert!(code == 2 && said.contains("no log of euclid here, but of edge, gauss"), "{code} {said}");
+        let (code, said, written) = ecod(command, input, output, &["--node", "gauss"]);
+        assert!(code == 0 && !said.contains("edge") && written.contains("gauss"), "{code} {said}");
+        assert!(command == "report" || said.contains("4 lines"), "{said}");
     }
 }
 

@@ -17,7 +17,7 @@ use std::time::Duration;
 use ecod::landmark::LandmarkConfig;
 use ecod::replay::FusedLine;
 use ecod::wire::Role;
-use ecod_actors::recorder::SchemaName;
+use ecod_actors::recorder::{SchemaName, files};
 
 use cell::{Cell, Log, name};
 
@@ -112,7 +112,7 @@ async fn every_run_is_made_again_under_its_own_configuration() {
     assert!(!said.contains("missing") && !said.contains("middle"), "{said}");
 }
 
-/// An observer's log has what all of the cell said, and the reports in it can be fused.
+/// An observer's log has what all of the cell said, and the reports in it can be fused, also those of several runs.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_observer_records_what_all_say() {
     let mut cell = Cell::default();
@@ -124,19 +124,17 @@ async fn an_observer_records_what_all_say() {
     let config = cell.directory().join("edge.toml");
     std::fs::write(&config, toml::to_string(&cell.config("edge", Role::Edge)).unwrap()).unwrap();
     let arguments = ["record", "--config", config.to_str().unwrap(), "--dir", dir.to_str().unwrap(), "--seed", &seed];
-    let observer = Command::new(env!("CARGO_BIN_EXE_ecod-node")).args(arguments).spawn().unwrap();
-    let mut observer = disk::Process(observer);
-    cell.until("the observer takes part", |cell| {
-        cell.node("edge")
-            .members()
-            .borrow()
-            .iter()
-            .any(|member| member.name.as_str().starts_with("recorder-"))
-            .then_some(())
-    })
-    .await;
-    cell.drive(Duration::from_secs(4)).await;
-    observer.terminate();
+    for time in [Duration::from_secs(4), Duration::from_secs(2)] {
+        let observer = Command::new(env!("CARGO_BIN_EXE_ecod-node")).args(arguments).spawn().unwrap();
+        let name = format!("recorder-{}", observer.id());
+        let mut observer = disk::Process(observer);
+        cell.until("the observer takes part", |cell| {
+            cell.node("edge").members().borrow().iter().any(|member| member.name.as_str() == name).then_some(())
+        })
+        .await;
+        cell.drive(time).await;
+        observer.terminate();
+    }
     let _directory = cell.stop().await;
 
     let log = Log::read(&dir);
@@ -165,6 +163,12 @@ async fn an_observer_records_what_all_say() {
         lines.len() > 20 && lines.iter().filter(|line| labels(line).as_deref() == Some("car")).count() > 20,
         "{said}"
     );
-    assert!(lines.iter().all(|line| key(line).0.starts_with("recorder-")));
-    assert_eq!(log.identity.unwrap().cell, name("cell"));
+    assert!(lines.iter().all(|line| key(line).0 == "recorder"));
+    let identity = log.identity.unwrap();
+    assert_eq!((identity.cell, identity.node), (name("cell"), name("recorder")));
+    let files = files(&dir).unwrap();
+    let is_named = |file: &std::path::PathBuf| file.file_name().unwrap().to_str().unwrap().starts_with("recorder-2");
+    assert!(files.len() == 2 && files.iter().all(is_named), "a limit holds for all runs: {files:?}");
+    let (alone, _) = replay(&files[0]);
+    assert!(alone.len() < lines.len(), "the second run is replayed too");
 }
