@@ -235,6 +235,9 @@ impl Assembly {
 
     async fn start_recorder(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
         let Some(arguments) = self.recorder_arguments() else { return Err("no [record] is configured".into()) };
+        if !self.config.may_lead() && !arguments.config.reports {
+            tracing::info!("reports of other vehicles are not recorded, key `record.reports` is false");
+        }
         seat(&self.seats.recorder, Actor::spawn_linked(None, Recorder, arguments, supervisor).await)
     }
 

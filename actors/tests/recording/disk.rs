@@ -33,9 +33,14 @@ impl Drop for Process {
 
 /// An edge that records, started by a shell after `prelude`.
 pub(crate) fn edge(directory: &Path, prelude: &str) -> Process {
+    node_of(Role::Edge, directory, prelude)
+}
+
+/// The same in another role; its name is `edge` all the same.
+pub(crate) fn node_of(role: Role, directory: &Path, prelude: &str) -> Process {
     let address = free_address();
     let file = directory.join("edge.toml");
-    let config = config("edge", Role::Edge, Some(address), address, directory);
+    let config = config("edge", role, Some(address), address, directory);
     std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
     let script = format!("{prelude} exec {} --config {}", env!("CARGO_BIN_EXE_ecod-node"), file.display());
     let log = std::fs::File::create(directory.join("edge.log")).unwrap();
@@ -94,6 +99,19 @@ fn a_disk_that_refuses_bytes_costs_entries_and_nothing_else() {
     };
     assert!(log.messages.iter().any(|message| is(&message, "\"continue\"")), "the second file says where it begins");
     assert!(log.messages.iter().any(|message| is(&message, "\"missing\"")), "and that something is lost");
+}
+
+/// Who only follows takes no reports of others unless told to, which shows in the log of the node, not only in what is
+/// missing afterwards.
+#[test]
+fn a_vehicle_that_never_leads_says_that_it_records_no_reports_of_others() {
+    for (role, says_so) in [(Role::Cav, true), (Role::Auto, false)] {
+        let directory = tempfile::tempdir().unwrap();
+        let _process = node_of(role, directory.path(), "");
+        let said = || std::fs::read_to_string(directory.path().join("edge.log")).unwrap_or_default();
+        wait_until("it records", directory.path(), || said().contains("edge/edge-"));
+        assert_eq!(said().contains("key `record.reports` is false"), says_so, "{}", said());
+    }
 }
 
 /// A map log on a full disk ends, and maps go on.
