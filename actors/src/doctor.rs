@@ -10,6 +10,8 @@ mod clock;
 mod network;
 mod storage;
 
+use std::path::Path;
+
 use serde::Serialize;
 
 use crate::config::NodeConfig;
@@ -54,13 +56,14 @@ impl Finding {
     }
 }
 
-/// Looks at everything that the configuration asks for; `config` is taken as valid.
-pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
+/// Looks at everything that the configuration asks for; `config` is taken as valid, `file` is where it was read from.
+pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     let mut findings = Vec::new();
     #[cfg(feature = "camera")]
     findings.extend(camera::examine(config).await);
     findings.extend(network::broker(config).await);
     findings.push(network::gossip(config));
+    findings.extend(network::seeds(config).await);
     #[cfg(feature = "camera")]
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
@@ -71,6 +74,7 @@ pub async fn examine(config: &NodeConfig) -> Vec<Finding> {
     findings.extend(certificates::examine(config));
     findings.push(clock::synchronised());
     findings.extend(storage::directories(config));
+    findings.extend(storage::service(config, file));
     findings
 }
 
@@ -95,7 +99,7 @@ mod tests {
     }
 
     async fn finding(config: &NodeConfig, check: &str) -> Finding {
-        let findings = examine(config).await;
+        let findings = examine(config, Path::new("node.toml")).await;
         findings
             .iter()
             .find(|finding| finding.check == check)
@@ -109,7 +113,7 @@ mod tests {
         let mut config = config();
         config.state_dir = Some(directory.path().into());
         config.record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path().join("a/b")) });
-        let findings = examine(&config).await;
+        let findings = examine(&config, Path::new("node.toml")).await;
         assert!(findings.iter().all(|finding| finding.verdict < Verdict::Broken), "{findings:?}");
         assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0, "nothing is left behind");
     }
@@ -167,7 +171,7 @@ mod tests {
         config.dashboard.enabled = true;
         assert!(finding(&config, "dashboard").await.verdict < Verdict::Broken);
         config.dashboard.enabled = false;
-        assert!(examine(&config).await.iter().all(|finding| finding.check != "dashboard"));
+        assert!(examine(&config, Path::new("node.toml")).await.iter().all(|finding| finding.check != "dashboard"));
     }
 
     #[cfg(feature = "foxglove")]
@@ -199,6 +203,44 @@ mod tests {
         let finding = finding(&config, "broker").await;
         assert_eq!(finding.verdict, Verdict::Broken);
         assert!(finding.seen.contains(&address.to_string()), "{finding:?}");
+    }
+
+    #[tokio::test]
+    async fn a_seed_without_an_address_is_doubtful() {
+        let mut config = config();
+        config.role = Role::Cav;
+        let seeds = ["127.0.0.1:17884", "[::1]:17884", "egde.invalid:17884"].map(str::to_owned);
+        config.membership.seeds = seeds.to_vec();
+        let findings = examine(&config, Path::new("node.toml")).await;
+        let findings: Vec<_> = findings.into_iter().filter(|finding| finding.check == "seed").collect();
+        let verdicts: Vec<_> = findings.iter().map(|finding| finding.verdict).collect();
+        assert_eq!(verdicts, [Verdict::Fine, Verdict::Doubtful, Verdict::Doubtful], "{findings:?}");
+        assert!(findings.iter().zip(&seeds).all(|(finding, seed)| finding.seen.contains(seed)), "{findings:?}");
+    }
+
+    /// A log may be written by whoever tries, and not by the service, whose unit protects the system from it.
+    #[tokio::test]
+    async fn what_the_unit_does_not_let_the_service_write_is_doubtful() {
+        let unit = include_str!("../../packaging/systemd/ecod-node.service");
+        for line in
+            ["ProtectSystem=strict", "StateDirectory=ecod", "ExecStart=/usr/bin/ecod-node --config /etc/ecod/node.toml"]
+        {
+            assert!(unit.lines().any(|found| found == line), "{line}");
+        }
+        let directory = tempfile::tempdir().unwrap();
+        let mut config = config();
+        config.record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path().join("log")) });
+        let of_service = Path::new("/etc/ecod/node.toml");
+        let findings = examine(&config, of_service).await;
+        let found: Vec<_> = findings.iter().filter(|finding| finding.check == "service").collect();
+        assert!(found.len() == 1 && found[0].verdict == Verdict::Doubtful, "{findings:?}");
+        assert!(
+            found[0].fix.as_ref().is_some_and(|fix| fix.contains("`record.dir`") && fix.contains("ReadWritePaths"))
+        );
+        assert!(storage::service(&config, Path::new("node.toml")).is_empty(), "another node may write where it likes");
+        config.record = Some(RecordConfig::new("/var/lib/ecod/log"));
+        config.state_dir = Some("/var/lib/ecod".into());
+        assert!(storage::service(&config, of_service).is_empty());
     }
 
     #[tokio::test]

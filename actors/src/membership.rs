@@ -39,6 +39,7 @@ pub use config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
 pub use counters::{FrameCounters, FrameEvent};
 pub(crate) use key::payload_key;
 pub use key::{KeyError, check_key};
+pub(crate) use seeds::look_up;
 pub use socket::BindError;
 pub(crate) use socket::is_of_this_machine;
 pub(crate) use throttle::Throttle;

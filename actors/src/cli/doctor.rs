@@ -27,7 +27,7 @@ pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
     let config =
         NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new()).map_err(Failure::usage)?;
     let runtime = tokio::runtime::Runtime::new().context("no threads")?;
-    let findings = runtime.block_on(examine(&config));
+    let findings = runtime.block_on(examine(&config, &arguments.config));
     // A camera may block for good.
     runtime.shutdown_timeout(Duration::ZERO);
     if arguments.json {

@@ -5,15 +5,19 @@ use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
 use ecod::names::NodeName;
+use tokio::time::timeout;
 
 use super::Finding;
 use crate::config::NodeConfig;
 use crate::dashboard::DEFAULT_ADDRESS;
 use crate::gateway::{self, Security};
-use crate::membership::DEFAULT_PORT;
+use crate::membership::{self, DEFAULT_PORT};
 
 /// How long a datagram to oneself may take.
 const PATIENCE: Duration = Duration::from_millis(500);
+
+/// How long a name service may take.
+const LOOKUP_PATIENCE: Duration = Duration::from_secs(5);
 
 /// The external broker as it answers, and the port of the embedded one.
 pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
@@ -49,6 +53,28 @@ pub(super) fn gossip(config: &NodeConfig) -> Finding {
     let port = Port { check: "gossip port", address, key: "membership.bind" };
     let bound = UdpSocket::bind(address);
     if membership.bind.is_some() { port.of(bound) } else { port.or_another(bound, "others have this node as a seed") }
+}
+
+/// Whether the seeds have addresses; nothing is sent to them, as they need not be there.
+pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
+    let ipv4 = config.membership.bind.is_none_or(|bind| bind.is_ipv4());
+    let mut findings = Vec::new();
+    for seed in &config.membership.seeds {
+        let found = timeout(LOOKUP_PATIENCE, membership::look_up(seed, ipv4)).await;
+        let found = found.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
+        findings.push(match found {
+            Ok(addresses) => {
+                let addresses: Vec<_> = addresses.iter().map(|address| address.ip().to_string()).collect();
+                Finding::fine("seed", format!("{seed} is at {}", addresses.join(", ")))
+            }
+            Err(error) => {
+                let fix =
+                    "mend it in `membership.seeds`, or the name service; the node goes on without it, and asks again";
+                Finding::doubtful("seed", format!("{seed}: {}", words(&error)), fix)
+            }
+        });
+    }
+    findings
 }
 
 /// The port on which a vehicle that moves is told its poses.

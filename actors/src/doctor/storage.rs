@@ -4,6 +4,7 @@ use std::fs;
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use super::Finding;
 use crate::config::NodeConfig;
@@ -12,6 +13,10 @@ use crate::recorder::free_bytes;
 
 /// Free space in bytes below which a directory of state is doubtful.
 const LITTLE: u64 = 100_000_000;
+
+/// Where the packaged service has its configuration, and the only directory that its unit as it comes lets it write.
+const SERVICE_CONFIGURATION: &str = "/etc/ecod";
+const SERVICE_STATE: &str = "/var/lib/ecod";
 
 /// Whether there is a key, and whether others can read it.
 pub(super) fn key(config: &NodeConfig) -> Finding {
@@ -66,6 +71,42 @@ pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
         });
     }
     findings
+}
+
+/// What a configuration of the packaged service has it write elsewhere than its unit allows: whoever runs this may be
+/// able to, where the service is not.
+pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
+    if !absolute(file).starts_with(SERVICE_CONFIGURATION) {
+        return Vec::new();
+    }
+    let writable = [vec![PathBuf::from(SERVICE_STATE)], added_to_unit()].concat();
+    let record = config.record.as_ref().map(|record| &record.dir);
+    let written =
+        [("state_dir", config.state_dir.as_ref()), ("record.dir", record), ("map_log", config.map_log.as_ref())];
+    let written = written.into_iter().filter_map(|(key, path)| Some((key, absolute(path?))));
+    let outside = written.filter(|(_, path)| !writable.iter().any(|writable| path.starts_with(writable)));
+    let finding = |(key, path): (&str, PathBuf)| {
+        let path = path.display();
+        let seen = format!("its unit does not let the service write {path}");
+        let fix = format!(
+            "set `{key}` to what is below {SERVICE_STATE}, or add ReadWritePaths= by `systemctl edit ecod-node`"
+        );
+        Finding::doubtful("service", seen, fix)
+    };
+    outside.map(finding).collect()
+}
+
+/// What the operator added to the unit, as far as systemd tells.
+fn added_to_unit() -> Vec<PathBuf> {
+    let arguments = ["show", "--property=ReadWritePaths", "--value", "ecod-node"];
+    let answer = Command::new("systemctl").args(arguments).output().map(|answer| answer.stdout).unwrap_or_default();
+    // A sign before a path says what to do when it is missing.
+    let paths = String::from_utf8_lossy(&answer);
+    paths.split_whitespace().map(|path| path.trim_start_matches(['-', '+']).into()).collect()
+}
+
+fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.into())
 }
 
 fn directory(check: &'static str, dir: &Path, needed: u64, key: &str) -> Finding {

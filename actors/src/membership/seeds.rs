@@ -40,12 +40,7 @@ async fn resolve_once(
     unresolved: &mut BTreeSet<String>,
 ) {
     for seed in seeds {
-        let family = if ipv4 { "IPv4" } else { "IPv6" };
-        let found = lookup_host(seed).await.and_then(|found| {
-            let found: Vec<_> = found.filter(|address| address.is_ipv4() == ipv4).collect();
-            if found.is_empty() { Err(io::Error::other(format!("no {family} address"))) } else { Ok(found) }
-        });
-        match found {
+        match look_up(seed, ipv4).await {
             Ok(found) => {
                 known.insert(seed.clone(), found);
                 if unresolved.remove(seed) {
@@ -58,6 +53,13 @@ async fn resolve_once(
             Err(_) => {}
         }
     }
+}
+
+/// The addresses of a seed that a socket of its family reaches.
+pub(crate) async fn look_up(seed: &str, ipv4: bool) -> io::Result<Vec<SocketAddr>> {
+    let found: Vec<_> = lookup_host(seed).await?.filter(|address| address.is_ipv4() == ipv4).collect();
+    let family = if ipv4 { "IPv4" } else { "IPv6" };
+    if found.is_empty() { Err(io::Error::other(format!("no {family} address"))) } else { Ok(found) }
 }
 
 #[cfg(test)]
