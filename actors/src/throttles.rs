@@ -1,6 +1,7 @@
 //! A steady rate for each of many sources.
 
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::time::Duration;
 
 use ecod::time::Timestamp;
@@ -37,6 +38,14 @@ impl<K: Ord + Clone> Throttles<K> {
         let allowed = throttle.allow(now);
         self.sources.insert(source.clone(), throttle);
         allowed
+    }
+}
+
+/// What counts as one source: an IPv4 address, or the network of an IPv6 host, which has 2⁶⁴ addresses to choose from.
+pub(crate) fn source(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V4(v4) => IpAddr::V4(v4),
+        IpAddr::V6(v6) => IpAddr::V6((u128::from(v6) >> 64 << 64).into()),
     }
 }
 

@@ -10,6 +10,7 @@ use tokio::sync::oneshot;
 
 use crate::clock;
 use crate::membership::Throttle;
+use crate::throttles::source;
 
 /// Limits connections that have not logged in yet, by source address and in all. Where too many wait, the oldest gives
 /// way: whoever means to log in does so at once.
@@ -215,14 +216,6 @@ impl Drop for Ticket {
 impl Drop for Visit {
     fn drop(&mut self) {
         self.admission.sources().welcome(self.source, clock::now());
-    }
-}
-
-/// What counts as one source: an IPv4 address, or the network of an IPv6 host, which has 2⁶⁴ addresses to choose from.
-pub(super) fn source(address: IpAddr) -> IpAddr {
-    match address.to_canonical() {
-        IpAddr::V4(v4) => IpAddr::V4(v4),
-        IpAddr::V6(v6) => IpAddr::V6((u128::from(v6) >> 64 << 64).into()),
     }
 }
 

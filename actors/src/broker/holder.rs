@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use rmqtt::types::ClientId;
 
-use super::admission::source;
 use crate::pki::Identity;
+use crate::throttles::source;
 
 /// Who is at the other end: a node by its certificate, or somebody by an address.
 #[derive(Debug, Clone)]

@@ -22,7 +22,8 @@ pub struct DashboardConfig {
     /// Most pictures of the cell a second that browsers get; default 10. Less costs less, more shows more of a fast
     /// cell.
     pub max_rate_hz: f64,
-    /// Most connections at a time; default 64. A browser's tab takes one for as long as it is open.
+    /// Most connections at a time; default 64. A browser's tab takes one for as long as it is looked at, and others for
+    /// a moment; half of them at most are for live pictures.
     pub max_connections: usize,
 }
 

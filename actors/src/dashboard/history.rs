@@ -9,6 +9,7 @@ use ecod::time::Timestamp;
 use ecod::wire::Reputations;
 use serde::Serialize;
 
+use super::picture::json;
 use crate::leader_election::{Leadership, Position};
 
 /// A span of time in which one node led, as this node saw it.
@@ -28,37 +29,33 @@ pub(super) struct Reign {
 }
 
 /// What one span of [`SAMPLE_PERIOD`] came to.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub(super) struct Sample {
+#[derive(Debug, Serialize)]
+struct Sample<'a> {
     /// When the span ended.
-    pub at_us: Timestamp,
+    at_us: Timestamp,
     /// Rounds accepted in it.
-    pub rounds: u32,
+    rounds: u32,
     /// Milliseconds from the oldest capture in a map to its receipt, median; absent without such a map.
-    pub latency_p50_ms: Option<f64>,
+    latency_p50_ms: Option<f64>,
     /// The same, largest.
-    pub latency_max_ms: Option<f64>,
+    latency_max_ms: Option<f64>,
     /// Reputation of every vehicle shown.
-    pub reputations: BTreeMap<NodeName, f64>,
+    reputations: BTreeMap<&'a NodeName, f64>,
 }
 
 /// Leaders and samples, the oldest first.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Default)]
 pub(super) struct History {
     /// Who led.
     pub reigns: VecDeque<Reign>,
-    /// How it went.
-    pub samples: VecDeque<Sample>,
+    /// When spans ended and, as JSON, how they went: it is written once and not for every browser that asks.
+    samples: VecDeque<(Timestamp, Vec<u8>)>,
     /// How often the leader changed since the node started.
     pub failovers: u64,
-    #[serde(skip)]
     last_round: Option<(Epoch, Timestamp)>,
     /// The gap before the last epoch's first round, which may be known before its reign is.
-    #[serde(skip)]
     last_gap: Option<(Epoch, u64)>,
-    #[serde(skip)]
     latencies_ms: Vec<f64>,
-    #[serde(skip)]
     rounds: u32,
 }
 
@@ -78,10 +75,13 @@ pub(super) const MAX_VEHICLES: usize = 64;
 const MAX_LATENCIES: usize = 256;
 
 impl History {
-    /// The same without samples up to a time, for whoever has those.
-    pub(super) fn since(&self, time: Timestamp) -> Self {
-        let samples = self.samples.iter().filter(|sample| sample.at_us > time).cloned().collect();
-        Self { samples, reigns: self.reigns.clone(), failovers: self.failovers, ..Self::default() }
+    /// All of it as JSON, but for samples up to a time, for whoever has those.
+    pub(super) fn json_since(&self, time: Timestamp) -> Vec<u8> {
+        let samples: Vec<_> = self.samples.iter().filter(|(at, _)| *at > time).map(|(_, sample)| &**sample).collect();
+        let (reigns, samples, failovers) = (json(&self.reigns), samples.join(&b','), json(&self.failovers));
+        let parts: [&[u8]; 7] =
+            [b"{\"reigns\":", &reigns, b",\"samples\":[", &samples, b"],\"failovers\":", &failovers, b"}"];
+        parts.concat()
     }
 
     /// Notes who leads now.
@@ -129,9 +129,9 @@ impl History {
             rounds: std::mem::take(&mut self.rounds),
             latency_p50_ms: latencies.get(latencies.len() / 2).copied(),
             latency_max_ms: latencies.last().copied(),
-            reputations: reputations.map(|(name, reputation)| (name.clone(), reputation.score)).collect(),
+            reputations: reputations.map(|(name, reputation)| (name, reputation.score)).collect(),
         };
-        push(&mut self.samples, sample, MAX_SAMPLES);
+        push(&mut self.samples, (now, json(&sample)), MAX_SAMPLES);
     }
 }
 
@@ -198,6 +198,9 @@ mod tests {
             history.sample(None, seconds(n));
         }
         assert_eq!((history.reigns.len(), history.samples.len()), (MAX_REIGNS, MAX_SAMPLES));
-        assert_eq!(history.samples.back().map(|sample| sample.rounds), Some(1000));
+        let told: serde_json::Value = serde_json::from_slice(&history.json_since(seconds(997))).unwrap();
+        let told = told["samples"].as_array().unwrap();
+        assert_eq!(told.len(), 2, "those that a browser has are left out");
+        assert_eq!((&told[1]["at_us"], &told[1]["rounds"]), (&999_000_000.into(), &1000.into()));
     }
 }

@@ -13,7 +13,8 @@ use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
 
 use super::history::{History, SAMPLE_PERIOD};
 use super::latency::Latencies;
-use super::picture::{API_VERSION, LeadershipFacts, Picture, Stamped, nodes};
+use super::paced::{Made, Paced};
+use super::picture::{API_VERSION, LeadershipFacts, Picture, Stamped, json, nodes};
 use super::sources::Sources;
 use crate::clock;
 use crate::gateway::{GatewayMessage, LinkState};
@@ -27,16 +28,8 @@ pub(super) struct Observer {
     latencies: Latencies,
     pictures: watch::Sender<Bytes>,
     seen: Mutex<Seen>,
-    least_pause: Duration,
-    made: Mutex<Option<Made>>,
-}
-
-/// The latest picture as a server-sent event.
-#[derive(Debug, Clone)]
-struct Made {
-    event: Bytes,
-    /// When it is old enough for the next.
-    next: Instant,
+    /// The latest picture as a server-sent event.
+    event: Paced<Bytes>,
 }
 
 #[derive(Debug, Default)]
@@ -53,9 +46,6 @@ const PROBE_PERIOD: Duration = Duration::from_millis(500);
 /// How often browsers get a picture although nothing came in: they take a longer silence for a lost connection.
 const HEARTBEAT: Duration = Duration::from_secs(1);
 
-/// Pauses are at least so many times as long as making the picture took, so that large cells cost no more.
-const PAUSE_FACTOR: u32 = 20;
-
 /// Around the JSON of a picture in its event.
 const EVENT_HEAD: &[u8] = b"event: picture\ndata: ";
 const EVENT_END: &[u8] = b"\n\n";
@@ -70,8 +60,7 @@ impl Observer {
             latencies: Latencies::default(),
             pictures: watch::Sender::new(Bytes::new()),
             seen: Mutex::default(),
-            least_pause: Duration::from_secs_f64(1.0 / max_rate_hz),
-            made: Mutex::default(),
+            event: Paced::new(Duration::from_secs_f64(1.0 / max_rate_hz)),
         }
     }
 
@@ -85,9 +74,9 @@ impl Observer {
         &self.latencies
     }
 
-    /// What the node saw over time, with samples taken later than `time` only.
-    pub(super) fn history_since(&self, time: Timestamp) -> History {
-        self.seen().history.since(time)
+    /// What the node saw over time as JSON, with samples taken later than `time` only.
+    pub(super) fn history_since(&self, time: Timestamp) -> Vec<u8> {
+        self.seen().history.json_since(time)
     }
 
     /// How often the leader changed since the node started.
@@ -142,7 +131,7 @@ impl Observer {
 
     /// The latest picture as a server-sent event, made anew when the last one is old enough.
     pub(super) fn event(&self) -> Bytes {
-        self.made().event
+        self.made().value
     }
 
     /// The latest picture as JSON.
@@ -151,19 +140,8 @@ impl Observer {
         event.slice(EVENT_HEAD.len()..event.len() - EVENT_END.len())
     }
 
-    fn made(&self) -> Made {
-        let mut kept = self.made.lock().unwrap_or_else(PoisonError::into_inner);
-        let begun = Instant::now();
-        if let Some(made) = kept.as_ref().filter(|made| begun < made.next) {
-            return made.clone();
-        }
-        let mut event = EVENT_HEAD.to_vec();
-        if let Err(error) = serde_json::to_writer(&mut event, &self.picture()) {
-            tracing::warn!(%error, "picture for browsers cut short");
-        }
-        event.extend_from_slice(EVENT_END);
-        let next = Instant::now() + self.least_pause.max(begun.elapsed() * PAUSE_FACTOR);
-        kept.insert(Made { event: event.into(), next }).clone()
+    fn made(&self) -> Made<Bytes> {
+        self.event.get(|| [EVENT_HEAD, &json(&self.picture()), EVENT_END].concat().into())
     }
 
     /// Looks on; ends never.
@@ -203,7 +181,7 @@ impl Observer {
                 _ = samples.tick() => self.sample(),
                 () = tokio::time::sleep_until(due), if self.viewers() > 0 => {
                     let made = self.made();
-                    self.pictures.send_replace(made.event);
+                    self.pictures.send_replace(made.value);
                     (next_picture, pictured, changed) = (made.next, Instant::now(), false);
                 }
             }

@@ -145,6 +145,15 @@ impl LeadershipFacts {
     }
 }
 
+/// A value as JSON; cut short if it cannot be written, which is logged.
+pub(super) fn json(value: &impl Serialize) -> Vec<u8> {
+    let mut text = Vec::new();
+    if let Err(error) = serde_json::to_writer(&mut text, value) {
+        tracing::warn!(%error, "answer for browsers cut short");
+    }
+    text
+}
+
 /// This node, those that answer, and those that only brokers tell of; `met` are names of nodes that have answered at
 /// some time, `links` how the links are, if the gateway tells.
 pub(super) fn nodes(sources: &Sources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {

@@ -1,6 +1,7 @@
 //! What is answered to which request.
 
 use std::convert::Infallible;
+use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -18,6 +19,9 @@ use super::access::{Access, HEADERS, Verdict};
 use super::assets::Asset;
 use super::metrics;
 use super::observer::Observer;
+use super::paced::Paced;
+use super::picture::json;
+use super::places::Place;
 use crate::clock;
 use crate::counters::Event;
 use crate::membership::Throttle;
@@ -27,7 +31,11 @@ use crate::membership::Throttle;
 pub(super) struct Site {
     observer: Arc<Observer>,
     access: Arc<Access>,
-    throttle: Arc<Mutex<Throttle>>,
+    answers: Arc<Mutex<Throttle>>,
+    /// Apart, so that whoever may not look takes nothing from those who may.
+    refusals: Arc<Mutex<Throttle>>,
+    metrics: Arc<Paced<Result<Bytes, fmt::Error>>>,
+    landmarks: Bytes,
     max_viewers: usize,
 }
 
@@ -35,11 +43,24 @@ pub(super) struct Site {
 const BURST: u32 = 512;
 const STEADY: Duration = Duration::from_millis(5);
 
+/// Least time between two readings of all metrics.
+const METRICS_PAUSE: Duration = Duration::from_millis(100);
+
+const JSON: &str = "application/json";
+
 impl Site {
     /// Half of the connections at most are for live pictures.
     pub(super) fn new(observer: Arc<Observer>, access: Access, max_connections: usize) -> Self {
-        let throttle = Arc::new(Mutex::new(Throttle::new(BURST, STEADY, clock::now())));
-        Self { observer, access: Arc::new(access), throttle, max_viewers: max_connections / 2 }
+        let throttle = || Arc::new(Mutex::new(Throttle::new(BURST, STEADY, clock::now())));
+        Self {
+            access: Arc::new(access),
+            answers: throttle(),
+            refusals: throttle(),
+            metrics: Arc::new(Paced::new(METRICS_PAUSE)),
+            landmarks: json(&observer.sources().landmarks).into(),
+            max_viewers: max_connections / 2,
+            observer,
+        }
     }
 
     /// All paths. Health is answered to everybody, as it is asked for by machines that hold no secrets.
@@ -60,22 +81,24 @@ impl Site {
             .with_state(self)
     }
 
-    fn is_within_rate(&self) -> bool {
-        self.throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(clock::now())
-    }
-
     fn count(&self, event: Event) {
         self.observer.sources().counters.count(event);
     }
 }
 
-/// Lets through what may pass.
+/// Lets through what may pass, and as much of it as may.
 async fn guard(State(site): State<Site>, request: Request, next: Next) -> Response {
-    if !site.is_within_rate() {
+    let verdict = site.access.judge(request.uri(), request.headers());
+    let is_allowed = matches!(verdict, Verdict::Allowed | Verdict::SignIn);
+    let throttle = if is_allowed { &site.answers } else { &site.refusals };
+    if !throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(clock::now()) {
         site.count(Event::BrowserThrottled);
         return (StatusCode::TOO_MANY_REQUESTS, [(header::RETRY_AFTER, "1")], "too many requests\n").into_response();
     }
-    match site.access.judge(request.uri(), request.headers()) {
+    if is_allowed && let Some(place) = request.extensions().get::<Arc<Place>>() {
+        place.keep();
+    }
+    match verdict {
         Verdict::Allowed => next.run(request).await,
         Verdict::SignIn => {
             let location = HeaderValue::from_str(request.uri().path()).unwrap_or(HeaderValue::from_static("/"));
@@ -112,7 +135,7 @@ async fn show_readiness(State(site): State<Site>) -> Response {
 }
 
 async fn show_metrics(State(site): State<Site>) -> Response {
-    match metrics::metrics(&site.observer) {
+    match site.metrics.get(|| metrics::metrics(&site.observer).map(Bytes::from)).value {
         Ok(text) => ([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response(),
         Err(error) => {
             tracing::warn!(%error, "metrics not written");
@@ -122,17 +145,18 @@ async fn show_metrics(State(site): State<Site>) -> Response {
 }
 
 async fn show_picture(State(site): State<Site>) -> Response {
-    ([(header::CONTENT_TYPE, "application/json")], site.observer.json()).into_response()
+    ([(header::CONTENT_TYPE, JSON)], site.observer.json()).into_response()
 }
 
 /// All of the history, or with `?since=` only later samples.
 async fn show_history(State(site): State<Site>, uri: Uri) -> Response {
     let since = uri.query().and_then(|query| query.strip_prefix("since=")).and_then(|time| time.parse().ok());
-    Json(site.observer.history_since(Timestamp(since.unwrap_or(0)))).into_response()
+    let history = site.observer.history_since(Timestamp(since.unwrap_or(0)));
+    ([(header::CONTENT_TYPE, JSON)], history).into_response()
 }
 
 async fn show_landmarks(State(site): State<Site>) -> Response {
-    Json(&site.observer.sources().landmarks).into_response()
+    ([(header::CONTENT_TYPE, JSON)], site.landmarks).into_response()
 }
 
 /// Pictures as they are made. Each browser has the latest and what fits into its socket; what it is too slow for, it

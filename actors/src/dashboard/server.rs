@@ -6,16 +6,21 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use axum::Router;
+use hyper::Request;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{Semaphore, oneshot, watch};
+use tokio::sync::{oneshot, watch};
 use tokio_io_timeout::TimeoutStream;
 
 use super::access::Access;
 use super::config::{DEFAULT_ADDRESS, DashboardConfig};
 use super::observer::Observer;
+use super::places::{Admitted, Place, Places};
 use super::routes::Site;
 use crate::counters::Event;
 
@@ -30,8 +35,8 @@ pub(super) struct Server {
 const RETRY_MIN: Duration = Duration::from_millis(500);
 const RETRY_MAX: Duration = Duration::from_secs(10);
 
-/// How long a browser may take for the head of a request, also between two on one connection.
-const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
+/// How long a browser may take for its request.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// How long a browser may read nothing of what it asked for.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
@@ -93,10 +98,10 @@ async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch
     tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
     bound.send_replace(Some(address));
     let router = Site::new(Arc::clone(observer), access, config.max_connections).router();
-    let places = Arc::new(Semaphore::new(config.max_connections));
+    let places = Places::new(config.max_connections);
     loop {
-        let stream = match listener.accept().await {
-            Ok((stream, _)) => stream,
+        let (stream, from) = match listener.accept().await {
+            Ok(accepted) => accepted,
             Err(error) => {
                 // Out of file descriptors, most likely: some may be free soon.
                 tracing::debug!(%error, "no connection accepted");
@@ -104,31 +109,41 @@ async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch
                 continue;
             }
         };
-        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+        let admitted = places.admit(from.ip());
+        if admitted.as_ref().is_none_or(|admitted| admitted.displaces) {
             observer.sources().counters.count(Event::BrowserRefused);
-            continue;
-        };
+        }
+        let Some(Admitted { place, displaced, .. }) = admitted else { continue };
         let router = router.clone();
         tokio::spawn(async move {
-            if let Err(error) = answer(stream, router).await {
-                tracing::debug!(%error, "connection of a browser ended");
+            tokio::select! {
+                answered = answer(stream, Arc::new(place), router) => if let Err(error) = answered {
+                    tracing::debug!(%error, "connection of a browser ended");
+                },
+                _ = displaced => tracing::debug!(%from, "connection of a browser gave way to another"),
             }
-            drop(place);
         });
     }
 }
 
-async fn answer(stream: TcpStream, router: axum::Router) -> hyper::Result<()> {
+/// Answers one request. What keeps its connection between two requests would take a place for nothing.
+async fn answer(stream: TcpStream, place: Arc<Place>, router: Router) -> hyper::Result<()> {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "small packets may wait");
     }
     let mut stream = TimeoutStream::new(stream);
     stream.set_write_timeout(Some(WRITE_TIMEOUT));
+    let routed = TowerToHyperService::new(router);
+    let service = service_fn(|mut request: Request<Incoming>| {
+        request.extensions_mut().insert(Arc::clone(&place));
+        routed.call(request)
+    });
     http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEAD_TIMEOUT)
+        .keep_alive(false)
         .max_buf_size(MAX_BUFFER_BYTES)
-        .serve_connection(TokioIo::new(Box::pin(stream)), TowerToHyperService::new(router))
+        .serve_connection(TokioIo::new(Box::pin(stream)), service)
         .await
 }
 

@@ -122,6 +122,18 @@ fn every_count_of_something_left_out_is_on_the_page() {
     }
 }
 
+/// What all ask for is read once for them.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn two_that_scrape_at_once_get_the_same() {
+    let (node, page) = start(config("edge", Role::Edge, 6)).await;
+    until("the node is ready", || async { get(page, "/readyz").await.status == 200 }).await;
+    // The age of a round and the processor time change from one reading to the next.
+    until("the same twice", || async { get(page, "/metrics").await.body == get(page, "/metrics").await.body }).await;
+    let first = get(page, "/metrics").await.body;
+    until("something new", || async { get(page, "/metrics").await.body != first }).await;
+    node.stop().await;
+}
+
 /// The metrics that a file asks for.
 fn names(file: &str) -> Vec<&str> {
     let words = file.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
