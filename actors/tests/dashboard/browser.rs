@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use ecod::wire::Role;
 use ecod_actors::gateway::Secret;
 
-use crate::cell::{self, Vehicles, config};
+use crate::cell::{self, Stray, Vehicles, config};
 use crate::http::Events;
 use crate::processes::{Place, free_places, start};
 use crate::webdriver::Browser;
@@ -121,6 +121,75 @@ async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
     assert_eq!(browser.evaluate(&format!("{LIVE} && {is_told}")).await, true);
     drop(others);
     browser.until(&format!("{LIVE} && document.querySelector('#notice').hidden")).await;
+    browser.quit().await;
+    node.stop().await;
+}
+
+/// What browsers have only since 2023.
+const WITHOUT_THE_LATEST: &str = "for (const [of, names] of [[Map, ['groupBy']], [Object, ['groupBy']], [Array, ['fromAsync']], \
+    [Array.prototype, ['findLast', 'findLastIndex', 'toSorted', 'toReversed', 'toSpliced', 'with']], \
+    [Promise, ['withResolvers']], [Set.prototype, ['union', 'difference']]]) for (const name of names) delete of[name];";
+
+/// Browsers of some years ago show the map, and where something cannot be drawn the page does not look well.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so() {
+    let (node, page) = cell::start(config("euclid", Role::Auto, 12)).await;
+    let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 12);
+    let browser = Browser::start().await;
+    browser.prepare(WITHOUT_THE_LATEST).await;
+    browser.open(&format!("http://{page}/")).await;
+    browser.until(SHOWN).await;
+    assert_eq!(browser.complaints().await, Vec::<String>::new());
+
+    let is_live = "document.querySelector('#state').classList.contains('live')";
+    let is_said = "!document.querySelector('#notice').hidden \
+        && /cannot draw/.test(document.querySelector('#notice').textContent)";
+    browser.until(is_live).await;
+    browser
+        .evaluate("document.querySelector('#places').id = 'gone', document.querySelector('#as-table').click()")
+        .await;
+    browser.until(&format!("{is_said} && !{is_live}")).await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(browser.evaluate(&format!("{is_said} && !{is_live}")).await, true, "and goes on to");
+    browser.evaluate("document.querySelector('#gone').id = 'places'").await;
+    browser.until(&format!("{is_live} && document.querySelector('#notice').hidden")).await;
+    browser.quit().await;
+    node.stop().await;
+}
+
+/// Far away from everything else, and a position all the same.
+const FAR_M: f64 = 9e7;
+
+/// A vehicle that is told a wrong pose makes the map a dot, until it is told a right one. What it only detects far away
+/// does not.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn a_wrong_position_is_got_over() {
+    let (node, page) = cell::start(config("euclid", Role::Auto, 12)).await;
+    let mut stray = Stray::start(node.broker_address().unwrap());
+    let browser = Browser::start().await;
+    browser.look(1440, 900, "light").await;
+    browser.open(&format!("http://{page}/")).await;
+    let width = "(([...all]) => { const xs = all.map((place) => Number(place.getAttribute('x'))); \
+        return Math.max(...xs) - Math.min(...xs); })(document.querySelectorAll('#map .place'))";
+    browser.until(&format!("{width} > 300")).await;
+    stray.report(FAR_M, 1.0).await;
+    browser.until(&format!("{width} < 1")).await;
+    stray.report(1.0, FAR_M).await;
+    browser.until(&format!("{width} > 300")).await;
+    browser.until("document.querySelectorAll('#map .body').length === 1").await;
+    stray.report(2.0, FAR_M).await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true);
+
+    browser.evaluate("document.querySelector('#zoom-in').click()").await;
+    browser.until("document.querySelector('#map').classList.contains('zoomed')").await;
+    stray.report(FAR_M, 1.0).await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true, "it stands where it was put");
+    browser.evaluate("document.querySelector('#fit').click()").await;
+    browser.until(&format!("{width} < 1")).await;
     browser.quit().await;
     node.stop().await;
 }

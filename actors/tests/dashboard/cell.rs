@@ -90,6 +90,42 @@ impl Vehicles {
     }
 }
 
+/// A vehicle that votes now and then; ends when dropped.
+pub(crate) struct Stray {
+    client: AsyncClient,
+    seq: u64,
+    _task: JoinSet<()>,
+}
+
+impl Stray {
+    pub(crate) fn start(broker: SocketAddr) -> Self {
+        let options = MqttOptions::new("stray", broker.ip().to_string(), broker.port());
+        let (client, mut events) = AsyncClient::new(options, 16);
+        let mut tasks = JoinSet::new();
+        tasks.spawn(async move {
+            loop {
+                if events.poll().await.is_err() {
+                    tokio::time::sleep(Duration::from_millis(200)).await;
+                }
+            }
+        });
+        Self { client, seq: 0, _task: tasks }
+    }
+
+    /// Reports from a place in the east that something stands at another.
+    pub(crate) async fn report(&mut self, at_m: f64, seen_at_m: f64) {
+        self.seq += 1;
+        let node = NodeName::from_static("stray");
+        let report = ObjectReport {
+            pose: Some(WirePose { x_m: at_m, y_m: 0.0, heading_rad: 0.0 }),
+            objects: vec![PerceivedObject::new("car", 0.8, seen_at_m, 0.0)],
+            ..ObjectReport::new(node, self.seq, clock::now())
+        };
+        let payload = encode(&report, Encoding::Json);
+        self.client.publish("ecod/v1/lot/vote_detections/stray", QoS::AtLeastOnce, false, payload).await.unwrap();
+    }
+}
+
 async fn report_to(broker: SocketAddr, vehicle: usize, landmarks: usize) {
     let options = MqttOptions::new(format!("vehicle-{vehicle}"), broker.ip().to_string(), broker.port());
     let (client, mut events) = AsyncClient::new(options, 16);

@@ -40,6 +40,11 @@ impl Browser {
         browser
     }
 
+    /// Runs a script in every page before those of the page itself.
+    pub(crate) async fn prepare(&self, script: &str) {
+        self.chromium("Page.addScriptToEvaluateOnNewDocument", json!({ "source": script })).await;
+    }
+
     pub(crate) async fn open(&self, url: &str) {
         self.command("url", json!({ "url": url })).await;
     }

@@ -8,8 +8,10 @@ import * as tables from "./tables.js";
 
 const TEXT_MS = 250;
 let [queued, textAt, told] = [false, 0, {}];
+/// Why a part of the page could not be drawn.
+const faults = {};
 
-const live = new Live(draw, drawHistory);
+const live = new Live(draw, () => attempt("history", drawHistory));
 const map = new BirdsEye(draw);
 
 byId("as-table").onclick = ({ target }) => {
@@ -26,14 +28,28 @@ function draw() {
   queued = true;
   requestAnimationFrame(() => {
     queued = false;
+    if (live.picture) attempt("picture", drawPicture);
     drawState();
-    if (!live.picture) return;
-    const scene = arrange(live.picture, live.landmarks, live.now);
-    if (!byId("map-frame").hidden) map.draw(scene);
-    if (performance.now() - textAt < TEXT_MS) return;
-    textAt = performance.now();
-    drawText(live.picture, scene);
   });
+}
+
+/// What cannot be drawn is said, in place of a state that looks well.
+function attempt(part, drawing) {
+  try {
+    drawing();
+    faults[part] = null;
+  } catch (error) {
+    if (String(error) !== String(faults[part])) console.error(error);
+    faults[part] = error;
+  }
+}
+
+function drawPicture() {
+  const scene = arrange(live.picture, live.landmarks, live.now);
+  if (!byId("map-frame").hidden) map.draw(scene);
+  if (performance.now() - textAt < TEXT_MS) return;
+  drawText(live.picture, scene);
+  textAt = performance.now();
 }
 
 /// What of the picture is on the map, joined with where places are and what colours vehicles have.
@@ -48,7 +64,11 @@ function arrange(picture, landmarks, now) {
     const state = place.label !== null ? "full" : empty ? "" : "unknown";
     return { ...place, facing_rad: known.get(place.id)?.facing_rad, state, words: empty ? "seen empty" : "not seen" };
   });
-  const byNode = Map.groupBy(picture.vehicles, (sighting) => sighting.report.node);
+  const byNode = new Map();
+  for (const sighting of picture.vehicles) {
+    const { node } = sighting.report;
+    byNode.set(node, [...(byNode.get(node) ?? []), sighting]);
+  }
   const vehicles = [...byNode].map(([node, sightings]) => vehicle(node, sightings, known, colour.get(node)));
   return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };
 }
@@ -85,17 +105,20 @@ function drawText(picture, scene) {
 /// Whether what is shown is true now, in colour and in words.
 function drawState() {
   const { picture } = live;
+  const fault = Object.values(faults).find(Boolean);
   const [look, words] = !picture ? (live.refused ? ["stale", "Sign in"] : ["waiting", "Connecting"])
     : !live.connected ? ["stale", "Connection lost"]
+    : fault ? ["stale", "Not drawn"]
     : picture.readiness.ready ? ["live", `Live, ${picture.readiness.reason}`] : ["unready", sentence(picture.readiness.reason)];
   byId("state").className = `state ${look}`;
   text(byId("state-text"), words);
   // Beside the words and not among them: a screen reader would say every second.
   text(byId("state-age"), picture && !live.connected ? `${Math.round((live.now - picture.now_us) / 1e6)} s old` : "");
-  const stale = picture !== null && (!live.connected || !picture.readiness.ready);
+  const stale = picture !== null && (!live.connected || fault !== undefined || !picture.readiness.ready);
   document.body.classList.toggle("stale-data", stale);
   const notice = live.refused ? "This page needs the node's token: open it with ?token= and the token."
     : picture && !live.connected ? "The node does not answer. What is shown is what it said last."
+    : fault ? `This browser cannot draw what the node says (${fault.message}). The same is at /api/picture.`
     : stale ? `What is shown may be out of date: ${picture.readiness.reason}.`
     : live.crowded ? "The node has no room for another live page: this one follows every two seconds." : "";
   text(byId("notice"), notice);

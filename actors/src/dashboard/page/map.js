@@ -9,6 +9,10 @@ const MAX_DRAWN = 2000;
 /// Vehicles that have not reported, and objects that nobody has seen for so long are pale and say how long.
 const OLD_S = 2;
 const MARGIN_PX = 56;
+/// Pixels to a metre at most, before anybody zooms.
+const MAX_SCALE = 4000;
+/// The map is fitted anew when half of it has been enough for so long.
+const ROOMY_MS = 5000;
 
 /// Colours by name, in the order of the alphabet.
 export const colours = (names) => new Map([...new Set(names)].sort().map((name, index) => [name, index % 8]));
@@ -17,6 +21,7 @@ export class BirdsEye {
   #picture = byId("map");
   #layers = {};
   #bounds = null;
+  #fullAt = 0;
   #zoom = 1;
   #shift = [0, 0];
 
@@ -43,7 +48,7 @@ export class BirdsEye {
     const box = this.#picture.getBoundingClientRect();
     const empty = scene.places.length + scene.objects.length + scene.vehicles.length === 0;
     byId("map-empty").hidden = !empty;
-    if (box.width < 40 || empty) return;
+    if (Math.min(box.width, box.height) <= 2 * MARGIN_PX || empty) return;
     set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene) });
     this.#picture.classList.toggle("zoomed", this.#zoom !== 1);
     const at = this.#projection(scene, box);
@@ -58,18 +63,25 @@ export class BirdsEye {
     });
   }
 
-  /// The bounds only grow, so that the map stands still while vehicles come and go; Fit takes them anew.
   #projection(scene, box) {
-    const points = [...scene.places, ...scene.objects, ...scene.vehicles.flatMap((v) => [v.pose, ...v.objects])].filter(Boolean);
-    const [xs, ys] = [points.map((p) => p.x_m), points.map((p) => p.y_m)];
-    const b = this.#bounds ?? [Infinity, Infinity, -Infinity, -Infinity];
-    this.#bounds = [xs.reduce(min, b[0]), ys.reduce(min, b[1]), xs.reduce(max, b[2]), ys.reduce(max, b[3])];
+    this.#takeIn(scene, box);
     const [left, bottom, right, top] = this.#bounds;
-    const fit = Math.min((box.width - 2 * MARGIN_PX) / Math.max(right - left, 1e-3), (box.height - 2 * MARGIN_PX) / Math.max(top - bottom, 1e-3));
-    const scale = Math.min(fit, 4000) * this.#zoom;
+    const scale = fitting(this.#bounds, box) * this.#zoom;
     const [cx, cy] = [box.width / 2 + this.#shift[0], box.height / 2 + this.#shift[1]];
     const at = (p) => [cx + (p.x_m - (left + right) / 2) * scale, cy - (p.y_m - (bottom + top) / 2) * scale];
     return Object.assign(at, { scale });
+  }
+
+  /// The bounds grow at once and shrink late, so that the map stands still while vehicles come and go, and a position
+  /// that was wrong is got over. Once moved or zoomed by hand it stands still until Fit.
+  #takeIn(scene, box) {
+    const moved = this.#zoom !== 1 || this.#shift.some((shift) => shift !== 0);
+    if (this.#bounds && moved) return;
+    const now = performance.now();
+    const needed = bounds(scene);
+    const grown = union(this.#bounds ?? needed, needed);
+    if (fitting(needed, box) < 2 * fitting(grown, box)) this.#fullAt = now;
+    this.#bounds = now - this.#fullAt > ROOMY_MS ? needed : grown;
   }
 
   #grid(at, box) {
@@ -204,8 +216,21 @@ export class BirdsEye {
   }
 }
 
-const min = (a, b) => Math.min(a, b);
-const max = (a, b) => Math.max(a, b);
+/// Where the places, objects and vehicles are: west, south, east, north. What a vehicle detected, which is placed less
+/// surely, counts where there is little else.
+function bounds({ places, objects, vehicles }) {
+  const sure = [...places, ...objects, ...vehicles.map((v) => v.pose)].filter(Boolean);
+  const points = sure.length > 1 ? sure : [...sure, ...vehicles.flatMap((v) => v.objects)];
+  return points.length > 0 ? points.map((p) => [p.x_m, p.y_m, p.x_m, p.y_m]).reduce((a, b) => union(a, b)) : [0, 0, 0, 0];
+}
+
+const union = (a, b) => [Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.max(a[2], b[2]), Math.max(a[3], b[3])];
+
+/// Pixels to a metre with which the bounds fill the box.
+function fitting([left, bottom, right, top], box) {
+  const fill = (pixels, metres) => (pixels - 2 * MARGIN_PX) / Math.max(metres, 1e-3);
+  return Math.min(fill(box.width, right - left), fill(box.height, top - bottom), MAX_SCALE);
+}
 
 /// Half axes in metres and the direction of the longer, of the ellipse that holds 95 %.
 function ellipse([xx, xy, yy]) {
