@@ -127,6 +127,7 @@ impl Tracker {
         track.vehicle = Some(number);
         if is_in_reach {
             track.motion.update(at, &measurement, density);
+            track.motion.limit_speed(self.config.max_speed_mps);
         } else if at >= track.motion.at {
             // New, or somewhere else all at once.
             track.motion = Motion::new(at, &measurement, self.config.speed_mps);
