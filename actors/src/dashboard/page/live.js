@@ -14,6 +14,8 @@ export class Live {
   crowded = false;
   #source = null;
   #heard = 0;
+  /// Whether the node is to tell its whole history: it may be another run.
+  #afresh = false;
 
   constructor(onPicture, onHistory) {
     this.onPicture = onPicture;
@@ -82,7 +84,7 @@ export class Live {
   }
 
   async #restart() {
-    this.history = { reigns: [], samples: [], failovers: 0 };
+    this.#afresh = true;
     this.landmarks = (await this.#get("/api/landmarks")) ?? this.landmarks;
     this.#refresh();
   }
@@ -93,10 +95,13 @@ export class Live {
       this.#close();
       this.#follow();
     }
-    const since = this.history.samples.at(-1)?.at_us ?? 0;
+    // What is known is shown until there is other: the node may end before it has told.
+    const known = this.#afresh ? [] : this.history.samples;
+    const since = known.at(-1)?.at_us ?? 0;
     const news = await this.#get(`/api/history?since=${since}`);
     if (!news) return;
-    const samples = [...this.history.samples, ...news.samples.filter((sample) => sample.at_us > since)].slice(-300);
+    this.#afresh = false;
+    const samples = [...known, ...news.samples.filter((sample) => sample.at_us > since)].slice(-300);
     this.history = { ...news, samples };
     this.onHistory();
   }
