@@ -99,8 +99,8 @@ live-check: setup ## record with the feature foxglove, and look on as Foxglove d
 fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each; TARGETS=payload,... runs those only
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
 
-asyncapi-check: PACKAGES := ca-certificates npm
-asyncapi-check: setup ## validate docs/asyncapi.yaml by the parser of its standard; installs npm
+asyncapi-check: PACKAGES := ca-certificates $(if $(shell command -v npm),,npm)
+asyncapi-check: setup ## validate docs/asyncapi.yaml by the parser of its standard; installs npm where there is none
 	packaging/check-asyncapi
 
 python-check: PACKAGES += mosquitto-clients python3-venv
