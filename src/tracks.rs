@@ -115,7 +115,7 @@ impl Tracker {
             late: 0,
             refused: 0,
             evidence: Vec::new(),
-            recorded_from: Timestamp(0),
+            recorded_from: Timestamp::default(),
         }
     }
 

@@ -9,8 +9,8 @@ use rustix::time::{ClockId, Timespec, clock_gettime};
 /// The present time.
 ///
 /// The wall clock is read once, at the first call; from then on time passes by the monotonic clock that goes on while
-/// the machine is suspended. A step of the wall clock after that (NTP's first synchronisation, a daylight change by hand) is therefore not followed until the node
-/// restarts; aggregators estimate each vehicle's offset, so that a
+/// the machine is suspended. A step of the wall clock after that (NTP's first synchronisation, a daylight change by
+/// hand) is therefore not followed until the node restarts; aggregators estimate each vehicle's offset, so that a
 /// constant error up to their `max_clock_offset_s` does not matter to them.
 pub fn now() -> Timestamp {
     static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();

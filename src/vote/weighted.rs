@@ -46,7 +46,7 @@ pub(super) struct WeightedTally {
     fresh_votes: usize,
     evidence: Vec<Evidence>,
     /// Votes from then on become evidence.
-    recorded_from: Option<Timestamp>,
+    recorded_from: Timestamp,
 }
 
 impl WeightedTally {
@@ -67,13 +67,13 @@ impl WeightedTally {
             revisit_after: None,
             fresh_votes: 0,
             evidence: Vec::new(),
-            recorded_from: None,
+            recorded_from: Timestamp::default(),
         }
     }
 
     /// See [`super::Vote::begin_record`].
     pub(super) fn begin_record(&mut self, now: Timestamp) {
-        self.recorded_from = Some(now);
+        self.recorded_from = now;
         self.evidence.clear();
         self.ballots.values_mut().flat_map(|ballot| &mut ballot.casts).for_each(|cast| cast.since = now);
     }
@@ -235,7 +235,7 @@ impl WeightedTally {
                 let correct = ballot.shown == Some(cast.label);
                 let record = &mut self.records[cast.vehicle];
                 *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
-                if self.recorded_from.is_none_or(|from| cast.at >= from) {
+                if cast.at >= self.recorded_from {
                     self.evidence.push(Evidence {
                         node: self.names[cast.vehicle].clone(),
                         label: self.labels.name(cast.label).clone(),

@@ -64,8 +64,12 @@ impl Owed {
 
     /// To be called regularly while following; now and then returns what has been shared since the leader was first heard.
     pub(super) fn tick(&mut self, period: u32) -> Option<&ReputationLedger> {
-        self.wait = self.wait.saturating_sub(1);
-        if self.wait > 0 || self.repeats == 0 {
+        if self.repeats == 0 {
+            self.shared = ReputationLedger::default();
+            return None;
+        }
+        self.wait -= 1;
+        if self.wait > 0 {
             return None;
         }
         (self.wait, self.repeats) = (period.max(1), self.repeats - 1);
