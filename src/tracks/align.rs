@@ -62,12 +62,8 @@ impl Alignment {
         Self { at, about: Vector2::zeros(), error: Vector3::zeros(), covariance: spread.covariance(), pairs: 0.0 }
     }
 
-    /// The centre of rotation from now on; what is known about the old one holds for it.
+    /// The vehicle is there now, or what it sees: the error of its pose goes with it.
     pub(super) fn turn_about(&mut self, about: Vector2<f64>) {
-        let moved = about - self.about;
-        let shift = self.turned(&moved) - moved;
-        self.error.x += shift.x;
-        self.error.y += shift.y;
         self.about = about;
     }
 
