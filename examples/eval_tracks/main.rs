@@ -15,6 +15,7 @@ use std::fs::{self, File};
 use std::io::{BufWriter, Write as _};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -45,6 +46,9 @@ pub(crate) const FIGURES: [&str; 9] =
 /// The figures of one method, in the order of [`FIGURES`].
 pub(crate) type Figures = [f64; FIGURES.len()];
 
+const USAGE: &str = "eval_tracks [--seeds tuning|report] [--count N] [--seconds S] [--observers 2,4,8] [--write-table FILE] \
+                     [--svg FILE] [--recordings DIR]";
+
 struct Options {
     seeds: Range<u64>,
     count: usize,
@@ -67,21 +71,34 @@ fn options() -> anyhow::Result<Options> {
     };
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
+        if key == "--help" || key == "-h" {
+            println!("{USAGE}");
+            std::process::exit(0);
+        }
         let value = args.next().with_context(|| format!("{key} needs a value"))?;
         match key.as_str() {
             "--seeds" if value == "tuning" => options.seeds = TUNING,
             "--seeds" if value == "report" => options.seeds = REPORT,
             "--seeds" => bail!("--seeds is tuning or report, not {value}"),
-            "--count" => options.count = value.parse()?,
-            "--seconds" => options.seconds = value.parse()?,
-            "--observers" => options.observers = value.split(',').map(str::parse).collect::<Result<_, _>>()?,
+            "--count" => options.count = number(&key, &value)?,
+            "--seconds" => options.seconds = number(&key, &value)?,
+            "--observers" => {
+                options.observers = value.split(',').map(|count| number(&key, count)).collect::<Result<_, _>>()?;
+            }
             "--write-table" => options.table = Some(value.into()),
             "--svg" => options.svg = Some(value.into()),
             "--recordings" => options.recordings = Some(value.into()),
             _ => bail!("unknown option {key}"),
         }
     }
+    if options.count == 0 || options.observers.contains(&0) {
+        bail!("--count and --observers are 1 or more");
+    }
     Ok(options)
+}
+
+fn number<T: FromStr<Err: Into<anyhow::Error>>>(key: &str, value: &str) -> anyhow::Result<T> {
+    value.parse().map_err(|error: T::Err| error.into().context(format!("{key} {value}")))
 }
 
 /// A kind of traffic and the name of its rows.
