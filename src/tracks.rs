@@ -14,7 +14,9 @@ mod calibration;
 mod config;
 mod evidence;
 mod grid;
+mod joining;
 mod motion;
+mod pairs;
 mod source;
 mod taking;
 #[cfg(test)]
@@ -33,8 +35,9 @@ use crate::names::NodeName;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{FusedObject, ObjectReport, PerceivedObject, PoseCorrection};
-use align::{Alignment, Pair, Spread};
+use align::{Alignment, Spread};
 use grid::Grid;
+use pairs::Sightings;
 use source::Source;
 use taking::Taking;
 use track::Track;
@@ -188,37 +191,39 @@ impl Tracker {
 
     /// Closes a round at `now`.
     pub fn close(&mut self, now: Timestamp) -> TracksRound {
-        let mut pending = std::mem::take(&mut self.pending);
-        pending.sort_by(|(a, x), (b, y)| (a, &x.node, x.seq).cmp(&(b, &y.node, y.seq)));
-        let oldest_capture = pending.first().map(|(at, _)| *at);
-        self.index(pending.first().map_or(now, |(at, _)| *at));
-        let mut pairs: Vec<(u32, Timestamp, Vec<Pair>)> = Vec::new();
-        for (at, report) in &pending {
+        let pending = std::mem::take(&mut self.pending);
+        let oldest_capture = pending.iter().map(|(at, _)| *at).min();
+        let mut pending: Vec<_> = pending
+            .into_iter()
+            .map(|(stamp, report)| {
+                let delay_s = self.heard(&report.node).map_or(0.0, |source| source.alignment.delay_s());
+                (stamp.shifted((-delay_s * 1e6) as i64), delay_s, report)
+            })
+            .collect();
+        pending.sort_by(|(a, _, x), (b, _, y)| (a, &x.node, x.seq).cmp(&(b, &y.node, y.seq)));
+        self.index(pending.first().map_or(now, |(at, ..)| *at));
+        let mut sightings: Vec<Sightings> = Vec::new();
+        for (at, delay_s, report) in &pending {
             if self.drift_m(*at) > self.config.gate_m / 2.0 {
                 self.index(*at);
             }
             let number = self.number_of(&report.node, *at);
             let Some(mut source) = self.sources[number as usize].take() else { continue };
             let mut taking =
-                Taking { number, source: &mut source, report, at: *at, has_jumped: false, pairs: Vec::new() };
+                Taking { number, source: &mut source, report, at: *at, has_jumped: false, sightings: Vec::new() };
             self.take(&mut taking);
-            let Taking { has_jumped, pairs: of_report, .. } = taking;
+            let Taking { has_jumped, sightings: seen, .. } = taking;
             if has_jumped {
-                pairs.retain(|(other, ..)| *other != number);
+                sightings.retain(|earlier| earlier.number != number);
             }
-            pairs.push((number, *at, of_report));
+            sightings.push(Sightings { number, at: *at, delay_s: *delay_s, seen });
             self.sources[number as usize] = Some(source);
             self.fused_until = self.fused_until.max(*at);
         }
         if self.config.align {
-            let spread = self.spread();
-            for (number, at, pairs) in pairs {
-                if let Some(source) = &mut self.sources[number as usize] {
-                    source.alignment.observe(at, &pairs, &spread);
-                }
-            }
+            self.align(&sightings);
         }
-        self.merge(now);
+        self.join(now);
         self.forget(now);
         TracksRound {
             objects: self.objects(now),
@@ -229,8 +234,13 @@ impl Tracker {
     }
 
     fn spread(&self) -> Spread {
-        let TracksConfig { align_offset_m, align_heading_rad, align_memory_s, .. } = self.config;
-        Spread { offset_m: align_offset_m, heading_rad: align_heading_rad, memory_s: align_memory_s }
+        let TracksConfig { align_offset_m, align_heading_rad, align_delay_s, align_memory_s, .. } = self.config;
+        Spread {
+            offset_m: align_offset_m,
+            heading_rad: align_heading_rad,
+            delay_s: align_delay_s,
+            memory_s: align_memory_s,
+        }
     }
 
     /// The vehicle's number, given now if it has none.

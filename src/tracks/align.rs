@@ -1,11 +1,13 @@
-//! By how much a vehicle's positions are off, from what others see of the same objects.
+//! By how much a vehicle's positions and stamps are off, from what others see of the same objects.
 //!
-//! The error is an offset and a rotation, small and changing slowly: a Gauss-Markov process of three states with a
-//! known spread at rest, so that what all vehicles are off by together, which nobody can see, decays. Every round is
+//! The error is an offset, a rotation and a delay, small and changing slowly: a Gauss-Markov process of four states with
+//! a known spread at rest, so that what all vehicles are off by together, which nobody can see, decays. A delay puts
+//! what moves one way too far ahead and what moves the other way too far behind; taken for offsets, those of two
+//! vehicles that each heed one direction would pull each other along without end. Every round is
 //! one step of an extended Kalman filter in information form over all pairs, reweighted against wrong ones by Cauchy's
 //! function (Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
 
-use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix2x4, Matrix4, Vector2, Vector4};
 
 use crate::geometry::wrap_angle;
 use crate::time::Timestamp;
@@ -16,6 +18,8 @@ use crate::wire::PoseCorrection;
 pub(super) struct Pair {
     pub(super) reported: Vector2<f64>,
     pub(super) reference: Vector2<f64>,
+    /// How fast the object goes, m/s.
+    pub(super) velocity: Vector2<f64>,
     /// Variance of the difference in each direction, m²: what is independent from pair to pair.
     pub(super) variance: f64,
     /// Variance of what the references may be off by together, m².
@@ -27,13 +31,14 @@ pub(super) struct Pair {
 pub(super) struct Spread {
     pub(super) offset_m: f64,
     pub(super) heading_rad: f64,
+    pub(super) delay_s: f64,
     pub(super) memory_s: f64,
 }
 
 impl Spread {
-    fn covariance(&self) -> Matrix3<f64> {
-        let (offset, heading) = (self.offset_m * self.offset_m, self.heading_rad * self.heading_rad);
-        Matrix3::from_diagonal(&Vector3::new(offset, offset, heading))
+    fn covariance(&self) -> Matrix4<f64> {
+        let deviations = Vector4::new(self.offset_m, self.offset_m, self.heading_rad, self.delay_s);
+        Matrix4::from_diagonal(&deviations.component_mul(&deviations))
     }
 }
 
@@ -42,9 +47,9 @@ impl Spread {
 pub(super) struct Alignment {
     at: Timestamp,
     about: Vector2<f64>,
-    /// East, north, rotation.
-    error: Vector3<f64>,
-    covariance: Matrix3<f64>,
+    /// East, north, rotation, and seconds by which stamps are late.
+    error: Vector4<f64>,
+    covariance: Matrix4<f64>,
     pairs: f64,
 }
 
@@ -54,12 +59,15 @@ const ITERATIONS: usize = 3;
 /// Residual, in standard deviations, at which a pair counts half.
 const CAUCHY: f64 = 2.0;
 
+/// Largest delay, in standard deviations.
+const MOST_DELAY: f64 = 3.0;
+
 /// Fewest pairs that a correction is published for.
 const MIN_PAIRS: f64 = 3.0;
 
 impl Alignment {
     pub(super) fn new(at: Timestamp, spread: &Spread) -> Self {
-        Self { at, about: Vector2::zeros(), error: Vector3::zeros(), covariance: spread.covariance(), pairs: 0.0 }
+        Self { at, about: Vector2::zeros(), error: Vector4::zeros(), covariance: spread.covariance(), pairs: 0.0 }
     }
 
     /// The vehicle is there now, or what it sees: the error of its pose goes with it.
@@ -83,14 +91,21 @@ impl Alignment {
         Vector2::new(cos * vector.x - sin * vector.y, sin * vector.x + cos * vector.y)
     }
 
-    /// Variance of a corrected position in each direction, on average, m².
-    pub(super) fn variance_at(&self, reported: &Vector2<f64>) -> f64 {
-        let lever = (reported - self.about).norm_squared();
-        (self.covariance.m11 + self.covariance.m22 + lever * self.covariance.m33) / 2.0
+    /// Seconds by which stamps are late.
+    pub(super) fn delay_s(&self) -> f64 {
+        self.error.w
     }
 
-    /// Takes the pairs of a round in.
-    pub(super) fn observe(&mut self, at: Timestamp, pairs: &[Pair], spread: &Spread) {
+    /// Variance of a corrected position in each direction, on average, m², of what goes at `velocity` m/s.
+    pub(super) fn variance_at(&self, reported: &Vector2<f64>, velocity: &Vector2<f64>) -> f64 {
+        let lever = (reported - self.about).norm_squared();
+        let turned_and_moved = lever * self.covariance.m33 + velocity.norm_squared() * self.covariance.m44;
+        (self.covariance.m11 + self.covariance.m22 + turned_and_moved) / 2.0
+    }
+
+    /// Takes the pairs of a report in, whose references are where the objects were at `at`: the report's stamp, less
+    /// `delay_s`.
+    pub(super) fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Pair], spread: &Spread) {
         self.fade(at, spread);
         let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty()) else { return };
         let prior = self.error;
@@ -101,8 +116,10 @@ impl Alignment {
             counted = 0.0;
             for pair in pairs {
                 let arm = self.turned(&(pair.reported - self.about));
-                let jacobian = Matrix2x3::new(1.0, 0.0, -arm.y, 0.0, 1.0, arm.x);
-                let residual = pair.reference - self.correct(&pair.reported);
+                let (x, y) = (pair.velocity.x, pair.velocity.y);
+                let jacobian = Matrix2x4::new(1.0, 0.0, -arm.y, x, 0.0, 1.0, arm.x, y);
+                let later = pair.velocity * (self.error.w - delay_s);
+                let residual = pair.reference - self.correct(&pair.reported) - later;
                 let squared = residual.norm_squared() / (pair.variance + pair.common);
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
                 // What the references share is no better known for their number.
@@ -113,6 +130,9 @@ impl Alignment {
             }
             let Some(covariance) = information.try_inverse() else { return };
             self.error = covariance * vector;
+            // Nobody's stamps move the time at which all reports are fused.
+            let most_s = MOST_DELAY * spread.delay_s;
+            self.error.w = self.error.w.clamp(-most_s, most_s);
             self.covariance = (covariance + covariance.transpose()) * 0.5;
         }
         self.pairs += counted;
@@ -150,7 +170,7 @@ mod tests {
     /// four metres away, always on the same side.
     #[test]
     fn three_wrong_pairs_in_ten_do_not_mislead() {
-        let spread = Spread { offset_m: 0.5, heading_rad: 0.01, memory_s: 10.0 };
+        let spread = Spread { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let start = Timestamp(1_732_154_400_000_000);
         let mut alignment = Alignment::new(start, &spread);
@@ -161,10 +181,11 @@ mod tests {
                 let mut noise = || rng.random_range(-0.2..0.2);
                 let reference = reported + error + Vector2::new(noise(), noise());
                 let wrong = if rng.random_bool(0.3) { rng.random_range(2.0..4.0) } else { 0.0 };
-                Pair { reported, reference: reference + Vector2::new(0.0, wrong), variance: 0.04, common: 0.02 }
+                let reference = reference + Vector2::new(0.0, wrong);
+                Pair { reported, reference, velocity: Vector2::zeros(), variance: 0.04, common: 0.02 }
             };
             let pairs: Vec<_> = (0..12).map(pair).collect();
-            alignment.observe(Timestamp(start.0 + round * 100_000), &pairs, &spread);
+            alignment.observe(Timestamp(start.0 + round * 100_000), 0.0, &pairs, &spread);
         }
         let off = alignment.correct(&Vector2::zeros()) - error;
         assert!(off.norm() < 0.15, "off by {off:?}");

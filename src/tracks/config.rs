@@ -59,12 +59,16 @@ pub struct TracksConfig {
     /// What a vehicle is called that nobody else has seen. Default `car`: the label that the cell's detectors give
     /// vehicles.
     pub vehicle_label: Label,
-    /// Whether offsets and rotations of vehicles' poses are estimated and corrected. Default true.
+    /// Whether offsets and rotations of vehicles' poses, and delays of their stamps, are estimated and corrected. Default
+    /// true.
     pub align: bool,
     /// Standard deviation in metres of a pose's offset. Default 0.5.
     pub align_offset_m: f64,
     /// Standard deviation in radians of a pose's rotation. Default 0.01.
     pub align_heading_rad: f64,
+    /// Standard deviation in seconds by which a vehicle's stamps are late or early, beyond what its clock is known to be
+    /// off by; three times as much is corrected at most. Default 0.02.
+    pub align_delay_s: f64,
     /// Time in seconds over which errors of a pose change. Default 10.
     pub align_memory_s: f64,
     /// Most objects kept at once. Default 20000.
@@ -95,6 +99,7 @@ impl Default for TracksConfig {
             align: true,
             align_offset_m: 0.5,
             align_heading_rad: 0.01,
+            align_delay_s: 0.02,
             align_memory_s: 10.0,
             max_tracks: 20_000,
             max_density: 16,
@@ -126,6 +131,7 @@ impl TracksConfig {
         }
         check_range("align_offset_m", self.align_offset_m, 1e-3, 10.0)?;
         check_range("align_heading_rad", self.align_heading_rad, 1e-5, 0.5)?;
+        check_range("align_delay_s", self.align_delay_s, 1e-6, 1.0)?;
         check_range("align_memory_s", self.align_memory_s, 0.1, 1e4)?;
         check_range("max_tracks", self.max_tracks as f64, 1.0, 1e6)?;
         check_range("max_density", self.max_density as f64, 1.0, 1e4)

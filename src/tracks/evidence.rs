@@ -12,7 +12,7 @@ use super::trust::SETTLED_AFTER;
 use crate::time::Timestamp;
 
 /// Time in seconds over which evidence fades.
-const MEMORY_S: f64 = 2.0;
+const MEMORY_S: f64 = 3.0;
 
 /// Correlation of the confidences of successive frames.
 const CORRELATION: f64 = 0.3;
@@ -21,8 +21,11 @@ const CORRELATION: f64 = 0.3;
 const INDEPENDENT_S: f64 = 0.1;
 
 /// Most nats that the order of hits and misses can speak for an object, and against it.
-const MOST_NATS: f64 = 1.5;
+const MOST_NATS: f64 = 2.5;
 const LEAST_NATS: f64 = 2.5;
+
+/// Most nats that one vehicle can speak for an object in all, so that a few others together outweigh it.
+const MOST_WORD_NATS: f64 = 8.0;
 
 /// What one vehicle has seen of one object.
 #[derive(Debug, Clone)]
@@ -136,15 +139,17 @@ impl Witness {
         self.pattern = (self.pattern + nats).clamp(-LEAST_NATS, MOST_NATS);
     }
 
-    /// All that the vehicle has to say, in nats.
-    pub(super) fn nats(&self) -> f64 {
-        let confidence = if self.weight > 1e-3 {
-            let worth = self.weight / (1.0 + CORRELATION * (self.weight - 1.0).max(0.0));
+    /// All that the vehicle has to say at `at`, in nats.
+    pub(super) fn nats(&self, at: Timestamp) -> f64 {
+        let kept = (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp();
+        let weight = kept * self.weight;
+        let confidence = if weight > 1e-3 {
+            let worth = weight / (1.0 + CORRELATION * (weight - 1.0).max(0.0));
             self.score / self.weight * worth
         } else {
             0.0
         };
-        self.pattern + confidence
+        (kept * self.pattern + confidence).min(MOST_WORD_NATS)
     }
 }
 

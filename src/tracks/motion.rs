@@ -157,6 +157,11 @@ impl Motion {
         self.vv = symmetric(self.vv + after(1, 1));
     }
 
+    /// The velocity may be another one altogether, by a standard deviation of `speed_mps` in each direction.
+    pub(super) fn doubt_velocity(&mut self, speed_mps: f64) {
+        self.vv += Matrix2::identity() * (speed_mps * speed_mps);
+    }
+
     /// Keeps the speed within what an object can have.
     pub(super) fn limit_speed(&mut self, most_mps: f64) {
         let speed = self.velocity.norm();

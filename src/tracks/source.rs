@@ -88,6 +88,17 @@ impl Noise {
     }
 }
 
+/// The middle of what a vehicle detected: the median each way, which no stray detection moves far.
+fn middle(report: &ObjectReport) -> Option<Vector2<f64>> {
+    let median = |coordinate: fn(&PerceivedObject) -> f64| {
+        let mut values: Vec<f64> = report.objects.iter().map(coordinate).collect();
+        values.sort_by(f64::total_cmp);
+        let last = values.len().checked_sub(1)?;
+        Some((values[last / 2] + values[last.div_ceil(2)]) / 2.0)
+    };
+    Some(Vector2::new(median(|object| object.x_m)?, median(|object| object.y_m)?))
+}
+
 fn stated(object: &PerceivedObject, config: &TracksConfig) -> Covariance {
     object.covariance().unwrap_or_else(|| Covariance::isotropic(config.noise_m))
 }
@@ -103,6 +114,8 @@ pub(super) struct View {
     directions: [f32; Self::DIRECTIONS],
     /// By distance from the centre.
     rates: [Bin; Self::BINS],
+    /// By direction, how far the sight goes before it meets what was detected, metres.
+    sight_m: [f32; Self::RAYS],
     farthest_m: f64,
 }
 
@@ -123,6 +136,7 @@ impl Default for View {
             centre: None,
             directions: [0.0; Self::DIRECTIONS],
             rates: [bin; Self::BINS],
+            sight_m: [f32::INFINITY; Self::RAYS],
             farthest_m: 0.0,
         }
     }
@@ -132,6 +146,14 @@ impl View {
     const BINS: usize = 16;
     const BIN_M: f64 = 10.0;
     const DIRECTIONS: usize = 24;
+    const RAYS: usize = 360;
+
+    /// Half the width in metres of what hides others.
+    const HIDES_M: f64 = 0.6;
+
+    /// Distance in metres behind a detection from which an object is hidden by it, and not the same.
+    const BEHIND_M: f64 = 3.0;
+
     /// Looks after which older ones are forgotten.
     const MEMORY: f32 = 400.0;
 
@@ -141,10 +163,9 @@ impl View {
     /// Takes note of where a report comes from; true if the vehicle is somewhere else all at once.
     pub(super) fn observe(&mut self, report: &ObjectReport) -> bool {
         self.pose = report.pose.map(Pose::from);
-        self.stated = report.view;
-        let count = report.objects.len() as f64;
-        let sum: Vector2<f64> = report.objects.iter().map(|object| Vector2::new(object.x_m, object.y_m)).sum();
-        let middle = (count > 0.0).then(|| sum / count);
+        // Of no use without the pose that it is from.
+        self.stated = report.view.filter(|_| report.pose.is_some());
+        let middle = middle(report);
         let Some(here) = self.pose.map(|pose| pose.position.coords).or(middle).or(self.centre) else { return false };
         let has_jumped = self.centre.is_some_and(|before| (here - before).norm() > Self::JUMP_M);
         if has_jumped {
@@ -159,6 +180,9 @@ impl View {
         self.directions.iter_mut().for_each(|count| *count *= 0.99);
         for object in &report.objects {
             let offset = Vector2::new(object.x_m, object.y_m) - centre;
+            if offset.norm() > Self::BIN_M * Self::BINS as f64 {
+                continue;
+            }
             self.farthest_m = self.farthest_m.max(offset.norm());
             self.directions[self.direction(&offset)] += 1.0;
         }
@@ -179,12 +203,38 @@ impl View {
     pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<Rates> {
         let offset = reported - self.centre?;
         let distance = offset.norm();
-        if distance > self.reach_m() || !self.faces(&offset) {
+        if distance > self.reach_m() || !self.faces(&offset) || self.is_hidden(&offset) {
             return None;
         }
         let bin = &self.rates[Self::bin(distance)];
         let rate = |(hits, looks): (f32, f32)| f64::from(hits / looks).clamp(0.02, 0.98);
         Some(Rates { stay: rate(bin.stay), find: rate(bin.find) })
+    }
+
+    /// Notes behind what nothing is seen in a frame: the vehicle's own parts, nearer than `nearest_m`, hide nothing.
+    pub(super) fn cast_shadows<'a>(&mut self, objects: impl Iterator<Item = &'a PerceivedObject>, nearest_m: f64) {
+        self.sight_m = [f32::INFINITY; Self::RAYS];
+        let Some(pose) = self.pose else { return };
+        for object in objects {
+            let offset = Vector2::new(object.x_m, object.y_m) - pose.position.coords;
+            let distance_m = offset.norm();
+            if distance_m <= nearest_m.max(2.0 * Self::HIDES_M) {
+                continue;
+            }
+            let half_angle = (Self::HIDES_M / distance_m).asin();
+            let rays = Self::RAYS as f64 / TAU;
+            let middle = offset.y.atan2(offset.x).rem_euclid(TAU) * rays;
+            let (first, last) = (middle - half_angle * rays, middle + half_angle * rays);
+            for ray in first.round() as i64..=last.round() as i64 {
+                let sight_m = &mut self.sight_m[ray.rem_euclid(Self::RAYS as i64) as usize];
+                *sight_m = sight_m.min(distance_m as f32);
+            }
+        }
+    }
+
+    fn is_hidden(&self, offset: &Vector2<f64>) -> bool {
+        let ray = (offset.y.atan2(offset.x).rem_euclid(TAU) * Self::RAYS as f64 / TAU).round() as usize % Self::RAYS;
+        offset.norm() > f64::from(self.sight_m[ray]) + Self::BEHIND_M
     }
 
     /// It looked at an object that is sure to exist.

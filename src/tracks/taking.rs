@@ -7,14 +7,15 @@ use nalgebra::{Matrix2, Vector2};
 use uuid::Uuid;
 
 use super::Tracker;
-use super::align::{Alignment, Pair};
+use super::align::Alignment;
 use super::assignment::{Pairing, assign};
 use super::calibration::log_odds;
 use super::config::TracksConfig;
 use super::evidence::Rates;
 use super::motion::{Measurement, Motion};
+use super::pairs::Sighting;
 use super::source::Source;
-use super::track::Track;
+use super::track::{OTHER_LABEL, Track};
 use super::trust::{Others, Word, judge};
 use crate::reputation::Evidence;
 use crate::time::Timestamp;
@@ -39,7 +40,7 @@ pub(super) struct Taking<'a> {
     /// Whether the vehicle is somewhere else all at once, and nothing is known of its alignment any more.
     pub(super) has_jumped: bool,
     /// What the vehicle's alignment is estimated from.
-    pub(super) pairs: Vec<Pair>,
+    pub(super) sightings: Vec<Sighting>,
 }
 
 /// Where nothing is known of a vehicle's view.
@@ -48,17 +49,24 @@ const UNKNOWN: Rates = Rates { stay: 0.9, find: 0.15 };
 /// Standard deviation of reported velocities, m/s.
 const VELOCITY_SIGMA_MPS: f64 = 1.0;
 
-/// Within how much time another vehicle's detection still tells where an object was.
-const SIMULTANEOUS: Duration = Duration::from_millis(300);
-
 /// Within how much time another vehicle's detection confirms that an object is there.
 const CONFIRMED_WITHIN: Duration = Duration::from_millis(500);
+
+/// Trust that positions are weighed by at least.
+const LEAST_TRUST: f64 = 0.05;
 
 /// Detections after which a track is known well enough to measure detections by.
 const MATURE_HITS: u32 = 8;
 
 /// Detections after which a track says what a vehicle sees.
 const SURE_HITS: u32 = 5;
+
+/// Within how much time a new object may be anywhere that the highest speed allows.
+const FAST_WITHIN: Duration = Duration::from_millis(250);
+
+/// Most detections of a report that are held against such objects: where more are new, nothing is known yet, or somebody
+/// makes them up.
+const MOST_FAST: usize = 64;
 
 /// Confidence of a vehicle that it exists itself, log-odds.
 const SELF_NATS: f64 = 4.0;
@@ -74,9 +82,18 @@ impl Tracker {
         if let Some(centre) = source.view.centre() {
             source.alignment.turn_about(centre);
         }
-        self.take_own_pose(taking);
+        let is_trusted = source.trust(&self.reputation) > 0.0;
+        let hides = |object: &&PerceivedObject| source.calibration.nats(object.confidence) > 0.0;
+        source.view.cast_shadows(report.objects.iter().filter(hides), self.config.vehicle_radius_m);
+        // What a proven liar says is judged where others say something of it, and counts for nothing.
+        if is_trusted {
+            self.take_own_pose(taking);
+        }
         let seen = self.seen(taking.source, taking.report);
-        let chosen = self.associate(taking.number, &seen, taking.at);
+        let mut chosen = self.associate(taking.number, &seen, taking.at);
+        if is_trusted {
+            self.associate_fast(taking.source, &seen, taking.at, &mut chosen);
+        }
         let mut chosen = chosen.iter().peekable();
         let mut founding = Vec::new();
         for (detection, seen) in seen.iter().enumerate() {
@@ -86,7 +103,7 @@ impl Tracker {
             }
         }
         self.look(taking);
-        for seen in founding {
+        for seen in founding.into_iter().filter(|_| is_trusted) {
             self.found(taking, seen);
         }
     }
@@ -102,17 +119,10 @@ impl Tracker {
             common_m: self.config.common_m,
         };
         let (density, number, at) = (self.config.density(), taking.number, taking.at);
-        let reach_m = 2.0 * self.config.vehicle_radius_m;
-        let offset = |track: u32| (self.tracks[track as usize].motion.position_at(at) - measurement.position).norm();
-        let unclaimed = || {
-            let around = self.near.around(&measurement.position, reach_m + self.drift_m(at));
-            around.filter(|track| self.tracks[*track as usize].vehicle.is_none() && offset(*track) <= reach_m)
-        };
         let known = self.own.get(&number).copied();
-        let known = known.or_else(|| unclaimed().min_by(|a, b| offset(*a).total_cmp(&offset(*b)).then(a.cmp(b))));
         let is_in_reach = known.is_some_and(|track| {
             let innovation = self.tracks[track as usize].motion.innovation(at, &measurement, density);
-            offset(track) <= self.config.gate_m.max(reach_m) || innovation.distance_squared <= self.config.gate()
+            innovation.offset.norm() <= self.config.gate_m || innovation.distance_squared <= self.config.gate()
         });
         let track = match known {
             Some(track) => track as usize,
@@ -129,12 +139,13 @@ impl Tracker {
             track.motion.update(at, &measurement, density);
             track.motion.limit_speed(self.config.max_speed_mps);
         } else if at >= track.motion.at {
-            // New, or somewhere else all at once.
+            // New, or somewhere else all at once, where nobody else can have seen it before.
             track.motion = Motion::new(at, &measurement, self.config.speed_mps);
+            track.witnesses.clear();
         }
         track.refresh(at);
         self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        if let Some(witness) = track.witness(number, at) {
+        if let Some(witness) = track.eyewitness(number, at) {
             witness.hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
         }
     }
@@ -142,12 +153,13 @@ impl Tracker {
     /// The report's detections, corrected; those of the vehicle itself are left out.
     fn seen<'a>(&self, source: &Source, report: &'a ObjectReport) -> Vec<Seen<'a>> {
         let own = report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
+        let trust = source.trust(&self.reputation).max(LEAST_TRUST);
         let seen = |(index, object): (usize, &'a PerceivedObject)| {
             let reported = Vector2::new(object.x_m, object.y_m);
             let is_itself = own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
             let measurement = Measurement {
                 position: source.alignment.correct(&reported),
-                independent: source.noise.covariance(object, &self.config),
+                independent: source.noise.covariance(object, &self.config) / trust,
                 common_m: self.config.common_m,
             };
             (!is_itself).then_some(Seen { index, object, reported, measurement })
@@ -176,7 +188,7 @@ impl Tracker {
                 let spread = (innovation.covariance.determinant().sqrt() / alone).ln();
                 let maturity = f64::from(track.hits.clamp(1, 10)).ln();
                 let benefit = gate - innovation.distance_squared - spread + maturity + 2.0 * likeness.ln();
-                if benefit > 0.0 || likeness > super::track::OTHER_LABEL {
+                if benefit > 0.0 || likeness > OTHER_LABEL {
                     let benefit = benefit.max(0.01);
                     pairings.push(Pairing { detection: detection as u32, track: candidate, benefit });
                 }
@@ -185,9 +197,51 @@ impl Tracker {
         assign(seen.len(), &pairings)
     }
 
+    /// The same for what is left and goes too fast for that: objects that are so new that their velocity may be any.
+    fn associate_fast(&mut self, source: &Source, seen: &[Seen<'_>], at: Timestamp, chosen: &mut Vec<Pairing>) {
+        let speed_mps = self.config.max_speed_mps;
+        let reach_m = speed_mps * FAST_WITHIN.as_secs_f64() + self.drift_m(at);
+        let mut continued: Vec<u32> = chosen.iter().map(|pairing| pairing.track).collect();
+        continued.sort_unstable();
+        let mut matched = chosen.iter().map(|pairing| pairing.detection as usize).peekable();
+        let left = seen.iter().enumerate().filter(|(detection, _)| matched.next_if_eq(detection).is_none());
+        let likely = left.filter(|(_, seen)| source.calibration.nats(seen.object.confidence) > 0.0);
+        let mut pairings = Vec::new();
+        for (detection, seen) in likely.take(MOST_FAST) {
+            let near = self.wide.around(&seen.measurement.position, reach_m);
+            let near = near.filter(|track| continued.binary_search(track).is_err());
+            pairings.extend(near.filter_map(|track| {
+                let benefit = self.benefit_if_fast(&self.tracks[track as usize], seen, at)?;
+                Some(Pairing { detection: detection as u32, track, benefit })
+            }));
+        }
+        for pairing in assign(seen.len(), &pairings) {
+            self.tracks[pairing.track as usize].motion.doubt_velocity(speed_mps / 2.0);
+            chosen.push(pairing);
+        }
+        chosen.sort_by_key(|pairing| pairing.detection);
+    }
+
+    /// What it is worth to take a detection for a new object of whatever velocity; `None` if it cannot be.
+    fn benefit_if_fast(&self, track: &Track, seen: &Seen<'_>, at: Timestamp) -> Option<f64> {
+        let passed = at.since(track.last_seen);
+        let is_new = track.hits < SURE_HITS && track.vehicle.is_none();
+        let offset = seen.measurement.position - track.motion.position_at(at);
+        let speed_mps = self.config.max_speed_mps;
+        if !is_new || passed > FAST_WITHIN || offset.norm() > speed_mps * passed.as_secs_f64() {
+            return None;
+        }
+        let likeness = track.likeness(seen.object);
+        let mut motion = track.motion.clone();
+        motion.doubt_velocity(speed_mps / 2.0);
+        let innovation = motion.innovation(at, &seen.measurement, self.config.density());
+        let is_possible = innovation.distance_squared <= self.config.gate() && likeness > OTHER_LABEL;
+        is_possible.then(|| (self.config.gate() - innovation.distance_squared + 2.0 * likeness.ln()).max(0.01))
+    }
+
     /// An object was detected again.
     fn confirm(&mut self, taking: &mut Taking<'_>, track: u32, seen: &Seen<'_>) {
-        let Taking { number, source, at, pairs, .. } = taking;
+        let Taking { number, source, at, sightings, .. } = taking;
         let (number, at, config) = (*number, *at, &self.config);
         let index = track as usize;
         let track = &mut self.tracks[index];
@@ -197,35 +251,31 @@ impl Tracker {
             let expected = track.motion.covariance_at(at, density).trace();
             source.noise.learn(seen.object, offset.norm_squared(), expected, config);
         }
-        let (mut sum, mut count, mut common) = (Vector2::zeros(), 0.0, 0.0);
-        for other in track.seen_by(at - SIMULTANEOUS).filter(|witness| witness.source != number) {
-            let Some(hit) = other.last_hit else { continue };
-            sum += other.position + track.motion.velocity * (at.micros_from(hit) as f64 * 1e-6);
-            let theirs = self.sources.get(other.source as usize).and_then(Option::as_ref);
-            common += theirs.map_or(0.0, |theirs| theirs.alignment.variance_at(&seen.reported));
-            count += 1.0;
+        let is_confirmed = track.seen_by(at - CONFIRMED_WITHIN).any(|witness| witness.source != number);
+        if track.hits >= SURE_HITS && track.vehicle.is_none() {
+            let variance = seen.measurement.independent.trace() / 2.0;
+            sightings.push(Sighting { track: index as u32, reported: seen.reported, variance });
         }
-        let is_confirmed = count > 0.0;
-        if is_confirmed && track.hits >= SURE_HITS && track.vehicle.is_none() {
-            let variance = seen.measurement.independent.trace() * (1.0 + 1.0 / count) / 2.0;
-            pairs.push(Pair { reported: seen.reported, reference: sum / count, variance, common: common / count });
-        }
-        let rates = source.view.rates_at(&seen.reported).unwrap_or(UNKNOWN);
+        let rates = source.view.rates_at(&seen.reported);
+        let is_trusted = source.trust(&self.reputation) > 0.0;
         let last = track.witnesses.iter().find(|witness| witness.source == number && witness.was_hit);
         let last = last.map(|witness| witness.log_odds);
         let was_hit = last.is_some();
-        if track.hits >= SURE_HITS && (is_confirmed || was_hit) && track.hears(number, at) {
+        if rates.is_some() && track.hits >= SURE_HITS && (is_confirmed || was_hit) && track.hears(number, at) {
             source.view.learn(&seen.reported, was_hit, true);
         }
-        track.motion.update(at, &seen.measurement, density);
-        describe(track, source, seen, at, config);
+        if is_trusted {
+            track.motion.update(at, &seen.measurement, density);
+            describe(track, source, seen, at, config);
+        }
         self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
         if let Some(log_odds) = last {
             source.calibration.learn(log_odds, true);
         }
         let nats = source.calibration.nats(seen.object.confidence);
-        if let Some(witness) = track.witness(number, at) {
-            witness.hit(at, seen.measurement.position, nats, rates, true);
+        let seat = if is_trusted { track.eyewitness(number, at) } else { track.witness(number, at) };
+        if let Some(witness) = seat {
+            witness.hit(at, seen.measurement.position, nats, rates.unwrap_or(UNKNOWN), true);
             witness.log_odds = log_odds(seen.object.confidence);
         }
         self.settle(taking, index, &seen.reported);
@@ -235,6 +285,7 @@ impl Tracker {
     fn look(&mut self, taking: &mut Taking<'_>) {
         let (number, at) = (taking.number, taking.at);
         let Some(centre) = taking.source.view.centre() else { return };
+        let is_trusted = taking.source.trust(&self.reputation) > 0.0;
         let reach_m = taking.source.view.reach_m() + self.drift_m(at);
         let candidates: Vec<u32> = self.wide.around(&centre, reach_m).collect();
         for candidate in candidates {
@@ -260,7 +311,7 @@ impl Tracker {
             if let Some(witness) = track.witness(number, at) {
                 witness.miss(at, rates);
             }
-            if knew_it {
+            if knew_it && is_trusted {
                 track.overlooked(at, dt_s, rates.of(was_hit));
             }
             self.settle(taking, candidate as usize, &position);
@@ -301,7 +352,7 @@ impl Tracker {
         let mut track = Track::new(founding_id(taking.report, seen.index), at, &seen.measurement, &self.config);
         describe(&mut track, taking.source, seen, at, &self.config);
         let nats = taking.source.calibration.nats(seen.object.confidence);
-        if let Some(witness) = track.witness(number, at) {
+        if let Some(witness) = track.eyewitness(number, at) {
             witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
             witness.log_odds = log_odds(seen.object.confidence);
         }

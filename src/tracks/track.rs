@@ -8,6 +8,7 @@ use uuid::Uuid;
 
 use super::config::TracksConfig;
 use super::evidence::{Witness, logistic};
+use super::joining::Neighbours;
 use super::motion::{Measurement, Motion};
 use crate::geometry::{Covariance, wrap_angle};
 use crate::names::{Label, NodeName};
@@ -20,6 +21,9 @@ const MAX_WITNESSES: usize = 32;
 /// Were the others to make room for newcomers, none of more than 32 would stay for long enough to be judged.
 const SEAT_KEPT: Duration = Duration::from_secs(1);
 
+/// Labels that are kept of an object, the likeliest.
+const MAX_LABELS: usize = 8;
+
 /// Probability of a label that was never read, for the association.
 pub(super) const OTHER_LABEL: f64 = 0.02;
 
@@ -30,13 +34,13 @@ const USABLE_M: f64 = 1.5;
 const PRIOR_NATS: f64 = 0.4;
 
 /// Objects that go for good, per second.
-const GONE_RATE: f64 = 0.1;
+const GONE_RATE: f64 = 0.02;
 
 /// Time in seconds after which an object that nobody looks for is as good as gone.
 const UNSEEN_S: f64 = 2.0;
 
 /// Odds that what is followed is none of the things that only seem to be there: most tracks are of these.
-const PRIOR_ODDS: f64 = 0.05;
+const PRIOR_ODDS: f64 = 0.07;
 
 /// See the module.
 #[derive(Debug, Clone)]
@@ -56,6 +60,7 @@ pub(super) struct Track {
     pub(super) vehicle: Option<u32>,
     /// Detections so far.
     pub(super) hits: u32,
+    pub(super) neighbours: Neighbours,
     /// Log-odds taken over from another aggregator, fading, and when they were renewed.
     inherited: Option<(f64, Timestamp)>,
 }
@@ -75,6 +80,7 @@ impl Track {
             gone: 0.0,
             vehicle: None,
             hits: 0,
+            neighbours: Neighbours::default(),
             inherited: None,
         }
     }
@@ -99,12 +105,23 @@ impl Track {
     /// The vehicle's part in it, made if there is none and room for one.
     pub(super) fn witness(&mut self, source: u32, at: Timestamp) -> Option<&mut Witness> {
         let seat = self.seat(source, at)?;
-        match self.witnesses.get_mut(seat) {
-            None => self.witnesses.push(Witness::new(source, at)),
-            Some(witness) if witness.source != source => *witness = Witness::new(source, at),
-            Some(_) => {}
+        Some(self.sit(seat, source, at))
+    }
+
+    /// The same for a vehicle that detects it: one that never did makes room.
+    pub(super) fn eyewitness(&mut self, source: u32, at: Timestamp) -> Option<&mut Witness> {
+        let blind = || self.witnesses.iter().position(|witness| witness.last_hit.is_none());
+        let seat = self.seat(source, at).or_else(blind)?;
+        Some(self.sit(seat, source, at))
+    }
+
+    fn sit(&mut self, seat: usize, source: u32, at: Timestamp) -> &mut Witness {
+        if seat == self.witnesses.len() {
+            self.witnesses.push(Witness::new(source, at));
+        } else if self.witnesses[seat].source != source {
+            self.witnesses[seat] = Witness::new(source, at);
         }
-        self.witnesses.get_mut(seat)
+        &mut self.witnesses[seat]
     }
 
     /// Takes over what a detection says beside its place.
@@ -121,9 +138,9 @@ impl Track {
                 None => self.labels.push((label.clone(), score)),
             }
         }
-        if self.labels.len() > 8 {
+        if self.labels.len() > MAX_LABELS {
             self.labels.sort_by(|a, b| b.1.total_cmp(&a.1));
-            self.labels.truncate(8);
+            self.labels.truncate(MAX_LABELS);
         }
         if let Some(new) = heading_rad {
             let old = self.heading_rad.unwrap_or(new);
@@ -169,7 +186,7 @@ impl Track {
 
     /// Log-odds that there is such an object, each vehicle's word weighted by the trust in it.
     pub(super) fn nats(&self, at: Timestamp, trust: impl Fn(u32) -> f64) -> f64 {
-        let witnessed: f64 = self.witnesses.iter().map(|witness| trust(witness.source) * witness.nats()).sum();
+        let witnessed: f64 = self.witnesses.iter().map(|witness| trust(witness.source) * witness.nats(at)).sum();
         let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
         PRIOR_NATS + witnessed + inherited
     }
@@ -193,7 +210,7 @@ impl Track {
         })
     }
 
-    /// Takes in a track of the same object.
+    /// Takes in a later track of the same object; what this one is called holds.
     pub(super) fn absorb(&mut self, other: Self) {
         for theirs in other.witnesses {
             match self.witnesses.iter().position(|mine| mine.source == theirs.source) {
@@ -207,6 +224,7 @@ impl Track {
             self.last_seen = other.last_seen;
             self.gone = other.gone;
         }
+        self.neighbours.absorb(other.neighbours, self.id);
         self.hits = self.hits.saturating_add(other.hits);
         self.vehicle = self.vehicle.or(other.vehicle);
         self.heading_rad = self.heading_rad.or(other.heading_rad);
@@ -216,7 +234,7 @@ impl Track {
     /// Takes over what another aggregator knew.
     pub(super) fn inherit(&mut self, object: &FusedObject, at: Timestamp) {
         let existence = object.existence.unwrap_or(object.confidence).clamp(0.01, 0.99);
-        self.inherited = Some(((existence / (1.0 - existence)).ln() - PRIOR_NATS, at));
+        self.inherited = Some(((existence / (1.0 - existence) / PRIOR_ODDS).ln() - PRIOR_NATS, at));
         self.first_seen = object.first_seen_us.map_or(self.first_seen, |first| first.min(self.first_seen));
         self.labels = object.scores.iter().map(|(label, score)| (label.clone(), *score)).collect();
         self.heading_rad = object.heading_rad;
@@ -233,20 +251,20 @@ impl Track {
     ) -> FusedObject {
         let covariance = self.motion.covariance_at(now, config.density());
         let position = self.motion.position_at(now);
-        let there = logistic(self.nats(now, trust)) * self.presence(now);
+        let there = believed(logistic(self.nats(now, trust))) * self.presence(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
         let scores = self.labels.iter().map(|(label, weight)| (label.clone(), weight / total.max(1e-9)));
         let variance = covariance.trace() / 2.0;
         let usable = 1.0 - (-USABLE_M * USABLE_M / (2.0 * variance)).exp();
         let covariance = Covariance { xx: covariance.m11, xy: covariance.m12, yy: covariance.m22 };
-        let confidence = believed(there * usable);
+        let confidence = there * usable;
         let moving = self.hits > 1;
         FusedObject {
             contributors: self
                 .seen_by(now - Duration::from_secs_f64(config.life_s))
                 .filter_map(|witness| name(witness.source))
                 .collect(),
-            existence: Some(believed(there)),
+            existence: Some(there),
             scores: scores.collect(),
             velocity_mps: moving.then_some([self.motion.velocity.x, self.motion.velocity.y]),
             heading_rad: self.heading_rad.or_else(|| self.course_rad()),

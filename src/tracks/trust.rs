@@ -59,7 +59,7 @@ impl Others {
                 continue;
             }
             let weight = trust(witness.source);
-            others.nats += weight * witness.nats();
+            others.nats += weight * witness.nats(at);
             others.looking += usize::from(weight > 0.5 && witness.looks > 5);
             let lately = witness.last_hit.is_some_and(|hit| at.since(hit) <= SETTLED_AFTER);
             others.detecting += usize::from(weight > 0.5 && lately);

@@ -1,5 +1,5 @@
-//! What happens to the objects between reports: those that turn out to be one are joined, those that are gone
-//! forgotten.
+//! What happens to the objects between reports: they are indexed, those that are gone are forgotten, and those of
+//! another aggregator's map taken over.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -8,6 +8,7 @@ use nalgebra::Vector2;
 use uuid::Uuid;
 
 use super::Tracker;
+use super::joining::SAME_M;
 use super::motion::Measurement;
 use super::track::Track;
 use crate::geometry::Covariance;
@@ -16,12 +17,6 @@ use crate::wire::{FusedObject, GlobalMap};
 
 /// How long a silent vehicle is remembered after its last object.
 const REMEMBERED: Duration = Duration::from_secs(10);
-
-/// Two objects are never taken for one beyond this distance in metres.
-const MERGE_M: f64 = 2.0;
-
-/// Nor beyond this distance in standard deviations.
-const MERGE_SIGMAS: f64 = 3.0;
 
 /// Probability of being there below which an unseen object is forgotten.
 const LEAST_PRESENCE: f64 = 0.02;
@@ -62,43 +57,6 @@ impl Tracker {
         self.fastest_mps * (at.micros_from(self.indexed_at) as f64 * 1e-6).abs()
     }
 
-    /// Joins objects that are one: near each other, and never told apart by one vehicle in one frame. The older stays.
-    pub(super) fn merge(&mut self, now: Timestamp) {
-        self.index(now);
-        let mut joined: Vec<(usize, usize)> = Vec::new();
-        for (older, track) in self.tracks.iter().enumerate() {
-            let position = track.motion.position_at(now);
-            let later = self.near.around(&position, MERGE_M).map(|other| other as usize).filter(|other| *other > older);
-            joined.extend(
-                later.filter(|other| self.are_one(track, &self.tracks[*other], now)).map(|other| (older, other)),
-            );
-        }
-        if joined.is_empty() {
-            return;
-        }
-        let mut tracks: Vec<Option<Track>> = std::mem::take(&mut self.tracks).into_iter().map(Some).collect();
-        for (older, later) in joined {
-            if tracks[older].is_some()
-                && let Some(later) = tracks[later].take()
-                && let Some(older) = &mut tracks[older]
-            {
-                older.absorb(later);
-            }
-        }
-        self.tracks = tracks.into_iter().flatten().collect();
-    }
-
-    fn are_one(&self, track: &Track, other: &Track, now: Timestamp) -> bool {
-        let offset = other.motion.position_at(now) - track.motion.position_at(now);
-        if offset.norm() >= MERGE_M || track.vehicle.is_some() && other.vehicle.is_some() || track.is_told_apart(other)
-        {
-            return false;
-        }
-        let density = self.config.density();
-        let covariance = track.motion.covariance_at(now, density) + other.motion.covariance_at(now, density);
-        offset.norm_squared() < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
-    }
-
     /// Forgets objects that are gone, and vehicles that have been silent for longer than any object lives,
     /// save what their word is worth.
     pub(super) fn forget(&mut self, now: Timestamp) {
@@ -134,12 +92,12 @@ impl Tracker {
                 continue;
             }
             let seen = self.inherited(object);
-            let nearest = self.near.around(&seen.position, MERGE_M).map(|track| {
+            let nearest = self.near.around(&seen.position, SAME_M).map(|track| {
                 let offset = self.tracks[track as usize].motion.position_at(now) - seen.position;
                 (track as usize, offset.norm())
             });
             let nearest =
-                nearest.filter(|(track, distance)| *distance < MERGE_M && !stated.contains(&self.tracks[*track].id));
+                nearest.filter(|(track, distance)| *distance < SAME_M && !stated.contains(&self.tracks[*track].id));
             match nearest.min_by(|a, b| a.1.total_cmp(&b.1)) {
                 Some((track, _)) => self.tracks[track].id = object.id,
                 None => {

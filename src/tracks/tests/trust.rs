@@ -36,6 +36,37 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
     assert_eq!((judged.len(), contributors), (32, 32));
 }
 
+#[test]
+fn whoever_sees_an_object_is_heard_before_those_who_overlook_it() {
+    let seen = Measurement { position: Vector2::zeros(), independent: Matrix2::identity(), common_m: 0.2 };
+    let mut track = Track::new(Uuid::nil(), at(0), &seen, &TracksConfig::default());
+    let taken = (0..100).filter(|vehicle| track.witness(*vehicle, at(0)).is_some()).count();
+    assert!(taken < 100 && track.witness(100, at(1)).is_none());
+    assert!(track.eyewitness(100, at(1)).is_some());
+    assert!(track.hears(100, at(1)) && !track.hears(0, at(1)));
+}
+
+/// Four look straight at the place, and one that they otherwise agree with is sure that something is there.
+#[test]
+fn one_sure_vehicle_does_not_outweigh_all_that_see_nothing() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..30 {
+        let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+        for (n, node) in ["a", "b", "c", "d", "liar"].into_iter().enumerate() {
+            let pose = Some(WirePose { x_m: n as f64 * 6.0, y_m: 0.0, heading_rad: 0.0 });
+            let mut objects: Vec<_> = (0..5).map(|n| car(f64::from(n) * 8.0 - 4.0, -15.0)).collect();
+            if node == "liar" {
+                objects.push(PerceivedObject::new("car", 0.99, 12.0, 25.0));
+            }
+            tracker.observe(&ObjectReport { pose, view, ..report(node, frame, objects) }, at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    assert!(sure(&round).iter().all(|object| object.y_m < 10.0), "{:?}", sure(&round));
+    assert!(sure(&round).len() >= 5);
+}
+
 /// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
 /// says as much; of many others that nothing is known of.
 #[test]
