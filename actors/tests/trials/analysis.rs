@@ -63,6 +63,8 @@ pub(crate) struct Verdict {
     pub(crate) reputations_changed: bool,
     /// New leaderships beyond those that the faults explain, and expected ones that did not come about.
     pub(crate) false_failovers: u64,
+    /// Whether the machine withheld so much processor time that the rest tells nothing; judged by the caller.
+    pub(crate) is_void: bool,
 }
 
 /// A node that has taken no map for so long at the end of a phase is without service.
@@ -73,7 +75,7 @@ pub(crate) const QUIET: Duration = Duration::from_secs(1);
 
 /// Judges a trial by the logs of all its processes.
 pub(crate) fn judge(runs: &[NodeRun], phases: &[Phase]) -> Verdict {
-    let mut verdict = Verdict { stale_accepted: runs.iter().map(stale).sum(), ..Verdict::default() };
+    let mut verdict = Verdict { stale_accepted: runs.iter().flat_map(stale).count() as u64, ..Verdict::default() };
     let mut known: BTreeSet<&Epoch> =
         phases.first().map(|first| epochs(runs, Timestamp::default(), first.from)).unwrap_or_default();
     for phase in phases {
@@ -98,16 +100,15 @@ pub(crate) fn percentile(sorted: &[Duration], percent: usize) -> Option<Duration
     sorted.get(rank - 1).copied()
 }
 
-/// How many maps a process took although it had taken a later one.
-pub(crate) fn stale(run: &NodeRun) -> u64 {
+/// The maps that a process took although it had taken a later one.
+pub(crate) fn stale(run: &NodeRun) -> impl Iterator<Item = &Accepted> {
     let mut latest: Option<(&Epoch, u64)> = None;
-    let mut stale = 0;
-    for map in &run.accepted {
+    run.accepted.iter().filter(move |map| {
         let this = (&map.epoch, map.round);
-        stale += u64::from(latest.is_some_and(|latest| this <= latest));
+        let is_stale = latest.is_some_and(|latest| this <= latest);
         latest = latest.max(Some(this));
-    }
-    stale
+        is_stale
+    })
 }
 
 /// Pairs of maps taken one after the other, the second within the time.

@@ -12,7 +12,9 @@ use crate::scenario::Scenario;
 pub(crate) struct Outcome {
     scenario: &'static str,
     nodes: usize,
+    /// Those that count.
     trials: usize,
+    void: usize,
     gap_ms: Gaps,
     stale_accepted: u64,
     missed_rounds: u64,
@@ -34,7 +36,9 @@ struct Gaps {
 }
 
 impl Outcome {
-    pub(crate) fn new(scenario: &Scenario, nodes: usize, verdicts: &[Verdict]) -> Self {
+    /// What the verdicts that are not void come to.
+    pub(crate) fn new(scenario: &Scenario, nodes: usize, all: &[Verdict]) -> Self {
+        let verdicts: Vec<&Verdict> = all.iter().filter(|verdict| !verdict.is_void).collect();
         let mut gaps: Vec<Duration> = verdicts.iter().filter_map(|verdict| verdict.gap).collect();
         gaps.sort_unstable();
         let gap = |percent| percentile(&gaps, percent).map(|gap| gap.as_millis() as u64);
@@ -42,6 +46,7 @@ impl Outcome {
             scenario: scenario.name,
             nodes,
             trials: verdicts.len(),
+            void: all.len() - verdicts.len(),
             gap_ms: Gaps { p50: gap(50), p99: gap(99), max: gap(100) },
             stale_accepted: verdicts.iter().map(|verdict| verdict.stale_accepted).sum(),
             missed_rounds: verdicts.iter().map(|verdict| verdict.missed_rounds).sum(),
@@ -56,7 +61,7 @@ impl Outcome {
 
     /// The bars that were missed, in words.
     pub(crate) fn misses(&self) -> Vec<String> {
-        let gap = self.gap_bar_ms.filter(|bar| self.gap_ms.p99.is_none_or(|p99| p99 > *bar));
+        let gap = self.gap_bar_ms.filter(|bar| self.trials > 0 && self.gap_ms.p99.is_none_or(|p99| p99 > *bar));
         let gap = gap.map(|bar| format!("gap p99 {} ms, at most {bar}", number(self.gap_ms.p99)));
         let none = |what: &str, count: u64| (count > 0).then(|| format!("{what} {count}, must be 0"));
         let counts = [
@@ -74,14 +79,30 @@ impl Outcome {
 /// A line for each outcome, with its bars.
 pub(crate) fn table(outcomes: &[Outcome]) -> String {
     let mut text = format!(
-        "{:<29}{:>6}{:>7}{:>7}{:>7}{:>7}{:>6}{:>7}{:>7}{:>12}{:>8}{:>7}\n",
-        "scenario", "nodes", "trials", "p50", "p99", "max", "bar", "stale", "missed", "unrecovered", "double", "false"
+        "{:<29}{:>6}{:>7}{:>6}{:>7}{:>7}{:>7}{:>6}{:>7}{:>7}{:>12}{:>8}{:>7}\n",
+        "scenario",
+        "nodes",
+        "trials",
+        "void",
+        "p50",
+        "p99",
+        "max",
+        "bar",
+        "stale",
+        "missed",
+        "unrecovered",
+        "double",
+        "false"
     );
     for outcome in outcomes {
-        let Outcome { scenario, nodes, trials, gap_ms, stale_accepted, missed_rounds, unrecovered, .. } = outcome;
-        let mark = if outcome.misses().is_empty() { "" } else { "  MISSED" };
+        let Outcome { scenario, nodes, trials, void, gap_ms, stale_accepted, missed_rounds, unrecovered, .. } = outcome;
+        let mark = match outcome.misses().is_empty() {
+            _ if *trials == 0 => "  NOT MEASURED",
+            true => "",
+            false => "  MISSED",
+        };
         text += &format!(
-            "{scenario:<29}{nodes:>6}{trials:>7}{:>7}{:>7}{:>7}{:>6}{stale_accepted:>7}{missed_rounds:>7}{unrecovered:>12}{:>8}{:>7}{mark}\n",
+            "{scenario:<29}{nodes:>6}{trials:>7}{void:>6}{:>7}{:>7}{:>7}{:>6}{stale_accepted:>7}{missed_rounds:>7}{unrecovered:>12}{:>8}{:>7}{mark}\n",
             number(gap_ms.p50),
             number(gap_ms.p99),
             number(gap_ms.max),
@@ -90,7 +111,8 @@ pub(crate) fn table(outcomes: &[Outcome]) -> String {
             outcome.false_failovers,
         );
     }
-    text + "gaps in ms, of the worst vehicle, the period of 100 ms included; bar: the most that p99 may be\n"
+    text + "gaps in ms, of the worst vehicle, the period of 100 ms included; bar: the most that p99 may be\n\
+            void: the hypervisor withheld more than 100 ms of processor time within half a second; not counted\n"
 }
 
 fn number(value: Option<u64>) -> String {
@@ -123,6 +145,18 @@ mod tests {
     }
 
     #[test]
+    fn void_trials_miss_no_bar_and_are_counted() {
+        let wrong = Verdict { gap: Some(Duration::from_secs(2)), unrecovered: true, ..Verdict::default() };
+        let void = Verdict { is_void: true, ..wrong.clone() };
+        let right = Verdict { gap: Some(Duration::from_millis(110)), ..Verdict::default() };
+        let table_of = |verdicts: &[Verdict]| table(&[Outcome::new(&SCENARIOS[0], 5, verdicts)]);
+        assert!(Outcome::new(&SCENARIOS[0], 5, &[void.clone(), right.clone()]).misses().is_empty());
+        assert!(!Outcome::new(&SCENARIOS[0], 5, &[void.clone(), right.clone(), wrong]).misses().is_empty());
+        assert!(!table_of(&[void.clone(), right]).contains("NOT MEASURED"));
+        assert!(table_of(&[void]).contains("NOT MEASURED"));
+    }
+
+    #[test]
     fn rounds_may_be_missed_when_a_process_dies_but_not_when_it_hands_over() {
         let missed = Verdict { missed_rounds: 1, ..Verdict::default() };
         assert!(outcome("edge_sigkill", missed.clone()).misses().is_empty());
@@ -133,7 +167,7 @@ mod tests {
     fn the_file_has_the_promised_keys_and_whole_milliseconds() {
         let json = serde_json::to_value([outcome("edge_sigkill", Verdict::default())]).unwrap();
         let expected = serde_json::json!([{
-            "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "gap_ms": {"p50": 150, "p99": 150, "max": 150},
+            "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "void": 0, "gap_ms": {"p50": 150, "p99": 150, "max": 150},
             "stale_accepted": 0, "missed_rounds": 0, "unrecovered": 0, "double_leader_after_quiet": 0,
             "false_failovers": 0, "reputations_changed": 0,
         }]);
