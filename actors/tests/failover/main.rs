@@ -45,7 +45,7 @@ async fn maps_go_on_without_the_edge_and_with_it_again() {
     for name in ["euclid", "gauss", "noether"] {
         let record = cell.record(name);
         record.never_goes_back();
-        record.misses_and_repeats_none_after(before);
+        record.misses_and_repeats_none_after(before, "edge");
     }
     cell.stop().await;
 }

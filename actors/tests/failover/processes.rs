@@ -116,6 +116,6 @@ fn edge_is_killed(directory: &TempDir) {
     std::thread::sleep(Duration::from_millis(500));
     for name in vehicles {
         record(name).never_goes_back();
-        record(name).misses_and_repeats_none_after(before);
+        record(name).misses_and_repeats_none_after(before, "edge");
     }
 }
