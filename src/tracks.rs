@@ -24,6 +24,7 @@ mod tests;
 mod track;
 mod trust;
 mod upkeep;
+mod witnesses;
 
 use std::collections::BTreeMap;
 
@@ -77,9 +78,8 @@ pub struct Tracker {
     fleet: Fleet,
     /// The oldest first.
     tracks: Vec<Track>,
-    /// Tracks by place, in cells of the gate's size and in large ones.
-    near: Grid,
-    wide: Grid,
+    /// Tracks by place, in cells whose side is a multiple of the gate's.
+    grid: Grid,
     /// When they were there, and how fast the fastest of them goes.
     indexed_at: Timestamp,
     fastest_mps: f64,
@@ -94,16 +94,15 @@ pub struct Tracker {
     recorded_from: Timestamp,
 }
 
-/// Side of a large cell in metres.
-const WIDE_M: f64 = 16.0;
+/// Least side of a cell in metres: larger ones hold more that is too far, smaller ones are more to look up.
+const LEAST_CELL_M: f64 = 12.0;
 
 impl Tracker {
     /// Knows nothing yet; both are taken as valid.
     pub fn new(config: TracksConfig, reputation: ReputationConfig) -> Self {
         Self {
             reputation,
-            near: Grid::new(config.gate_m),
-            wide: Grid::new(WIDE_M.max(config.gate_m)),
+            grid: Grid::new(config.gate_m * (LEAST_CELL_M / config.gate_m).ceil()),
             config,
             indexed_at: Timestamp(0),
             fastest_mps: 0.0,
@@ -209,8 +208,15 @@ impl Tracker {
             }
             let number = self.number_of(&report.node, *at);
             let Some(mut source) = self.sources[number as usize].take() else { continue };
-            let mut taking =
-                Taking { number, source: &mut source, report, at: *at, has_jumped: false, sightings: Vec::new() };
+            let mut taking = Taking {
+                number,
+                trust: source.trust(&self.reputation),
+                source: &mut source,
+                report,
+                at: *at,
+                has_jumped: false,
+                sightings: Vec::with_capacity(report.objects.len()),
+            };
             self.take(&mut taking);
             let Taking { has_jumped, sightings: seen, .. } = taking;
             if has_jumped {
@@ -259,10 +265,16 @@ impl Tracker {
         number as u32
     }
 
+    /// Weight of each vehicle's word by its number, 0 to 1; none of numbers that nobody has.
+    fn trusts(&self) -> Vec<f64> {
+        let trust = |source: &Option<Source>| source.as_ref().map_or(0.0, |source| source.trust(&self.reputation));
+        self.sources.iter().map(trust).collect()
+    }
+
     fn objects(&self, now: Timestamp) -> Vec<FusedObject> {
-        let source = |number: u32| self.sources.get(number as usize).and_then(Option::as_ref);
-        let trust = |number: u32| source(number).map_or(0.0, |source| source.trust(&self.reputation));
-        let name = |number: u32| source(number).map(|source| source.node.clone());
+        let trusts = self.trusts();
+        let trust = |number: u32| trusts[number as usize];
+        let name = |number: u32| self.sources[number as usize].as_ref().map(|source| source.node.clone());
         let objects = self.tracks.iter().map(|track| track.fused(now, &self.config, trust, name));
         objects.filter(|object| object.confidence >= self.config.min_confidence).collect()
     }

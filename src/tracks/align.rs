@@ -7,7 +7,7 @@
 //! one step of an extended Kalman filter in information form over all pairs, reweighted against wrong ones by Cauchy's
 //! function (Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
 
-use nalgebra::{Matrix2x4, Matrix4, Vector2, Vector4};
+use nalgebra::{Matrix2x4, Matrix4, Rotation2, Vector2, Vector4};
 
 use crate::geometry::wrap_angle;
 use crate::time::Timestamp;
@@ -77,7 +77,13 @@ impl Alignment {
 
     /// Where a reported position belongs.
     pub(super) fn correct(&self, reported: &Vector2<f64>) -> Vector2<f64> {
-        self.about + self.turned(&(reported - self.about)) + self.error.xy()
+        self.correction()(reported)
+    }
+
+    /// The same for many.
+    pub(super) fn correction(&self) -> impl Fn(&Vector2<f64>) -> Vector2<f64> + use<> {
+        let (about, rotation, offset) = (self.about, self.rotation(), self.error.xy());
+        move |reported| about + rotation * (reported - about) + offset
     }
 
     /// A reported direction as it should be.
@@ -87,8 +93,11 @@ impl Alignment {
 
     /// A reported velocity as it should be.
     pub(super) fn turned(&self, vector: &Vector2<f64>) -> Vector2<f64> {
-        let (sin, cos) = self.error.z.sin_cos();
-        Vector2::new(cos * vector.x - sin * vector.y, sin * vector.x + cos * vector.y)
+        self.rotation() * vector
+    }
+
+    fn rotation(&self) -> Rotation2<f64> {
+        Rotation2::new(self.error.z)
     }
 
     /// Seconds by which stamps are late.
@@ -113,13 +122,15 @@ impl Alignment {
         for _ in 0..ITERATIONS {
             let mut information = prior_information;
             let mut vector = prior_information * prior;
+            let correct = self.correction();
             counted = 0.0;
             for pair in pairs {
-                let arm = self.turned(&(pair.reported - self.about));
+                let corrected = correct(&pair.reported);
+                let arm = corrected - self.about - self.error.xy();
                 let (x, y) = (pair.velocity.x, pair.velocity.y);
                 let jacobian = Matrix2x4::new(1.0, 0.0, -arm.y, x, 0.0, 1.0, arm.x, y);
                 let later = pair.velocity * (self.error.w - delay_s);
-                let residual = pair.reference - self.correct(&pair.reported) - later;
+                let residual = pair.reference - corrected - later;
                 let squared = residual.norm_squared() / (pair.variance + pair.common);
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
                 // What the references share is no better known for their number.

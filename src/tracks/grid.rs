@@ -8,7 +8,13 @@ use smallvec::SmallVec;
 #[derive(Debug, Clone, Default)]
 pub(super) struct Grid {
     cell_m: f64,
-    cells: HashMap<(i32, i32), SmallVec<[u32; 6]>>,
+    cells: HashMap<(i32, i32), SmallVec<[Point; 2]>>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Point {
+    at: Vector2<f64>,
+    number: u32,
 }
 
 impl Grid {
@@ -22,24 +28,28 @@ impl Grid {
         self.cells.clear();
     }
 
-    /// Adds a point and says how many its cell holds now.
-    pub(super) fn insert(&mut self, at: &Vector2<f64>, number: u32) -> usize {
+    /// Adds a point.
+    pub(super) fn insert(&mut self, at: &Vector2<f64>, number: u32) {
         let cell = self.cells.entry((self.line(at.x), self.line(at.y))).or_default();
-        cell.push(number);
-        cell.len()
+        cell.push(Point { at: *at, number });
     }
 
-    /// How many points lie in the cell of `at`.
-    pub(super) fn crowd(&self, at: &Vector2<f64>) -> usize {
-        self.cells.get(&(self.line(at.x), self.line(at.y))).map_or(0, SmallVec::len)
+    /// How many points lie in the square of `side_m`, a whole part of a cell's, that `at` lies in.
+    pub(super) fn crowd(&self, at: &Vector2<f64>, side_m: f64) -> usize {
+        let square = |point: &Vector2<f64>| point.map(|coordinate_m| (coordinate_m / side_m).floor());
+        let here = square(at);
+        let points = self.cells.get(&(self.line(at.x), self.line(at.y))).into_iter().flatten();
+        points.filter(|point| square(&point.at) == here).count()
     }
 
-    /// The points in all cells that a square of half the side `reach_m` around `at` touches.
+    /// The points within `reach_m` of `at`.
     pub(super) fn around(&self, at: &Vector2<f64>, reach_m: f64) -> impl Iterator<Item = u32> + '_ {
         let (west, east) = (self.line(at.x - reach_m), self.line(at.x + reach_m));
         let (south, north) = (self.line(at.y - reach_m), self.line(at.y + reach_m));
         let columns = (west..=east).flat_map(move |column| (south..=north).map(move |row| (column, row)));
-        columns.filter_map(|cell| self.cells.get(&cell)).flatten().copied()
+        let points = columns.filter_map(|cell| self.cells.get(&cell)).flatten();
+        let (at, reach_squared) = (*at, reach_m * reach_m);
+        points.filter(move |point| (point.at - at).norm_squared() <= reach_squared).map(|point| point.number)
     }
 
     fn line(&self, coordinate_m: f64) -> i32 {

@@ -107,7 +107,7 @@ impl Tracker {
         let mut besides = Vec::new();
         for (older, track) in self.tracks.iter().enumerate() {
             let position = track.motion.position_at(now);
-            let near = self.near.around(&position, SAME_M).map(|other| other as usize).filter(|other| *other > older);
+            let near = self.grid.around(&position, SAME_M).map(|other| other as usize).filter(|other| *other > older);
             besides.extend(near.filter_map(|later| {
                 let other = &self.tracks[later];
                 let is_beside = (other.motion.position_at(now) - position).norm() < SAME_M;

@@ -37,9 +37,11 @@ impl Tracker {
     /// Estimates the errors of the vehicles' poses, when all of a round is taken in: held against what was detected at
     /// the same time, wherever that is known, a lag of the tracks behind the objects is nobody's error.
     pub(super) fn align(&mut self, sightings: &[Sightings]) {
-        let spread = self.spread();
+        let (spread, trusts) = (self.spread(), self.trusts());
+        let mut pairs: Vec<Pair> = Vec::new();
         for Sightings { number, at, delay_s, seen } in sightings {
-            let pairs: Vec<Pair> = seen.iter().filter_map(|seen| self.pair(*number, *at, seen)).collect();
+            pairs.clear();
+            pairs.extend(seen.iter().filter_map(|seen| self.pair(*number, *at, seen, &trusts)));
             if let Some(source) = self.sources.get_mut(*number as usize).and_then(Option::as_mut) {
                 source.alignment.observe(*at, *delay_s, &pairs, &spread);
             }
@@ -47,7 +49,7 @@ impl Tracker {
     }
 
     /// The detection beside the mean of where the others saw the object, each as far as it is trusted.
-    fn pair(&self, number: u32, at: Timestamp, seen: &Sighting) -> Option<Pair> {
+    fn pair(&self, number: u32, at: Timestamp, seen: &Sighting, trusts: &[f64]) -> Option<Pair> {
         let track = &self.tracks[seen.track as usize];
         let velocity = track.motion.velocity;
         let (mut sum, mut weight, mut common) = (Vector2::zeros(), 0.0, 0.0);
@@ -55,7 +57,7 @@ impl Tracker {
             let theirs = self.sources.get(other.source as usize).and_then(Option::as_ref);
             let (Some(hit), Some(theirs)) = (other.last_hit, theirs) else { continue };
             let passed_us = at.micros_from(hit);
-            let trust = theirs.trust(&self.reputation);
+            let trust = trusts[other.source as usize];
             if passed_us.unsigned_abs() > SIMULTANEOUS.as_micros() as u64 || trust <= 0.0 {
                 continue;
             }

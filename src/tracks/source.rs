@@ -1,6 +1,6 @@
 //! What is learnt about one vehicle: how noisy its positions are, where it sees, what its confidences are worth.
 
-use std::f64::consts::TAU;
+use std::f64::consts::PI;
 
 use nalgebra::{Matrix2, Vector2};
 
@@ -9,7 +9,7 @@ use super::calibration::Calibration;
 use super::config::TracksConfig;
 use super::evidence::Rates;
 use super::trust::Standing;
-use crate::geometry::{Covariance, Pose, wrap_angle};
+use crate::geometry::Covariance;
 use crate::names::NodeName;
 use crate::reputation::ReputationConfig;
 use crate::time::Timestamp;
@@ -106,7 +106,8 @@ fn stated(object: &PerceivedObject, config: &TracksConfig) -> Covariance {
 /// Where a vehicle sees things and how surely.
 #[derive(Debug, Clone)]
 pub(super) struct View {
-    pose: Option<Pose>,
+    /// Where the vehicle is and the unit vector that it heads along.
+    pose: Option<(Vector2<f64>, Vector2<f64>)>,
     stated: Option<FieldOfView>,
     /// The pose, or the middle of what it sees.
     centre: Option<Vector2<f64>>,
@@ -162,11 +163,14 @@ impl View {
 
     /// Takes note of where a report comes from; true if the vehicle is somewhere else all at once.
     pub(super) fn observe(&mut self, report: &ObjectReport) -> bool {
-        self.pose = report.pose.map(Pose::from);
+        self.pose = report.pose.map(|pose| {
+            let (sin, cos) = pose.heading_rad.sin_cos();
+            (Vector2::new(pose.x_m, pose.y_m), Vector2::new(cos, sin))
+        });
         // Of no use without the pose that it is from.
         self.stated = report.view.filter(|_| report.pose.is_some());
-        let middle = middle(report);
-        let Some(here) = self.pose.map(|pose| pose.position.coords).or(middle).or(self.centre) else { return false };
+        let posed = self.pose.map(|(position, _)| position);
+        let Some(here) = posed.or_else(|| middle(report)).or(self.centre) else { return false };
         let has_jumped = self.centre.is_some_and(|before| (here - before).norm() > Self::JUMP_M);
         if has_jumped {
             (self.farthest_m, self.directions) = (0.0, [0.0; Self::DIRECTIONS]);
@@ -202,11 +206,11 @@ impl View {
     /// How surely it detects what is at a reported position; `None` out of its view.
     pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<Rates> {
         let offset = reported - self.centre?;
-        let distance = offset.norm();
-        if distance > self.reach_m() || !self.faces(&offset) || self.is_hidden(&offset) {
+        let distance_m = offset.norm();
+        if distance_m > self.reach_m() || !self.faces(&offset, distance_m) || self.is_hidden(&offset, distance_m) {
             return None;
         }
-        let bin = &self.rates[Self::bin(distance)];
+        let bin = &self.rates[Self::bin(distance_m)];
         let rate = |(hits, looks): (f32, f32)| f64::from(hits / looks).clamp(0.02, 0.98);
         Some(Rates { stay: rate(bin.stay), find: rate(bin.find) })
     }
@@ -214,27 +218,28 @@ impl View {
     /// Notes behind what nothing is seen in a frame: the vehicle's own parts, nearer than `nearest_m`, hide nothing.
     pub(super) fn cast_shadows<'a>(&mut self, objects: impl Iterator<Item = &'a PerceivedObject>, nearest_m: f64) {
         self.sight_m = [f32::INFINITY; Self::RAYS];
-        let Some(pose) = self.pose else { return };
+        let Some((position, _)) = self.pose else { return };
         for object in objects {
-            let offset = Vector2::new(object.x_m, object.y_m) - pose.position.coords;
+            let offset = Vector2::new(object.x_m, object.y_m) - position;
             let distance_m = offset.norm();
             if distance_m <= nearest_m.max(2.0 * Self::HIDES_M) {
                 continue;
             }
-            let half_angle = (Self::HIDES_M / distance_m).asin();
-            let rays = Self::RAYS as f64 / TAU;
-            let middle = offset.y.atan2(offset.x).rem_euclid(TAU) * rays;
-            let (first, last) = (middle - half_angle * rays, middle + half_angle * rays);
-            for ray in first.round() as i64..=last.round() as i64 {
-                let sight_m = &mut self.sight_m[ray.rem_euclid(Self::RAYS as i64) as usize];
-                *sight_m = sight_m.min(distance_m as f32);
+            let aside = Vector2::new(-offset.y, offset.x) * (Self::HIDES_M / distance_m);
+            let (first, last) = (Self::ray(&(offset - aside)), Self::ray(&(offset + aside)));
+            let count = (last + Self::RAYS - first) % Self::RAYS + 1;
+            for ray in (first..first + count).map(|ray| ray % Self::RAYS) {
+                self.sight_m[ray] = self.sight_m[ray].min(distance_m as f32);
             }
         }
     }
 
-    fn is_hidden(&self, offset: &Vector2<f64>) -> bool {
-        let ray = (offset.y.atan2(offset.x).rem_euclid(TAU) * Self::RAYS as f64 / TAU).round() as usize % Self::RAYS;
-        offset.norm() > f64::from(self.sight_m[ray]) + Self::BEHIND_M
+    fn is_hidden(&self, offset: &Vector2<f64>, distance_m: f64) -> bool {
+        distance_m > f64::from(self.sight_m[Self::ray(offset)]) + Self::BEHIND_M
+    }
+
+    fn ray(offset: &Vector2<f64>) -> usize {
+        (turn(offset) * Self::RAYS as f64).round() as usize % Self::RAYS
     }
 
     /// It looked at an object that is sure to exist.
@@ -251,22 +256,34 @@ impl View {
         }
     }
 
-    fn faces(&self, offset: &Vector2<f64>) -> bool {
-        let Some(pose) = self.pose else { return true };
+    fn faces(&self, offset: &Vector2<f64>, distance_m: f64) -> bool {
+        let Some((_, heading)) = self.pose else { return true };
         if let Some(view) = self.stated {
-            return wrap_angle(offset.y.atan2(offset.x) - pose.heading_rad).abs() <= view.angle_rad / 2.0;
+            return offset.dot(&heading) >= distance_m * (view.angle_rad / 2.0).min(PI).cos() - 1e-9;
         }
         let mean = self.directions.iter().sum::<f32>() / Self::DIRECTIONS as f32;
         self.directions[self.direction(offset)] > 0.1 * mean
     }
 
     fn direction(&self, offset: &Vector2<f64>) -> usize {
-        let heading_rad = self.pose.map_or(0.0, |pose| pose.heading_rad);
-        let turn = (offset.y.atan2(offset.x) - heading_rad).rem_euclid(TAU) / TAU;
-        ((turn * Self::DIRECTIONS as f64) as usize).min(Self::DIRECTIONS - 1)
+        let heading = self.pose.map_or(Vector2::x(), |(_, heading)| heading);
+        let from_heading = Vector2::new(heading.dot(offset), heading.perp(offset));
+        (turn(&from_heading) * Self::DIRECTIONS as f64) as usize % Self::DIRECTIONS
     }
 
     fn bin(distance_m: f64) -> usize {
         ((distance_m / Self::BIN_M) as usize).min(Self::BINS - 1)
+    }
+}
+
+/// Direction of an offset, counterclockwise from east, as a part of a turn, 0 to 1. Within a quarter it goes by the
+/// share of the coordinates instead of the angle: equal parts differ in angle by a factor of two at most, and need no
+/// trigonometry.
+fn turn(offset: &Vector2<f64>) -> f64 {
+    let share = offset.y / (offset.x.abs() + offset.y.abs()).max(f64::MIN_POSITIVE) / 4.0;
+    match offset.x < 0.0 {
+        true => 0.5 - share,
+        false if share < 0.0 => 1.0 + share,
+        false => share,
     }
 }

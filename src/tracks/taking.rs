@@ -37,6 +37,8 @@ pub(super) struct Taking<'a> {
     pub(super) source: &'a mut Source,
     pub(super) report: &'a ObjectReport,
     pub(super) at: Timestamp,
+    /// Weight of the vehicle's word, 0 to 1.
+    pub(super) trust: f64,
     /// Whether the vehicle is somewhere else all at once, and nothing is known of its alignment any more.
     pub(super) has_jumped: bool,
     /// What the vehicle's alignment is estimated from.
@@ -48,9 +50,6 @@ const UNKNOWN: Rates = Rates { stay: 0.9, find: 0.15 };
 
 /// Standard deviation of reported velocities, m/s.
 const VELOCITY_SIGMA_MPS: f64 = 1.0;
-
-/// Within how much time another vehicle's detection confirms that an object is there.
-const CONFIRMED_WITHIN: Duration = Duration::from_millis(500);
 
 /// Trust that positions are weighed by at least.
 const LEAST_TRUST: f64 = 0.05;
@@ -82,18 +81,20 @@ impl Tracker {
         if let Some(centre) = source.view.centre() {
             source.alignment.turn_about(centre);
         }
-        let is_trusted = source.trust(&self.reputation) > 0.0;
+        let is_trusted = taking.trust > 0.0;
         let hides = |object: &&PerceivedObject| source.calibration.nats(object.confidence) > 0.0;
         source.view.cast_shadows(report.objects.iter().filter(hides), self.config.vehicle_radius_m);
         // What a proven liar says is judged where others say something of it, and counts for nothing.
         if is_trusted {
             self.take_own_pose(taking);
         }
-        let seen = self.seen(taking.source, taking.report);
+        let seen = self.seen(taking);
         let mut chosen = self.associate(taking.number, &seen, taking.at);
         if is_trusted {
             self.associate_fast(taking.source, &seen, taking.at, &mut chosen);
         }
+        let mut detected: Vec<u32> = chosen.iter().map(|pairing| pairing.track).collect();
+        detected.sort_unstable();
         let mut chosen = chosen.iter().peekable();
         let mut founding = Vec::new();
         for (detection, seen) in seen.iter().enumerate() {
@@ -102,7 +103,7 @@ impl Tracker {
                 None => founding.push(seen),
             }
         }
-        self.look(taking);
+        self.look(taking, &detected);
         for seen in founding.into_iter().filter(|_| is_trusted) {
             self.found(taking, seen);
         }
@@ -145,49 +146,58 @@ impl Tracker {
         }
         track.refresh(at);
         self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        if let Some(witness) = track.eyewitness(number, at) {
+        if let Some(witness) = track.witnesses.detecting(number, at) {
             witness.hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
         }
     }
 
     /// The report's detections, corrected; those of the vehicle itself are left out.
-    fn seen<'a>(&self, source: &Source, report: &'a ObjectReport) -> Vec<Seen<'a>> {
+    fn seen<'a>(&self, taking: &Taking<'a>) -> Vec<Seen<'a>> {
+        let Taking { source, report, trust, .. } = taking;
         let own = report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
-        let trust = source.trust(&self.reputation).max(LEAST_TRUST);
+        let trust = trust.max(LEAST_TRUST);
+        let correct = source.alignment.correction();
         let seen = |(index, object): (usize, &'a PerceivedObject)| {
             let reported = Vector2::new(object.x_m, object.y_m);
             let is_itself = own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
             let measurement = Measurement {
-                position: source.alignment.correct(&reported),
+                position: correct(&reported),
                 independent: source.noise.covariance(object, &self.config) / trust,
                 common_m: self.config.common_m,
             };
             (!is_itself).then_some(Seen { index, object, reported, measurement })
         };
-        report.objects.iter().enumerate().filter_map(seen).collect()
+        let mut all = Vec::with_capacity(report.objects.len());
+        all.extend(report.objects.iter().enumerate().filter_map(seen));
+        all
     }
 
     /// Which detections are which objects: within the gate, and the likeliest for all together.
     fn associate(&self, number: u32, seen: &[Seen<'_>], at: Timestamp) -> Vec<Pairing> {
         let gate = self.config.gate();
         let density = self.config.density();
-        let reach_m = self.config.gate_m + self.drift_m(at);
+        let gate_m_squared = self.config.gate_m.powi(2);
+        let reach_m = self.config.gate_m + self.slack_m(at);
         let mut pairings = Vec::with_capacity(2 * seen.len());
         for (detection, seen) in seen.iter().enumerate() {
             let alone = seen.measurement.independent.trace() / 2.0 + self.config.common_m.powi(2);
-            for candidate in self.near.around(&seen.measurement.position, reach_m) {
+            for candidate in self.grid.around(&seen.measurement.position, reach_m) {
                 let track = &self.tracks[candidate as usize];
                 if track.vehicle == Some(number) {
                     continue;
                 }
+                let offset = seen.measurement.position - track.motion.position_at(at);
+                if offset.norm_squared() > gate_m_squared {
+                    continue;
+                }
                 let innovation = track.motion.innovation(at, &seen.measurement, density);
-                if innovation.distance_squared > gate || innovation.offset.norm() > self.config.gate_m {
+                if innovation.distance_squared > gate {
                     continue;
                 }
                 let likeness = track.likeness(seen.object);
-                let spread = (innovation.covariance.determinant().sqrt() / alone).ln();
-                let maturity = f64::from(track.hits.clamp(1, 10)).ln();
-                let benefit = gate - innovation.distance_squared - spread + maturity + 2.0 * likeness.ln();
+                let spread = innovation.covariance.determinant().sqrt() / alone;
+                let maturity = f64::from(track.hits.clamp(1, 10));
+                let benefit = gate - innovation.distance_squared + (maturity * likeness.powi(2) / spread).ln();
                 if benefit > 0.0 || likeness > OTHER_LABEL {
                     let benefit = benefit.max(0.01);
                     pairings.push(Pairing { detection: detection as u32, track: candidate, benefit });
@@ -199,8 +209,11 @@ impl Tracker {
 
     /// The same for what is left and goes too fast for that: objects that are so new that their velocity may be any.
     fn associate_fast(&mut self, source: &Source, seen: &[Seen<'_>], at: Timestamp, chosen: &mut Vec<Pairing>) {
+        if chosen.len() == seen.len() {
+            return;
+        }
         let speed_mps = self.config.max_speed_mps;
-        let reach_m = speed_mps * FAST_WITHIN.as_secs_f64() + self.drift_m(at);
+        let reach_m = speed_mps * FAST_WITHIN.as_secs_f64() + self.slack_m(at);
         let mut continued: Vec<u32> = chosen.iter().map(|pairing| pairing.track).collect();
         continued.sort_unstable();
         let mut matched = chosen.iter().map(|pairing| pairing.detection as usize).peekable();
@@ -208,7 +221,7 @@ impl Tracker {
         let likely = left.filter(|(_, seen)| source.calibration.nats(seen.object.confidence) > 0.0);
         let mut pairings = Vec::new();
         for (detection, seen) in likely.take(MOST_FAST) {
-            let near = self.wide.around(&seen.measurement.position, reach_m);
+            let near = self.grid.around(&seen.measurement.position, reach_m);
             let near = near.filter(|track| continued.binary_search(track).is_err());
             pairings.extend(near.filter_map(|track| {
                 let benefit = self.benefit_if_fast(&self.tracks[track as usize], seen, at)?;
@@ -241,27 +254,25 @@ impl Tracker {
 
     /// An object was detected again.
     fn confirm(&mut self, taking: &mut Taking<'_>, track: u32, seen: &Seen<'_>) {
-        let Taking { number, source, at, sightings, .. } = taking;
-        let (number, at, config) = (*number, *at, &self.config);
+        let Taking { number, source, at, trust, sightings, .. } = taking;
+        let (number, at, is_trusted, config) = (*number, *at, *trust > 0.0, &self.config);
         let index = track as usize;
         let track = &mut self.tracks[index];
         let density = config.density();
         if track.hits >= MATURE_HITS && track.vehicle.is_none() {
-            let offset = track.motion.innovation(at, &seen.measurement, density).offset;
+            let offset = seen.measurement.position - track.motion.position_at(at);
             let expected = track.motion.covariance_at(at, density).trace();
             source.noise.learn(seen.object, offset.norm_squared(), expected, config);
         }
-        let is_confirmed = track.seen_by(at - CONFIRMED_WITHIN).any(|witness| witness.source != number);
         if track.hits >= SURE_HITS && track.vehicle.is_none() {
             let variance = seen.measurement.independent.trace() / 2.0;
             sightings.push(Sighting { track: index as u32, reported: seen.reported, variance });
         }
         let rates = source.view.rates_at(&seen.reported);
-        let is_trusted = source.trust(&self.reputation) > 0.0;
-        let last = track.witnesses.iter().find(|witness| witness.source == number && witness.was_hit);
-        let last = last.map(|witness| witness.log_odds);
+        let last = track.witnesses.get(number).filter(|witness| witness.was_hit).map(|witness| witness.log_odds);
         let was_hit = last.is_some();
-        if rates.is_some() && track.hits >= SURE_HITS && (is_confirmed || was_hit) && track.hears(number, at) {
+        let is_sure = track.hits >= SURE_HITS && (was_hit || track.is_confirmed(number, at));
+        if rates.is_some() && is_sure && track.witnesses.hears(number, at) {
             source.view.learn(&seen.reported, was_hit, true);
         }
         if is_trusted {
@@ -273,61 +284,61 @@ impl Tracker {
             source.calibration.learn(log_odds, true);
         }
         let nats = source.calibration.nats(seen.object.confidence);
-        let seat = if is_trusted { track.eyewitness(number, at) } else { track.witness(number, at) };
-        if let Some(witness) = seat {
-            witness.hit(at, seen.measurement.position, nats, rates.unwrap_or(UNKNOWN), true);
-            witness.log_odds = log_odds(seen.object.confidence);
+        let seat = if is_trusted { track.witnesses.detecting(number, at) } else { track.witnesses.looking(number, at) };
+        let Some(witness) = seat else { return };
+        witness.hit(at, seen.measurement.position, nats, rates.unwrap_or(UNKNOWN), true);
+        witness.log_odds = log_odds(seen.object.confidence);
+        if let Some(said) = witness.settled(at) {
+            self.settle(taking, index, &seen.reported, said);
         }
-        self.settle(taking, index, &seen.reported);
     }
 
-    /// What is in the vehicle's view and was not detected.
-    fn look(&mut self, taking: &mut Taking<'_>) {
+    /// What is in the vehicle's view and is none of the `detected`, by number.
+    fn look(&mut self, taking: &mut Taking<'_>, detected: &[u32]) {
         let (number, at) = (taking.number, taking.at);
         let Some(centre) = taking.source.view.centre() else { return };
-        let is_trusted = taking.source.trust(&self.reputation) > 0.0;
-        let reach_m = taking.source.view.reach_m() + self.drift_m(at);
-        let candidates: Vec<u32> = self.wide.around(&centre, reach_m).collect();
-        for candidate in candidates {
+        let reach_m = taking.source.view.reach_m() + self.slack_m(at);
+        let grid = std::mem::take(&mut self.grid);
+        for candidate in grid.around(&centre, reach_m).filter(|track| detected.binary_search(track).is_err()) {
             let track = &mut self.tracks[candidate as usize];
-            let witness = track.witnesses.iter().find(|witness| witness.source == number);
-            let is_done = witness.map_or(!track.hears(number, at), |witness| witness.last_look >= at);
-            if track.vehicle == Some(number) || is_done {
-                continue;
-            }
             let position = track.motion.position_at(at);
             let view = &mut taking.source.view;
-            let Some(rates) = view.rates_at(&position) else { continue };
+            let Some(rates) = view.rates_at(&position).filter(|_| track.vehicle != Some(number)) else { continue };
+            let witness = track.witnesses.get(number);
+            if witness.map_or(!track.witnesses.hears(number, at), |witness| witness.last_look >= at) {
+                continue;
+            }
             let was_hit = witness.is_some_and(|witness| witness.was_hit);
             if let Some(witness) = witness.filter(|witness| witness.was_hit) {
                 taking.source.calibration.learn(witness.log_odds, false);
             }
             let knew_it = witness.is_some_and(|witness| witness.last_hit.is_some());
             let dt_s = witness.map_or(0.0, |witness| at.since(witness.last_look).as_secs_f64());
-            let is_confirmed = track.seen_by(at - CONFIRMED_WITHIN).any(|witness| witness.source != number);
-            if track.hits >= SURE_HITS && (is_confirmed || was_hit) {
+            if track.hits >= SURE_HITS && (was_hit || track.is_confirmed(number, at)) {
                 view.learn(&position, was_hit, false);
             }
-            if let Some(witness) = track.witness(number, at) {
+            let settled = track.witnesses.looking(number, at).and_then(|witness| {
                 witness.miss(at, rates);
-            }
-            if knew_it && is_trusted {
+                witness.settled(at)
+            });
+            if knew_it && taking.trust > 0.0 {
                 track.overlooked(at, dt_s, rates.of(was_hit));
             }
-            self.settle(taking, candidate as usize, &position);
+            if let Some(said) = settled {
+                self.settle(taking, candidate as usize, &position, said);
+            }
         }
+        self.grid = grid;
     }
 
-    /// Holds what the vehicle said of an object for a while against the others' word.
-    fn settle(&mut self, taking: &mut Taking<'_>, track: usize, reported: &Vector2<f64>) {
+    /// Holds what the vehicle `said` of an object for a while, (hits, looks), against the others' word.
+    fn settle(&mut self, taking: &mut Taking<'_>, track: usize, reported: &Vector2<f64>, said: (u32, u32)) {
         let (number, at) = (taking.number, taking.at);
-        let track = &mut self.tracks[track];
-        let Some(witness) = track.witnesses.iter().position(|witness| witness.source == number) else { return };
-        let Some((hits, looks)) = track.witnesses[witness].settled(at) else { return };
+        let track = &self.tracks[track];
         let source = |number: u32| self.sources.get(number as usize).and_then(Option::as_ref);
         let trust = |other: u32| source(other).map_or(0.0, |source| source.trust(&self.reputation));
         let others = Others::of(&track.witnesses, number, at, trust);
-        let Some(word) = judge(hits, looks, &others) else { return };
+        let Some(word) = judge(said, &others) else { return };
         let distance_m = taking.source.view.centre().map_or(0.0, |centre| (reported - centre).norm());
         if word != Word::Invented {
             self.fleet.learn(distance_m, word == Word::True);
@@ -352,7 +363,7 @@ impl Tracker {
         let mut track = Track::new(founding_id(taking.report, seen.index), at, &seen.measurement, &self.config);
         describe(&mut track, taking.source, seen, at, &self.config);
         let nats = taking.source.calibration.nats(seen.object.confidence);
-        if let Some(witness) = track.eyewitness(number, at) {
+        if let Some(witness) = track.witnesses.detecting(number, at) {
             witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
             witness.log_odds = log_odds(seen.object.confidence);
         }

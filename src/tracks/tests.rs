@@ -230,6 +230,22 @@ fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
 }
 
 #[test]
+fn a_view_has_its_stated_angle_and_no_more_than_all_around() {
+    let sees = |angle_rad: f64, bearing_rad: f64| {
+        let mut view = View::default();
+        let pose = Some(WirePose { x_m: 10.0, y_m: -5.0, heading_rad: 2.0 });
+        let stated = Some(FieldOfView { range_m: 50.0, angle_rad });
+        view.observe(&ObjectReport { pose, view: stated, ..report("euclid", 0, vec![]) });
+        view.rates_at(&(Vector2::new(10.0, -5.0) + Vector2::new(bearing_rad.cos(), bearing_rad.sin()) * 20.0)).is_some()
+    };
+    assert!(sees(1.0, 2.0) && sees(1.0, 2.45) && sees(1.0, 1.55));
+    assert!(!sees(1.0, 2.55) && !sees(1.0, 1.45) && !sees(1.0, 5.1));
+    for angle_rad in [std::f64::consts::TAU, 7.0, 2.0 * std::f64::consts::TAU, 360.0] {
+        assert!((0..36).all(|n| sees(angle_rad, f64::from(n) * 0.18)), "{angle_rad}");
+    }
+}
+
+#[test]
 fn what_a_vehicle_was_off_by_says_nothing_of_where_it_has_jumped_to() {
     let mut tracker = tracker();
     let place = |x_m: f64| (0..4).map(|n| car(x_m + 10.0 * f64::from(n), 0.0)).collect::<Vec<_>>();

@@ -10,16 +10,14 @@ use super::config::TracksConfig;
 use super::evidence::{Witness, logistic};
 use super::joining::Neighbours;
 use super::motion::{Measurement, Motion};
+use super::witnesses::Witnesses;
 use crate::geometry::{Covariance, wrap_angle};
 use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
 use crate::wire::{FusedObject, PerceivedObject};
 
-/// Vehicles that an object can be known from at once; whoever has not looked for [`SEAT_KEPT`] makes room.
-const MAX_WITNESSES: usize = 32;
-
-/// Were the others to make room for newcomers, none of more than 32 would stay for long enough to be judged.
-const SEAT_KEPT: Duration = Duration::from_secs(1);
+/// Within how much time another vehicle's detection confirms that an object is there.
+const CONFIRMED_WITHIN: Duration = Duration::from_millis(500);
 
 /// Labels that are kept of an object, the likeliest.
 const MAX_LABELS: usize = 8;
@@ -47,7 +45,7 @@ const PRIOR_ODDS: f64 = 0.07;
 pub(super) struct Track {
     pub(super) id: Uuid,
     pub(super) motion: Motion,
-    pub(super) witnesses: SmallVec<[Witness; 3]>,
+    pub(super) witnesses: Witnesses,
     /// Weights of the labels that were read, fading.
     labels: SmallVec<[(Label, f64); 1]>,
     heading_rad: Option<f64>,
@@ -71,7 +69,7 @@ impl Track {
         Self {
             id,
             motion: Motion::new(at, seen, config.speed_mps),
-            witnesses: SmallVec::new(),
+            witnesses: Witnesses::default(),
             labels: SmallVec::new(),
             heading_rad: None,
             size_m: None,
@@ -83,45 +81,6 @@ impl Track {
             neighbours: Neighbours::default(),
             inherited: None,
         }
-    }
-
-    /// Where the vehicle's part in it is or could be; `None` while there are enough others.
-    fn seat(&self, source: u32, at: Timestamp) -> Option<usize> {
-        let held = self.witnesses.iter().position(|witness| witness.source == source);
-        let free = || Some(self.witnesses.len()).filter(|count| *count < MAX_WITNESSES);
-        let left = || {
-            let looks = self.witnesses.iter().map(|witness| witness.last_look).enumerate();
-            let (oldest, look) = looks.min_by_key(|(_, look)| *look)?;
-            (at.since(look) > SEAT_KEPT).then_some(oldest)
-        };
-        held.or_else(free).or_else(left)
-    }
-
-    /// Whether the vehicle's word about it is kept.
-    pub(super) fn hears(&self, source: u32, at: Timestamp) -> bool {
-        self.seat(source, at).is_some()
-    }
-
-    /// The vehicle's part in it, made if there is none and room for one.
-    pub(super) fn witness(&mut self, source: u32, at: Timestamp) -> Option<&mut Witness> {
-        let seat = self.seat(source, at)?;
-        Some(self.sit(seat, source, at))
-    }
-
-    /// The same for a vehicle that detects it: one that never did makes room.
-    pub(super) fn eyewitness(&mut self, source: u32, at: Timestamp) -> Option<&mut Witness> {
-        let blind = || self.witnesses.iter().position(|witness| witness.last_hit.is_none());
-        let seat = self.seat(source, at).or_else(blind)?;
-        Some(self.sit(seat, source, at))
-    }
-
-    fn sit(&mut self, seat: usize, source: u32, at: Timestamp) -> &mut Witness {
-        if seat == self.witnesses.len() {
-            self.witnesses.push(Witness::new(source, at));
-        } else if self.witnesses[seat].source != source {
-            self.witnesses[seat] = Witness::new(source, at);
-        }
-        &mut self.witnesses[seat]
     }
 
     /// Takes over what a detection says beside its place.
@@ -202,6 +161,11 @@ impl Track {
         self.witnesses.iter().filter(move |witness| witness.last_hit.is_some_and(|hit| hit >= limit))
     }
 
+    /// Whether any but the vehicle `source` detected it shortly before `at`.
+    pub(super) fn is_confirmed(&self, source: u32, at: Timestamp) -> bool {
+        self.seen_by(at - CONFIRMED_WITHIN).any(|witness| witness.source != source)
+    }
+
     /// Whether one vehicle told the two apart in one frame.
     pub(super) fn is_told_apart(&self, other: &Self) -> bool {
         self.witnesses.iter().any(|mine| {
@@ -212,13 +176,7 @@ impl Track {
 
     /// Takes in a later track of the same object; what this one is called holds.
     pub(super) fn absorb(&mut self, other: Self) {
-        for theirs in other.witnesses {
-            match self.witnesses.iter().position(|mine| mine.source == theirs.source) {
-                Some(mine) if self.witnesses[mine].last_hit < theirs.last_hit => self.witnesses[mine] = theirs,
-                None if self.witnesses.len() < MAX_WITNESSES => self.witnesses.push(theirs),
-                _ => {}
-            }
-        }
+        self.witnesses.absorb(other.witnesses);
         if self.last_seen < other.last_seen {
             self.motion = other.motion;
             self.last_seen = other.last_seen;

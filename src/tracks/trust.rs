@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::evidence::Witness;
+use super::witnesses::Witnesses;
 use crate::names::NodeName;
 use crate::reputation::ReputationConfig;
 use crate::time::Timestamp;
@@ -52,7 +52,7 @@ pub(super) struct Others {
 
 impl Others {
     /// All but the vehicle `source`; `trust` weighs their words.
-    pub(super) fn of(witnesses: &[Witness], source: u32, at: Timestamp, trust: impl Fn(u32) -> f64) -> Self {
+    pub(super) fn of(witnesses: &Witnesses, source: u32, at: Timestamp, trust: impl Fn(u32) -> f64) -> Self {
         let mut others = Self::default();
         for witness in witnesses.iter().filter(|witness| witness.source != source) {
             if at.since(witness.last_look) > SETTLED_AFTER {
@@ -68,8 +68,8 @@ impl Others {
     }
 }
 
-/// Judges `hits` of `looks` since the last judgement; `None` where nothing is settled.
-pub(super) fn judge(hits: u32, looks: u32, others: &Others) -> Option<Word> {
+/// Judges what was said since the last judgement, hits and looks; `None` where nothing is settled.
+pub(super) fn judge((hits, looks): (u32, u32), others: &Others) -> Option<Word> {
     let share = f64::from(hits) / f64::from(looks.max(1));
     if others.detecting >= 1 && others.nats >= REAL_NATS && share >= ASSERTED {
         Some(Word::True)

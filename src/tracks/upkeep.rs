@@ -25,14 +25,14 @@ impl Tracker {
     /// Adds an object unless there is no room for it; says where.
     pub(super) fn add(&mut self, track: Track) -> Option<usize> {
         let position = track.motion.position;
-        if self.tracks.len() >= self.config.max_tracks || self.near.crowd(&position) >= self.config.max_density {
+        let crowd = self.grid.crowd(&position, self.config.gate_m);
+        if self.tracks.len() >= self.config.max_tracks || crowd >= self.config.max_density {
             self.refused += 1;
             return None;
         }
         let index = self.tracks.len();
         self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        self.near.insert(&position, index as u32);
-        self.wide.insert(&position, index as u32);
+        self.grid.insert(&position, index as u32);
         self.tracks.push(track);
         Some(index)
     }
@@ -41,20 +41,24 @@ impl Tracker {
     pub(super) fn index(&mut self, at: Timestamp) {
         self.indexed_at = at;
         self.fastest_mps = self.tracks.iter().map(|track| track.motion.velocity.norm()).fold(0.0, f64::max);
-        self.near.clear();
-        self.wide.clear();
+        self.grid.clear();
         self.own.clear();
         for (index, track) in self.tracks.iter().enumerate() {
             self.own.extend(track.vehicle.map(|number| (number, index as u32)));
             let position = track.motion.position_at(at);
-            self.near.insert(&position, index as u32);
-            self.wide.insert(&position, index as u32);
+            self.grid.insert(&position, index as u32);
         }
     }
 
-    /// How far any object may be at `at` from where it is indexed.
+    /// How far any object may have gone at `at` from where it is indexed.
     pub(super) fn drift_m(&self, at: Timestamp) -> f64 {
         self.fastest_mps * (at.micros_from(self.indexed_at) as f64 * 1e-6).abs()
+    }
+
+    /// The same with what the round's reports move an object by as a rule; a new one may be moved farther, and is found
+    /// there from the next round on.
+    pub(super) fn slack_m(&self, at: Timestamp) -> f64 {
+        self.drift_m(at) + self.config.gate_m / 2.0
     }
 
     /// Forgets objects that are gone, and vehicles that have been silent for longer than any object lives,
@@ -76,7 +80,7 @@ impl Tracker {
         }
         self.standings.keep(forgotten);
         for track in &mut self.tracks {
-            track.witnesses.retain(|witness| self.sources[witness.source as usize].is_some());
+            track.witnesses.keep(|number| self.sources[number as usize].is_some());
             track.vehicle = track.vehicle.filter(|number| self.sources[*number as usize].is_some());
         }
     }
@@ -92,7 +96,7 @@ impl Tracker {
                 continue;
             }
             let seen = self.inherited(object);
-            let nearest = self.near.around(&seen.position, SAME_M).map(|track| {
+            let nearest = self.grid.around(&seen.position, SAME_M).map(|track| {
                 let offset = self.tracks[track as usize].motion.position_at(now) - seen.position;
                 (track as usize, offset.norm())
             });

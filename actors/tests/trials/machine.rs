@@ -1,15 +1,16 @@
 //! Processor time that a hypervisor withholds: what a cell misses for want of it tells nothing of the cell.
 //!
 //! Where the host of a virtual machine is busy, processes that could run stand still, all at once and for longer than a
-//! leader may be silent. Linux counts that time (steal, proc_stat(5)); no load within the machine adds to it.
+//! leader may be silent. Linux counts that time (steal, proc_stat(5)): time in which something could have run.
 
 use std::fs;
+use std::num::NonZero;
 use std::time::Duration;
 
 use anyhow::Context;
 use tokio::time::{Instant, sleep};
 
-/// Time over which withheld time is added up.
+/// Least time over which withheld time is added up.
 const WINDOW: Duration = Duration::from_millis(500);
 
 /// Time between readings.
@@ -43,15 +44,17 @@ impl Machine {
         }
     }
 
-    /// The most processor time that was withheld within half a second.
-    pub(crate) fn most_withheld(&self) -> Duration {
-        let within = |(index, (from, before)): (usize, &(Instant, Duration))| {
+    /// The largest part of the processors' time that was withheld over half a second, 0 to 1.
+    pub(crate) fn most_withheld(&self) -> f64 {
+        let processors = std::thread::available_parallelism().map_or(1, NonZero::get);
+        let part = |(index, (from, before)): (usize, &(Instant, Duration))| {
             let later = &self.readings[index..];
             let end = later.partition_point(|(at, _)| *at < *from + WINDOW);
-            let (_, after) = later.get(end).or(later.last())?;
-            Some(after.saturating_sub(*before))
+            let (until, after) = later.get(end).or(later.last())?;
+            let span = until.saturating_duration_since(*from).max(WINDOW);
+            Some(after.saturating_sub(*before).as_secs_f64() / span.as_secs_f64())
         };
-        self.readings.iter().enumerate().filter_map(within).max().unwrap_or_default()
+        self.readings.iter().enumerate().filter_map(part).fold(0.0, f64::max) / processors as f64
     }
 }
 
@@ -80,12 +83,17 @@ mod tests {
     }
 
     #[test]
-    fn what_is_withheld_adds_up_over_half_a_second() {
-        let now_and_then = machine((0..100).map(|n| (50 * n, 1000 + 10 * (n / 2))));
-        assert_eq!(now_and_then.most_withheld(), Duration::from_millis(50));
-        let once = machine([(0, 7), (50, 7), (100, 130), (150, 130), (2000, 140)]);
-        assert_eq!(once.most_withheld(), Duration::from_millis(133));
-        assert_eq!(machine([]).most_withheld(), Duration::ZERO);
+    fn the_part_that_is_withheld_counts_by_half_seconds() {
+        let all = std::thread::available_parallelism().unwrap().get() as u64;
+        let part = |readings: &[(u64, u64)]| {
+            (100.0 * machine(readings.iter().map(|(at, withheld)| (*at, withheld * all))).most_withheld()).round()
+        };
+        let now_and_then: Vec<_> = (0..100).map(|n| (50 * n, 1000 + 10 * (n / 2))).collect();
+        assert_eq!(part(&now_and_then), 10.0);
+        assert_eq!(part(&[(0, 7), (50, 7), (100, 107), (150, 107), (500, 107), (1000, 110)]), 20.0);
+        assert_eq!(part(&[(0, 0), (50, 0), (2050, 400)]), 20.0, "the reader stood still as well");
+        assert_eq!(part(&[(0, 0), (100, 50)]), 10.0);
+        assert_eq!(part(&[]), 0.0);
     }
 
     #[test]

@@ -29,8 +29,8 @@ use intruder::Intruder;
 
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// Most processor time that may be withheld within half a second of a minute that counts.
-const MOST_WITHHELD: Duration = Duration::from_millis(250);
+/// Largest part of the processors' time that may be withheld in half a second of a minute that counts.
+const MOST_WITHHELD: f64 = 0.25;
 
 /// A map that is older than this when it is taken is of no use to a driver.
 const MAX_AGE: Duration = Duration::from_secs(1);
@@ -157,7 +157,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         stale_accepted: runs.iter().flat_map(stale).filter(counts).count() as u64,
         forged_accepted,
         accepted_older_than_1_s: accepted().filter(counts).filter(|map| map.age() > MAX_AGE).count(),
-        oldest_accepted_ms: accepted().map(Accepted::age).max().unwrap_or_default().as_millis() as u64,
+        oldest_accepted_ms: accepted().filter(counts).map(Accepted::age).max().unwrap_or_default().as_millis() as u64,
         unrecovered_minutes: past.iter().filter(unrecovered).count(),
         void_minutes: void.len(),
         watched_for_growth: series.values().filter(|series| series.is_telling()).count(),

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::tracks::trust::{Standing, Standings};
+use crate::tracks::witnesses::Witnesses;
 
 #[test]
 fn whoever_invents_or_hides_objects_loses_its_standing() {
@@ -38,12 +39,11 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
 
 #[test]
 fn whoever_sees_an_object_is_heard_before_those_who_overlook_it() {
-    let seen = Measurement { position: Vector2::zeros(), independent: Matrix2::identity(), common_m: 0.2 };
-    let mut track = Track::new(Uuid::nil(), at(0), &seen, &TracksConfig::default());
-    let taken = (0..100).filter(|vehicle| track.witness(*vehicle, at(0)).is_some()).count();
-    assert!(taken < 100 && track.witness(100, at(1)).is_none());
-    assert!(track.eyewitness(100, at(1)).is_some());
-    assert!(track.hears(100, at(1)) && !track.hears(0, at(1)));
+    let mut witnesses = Witnesses::default();
+    let taken = (0..100).filter(|vehicle| witnesses.looking(*vehicle, at(0)).is_some()).count();
+    assert!(taken < 100 && witnesses.looking(100, at(1)).is_none());
+    assert!(witnesses.detecting(100, at(1)).is_some());
+    assert!(witnesses.hears(100, at(1)) && !witnesses.hears(0, at(1)));
 }
 
 /// Four look straight at the place, and one that they otherwise agree with is sure that something is there.
