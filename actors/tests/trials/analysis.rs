@@ -63,7 +63,8 @@ pub(crate) struct Verdict {
     pub(crate) reputations_changed: bool,
     /// New leaderships beyond those that the faults explain, and expected ones that did not come about.
     pub(crate) false_failovers: u64,
-    /// Whether the machine withheld so much processor time that the rest tells nothing; judged by the caller.
+    /// Whether so much processor time was withheld from the machine that a missed bar tells nothing; judged by the
+    /// caller.
     pub(crate) is_void: bool,
 }
 

@@ -112,7 +112,7 @@ pub(crate) fn table(outcomes: &[Outcome]) -> String {
         );
     }
     text + "gaps in ms, of the worst vehicle, the period of 100 ms included; bar: the most that p99 may be\n\
-            void: the hypervisor withheld more than a tenth of the processors' time for half a second; not counted\n"
+            void: missed a bar while the hypervisor withheld more than a tenth of the processors' time for half a second\n"
 }
 
 fn number(value: Option<u64>) -> String {
