@@ -63,8 +63,8 @@ pub(crate) struct Verdict {
     pub(crate) reputations_changed: bool,
     /// New leaderships beyond those that the faults explain, and expected ones that did not come about.
     pub(crate) false_failovers: u64,
-    /// Whether so much processor time was withheld from the machine that a missed bar tells nothing; judged by the
-    /// caller.
+    /// Whether so much processor time was withheld from the machine that a missed bar of time tells nothing; judged by
+    /// the caller.
     pub(crate) is_void: bool,
 }
 
@@ -76,7 +76,7 @@ pub(crate) const QUIET: Duration = Duration::from_secs(1);
 
 /// Judges a trial by the logs of all its processes.
 pub(crate) fn judge(runs: &[NodeRun], phases: &[Phase]) -> Verdict {
-    let mut verdict = Verdict { stale_accepted: runs.iter().flat_map(stale).count() as u64, ..Verdict::default() };
+    let mut verdict = Verdict { stale_accepted: runs.iter().map(stale).sum(), ..Verdict::default() };
     let mut known: BTreeSet<&Epoch> =
         phases.first().map(|first| epochs(runs, Timestamp::default(), first.from)).unwrap_or_default();
     for phase in phases {
@@ -101,15 +101,16 @@ pub(crate) fn percentile(sorted: &[Duration], percent: usize) -> Option<Duration
     sorted.get(rank - 1).copied()
 }
 
-/// The maps that a process took although it had taken a later one.
-pub(crate) fn stale(run: &NodeRun) -> impl Iterator<Item = &Accepted> {
+/// How many maps a process took although it had taken a later one.
+pub(crate) fn stale(run: &NodeRun) -> u64 {
     let mut latest: Option<(&Epoch, u64)> = None;
-    run.accepted.iter().filter(move |map| {
+    let mut stale = 0;
+    for map in &run.accepted {
         let this = (&map.epoch, map.round);
-        let is_stale = latest.is_some_and(|latest| this <= latest);
+        stale += u64::from(latest.is_some_and(|latest| this <= latest));
         latest = latest.max(Some(this));
-        is_stale
-    })
+    }
+    stale
 }
 
 /// Pairs of maps taken one after the other, the second within the time.

@@ -28,7 +28,7 @@ const MOSQUITTO: &str = "/usr/sbin/mosquitto";
 pub(crate) const EDGE: usize = 0;
 
 /// Time for all processes to start and agree.
-const START_TIMEOUT: Duration = Duration::from_secs(120);
+const START_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// How long everything must have been well before a fault.
 const SETTLED: Duration = Duration::from_millis(1500);

@@ -29,11 +29,7 @@ pub(crate) struct Machine {
 impl Machine {
     /// Waits for so long.
     pub(crate) async fn sleep(&mut self, time: Duration) -> anyhow::Result<()> {
-        self.sleep_until(Instant::now() + time).await
-    }
-
-    /// Waits until then.
-    pub(crate) async fn sleep_until(&mut self, deadline: Instant) -> anyhow::Result<()> {
+        let deadline = Instant::now() + time;
         loop {
             let now = Instant::now();
             self.readings.push((now, withheld()?));

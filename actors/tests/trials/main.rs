@@ -2,9 +2,9 @@
 //!
 //! Here are two harnesses. `make soak` runs the one in `soak`. `make trials` runs the other; `TRIALS=n` is the number
 //! of trials of each scenario and cell size (default 20), `SCENARIOS=a,b` and `NODES=2,5` run those only. What cannot
-//! be run on this machine is skipped and said to be. So is what cannot be measured on it: a trial that missed a bar while
-//! a hypervisor withheld the processors is void, and repeated, at most as many times as there are to be trials. The
-//! results are printed and written to `target/trials.json`; the files of a trial that went wrong are kept.
+//! be run on this machine is skipped and said to be. A trial that missed a bar while a hypervisor withheld the processors
+//! is void, and repeated, at most as many times as there are to be trials; superseded maps and lost reputations count all
+//! the same, and a scenario of which no trial counts has failed. The results are printed and written to `target/trials.json`; the files of a trial that went wrong are kept.
 
 mod analysis;
 mod cell;

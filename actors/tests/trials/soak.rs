@@ -17,20 +17,16 @@ use ecod_actors::clock;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
-use tokio::time::Instant;
+use tokio::time::{Instant, sleep_until};
 
 use crate::analysis::{Accepted, NodeRun, longest_wait, stale};
 use crate::cell::{Cell, Plan};
-use crate::machine::Machine;
 use crate::{end_with_the_harness, network, target_file};
 use disturbance::Disturbance;
 use growth::{Resources, Series};
 use intruder::Intruder;
 
 const MINUTE: Duration = Duration::from_secs(60);
-
-/// Largest part of the processors' time that may be withheld in half a second of a minute that counts.
-const MOST_WITHHELD: f64 = 0.25;
 
 /// A map that is older than this when it is taken is of no use to a driver.
 const MAX_AGE: Duration = Duration::from_secs(1);
@@ -53,8 +49,6 @@ struct Summary {
     accepted_older_than_1_s: usize,
     oldest_accepted_ms: u64,
     unrecovered_minutes: usize,
-    /// Those in which the hypervisor withheld the processors: what is taken or not recovered then does not count.
-    void_minutes: usize,
     /// Processes that lived for long enough to show whether they grow.
     watched_for_growth: usize,
     growing: Vec<String>,
@@ -70,7 +64,6 @@ struct Minute {
     /// From the end of the disturbance until all followed one leader again; none if they did not.
     recovered_after_ms: Option<u64>,
     leader: String,
-    is_void: bool,
     /// The largest of all processes at the minute's end.
     largest: Resources,
     #[serde(skip)]
@@ -110,17 +103,15 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
     for number in 1..=minutes {
         let (began, from) = (Instant::now(), clock::now());
         let disturbance = Disturbance::draw(&mut rng, bridged);
-        let mut machine = Machine::default();
-        let disturbed = async {
-            disturbance.carry_out(cell, &mut intruder, &mut rng).await?;
-            let over = Instant::now();
-            let recovered = cell.settle_within(MINUTE.saturating_sub(began.elapsed())).await;
-            if let Err(why) = &recovered {
-                println!("minute {number}: {why:#}");
-            }
-            anyhow::Ok(recovered.is_ok().then(|| over.elapsed().as_millis() as u64))
-        };
-        let (recovered_after_ms, ()) = tokio::try_join!(disturbed, machine.sleep_until(began + MINUTE))?;
+        disturbance.carry_out(cell, &mut intruder, &mut rng).await?;
+        let over = Instant::now();
+        let limit = MINUTE.saturating_sub(began.elapsed());
+        let recovered = cell.settle_within(limit).await;
+        if let Err(why) = &recovered {
+            println!("minute {number}: {why:#}");
+        }
+        let recovered_after_ms = recovered.is_ok().then(|| over.elapsed().as_millis() as u64);
+        sleep_until(began + MINUTE).await;
         let mut largest = Resources::default();
         for (process, id) in cell.processes() {
             let resources = Resources::of(id).with_context(|| format!("resources of {process}"))?;
@@ -132,7 +123,6 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
             longest_gap_ms: 0,
             recovered_after_ms,
             leader: cell.leader_name()?,
-            is_void: machine.most_withheld() > MOST_WITHHELD,
             largest,
             span: (from, clock::now()),
         };
@@ -147,19 +137,15 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
     }
     let growing = series.iter().filter_map(|(process, series)| Some(format!("{process}: {}", series.growth()?)));
     let accepted = || runs.iter().flat_map(|run| &run.accepted);
-    let void: Vec<_> = past.iter().filter(|minute| minute.is_void).map(|minute| minute.span.0..minute.span.1).collect();
-    let counts = |map: &&Accepted| !void.iter().any(|span| span.contains(&map.at));
-    let unrecovered = |minute: &&Minute| minute.recovered_after_ms.is_none() && !minute.is_void;
     Ok(Summary {
         nodes: cell.nodes(),
         seed,
         maps_accepted: accepted().count(),
-        stale_accepted: runs.iter().flat_map(stale).filter(counts).count() as u64,
+        stale_accepted: runs.iter().map(stale).sum(),
         forged_accepted,
-        accepted_older_than_1_s: accepted().filter(counts).filter(|map| map.age() > MAX_AGE).count(),
-        oldest_accepted_ms: accepted().filter(counts).map(Accepted::age).max().unwrap_or_default().as_millis() as u64,
-        unrecovered_minutes: past.iter().filter(unrecovered).count(),
-        void_minutes: void.len(),
+        accepted_older_than_1_s: accepted().filter(|map| map.age() > MAX_AGE).count(),
+        oldest_accepted_ms: accepted().map(Accepted::age).max().unwrap_or_default().as_millis() as u64,
+        unrecovered_minutes: past.iter().filter(|minute| minute.recovered_after_ms.is_none()).count(),
         watched_for_growth: series.values().filter(|series| series.is_telling()).count(),
         growing: growing.collect(),
         largest: past.iter().map(|minute| minute.largest).fold(Resources::default(), Resources::max),
@@ -191,8 +177,7 @@ fn tell(minute: &Minute) -> String {
         Some(ms) => format!("all well {:.1} s later", ms as f64 / 1000.0),
         None => "NOT RECOVERED".to_owned(),
     };
-    let void = if minute.is_void { "; void: the hypervisor withheld the processors" } else { "" };
-    format!("{recovered}, {} leads; at most {}{void}", minute.leader, minute.largest)
+    format!("{recovered}, {} leads; at most {}", minute.leader, minute.largest)
 }
 
 /// Prints and writes the summary; what went wrong, in words.
@@ -205,7 +190,7 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
     }
     println!(
         "\n{} nodes, {} minutes, seed {}: {} maps taken, {} of them superseded, {} forged, {} older than 1 s (the oldest {} ms); \
-         {} minutes unrecovered, {} void; at most {}; {} processes grow, of {} that lived long enough to tell",
+         {} minutes unrecovered; at most {}; {} processes grow, of {} that lived long enough to tell",
         summary.nodes,
         summary.minutes.len(),
         summary.seed,
@@ -215,7 +200,6 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
         summary.accepted_older_than_1_s,
         summary.oldest_accepted_ms,
         summary.unrecovered_minutes,
-        summary.void_minutes,
         summary.largest,
         summary.growing.len(),
         summary.watched_for_growth,
