@@ -150,7 +150,7 @@ mod tests {
         let misses = |verdicts: &[Verdict]| Outcome::new(&SCENARIOS[0], 5, verdicts).misses();
         assert!(misses(&[void.clone(), right.clone()]).is_empty());
         assert!(!misses(&[void.clone(), right.clone(), slow]).is_empty());
-        assert!(!misses(&[void.clone()]).is_empty(), "nothing was measured");
+        assert!(!misses(std::slice::from_ref(&void)).is_empty(), "nothing was measured");
         let superseded = Verdict { stale_accepted: 1, ..void.clone() };
         assert_eq!(misses(&[superseded, right.clone()]), ["stale_accepted 1, must be 0"]);
         let forgotten = Verdict { reputations_changed: true, ..void };
