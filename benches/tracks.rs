@@ -40,7 +40,7 @@ fn round(figures: &mut Figures, observers: u32) -> f64 {
             let now = NOON + Duration::from_millis(100 * frame);
             let reports: Vec<_> = (0..observers).map(|observer| report(observer, observers, frame, now)).collect();
             elapsed(|| {
-                for report in &reports {
+                for report in reports {
                     tracker.observe(report, now);
                 }
                 std::hint::black_box(tracker.close(now));

@@ -2,6 +2,8 @@
 //!
 //! `cargo run --example three_reports`
 
+use std::sync::Arc;
+
 use ecod::aggregator::{Aggregator, FusionConfig};
 use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::names::NodeName;
@@ -29,7 +31,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 now = now.micros(),
             );
             let report: ObjectReport = decode_report(json.as_bytes(), &NodeName::new(node)?, &Default::default())?;
-            let fused = cell.report(ReportKind::Detections, &report, now)?;
+            let fused = cell.report(ReportKind::Detections, &Arc::new(report), now)?;
             if let Some(map) = fused.and_then(|fused| fused.map) {
                 println!("round {}", map.round);
                 for place in map.landmarks {

@@ -141,7 +141,7 @@ impl Aggregator {
     pub fn report(
         &mut self,
         kind: ReportKind,
-        report: &ObjectReport,
+        report: &Arc<ObjectReport>,
         now: Timestamp,
     ) -> Result<Option<Fused>, RejectReason> {
         let window = &mut self.windows[kind as usize];
@@ -152,7 +152,7 @@ impl Aggregator {
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
                 let tracks = self.tracks.as_mut();
                 let is_tracked = tracks.is_some_and(|tracks| {
-                    tracks.observe_only(report, captured_at, |object| !pace.is_at_landmark(object))
+                    tracks.observe_only(Arc::clone(report), captured_at, |object| !pace.is_at_landmark(object))
                 });
                 match admitted {
                     Admitted::InOrder(_) => pace.observe(report, captured_at),

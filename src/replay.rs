@@ -17,6 +17,7 @@ mod line;
 mod tests;
 
 use std::collections::{BTreeMap, HashSet, VecDeque};
+use std::sync::Arc;
 use std::time::Duration;
 
 pub use journal::{JournalEntry, JournalEvent, Rerun, RerunSummary};
@@ -242,7 +243,7 @@ impl Replay {
         }
         self.catch_up(before, now, &mut output);
         self.learn(&line);
-        match self.cell(now).report(line.kind, &line.report, now) {
+        match self.cell(now).report(line.kind, &Arc::new(line.report), now) {
             Ok(fused) => {
                 self.summary.late += u64::from(is_late);
                 self.heard[line.kind as usize] = true;

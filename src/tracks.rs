@@ -17,6 +17,7 @@ mod grid;
 mod joining;
 mod motion;
 mod pairs;
+mod shadows;
 mod source;
 mod taking;
 #[cfg(test)]
@@ -27,6 +28,7 @@ mod upkeep;
 mod witnesses;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use hashbrown::HashMap;
 
@@ -72,7 +74,7 @@ pub struct Tracker {
     config: TracksConfig,
     reputation: ReputationConfig,
     /// By number; numbers of forgotten vehicles are given anew.
-    sources: Vec<Option<Source>>,
+    sources: Vec<Option<Box<Source>>>,
     numbers: HashMap<NodeName, u32>,
     standings: Standings,
     fleet: Fleet,
@@ -85,7 +87,7 @@ pub struct Tracker {
     fastest_mps: f64,
     /// By a vehicle's number, the track that it is.
     own: HashMap<u32, u32>,
-    pending: Vec<(Timestamp, ObjectReport)>,
+    pending: Vec<(Timestamp, Arc<ObjectReport>)>,
     fused_until: Timestamp,
     late: u64,
     refused: u64,
@@ -95,7 +97,7 @@ pub struct Tracker {
 }
 
 /// Least side of a cell in metres: larger ones hold more that is too far, smaller ones are more to look up.
-const LEAST_CELL_M: f64 = 12.0;
+const LEAST_CELL_M: f64 = 24.0;
 
 impl Tracker {
     /// Knows nothing yet; both are taken as valid.
@@ -122,14 +124,14 @@ impl Tracker {
     }
 
     /// Takes one admitted report, captured at `captured_at` on the aggregator's clock; false if it came too late.
-    pub fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) -> bool {
-        self.observe_only(report, captured_at, |_| true)
+    pub fn observe(&mut self, report: impl Into<Arc<ObjectReport>>, captured_at: Timestamp) -> bool {
+        self.observe_only(report.into(), captured_at, |_| true)
     }
 
     /// The same with only some of the report's objects: those that are at no known place.
     pub fn observe_only(
         &mut self,
-        report: &ObjectReport,
+        report: Arc<ObjectReport>,
         captured_at: Timestamp,
         wanted: impl Fn(&PerceivedObject) -> bool,
     ) -> bool {
@@ -137,14 +139,7 @@ impl Tracker {
             self.late += 1;
             return false;
         }
-        let objects = report.objects.iter().filter(|object| wanted(object)).cloned().collect();
-        let (pose, view) = (report.pose, report.view);
-        let report = ObjectReport {
-            pose,
-            view,
-            objects,
-            ..ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us)
-        };
+        let report = if report.objects.iter().all(&wanted) { report } else { only(&report, wanted) };
         self.pending.push((captured_at, report));
         true
     }
@@ -180,7 +175,7 @@ impl Tracker {
 
     fn heard(&mut self, node: &NodeName) -> Option<&mut Source> {
         let number = *self.numbers.get(node)?;
-        self.sources.get_mut(number as usize)?.as_mut()
+        self.sources.get_mut(number as usize)?.as_deref_mut()
     }
 
     /// What could not be used so far.
@@ -260,14 +255,14 @@ impl Tracker {
         if number == self.sources.len() {
             self.sources.push(None);
         }
-        self.sources[number] = Some(source);
+        self.sources[number] = Some(Box::new(source));
         self.numbers.insert(node.clone(), number as u32);
         number as u32
     }
 
     /// Weight of each vehicle's word by its number, 0 to 1; none of numbers that nobody has.
     fn trusts(&self) -> Vec<f64> {
-        let trust = |source: &Option<Source>| source.as_ref().map_or(0.0, |source| source.trust(&self.reputation));
+        let trust = |source: &Option<Box<Source>>| source.as_ref().map_or(0.0, |source| source.trust(&self.reputation));
         self.sources.iter().map(trust).collect()
     }
 
@@ -276,7 +271,9 @@ impl Tracker {
         let trust = |number: u32| trusts[number as usize];
         let name = |number: u32| self.sources[number as usize].as_ref().map(|source| source.node.clone());
         let objects = self.tracks.iter().map(|track| track.fused(now, &self.config, trust, name));
-        objects.filter(|object| object.confidence >= self.config.min_confidence).collect()
+        let mut shown = Vec::with_capacity(self.tracks.len());
+        shown.extend(objects.filter(|object| object.confidence >= self.config.min_confidence));
+        shown
     }
 
     fn corrections(&self) -> BTreeMap<NodeName, PoseCorrection> {
@@ -286,4 +283,16 @@ impl Tracker {
         let sources = self.sources.iter().flatten();
         sources.filter_map(|source| Some((source.node.clone(), source.alignment.published()?))).collect()
     }
+}
+
+/// The report with only some of its objects.
+fn only(report: &ObjectReport, wanted: impl Fn(&PerceivedObject) -> bool) -> Arc<ObjectReport> {
+    let objects = report.objects.iter().filter(|object| wanted(object)).cloned().collect();
+    let (pose, view) = (report.pose, report.view);
+    Arc::new(ObjectReport {
+        pose,
+        view,
+        objects,
+        ..ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us)
+    })
 }

@@ -3,6 +3,8 @@
 #[path = "../examples/eval_tracks/baselines.rs"]
 mod baselines;
 
+use std::sync::Arc;
+
 use ecod::aggregator::{Aggregator, Algorithms, FusionConfig};
 use ecod::eval::tracks::{TrackEvaluation, TrackTruth};
 use ecod::names::NodeName;
@@ -30,7 +32,7 @@ fn fuse(recording: &TrafficRecording, mut each: impl FnMut(Option<&ObjectReport>
             each(None, cell.tick(cell.deadline()).and_then(|fused| fused.map).as_ref());
         }
         each(Some(&arrived.report), None);
-        let fused = cell.report(ReportKind::Detections, &arrived.report, time(n)).unwrap_or_default();
+        let fused = cell.report(ReportKind::Detections, &Arc::new(arrived.report.clone()), time(n)).unwrap_or_default();
         each(None, fused.and_then(|fused| fused.map).as_ref());
     }
 }

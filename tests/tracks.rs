@@ -1,5 +1,6 @@
 //! Tracking through the aggregator and the replay: what comes out of a cell for what its vehicles report.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::{Aggregator, FusionConfig};
@@ -91,7 +92,8 @@ fn beside_known_locations_only_the_rest_is_tracked_and_only_if_asked_for() {
         let mut last = None;
         for frame in 1..20 {
             let now = Timestamp(START + frame * 100_000);
-            let fused = cell.report(ReportKind::Detections, &report("euclid", frame, now, cars(frame)), now).unwrap();
+            let fused =
+                cell.report(ReportKind::Detections, &Arc::new(report("euclid", frame, now, cars(frame))), now).unwrap();
             last = fused.or_else(|| cell.tick(now)).or(last);
         }
         let map = last.unwrap().map.unwrap();
@@ -109,7 +111,8 @@ fn a_standby_leads_on_with_the_same_identities() {
     for frame in 1..30 {
         let now = Timestamp(START + frame * 100_000);
         for cell in [&mut leader, &mut standby] {
-            let fused = cell.report(ReportKind::Detections, &report("euclid", frame, now, cars(frame)), now).unwrap();
+            let fused =
+                cell.report(ReportKind::Detections, &Arc::new(report("euclid", frame, now, cars(frame))), now).unwrap();
             map = fused.or_else(|| cell.tick(now)).and_then(|fused| fused.map).or(map);
         }
     }
@@ -131,10 +134,11 @@ fn overtaken_reports_count_for_tracks_within_the_bound_and_not_for_known_locatio
     let mut last = None;
     for frame in (2..40).step_by(2) {
         let now = time(frame) + Duration::from_millis(20);
-        let in_time = report("euclid", frame, time(frame), vec![PerceivedObject::new("car", 0.8, 10.0, 8.0)]);
+        let standing = PerceivedObject::new("car", 0.8, 10.0, 8.0);
+        let in_time = Arc::new(report("euclid", frame, time(frame), vec![standing]));
         let moving = PerceivedObject::new("car", 0.9, 0.8 * (frame - 1) as f64, 0.0);
         let truck = PerceivedObject::new("truck", 0.99, 10.0, 8.0);
-        let overtaken = report("euclid", frame - 1, time(frame - 1), vec![moving, truck]);
+        let overtaken = Arc::new(report("euclid", frame - 1, time(frame - 1), vec![moving, truck]));
         last = cell.report(ReportKind::Detections, &in_time, now).unwrap().or(last);
         assert_eq!(cell.report(ReportKind::Detections, &overtaken, now), Ok(None));
         for again in [&in_time, &overtaken] {
@@ -147,7 +151,7 @@ fn overtaken_reports_count_for_tracks_within_the_bound_and_not_for_known_locatio
     assert!((moving.x_m - 0.8 * 40.0).abs() < 0.5, "{moving:?}");
     assert_eq!(map.landmarks[0].label.as_deref(), Some("car"), "known locations go by the latest report");
     assert_eq!((cell.overtaken(), cell.tracks_losses().late), (19, 0));
-    let late = report("euclid", 32, Timestamp(START + 3_250_000), cars(32));
+    let late = Arc::new(report("euclid", 32, Timestamp(START + 3_250_000), cars(32)));
     assert_eq!(cell.report(ReportKind::Detections, &late, time(40)), Err(RejectReason::OutOfOrder));
     assert_eq!((cell.overtaken(), cell.tracks_losses().late), (19, 1));
 }

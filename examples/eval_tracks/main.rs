@@ -16,6 +16,7 @@ use std::io::{BufWriter, Write as _};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -180,7 +181,7 @@ fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<G
         }
         watch(Event::Report(&arrived.report));
         // A rejected report is one that comes too late.
-        take(aggregator.report(ReportKind::Detections, &arrived.report, now).unwrap_or_default());
+        take(aggregator.report(ReportKind::Detections, &Arc::new(arrived.report.clone()), now).unwrap_or_default());
     }
     due.into_iter().for_each(|due| watch(Event::Due(due)));
     if let Some(aggregator) = &mut aggregator {

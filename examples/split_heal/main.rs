@@ -109,7 +109,7 @@ impl Cell {
             }
             for node in 0..SEEN.len() {
                 if self.now.micros().is_multiple_of(REPORT_MS * 1000) {
-                    self.vehicles[node].report(&report(node, self.now), self.now)?;
+                    self.vehicles[node].report(report(node, self.now), self.now)?;
                 }
                 self.vehicles[node].tick(self.now)?;
                 self.post(node);

@@ -1,6 +1,7 @@
 //! One vehicle: what a node runs, without clock, sockets and actors.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use anyhow::Context;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
@@ -73,7 +74,7 @@ impl Vehicle {
         let limits = Limits::default();
         match payload {
             Payload::Election(bytes) => self.handle(Input::Receive { message: ElectionMessage::decode(bytes)? }, now),
-            Payload::Report(kind, bytes) => self.fuse(*kind, &decode_report(bytes, from, &limits)?, now)?,
+            Payload::Report(kind, bytes) => self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?,
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),
             Payload::Evidence(bytes) => {
                 if self.ledger.merge_entries(decode_share(bytes, from, &limits)?.entries, self.election.epoch()) {
@@ -85,15 +86,16 @@ impl Vehicle {
     }
 
     /// Sends what it sees, for the map and as votes, and uses it itself.
-    pub(crate) fn report(&mut self, report: &ObjectReport, now: Timestamp) -> anyhow::Result<()> {
+    pub(crate) fn report(&mut self, report: ObjectReport, now: Timestamp) -> anyhow::Result<()> {
+        let report = Arc::new(report);
         for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
-            self.outbox.push((None, Payload::Report(kind, encode(report, Encoding::Cbor))));
-            self.fuse(kind, report, now)?;
+            self.outbox.push((None, Payload::Report(kind, encode(&*report, Encoding::Cbor))));
+            self.fuse(kind, &report, now)?;
         }
         Ok(())
     }
 
-    fn fuse(&mut self, kind: ReportKind, report: &ObjectReport, now: Timestamp) -> anyhow::Result<()> {
+    fn fuse(&mut self, kind: ReportKind, report: &Arc<ObjectReport>, now: Timestamp) -> anyhow::Result<()> {
         self.aggregator.report(kind, report, now)?.map_or(Ok(()), |fused| self.publish(fused, now))
     }
 

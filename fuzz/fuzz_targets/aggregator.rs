@@ -3,6 +3,7 @@
 #![no_main]
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
@@ -89,7 +90,7 @@ fuzz_target!(|cell: Cell| {
                 };
                 assert_valid(&report);
                 let kind = if votes { ReportKind::VoteDetections } else { ReportKind::Detections };
-                aggregator.report(kind, &report, now).ok().flatten().iter().for_each(check);
+                aggregator.report(kind, &Arc::new(report), now).ok().flatten().iter().for_each(check);
             }
             Step::Wait { ms } => {
                 now = now + Duration::from_millis(ms.into());

@@ -16,11 +16,11 @@ fn landmarks() -> Vec<Landmark> {
     vec![Landmark { id: "ball".into(), position: ball, facing_rad: None, vacancy: None, synonyms: vec![] }]
 }
 
-fn report(node: &str, label: &str, captured_ms: u64) -> ObjectReport {
-    ObjectReport {
+fn report(node: &str, label: &str, captured_ms: u64) -> Arc<ObjectReport> {
+    Arc::new(ObjectReport {
         objects: vec![PerceivedObject { landmark: Some("ball".into()), ..PerceivedObject::new(label, 0.9, 1.0, 0.0) }],
         ..ObjectReport::new(NodeName::new(node).unwrap(), captured_ms, at(captured_ms))
-    }
+    })
 }
 
 fn leader(config: FusionConfig) -> Aggregator {

@@ -123,7 +123,7 @@ impl Rerun {
     }
 
     /// Takes the next report.
-    pub fn report(&mut self, kind: ReportKind, report: &ObjectReport, at: Timestamp) -> Vec<FusedLine> {
+    pub fn report(&mut self, kind: ReportKind, report: &Arc<ObjectReport>, at: Timestamp) -> Vec<FusedLine> {
         self.summary.reports += 1;
         match self.running(at).report(kind, report, at) {
             Ok(fused) => self.lines(fused),

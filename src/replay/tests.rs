@@ -256,7 +256,7 @@ fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]
             let deadline = cell.deadline();
             publish(cell.tick(deadline));
         }
-        let fused = cell.report(*kind, report, *received_at).unwrap();
+        let fused = cell.report(*kind, &std::sync::Arc::new(report.clone()), *received_at).unwrap();
         pending = fused.is_none();
         publish(fused);
     }

@@ -7,7 +7,7 @@
 //! one step of an extended Kalman filter in information form over all pairs, reweighted against wrong ones by Cauchy's
 //! function (Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
 
-use nalgebra::{Matrix2x4, Matrix4, Rotation2, Vector2, Vector4};
+use nalgebra::{Matrix2, Matrix4, Rotation2, Vector2, Vector4};
 
 use crate::geometry::wrap_angle;
 use crate::time::Timestamp;
@@ -120,27 +120,23 @@ impl Alignment {
         let prior = self.error;
         let mut counted = 0.0;
         for _ in 0..ITERATIONS {
-            let mut information = prior_information;
-            let mut vector = prior_information * prior;
-            let correct = self.correction();
+            let (rotation, offset) = (self.rotation(), self.error.xy());
+            let mut normal = Normal::default();
             counted = 0.0;
             for pair in pairs {
-                let corrected = correct(&pair.reported);
-                let arm = corrected - self.about - self.error.xy();
-                let (x, y) = (pair.velocity.x, pair.velocity.y);
-                let jacobian = Matrix2x4::new(1.0, 0.0, -arm.y, x, 0.0, 1.0, arm.x, y);
+                let arm = rotation * (pair.reported - self.about);
                 let later = pair.velocity * (self.error.w - delay_s);
-                let residual = pair.reference - corrected - later;
+                let residual = pair.reference - (self.about + arm + offset) - later;
                 let squared = residual.norm_squared() / (pair.variance + pair.common);
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
                 // What the references share is no better known for their number.
                 let weight = trust / (pair.variance + pair.common * pairs.len() as f64);
-                information += jacobian.transpose() * jacobian * weight;
-                vector += jacobian.transpose() * (residual + jacobian * self.error) * weight;
+                normal.add(&Matrix2::from_columns(&[Vector2::new(-arm.y, arm.x), pair.velocity]), &residual, weight);
                 counted += trust;
             }
-            let Some(covariance) = information.try_inverse() else { return };
-            self.error = covariance * vector;
+            let (information, gradient) = (normal.information(), normal.gradient());
+            let Some(covariance) = (prior_information + information).try_inverse() else { return };
+            self.error = covariance * (prior_information * prior + information * self.error + gradient);
             // Nobody's stamps move the time at which all reports are fused.
             let most_s = MOST_DELAY * spread.delay_s;
             self.error.w = self.error.w.clamp(-most_s, most_s);
@@ -167,6 +163,40 @@ impl Alignment {
             dheading_rad: self.error.z,
             pairs: self.pairs,
         })
+    }
+}
+
+/// Sums over pairs for the normal equations. A residual's derivatives are the identity by the offset, and those by
+/// rotation and delay, which are the columns of a matrix: no more than these blocks has to be summed.
+#[derive(Default)]
+struct Normal {
+    weight: f64,
+    first: Matrix2<f64>,
+    second: Matrix2<f64>,
+    residual: Vector2<f64>,
+    turned: Vector2<f64>,
+}
+
+impl Normal {
+    fn add(&mut self, by_rotation_and_delay: &Matrix2<f64>, residual: &Vector2<f64>, weight: f64) {
+        let weighted = by_rotation_and_delay * weight;
+        self.weight += weight;
+        self.first += weighted;
+        self.second += weighted.tr_mul(by_rotation_and_delay);
+        self.residual += residual * weight;
+        self.turned += weighted.tr_mul(residual);
+    }
+
+    fn information(&self) -> Matrix4<f64> {
+        let mut information = Matrix4::from_diagonal_element(self.weight);
+        information.fixed_view_mut::<2, 2>(0, 2).copy_from(&self.first);
+        information.fixed_view_mut::<2, 2>(2, 0).copy_from(&self.first.transpose());
+        information.fixed_view_mut::<2, 2>(2, 2).copy_from(&self.second);
+        information
+    }
+
+    fn gradient(&self) -> Vector4<f64> {
+        Vector4::new(self.residual.x, self.residual.y, self.turned.x, self.turned.y)
     }
 }
 

@@ -25,10 +25,9 @@ const LARGEST_CLUSTER: usize = 48;
 /// The best pairings of `detections` detections, at most one for each detection and each track, by detection.
 pub(super) fn assign(detections: usize, pairings: &[Pairing]) -> Vec<Pairing> {
     let mut clusters = Clusters::new(detections);
-    let mut by_track: Vec<(u32, u32)> = pairings.iter().map(|pairing| (pairing.track, pairing.detection)).collect();
-    by_track.sort_unstable();
-    for pair in by_track.windows(2).filter(|pair| pair[0].0 == pair[1].0) {
-        clusters.join(pair[0].1, pair[1].1);
+    let mut first_of: HashMap<u32, u32> = HashMap::with_capacity(pairings.len());
+    for Pairing { detection, track, .. } in pairings {
+        clusters.join(*first_of.entry(*track).or_insert(*detection), *detection);
     }
     let mut by_cluster: Vec<(u32, Pairing)> =
         pairings.iter().map(|pairing| (clusters.root(pairing.detection), *pairing)).collect();

@@ -5,6 +5,8 @@
 //! [`EVEN_REHITS`] of the detections come again, about half are real. That confidence is found from rates by
 //! confidence, and the spread of the confidences above it gives their scale.
 
+use super::evidence::logistic;
+
 /// Part of the detections that come again among those of which half are real.
 const EVEN_REHITS: f64 = 0.62;
 
@@ -57,9 +59,14 @@ impl Calibration {
         Self { bins: [(0.0, 0.0); BINS], assumed, even: assumed, slope: SLOPE, since_fit: 0 }
     }
 
-    /// Log-odds that a detection of such confidence is real.
-    pub(super) fn nats(&self, confidence: f64) -> f64 {
-        (self.slope * (log_odds(confidence) - self.even)).clamp(-4.0, 4.0)
+    /// Log-odds that a detection is real whose confidence has so many.
+    pub(super) fn nats(&self, log_odds: f64) -> f64 {
+        (self.slope * (log_odds - self.even)).clamp(-4.0, 4.0)
+    }
+
+    /// Confidence above which detections are likelier real than not.
+    pub(super) fn even_confidence(&self) -> f64 {
+        logistic(self.even)
     }
 
     /// A detection of so many log-odds came again at the next look, or did not.

@@ -8,13 +8,17 @@ use smallvec::SmallVec;
 #[derive(Debug, Clone, Default)]
 pub(super) struct Grid {
     cell_m: f64,
-    cells: HashMap<(i32, i32), SmallVec<[Point; 2]>>,
+    cells: HashMap<(i32, i32), SmallVec<[Point; 4]>>,
 }
 
+/// A point that moves.
 #[derive(Debug, Clone, Copy)]
-struct Point {
-    at: Vector2<f64>,
-    number: u32,
+pub(super) struct Point {
+    /// Where it was when the grid was made.
+    pub(super) at: Vector2<f64>,
+    /// m/s.
+    pub(super) velocity: Vector2<f64>,
+    pub(super) number: u32,
 }
 
 impl Grid {
@@ -29,9 +33,8 @@ impl Grid {
     }
 
     /// Adds a point.
-    pub(super) fn insert(&mut self, at: &Vector2<f64>, number: u32) {
-        let cell = self.cells.entry((self.line(at.x), self.line(at.y))).or_default();
-        cell.push(Point { at: *at, number });
+    pub(super) fn insert(&mut self, point: Point) {
+        self.cells.entry((self.line(point.at.x), self.line(point.at.y))).or_default().push(point);
     }
 
     /// How many points lie in the square of `side_m`, a whole part of a cell's, that `at` lies in.
@@ -42,17 +45,23 @@ impl Grid {
         points.filter(|point| square(&point.at) == here).count()
     }
 
-    /// The points within `reach_m` of `at`.
-    pub(super) fn around(&self, at: &Vector2<f64>, reach_m: f64) -> impl Iterator<Item = u32> + '_ {
+    /// Visits the points that were within `reach_m` of `at`.
+    pub(super) fn around(&self, at: &Vector2<f64>, reach_m: f64, mut visit: impl FnMut(&Point)) {
         let (west, east) = (self.line(at.x - reach_m), self.line(at.x + reach_m));
         let (south, north) = (self.line(at.y - reach_m), self.line(at.y + reach_m));
-        let columns = (west..=east).flat_map(move |column| (south..=north).map(move |row| (column, row)));
-        let points = columns.filter_map(|cell| self.cells.get(&cell)).flatten();
-        let (at, reach_squared) = (*at, reach_m * reach_m);
-        points.filter(move |point| (point.at - at).norm_squared() <= reach_squared).map(|point| point.number)
+        for column in west..=east {
+            for row in south..=north {
+                let points = self.cells.get(&(column, row)).map_or(&[][..], SmallVec::as_slice);
+                let near = points.iter().filter(|point| (point.at - at).norm_squared() <= reach_m * reach_m);
+                near.for_each(&mut visit);
+            }
+        }
     }
 
     fn line(&self, coordinate_m: f64) -> i32 {
-        (coordinate_m / self.cell_m).floor() as i32
+        let cells = coordinate_m / self.cell_m;
+        // What `floor` says, which is a call where the processor may have no instruction for it.
+        let toward_zero = cells as i32;
+        toward_zero - i32::from(f64::from(toward_zero) > cells)
     }
 }

@@ -107,12 +107,13 @@ impl Tracker {
         let mut besides = Vec::new();
         for (older, track) in self.tracks.iter().enumerate() {
             let position = track.motion.position_at(now);
-            let near = self.grid.around(&position, SAME_M).map(|other| other as usize).filter(|other| *other > older);
-            besides.extend(near.filter_map(|later| {
+            self.grid.around(&position, SAME_M, |point| {
+                let later = point.number as usize;
                 let other = &self.tracks[later];
-                let is_beside = (other.motion.position_at(now) - position).norm() < SAME_M;
-                is_beside.then(|| Beside { older, later, are_apart: track.is_told_apart(other) })
-            }));
+                if later > older && (other.motion.position_at(now) - position).norm() < SAME_M {
+                    besides.push(Beside { older, later, are_apart: track.is_told_apart(other) });
+                }
+            });
         }
         besides
     }

@@ -113,13 +113,13 @@ impl Motion {
     pub(super) fn update(&mut self, at: Timestamp, seen: &Measurement, density: f64) {
         self.predict(at, density);
         let dt = self.seconds_to(at).min(0.0);
-        let Innovation { offset, covariance, .. } = self.innovation(at, seen, density);
-        let Some(inverse) = inverse(&covariance) else { return };
+        let noise = self.independent_at(dt, density) + seen.independent;
+        let Some(inverse) = inverse(&(noise + common(self.common_m) + common(seen.common_m))) else { return };
+        let offset = seen.position - self.position_at(at);
         let at_position = self.pp + self.pv * dt;
         let at_velocity = self.pv.transpose() + self.vv * dt;
         let position_gain = (at_position + common(self.common_m)) * inverse;
         let velocity_gain = at_velocity * inverse;
-        let noise = self.independent_at(dt, density) + seen.independent;
         self.position += position_gain * offset;
         self.velocity += velocity_gain * offset;
         self.joseph([at_position, at_velocity], [position_gain, velocity_gain], &noise);
@@ -149,9 +149,8 @@ impl Motion {
 
     /// The covariance after any gain, given those of the state with what was measured, and of the innovation.
     fn joseph(&mut self, with: [Matrix2<f64>; 2], gain: [Matrix2<f64>; 2], noise: &Matrix2<f64>) {
-        let after = |i: usize, j: usize| {
-            gain[i] * noise * gain[j].transpose() - gain[i] * with[j].transpose() - with[i] * gain[j].transpose()
-        };
+        let kept = [0, 1].map(|i| gain[i] * noise - with[i]);
+        let after = |i: usize, j: usize| kept[i] * gain[j].transpose() - gain[i] * with[j].transpose();
         self.pp = symmetric(self.pp + after(0, 0));
         self.pv += after(0, 1);
         self.vv = symmetric(self.vv + after(1, 1));

@@ -111,12 +111,11 @@ pub(super) struct View {
     stated: Option<FieldOfView>,
     /// The pose, or the middle of what it sees.
     centre: Option<Vector2<f64>>,
-    /// Detections by direction from the heading, fading.
+    /// Detections by direction from the heading, fading, and how many it takes for it to see that way.
     directions: [f32; Self::DIRECTIONS],
+    least: f32,
     /// By distance from the centre.
     rates: [Bin; Self::BINS],
-    /// By direction, how far the sight goes before it meets what was detected, metres.
-    sight_m: [f32; Self::RAYS],
     farthest_m: f64,
 }
 
@@ -136,8 +135,8 @@ impl Default for View {
             stated: None,
             centre: None,
             directions: [0.0; Self::DIRECTIONS],
+            least: 0.0,
             rates: [bin; Self::BINS],
-            sight_m: [f32::INFINITY; Self::RAYS],
             farthest_m: 0.0,
         }
     }
@@ -147,13 +146,6 @@ impl View {
     const BINS: usize = 16;
     const BIN_M: f64 = 10.0;
     const DIRECTIONS: usize = 24;
-    const RAYS: usize = 360;
-
-    /// Half the width in metres of what hides others.
-    const HIDES_M: f64 = 0.6;
-
-    /// Distance in metres behind a detection from which an object is hidden by it, and not the same.
-    const BEHIND_M: f64 = 3.0;
 
     /// Looks after which older ones are forgotten.
     const MEMORY: f32 = 400.0;
@@ -169,8 +161,7 @@ impl View {
         });
         // Of no use without the pose that it is from.
         self.stated = report.view.filter(|_| report.pose.is_some());
-        let posed = self.pose.map(|(position, _)| position);
-        let Some(here) = posed.or_else(|| middle(report)).or(self.centre) else { return false };
+        let Some(here) = self.position().or_else(|| middle(report)).or(self.centre) else { return false };
         let has_jumped = self.centre.is_some_and(|before| (here - before).norm() > Self::JUMP_M);
         if has_jumped {
             (self.farthest_m, self.directions) = (0.0, [0.0; Self::DIRECTIONS]);
@@ -190,7 +181,13 @@ impl View {
             self.farthest_m = self.farthest_m.max(offset.norm());
             self.directions[self.direction(&offset)] += 1.0;
         }
+        self.least = 0.1 * self.directions.iter().sum::<f32>() / Self::DIRECTIONS as f32;
         has_jumped
+    }
+
+    /// Where the vehicle says it is.
+    pub(super) fn position(&self) -> Option<Vector2<f64>> {
+        self.pose.map(|(position, _)| position)
     }
 
     /// The pose, or the middle of what it sees.
@@ -203,43 +200,16 @@ impl View {
         self.stated.map_or(self.farthest_m, |view| view.range_m).min(Self::BIN_M * Self::BINS as f64)
     }
 
-    /// How surely it detects what is at a reported position; `None` out of its view.
+    /// How surely it detects what is at a reported position and not hidden; `None` out of its view.
     pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<Rates> {
         let offset = reported - self.centre?;
         let distance_m = offset.norm();
-        if distance_m > self.reach_m() || !self.faces(&offset, distance_m) || self.is_hidden(&offset, distance_m) {
+        if distance_m > self.reach_m() || !self.faces(&offset, distance_m) {
             return None;
         }
         let bin = &self.rates[Self::bin(distance_m)];
         let rate = |(hits, looks): (f32, f32)| f64::from(hits / looks).clamp(0.02, 0.98);
         Some(Rates { stay: rate(bin.stay), find: rate(bin.find) })
-    }
-
-    /// Notes behind what nothing is seen in a frame: the vehicle's own parts, nearer than `nearest_m`, hide nothing.
-    pub(super) fn cast_shadows<'a>(&mut self, objects: impl Iterator<Item = &'a PerceivedObject>, nearest_m: f64) {
-        self.sight_m = [f32::INFINITY; Self::RAYS];
-        let Some((position, _)) = self.pose else { return };
-        for object in objects {
-            let offset = Vector2::new(object.x_m, object.y_m) - position;
-            let distance_m = offset.norm();
-            if distance_m <= nearest_m.max(2.0 * Self::HIDES_M) {
-                continue;
-            }
-            let aside = Vector2::new(-offset.y, offset.x) * (Self::HIDES_M / distance_m);
-            let (first, last) = (Self::ray(&(offset - aside)), Self::ray(&(offset + aside)));
-            let count = (last + Self::RAYS - first) % Self::RAYS + 1;
-            for ray in (first..first + count).map(|ray| ray % Self::RAYS) {
-                self.sight_m[ray] = self.sight_m[ray].min(distance_m as f32);
-            }
-        }
-    }
-
-    fn is_hidden(&self, offset: &Vector2<f64>, distance_m: f64) -> bool {
-        distance_m > f64::from(self.sight_m[Self::ray(offset)]) + Self::BEHIND_M
-    }
-
-    fn ray(offset: &Vector2<f64>) -> usize {
-        (turn(offset) * Self::RAYS as f64).round() as usize % Self::RAYS
     }
 
     /// It looked at an object that is sure to exist.
@@ -261,8 +231,7 @@ impl View {
         if let Some(view) = self.stated {
             return offset.dot(&heading) >= distance_m * (view.angle_rad / 2.0).min(PI).cos() - 1e-9;
         }
-        let mean = self.directions.iter().sum::<f32>() / Self::DIRECTIONS as f32;
-        self.directions[self.direction(offset)] > 0.1 * mean
+        self.directions[self.direction(offset)] > self.least
     }
 
     fn direction(&self, offset: &Vector2<f64>) -> usize {
@@ -279,7 +248,7 @@ impl View {
 /// Direction of an offset, counterclockwise from east, as a part of a turn, 0 to 1. Within a quarter it goes by the
 /// share of the coordinates instead of the angle: equal parts differ in angle by a factor of two at most, and need no
 /// trigonometry.
-fn turn(offset: &Vector2<f64>) -> f64 {
+pub(super) fn turn(offset: &Vector2<f64>) -> f64 {
     let share = offset.y / (offset.x.abs() + offset.y.abs()).max(f64::MIN_POSITIVE) / 4.0;
     match offset.x < 0.0 {
         true => 0.5 - share,

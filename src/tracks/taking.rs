@@ -12,8 +12,10 @@ use super::assignment::{Pairing, assign};
 use super::calibration::log_odds;
 use super::config::TracksConfig;
 use super::evidence::Rates;
+use super::grid::Point;
 use super::motion::{Measurement, Motion};
 use super::pairs::Sighting;
+use super::shadows::Shadows;
 use super::source::Source;
 use super::track::{OTHER_LABEL, Track};
 use super::trust::{Others, Word, judge};
@@ -26,6 +28,8 @@ struct Seen<'a> {
     /// Its place in the report.
     index: usize,
     object: &'a PerceivedObject,
+    /// Of its confidence.
+    log_odds: f64,
     reported: Vector2<f64>,
     measurement: Measurement,
 }
@@ -82,8 +86,11 @@ impl Tracker {
             source.alignment.turn_about(centre);
         }
         let is_trusted = taking.trust > 0.0;
-        let hides = |object: &&PerceivedObject| source.calibration.nats(object.confidence) > 0.0;
-        source.view.cast_shadows(report.objects.iter().filter(hides), self.config.vehicle_radius_m);
+        let even_confidence = source.calibration.even_confidence();
+        let mut shadows = Shadows::new(source.view.position());
+        for object in report.objects.iter().filter(|object| object.confidence > even_confidence) {
+            shadows.cast(object, self.config.vehicle_radius_m);
+        }
         // What a proven liar says is judged where others say something of it, and counts for nothing.
         if is_trusted {
             self.take_own_pose(taking);
@@ -99,11 +106,11 @@ impl Tracker {
         let mut founding = Vec::new();
         for (detection, seen) in seen.iter().enumerate() {
             match chosen.next_if(|pairing| pairing.detection as usize == detection) {
-                Some(pairing) => self.confirm(taking, pairing.track, seen),
+                Some(pairing) => self.confirm(taking, &shadows, pairing.track, seen),
                 None => founding.push(seen),
             }
         }
-        self.look(taking, &detected);
+        self.look(taking, &shadows, &detected);
         for seen in founding.into_iter().filter(|_| is_trusted) {
             self.found(taking, seen);
         }
@@ -165,7 +172,7 @@ impl Tracker {
                 independent: source.noise.covariance(object, &self.config) / trust,
                 common_m: self.config.common_m,
             };
-            (!is_itself).then_some(Seen { index, object, reported, measurement })
+            (!is_itself).then(|| Seen { index, object, log_odds: log_odds(object.confidence), reported, measurement })
         };
         let mut all = Vec::with_capacity(report.objects.len());
         all.extend(report.objects.iter().enumerate().filter_map(seen));
@@ -181,18 +188,15 @@ impl Tracker {
         let mut pairings = Vec::with_capacity(2 * seen.len());
         for (detection, seen) in seen.iter().enumerate() {
             let alone = seen.measurement.independent.trace() / 2.0 + self.config.common_m.powi(2);
-            for candidate in self.grid.around(&seen.measurement.position, reach_m) {
-                let track = &self.tracks[candidate as usize];
-                if track.vehicle == Some(number) {
-                    continue;
-                }
+            self.grid.around(&seen.measurement.position, reach_m, |point| {
+                let track = &self.tracks[point.number as usize];
                 let offset = seen.measurement.position - track.motion.position_at(at);
-                if offset.norm_squared() > gate_m_squared {
-                    continue;
+                if track.vehicle == Some(number) || offset.norm_squared() > gate_m_squared {
+                    return;
                 }
                 let innovation = track.motion.innovation(at, &seen.measurement, density);
                 if innovation.distance_squared > gate {
-                    continue;
+                    return;
                 }
                 let likeness = track.likeness(seen.object);
                 let spread = innovation.covariance.determinant().sqrt() / alone;
@@ -200,9 +204,9 @@ impl Tracker {
                 let benefit = gate - innovation.distance_squared + (maturity * likeness.powi(2) / spread).ln();
                 if benefit > 0.0 || likeness > OTHER_LABEL {
                     let benefit = benefit.max(0.01);
-                    pairings.push(Pairing { detection: detection as u32, track: candidate, benefit });
+                    pairings.push(Pairing { detection: detection as u32, track: point.number, benefit });
                 }
-            }
+            });
         }
         assign(seen.len(), &pairings)
     }
@@ -218,15 +222,16 @@ impl Tracker {
         continued.sort_unstable();
         let mut matched = chosen.iter().map(|pairing| pairing.detection as usize).peekable();
         let left = seen.iter().enumerate().filter(|(detection, _)| matched.next_if_eq(detection).is_none());
-        let likely = left.filter(|(_, seen)| source.calibration.nats(seen.object.confidence) > 0.0);
+        let likely = left.filter(|(_, seen)| source.calibration.nats(seen.log_odds) > 0.0);
         let mut pairings = Vec::new();
         for (detection, seen) in likely.take(MOST_FAST) {
-            let near = self.grid.around(&seen.measurement.position, reach_m);
-            let near = near.filter(|track| continued.binary_search(track).is_err());
-            pairings.extend(near.filter_map(|track| {
-                let benefit = self.benefit_if_fast(&self.tracks[track as usize], seen, at)?;
-                Some(Pairing { detection: detection as u32, track, benefit })
-            }));
+            self.grid.around(&seen.measurement.position, reach_m, |&Point { number: track, .. }| {
+                if continued.binary_search(&track).is_err()
+                    && let Some(benefit) = self.benefit_if_fast(&self.tracks[track as usize], seen, at)
+                {
+                    pairings.push(Pairing { detection: detection as u32, track, benefit });
+                }
+            });
         }
         for pairing in assign(seen.len(), &pairings) {
             self.tracks[pairing.track as usize].motion.doubt_velocity(speed_mps / 2.0);
@@ -253,7 +258,7 @@ impl Tracker {
     }
 
     /// An object was detected again.
-    fn confirm(&mut self, taking: &mut Taking<'_>, track: u32, seen: &Seen<'_>) {
+    fn confirm(&mut self, taking: &mut Taking<'_>, shadows: &Shadows, track: u32, seen: &Seen<'_>) {
         let Taking { number, source, at, trust, sightings, .. } = taking;
         let (number, at, is_trusted, config) = (*number, *at, *trust > 0.0, &self.config);
         let index = track as usize;
@@ -268,11 +273,13 @@ impl Tracker {
             let variance = seen.measurement.independent.trace() / 2.0;
             sightings.push(Sighting { track: index as u32, reported: seen.reported, variance });
         }
-        let rates = source.view.rates_at(&seen.reported);
-        let last = track.witnesses.get(number).filter(|witness| witness.was_hit).map(|witness| witness.log_odds);
+        let rates = source.view.rates_at(&seen.reported).filter(|_| !shadows.hide(&seen.reported));
+        let witness = track.witnesses.get(number);
+        let is_heard = witness.is_some() || track.witnesses.hears(number, at);
+        let last = witness.filter(|witness| witness.was_hit).map(|witness| witness.log_odds);
         let was_hit = last.is_some();
         let is_sure = track.hits >= SURE_HITS && (was_hit || track.is_confirmed(number, at));
-        if rates.is_some() && is_sure && track.witnesses.hears(number, at) {
+        if rates.is_some() && is_sure && is_heard {
             source.view.learn(&seen.reported, was_hit, true);
         }
         if is_trusted {
@@ -283,27 +290,36 @@ impl Tracker {
         if let Some(log_odds) = last {
             source.calibration.learn(log_odds, true);
         }
-        let nats = source.calibration.nats(seen.object.confidence);
+        let nats = source.calibration.nats(seen.log_odds);
         let seat = if is_trusted { track.witnesses.detecting(number, at) } else { track.witnesses.looking(number, at) };
         let Some(witness) = seat else { return };
         witness.hit(at, seen.measurement.position, nats, rates.unwrap_or(UNKNOWN), true);
-        witness.log_odds = log_odds(seen.object.confidence);
+        witness.log_odds = seen.log_odds;
         if let Some(said) = witness.settled(at) {
             self.settle(taking, index, &seen.reported, said);
         }
     }
 
     /// What is in the vehicle's view and is none of the `detected`, by number.
-    fn look(&mut self, taking: &mut Taking<'_>, detected: &[u32]) {
+    fn look(&mut self, taking: &mut Taking<'_>, shadows: &Shadows, detected: &[u32]) {
         let (number, at) = (taking.number, taking.at);
         let Some(centre) = taking.source.view.centre() else { return };
         let reach_m = taking.source.view.reach_m() + self.slack_m(at);
-        let grid = std::mem::take(&mut self.grid);
-        for candidate in grid.around(&centre, reach_m).filter(|track| detected.binary_search(track).is_err()) {
+        let since_indexed_s = at.micros_from(self.indexed_at) as f64 * 1e-6;
+        let mut in_view = Vec::new();
+        self.grid.around(&centre, reach_m, |point| {
+            let position = point.at + point.velocity * since_indexed_s;
+            if detected.binary_search(&point.number).is_err()
+                && let Some(rates) = taking.source.view.rates_at(&position).filter(|_| !shadows.hide(&position))
+            {
+                in_view.push((point.number, position, rates));
+            }
+        });
+        for (candidate, position, rates) in in_view {
             let track = &mut self.tracks[candidate as usize];
-            let position = track.motion.position_at(at);
-            let view = &mut taking.source.view;
-            let Some(rates) = view.rates_at(&position).filter(|_| track.vehicle != Some(number)) else { continue };
+            if track.vehicle == Some(number) {
+                continue;
+            }
             let witness = track.witnesses.get(number);
             if witness.map_or(!track.witnesses.hears(number, at), |witness| witness.last_look >= at) {
                 continue;
@@ -315,7 +331,7 @@ impl Tracker {
             let knew_it = witness.is_some_and(|witness| witness.last_hit.is_some());
             let dt_s = witness.map_or(0.0, |witness| at.since(witness.last_look).as_secs_f64());
             if track.hits >= SURE_HITS && (was_hit || track.is_confirmed(number, at)) {
-                view.learn(&position, was_hit, false);
+                taking.source.view.learn(&position, was_hit, false);
             }
             let settled = track.witnesses.looking(number, at).and_then(|witness| {
                 witness.miss(at, rates);
@@ -328,7 +344,6 @@ impl Tracker {
                 self.settle(taking, candidate as usize, &position, said);
             }
         }
-        self.grid = grid;
     }
 
     /// Holds what the vehicle `said` of an object for a while, (hits, looks), against the others' word.
@@ -362,10 +377,10 @@ impl Tracker {
         let (number, at) = (taking.number, taking.at);
         let mut track = Track::new(founding_id(taking.report, seen.index), at, &seen.measurement, &self.config);
         describe(&mut track, taking.source, seen, at, &self.config);
-        let nats = taking.source.calibration.nats(seen.object.confidence);
+        let nats = taking.source.calibration.nats(seen.log_odds);
         if let Some(witness) = track.witnesses.detecting(number, at) {
             witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
-            witness.log_odds = log_odds(seen.object.confidence);
+            witness.log_odds = seen.log_odds;
         }
         self.add(track);
     }

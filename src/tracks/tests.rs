@@ -60,7 +60,7 @@ fn two_cars(tracker: &mut Tracker, frames: std::ops::Range<u64>, seen: impl Fn(u
             if seen(frame) {
                 objects.push(place(frame as f64, 0.0));
             }
-            tracker.observe(&report(node, frame, objects), at(frame));
+            tracker.observe(report(node, frame, objects), at(frame));
         }
         last = tracker.close(at(frame));
     }
@@ -109,7 +109,7 @@ fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
         for (node, x_m, sees) in [("euclid", x_m, x_m + 0.4), ("gauss", 30.0, x_m - 0.5)] {
             // euclid detects its own bonnet, gauss detects euclid.
             let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
-            tracker.observe(&ObjectReport { pose, ..report(node, frame, vec![car(sees, 0.2)]) }, at(frame));
+            tracker.observe(ObjectReport { pose, ..report(node, frame, vec![car(sees, 0.2)]) }, at(frame));
         }
         round = tracker.close(at(frame));
     }
@@ -126,7 +126,7 @@ fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
     for frame in 0..40 {
         let x_m = if frame < 20 { 0.0 } else { 500.0 };
         let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
-        tracker.observe(&ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
+        tracker.observe(ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
         let round = tracker.close(at(frame));
         let [vehicle] = &*round.objects else { panic!("{:?}", round.objects) };
         assert!(near(vehicle, x_m, 0.0, 0.5), "{vehicle:?}");
@@ -142,7 +142,7 @@ fn the_pose_that_founds_a_track_is_not_counted_twice() {
     let mut tracker = tracker();
     for frame in 0..2 {
         let pose = Some(WirePose { x_m: frame as f64, y_m: 0.0, heading_rad: 0.0 });
-        tracker.observe(&ObjectReport { pose, ..report("euclid", 0, vec![]) }, at(0));
+        tracker.observe(ObjectReport { pose, ..report("euclid", 0, vec![]) }, at(0));
         let round = tracker.close(at(0));
         let variance = round.objects[0].covariance_m2[0];
         let config = TracksConfig::default();
@@ -179,7 +179,7 @@ fn a_heading_about_due_east_is_not_averaged_to_west() {
     for frame in 0..30 {
         let heading_rad = Some(if frame % 2 == 0 { 359f64 } else { 1.0 }.to_radians());
         let seen = PerceivedObject { heading_rad, ..car(0.0, 0.0) };
-        tracker.observe(&report("euclid", frame, vec![seen]), at(frame));
+        tracker.observe(report("euclid", frame, vec![seen]), at(frame));
         let round = tracker.close(at(frame));
         let heading_deg = round.objects[0].heading_rad.unwrap().to_degrees();
         assert!(heading_deg.abs() < 1.01, "{heading_deg}");
@@ -199,11 +199,11 @@ fn a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m: f64) {
     for frame in 0..30 {
         let x_m = frame as f64 * frame_m;
         for tracker in [&mut on_time, &mut late] {
-            tracker.observe(&report("euclid", frame, vec![car(x_m, 0.0)]), at(frame));
+            tracker.observe(report("euclid", frame, vec![car(x_m, 0.0)]), at(frame));
         }
-        on_time.observe(&report("gauss", frame, vec![car(x_m, 0.0)]), at(frame));
+        on_time.observe(report("gauss", frame, vec![car(x_m, 0.0)]), at(frame));
         if frame >= 3 {
-            late.observe(&report("gauss", frame - 3, vec![car(x_m - 3.0 * frame_m, 0.0)]), at(frame - 3));
+            late.observe(report("gauss", frame - 3, vec![car(x_m - 3.0 * frame_m, 0.0)]), at(frame - 3));
         }
         on_time.close(at(frame));
         late.close(at(frame));
@@ -212,7 +212,7 @@ fn a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m: f64) {
     assert_eq!((a.objects.len(), b.objects.len()), (1, 1), "{:?}", b.objects);
     assert!(near(&b.objects[0], a.objects[0].x_m, a.objects[0].y_m, 0.3), "held against where it was then");
     assert_eq!(b.objects[0].contributors.len(), 2);
-    late.observe(&report("gauss", 20, vec![car(0.0, 0.0)]), at(20));
+    late.observe(report("gauss", 20, vec![car(0.0, 0.0)]), at(20));
     assert_eq!(late.losses().late, 1);
 }
 
@@ -250,13 +250,13 @@ fn what_a_vehicle_was_off_by_says_nothing_of_where_it_has_jumped_to() {
     let mut tracker = tracker();
     let place = |x_m: f64| (0..4).map(|n| car(x_m + 10.0 * f64::from(n), 0.0)).collect::<Vec<_>>();
     for frame in 0..30 {
-        tracker.observe(&report("euclid", frame, place(0.0)), at(frame));
-        tracker.observe(&report("gauss", frame, place(0.5)), at(frame));
+        tracker.observe(report("euclid", frame, place(0.0)), at(frame));
+        tracker.observe(report("gauss", frame, place(0.5)), at(frame));
         tracker.close(at(frame));
     }
-    tracker.observe(&report("euclid", 30, place(0.0)), at(30));
-    tracker.observe(&report("gauss", 30, place(0.5)), at(30));
-    tracker.observe(&report("gauss", 31, place(5_000.0)), at(31));
+    tracker.observe(report("euclid", 30, place(0.0)), at(30));
+    tracker.observe(report("gauss", 30, place(0.5)), at(30));
+    tracker.observe(report("gauss", 31, place(5_000.0)), at(31));
     let corrections = tracker.close(at(31)).pose_corrections;
     assert!(corrections.contains_key(&name("euclid")) && !corrections.contains_key(&name("gauss")), "{corrections:?}");
 }
@@ -275,7 +275,7 @@ fn misaligned(config: TracksConfig) -> TracksRound {
                 car(cos * x - sin * y + dx + noise(&mut rng, 0.2), sin * x + cos * y + noise(&mut rng, 0.2))
             };
             let objects = (0..12).map(&mut seen).collect();
-            tracker.observe(&report(node, frame, objects), at(frame));
+            tracker.observe(report(node, frame, objects), at(frame));
         }
         round = tracker.close(at(frame));
     }
@@ -335,7 +335,7 @@ fn a_person_beside_a_car_is_not_the_car() {
             ..PerceivedObject::new("person", 0.7, 1.2, 0.0)
         };
         let objects = if frame % 2 == 0 { vec![car(0.0, 0.0), person] } else { vec![person, car(0.0, 0.0)] };
-        tracker.observe(&report("euclid", frame, objects), at(frame));
+        tracker.observe(report("euclid", frame, objects), at(frame));
         round = tracker.close(at(frame));
     }
     let labels: Vec<_> = sure(&round).iter().map(|object| (object.label.to_string(), object.x_m.round())).collect();
@@ -356,7 +356,7 @@ fn a_detector_with_low_confidences_is_understood_after_a_while() {
             let (x, y) = (rng.random_range(0.0..90.0), rng.random_range(10.0..60.0));
             objects.push(PerceivedObject::new("car", rng.random_range(0.02..0.08), x, y));
         }
-        tracker.observe(&report("euclid", frame, objects), at(frame));
+        tracker.observe(report("euclid", frame, objects), at(frame));
         round = tracker.close(at(frame));
     }
     assert_eq!(sure(&round).len(), 10, "{:?}", sure(&round));
@@ -367,11 +367,11 @@ fn no_more_objects_than_an_area_can_hold_are_kept() {
     let config = TracksConfig { max_density: 4, max_tracks: 20, ..TracksConfig::default() };
     let mut tracker = Tracker::new(config, ReputationConfig::default());
     let crowd = (0..100).map(|n| car((n % 10) as f64 * 0.3, (n / 10) as f64 * 0.3)).collect();
-    tracker.observe(&report("euclid", 0, crowd), at(0));
+    tracker.observe(report("euclid", 0, crowd), at(0));
     let round = tracker.close(at(0));
     assert!(round.objects.len() <= 4, "{}", round.objects.len());
     let wide = (0..100).map(|n| car(n as f64 * 50.0, 0.0)).collect();
-    tracker.observe(&report("euclid", 1, wide), at(1));
+    tracker.observe(report("euclid", 1, wide), at(1));
     assert!(tracker.close(at(1)).objects.len() <= 20);
     assert!(tracker.losses().refused >= 150);
 }
@@ -402,7 +402,7 @@ proptest! {
                 let pose = pose.map(|(x_m, heading_rad)| WirePose { x_m, y_m: 0.0, heading_rad });
                 let seq = (frame * 10 + seq) as u64;
                 let report = ObjectReport { pose, seq, ..report(&format!("v{node}"), frame as u64, objects) };
-                tracker.observe(&report, at(frame as u64 + 10 - lag));
+                tracker.observe(report, at(frame as u64 + 10 - lag));
             }
             let round = tracker.close(at(frame as u64 + 10));
             let mut ids = BTreeSet::new();
@@ -430,9 +430,9 @@ proptest! {
                 .enumerate()
                 .map(|(seq, (node, objects))| ObjectReport { seq: seq as u64, ..report(&format!("v{node}"), frame, objects) })
                 .collect();
-            assert!(reports.iter().all(|report| straight.observe(report, at(frame))));
+            assert!(reports.iter().all(|report| straight.observe(report.clone(), at(frame))));
             reports.shuffle(&mut rng);
-            assert!(reports.iter().all(|report| shuffled.observe(report, at(frame))));
+            assert!(reports.iter().all(|report| shuffled.observe(report.clone(), at(frame))));
             prop_assert_eq!(straight.close(at(frame)), shuffled.close(at(frame)));
         }
     }

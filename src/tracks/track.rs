@@ -1,5 +1,6 @@
 //! One object that is followed.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use nalgebra::Vector2;
@@ -211,19 +212,20 @@ impl Track {
         let position = self.motion.position_at(now);
         let there = believed(logistic(self.nats(now, trust))) * self.presence(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
-        let scores = self.labels.iter().map(|(label, weight)| (label.clone(), weight / total.max(1e-9)));
+        let mut scores = BTreeMap::new();
+        scores.extend(self.labels.iter().map(|(label, weight)| (label.clone(), weight / total.max(1e-9))));
         let variance = covariance.trace() / 2.0;
         let usable = 1.0 - (-USABLE_M * USABLE_M / (2.0 * variance)).exp();
         let covariance = Covariance { xx: covariance.m11, xy: covariance.m12, yy: covariance.m22 };
         let confidence = there * usable;
         let moving = self.hits > 1;
+        let seen_by = self.seen_by(now - Duration::from_secs_f64(config.life_s));
+        let mut contributors = Vec::with_capacity(self.witnesses.len());
+        contributors.extend(seen_by.filter_map(|witness| name(witness.source)));
         FusedObject {
-            contributors: self
-                .seen_by(now - Duration::from_secs_f64(config.life_s))
-                .filter_map(|witness| name(witness.source))
-                .collect(),
+            contributors,
             existence: Some(there),
-            scores: scores.collect(),
+            scores,
             velocity_mps: moving.then_some([self.motion.velocity.x, self.motion.velocity.y]),
             heading_rad: self.heading_rad.or_else(|| self.course_rad()),
             size_m: self.size_m,

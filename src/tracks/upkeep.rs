@@ -8,8 +8,10 @@ use nalgebra::Vector2;
 use uuid::Uuid;
 
 use super::Tracker;
+use super::grid::Point;
 use super::joining::SAME_M;
 use super::motion::Measurement;
+use super::source::Source;
 use super::track::Track;
 use crate::geometry::Covariance;
 use crate::time::Timestamp;
@@ -32,7 +34,7 @@ impl Tracker {
         }
         let index = self.tracks.len();
         self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        self.grid.insert(&position, index as u32);
+        self.grid.insert(Point { at: position, velocity: track.motion.velocity, number: index as u32 });
         self.tracks.push(track);
         Some(index)
     }
@@ -45,8 +47,8 @@ impl Tracker {
         self.own.clear();
         for (index, track) in self.tracks.iter().enumerate() {
             self.own.extend(track.vehicle.map(|number| (number, index as u32)));
-            let position = track.motion.position_at(at);
-            self.grid.insert(&position, index as u32);
+            let (at, velocity) = (track.motion.position_at(at), track.motion.velocity);
+            self.grid.insert(Point { at, velocity, number: index as u32 });
         }
     }
 
@@ -67,7 +69,7 @@ impl Tracker {
         let life = Duration::from_secs_f64(self.config.life_s);
         self.tracks.retain(|track| now.since(track.last_seen) <= life && track.presence(now) > LEAST_PRESENCE);
         let limit = now - life - REMEMBERED;
-        let silent = |slot: &Option<super::Source>| slot.as_ref().is_some_and(|source| source.last_report < limit);
+        let silent = |slot: &Option<Box<Source>>| slot.as_ref().is_some_and(|source| source.last_report < limit);
         if !self.sources.iter().any(silent) {
             return;
         }
@@ -96,13 +98,16 @@ impl Tracker {
                 continue;
             }
             let seen = self.inherited(object);
-            let nearest = self.grid.around(&seen.position, SAME_M).map(|track| {
-                let offset = self.tracks[track as usize].motion.position_at(now) - seen.position;
-                (track as usize, offset.norm())
+            let mut nearest: Option<(usize, f64)> = None;
+            self.grid.around(&seen.position, SAME_M, |point| {
+                let track = &self.tracks[point.number as usize];
+                let distance_m = (track.motion.position_at(now) - seen.position).norm();
+                let is_nearest = nearest.is_none_or(|(_, least_m)| distance_m < least_m);
+                if distance_m < SAME_M && is_nearest && !stated.contains(&track.id) {
+                    nearest = Some((point.number as usize, distance_m));
+                }
             });
-            let nearest =
-                nearest.filter(|(track, distance)| *distance < SAME_M && !stated.contains(&self.tracks[*track].id));
-            match nearest.min_by(|a, b| a.1.total_cmp(&b.1)) {
+            match nearest {
                 Some((track, _)) => self.tracks[track].id = object.id,
                 None => {
                     let mut track = Track::new(object.id, now, &seen, &self.config);

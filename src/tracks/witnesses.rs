@@ -28,6 +28,11 @@ impl Witnesses {
         self.seen.iter()
     }
 
+    /// How many they are.
+    pub(super) fn len(&self) -> usize {
+        self.seen.len()
+    }
+
     /// The vehicle's part, if it has any.
     pub(super) fn get(&self, source: u32) -> Option<&Witness> {
         self.held(source).map(|seat| &self.seen[seat])

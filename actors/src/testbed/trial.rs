@@ -2,8 +2,8 @@
 //! that a live node runs.
 
 use std::collections::BTreeMap;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread;
 
 use anyhow::Context;
@@ -120,8 +120,8 @@ fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<G
     reports.sort_by(|a, b| a.captured_at_us.cmp(&b.captured_at_us).then_with(|| a.node.cmp(&b.node)));
     let last = reports.last()?.captured_at_us;
     let mut map = None;
-    for report in &reports {
-        match aggregator.report(ReportKind::Detections, report, report.captured_at_us) {
+    for report in reports.into_iter().map(Arc::new) {
+        match aggregator.report(ReportKind::Detections, &report, report.captured_at_us) {
             Ok(closed) => map = closed.and_then(|fused| fused.map).or(map),
             Err(reason) => tracing::warn!(node = %report.node, %reason, "report not used"),
         }

@@ -24,7 +24,7 @@ fn highway(stamped_late_us: u64) -> Vector2<f64> {
             }
             let captured = at(frame) + std::time::Duration::from_micros(n as u64 * stamped_late_us);
             let pose = Some(WirePose { x_m, y_m: -2.0, heading_rad: 0.0 });
-            tracker.observe(&ObjectReport { pose, ..report(node, frame, objects) }, captured);
+            tracker.observe(ObjectReport { pose, ..report(node, frame, objects) }, captured);
         }
         let round = tracker.close(at(frame));
         if frame == 249 {
@@ -55,7 +55,7 @@ fn what_comes_the_other_way_in_a_frame_that_moves_is_one_object_with_a_velocity(
     let mut round = TracksRound::default();
     for frame in 0..10 {
         let objects = vec![car(100.0 - 6.0 * frame as f64, 3.0), car(50.0 - 3.0 * frame as f64, -3.0)];
-        tracker.observe(&report("euclid", frame, objects), at(frame));
+        tracker.observe(report("euclid", frame, objects), at(frame));
         round = tracker.close(at(frame));
     }
     let cars = sure(&round);

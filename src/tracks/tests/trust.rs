@@ -28,7 +28,7 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
     let mut contributors = 0;
     for frame in 0..40 {
         for vehicle in 0..50 {
-            tracker.observe(&report(&format!("v{vehicle:02}"), frame, vec![car(0.0, 0.0)]), at(frame));
+            tracker.observe(report(&format!("v{vehicle:02}"), frame, vec![car(0.0, 0.0)]), at(frame));
         }
         let round = tracker.close(at(frame));
         contributors = round.objects[0].contributors.len();
@@ -59,7 +59,7 @@ fn one_sure_vehicle_does_not_outweigh_all_that_see_nothing() {
             if node == "liar" {
                 objects.push(PerceivedObject::new("car", 0.99, 12.0, 25.0));
             }
-            tracker.observe(&ObjectReport { pose, view, ..report(node, frame, objects) }, at(frame));
+            tracker.observe(ObjectReport { pose, view, ..report(node, frame, objects) }, at(frame));
         }
         round = tracker.close(at(frame));
     }
@@ -78,8 +78,8 @@ fn a_liar_that_was_silent_is_still_a_liar() {
     let strangers = (0..2 * Standings::MOST).map(|n| (name(&format!("z{n}")), Standing::default()));
     tracker.standings.keep(strangers.collect::<Vec<_>>());
     for frame in 400..420 {
-        tracker.observe(&report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
-        tracker.observe(&report("newcomer", frame, vec![car(50.0, 25.0)]), at(frame));
+        tracker.observe(report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
+        tracker.observe(report("newcomer", frame, vec![car(50.0, 25.0)]), at(frame));
         round = tracker.close(at(frame));
     }
     let believed: Vec<_> = sure(&round).iter().map(|object| object.x_m.round()).collect();
@@ -104,8 +104,8 @@ fn whoever_votes_wrongly_is_not_believed_in_tracks() {
     let wrong = |node: &str| Evidence { node: name(node), label: "cup".into(), correct: false };
     let mut round = TracksRound::default();
     for frame in 0..20 {
-        tracker.observe(&report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
-        tracker.observe(&report("gauss", frame, vec![car(50.0, 25.0)]), at(frame));
+        tracker.observe(report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
+        tracker.observe(report("gauss", frame, vec![car(50.0, 25.0)]), at(frame));
         tracker.learn(&[wrong("liar"), wrong("unheard")]);
         round = tracker.close(at(frame));
     }
@@ -129,7 +129,7 @@ fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
                 _ => {}
             }
             let report = ObjectReport { pose, view, ..report(node, frame, objects) };
-            tracker.observe(&report, at(frame));
+            tracker.observe(report, at(frame));
         }
         for evidence in tracker.close(at(frame)).evidence {
             let (right, wrong) = counts.entry(evidence.node).or_default();

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::anyhow;
 use ecod::landmark::Landmark;
@@ -109,7 +110,7 @@ impl<'a> LogReplay<'a> {
             }
             SchemaName::ObjectReport => match read_report(message) {
                 Ok((kind, report)) => match self.machine() {
-                    Machine::Journal(rerun) => rerun.report(kind, &report, message.at),
+                    Machine::Journal(rerun) => rerun.report(kind, &Arc::new(report), message.at),
                     Machine::Reports(replay) => replay.report(kind, report, message.at),
                     Machine::Undecided => Vec::new(),
                 },
