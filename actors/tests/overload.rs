@@ -3,6 +3,10 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
 use std::net::SocketAddr;
+use std::num::NonZero;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use ecod::landmark::LandmarkConfig;
@@ -108,12 +112,14 @@ async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
 
     let mallory = connect(broker, "mallory", &mut tasks);
     tasks.spawn(flood(mallory, "mallory".to_owned(), Duration::from_micros(10)));
+    let sleepers = Sleepers::start();
     let flooded = answer_times(&edge, &euclid, 100).await;
+    let stood_still = sleepers.longest_delay();
     let [quiet_median, flooded_median] = [&quiet, &flooded].map(|times| times[times.len() / 2]);
     let left_out = shed(&edge, "mallory");
     println!("median {quiet_median:?}, beside a flood {flooded_median:?}; {left_out} left out");
     assert!(flooded_median < quiet_median + Duration::from_millis(50), "{quiet:?} {flooded:?}");
-    assert!(flooded.last().unwrap() < &Duration::from_secs(1), "{flooded:?}");
+    assert!(*flooded.last().unwrap() < Duration::from_secs(1) + stood_still, "{stood_still:?} {flooded:?}");
     assert!(left_out > 500, "the flood was {left_out} messages more than is taken");
     assert!(edge.counters().all_shed().iter().any(|shed| shed.reason == ShedReason::BrokerThrottled));
     assert_eq!(shed(&edge, "euclid"), 0);
@@ -138,6 +144,7 @@ async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
     tokio::time::timeout(PATIENCE, all_report).await.unwrap().unwrap();
     tokio::time::sleep(Duration::from_secs(1)).await;
 
+    let sleepers = Sleepers::start();
     let (begun, before) = (Instant::now(), resident_bytes());
     let (mut last, mut gaps) = (begun, Vec::new());
     while begun.elapsed() < Duration::from_secs(3) {
@@ -145,18 +152,57 @@ async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
         gaps.push(last.elapsed());
         last = Instant::now();
     }
+    let stood_still = sleepers.longest_delay();
     gaps.sort();
     let grown_mb = resident_bytes().saturating_sub(before) as f64 / 1e6;
     let [median, longest] = [gaps[gaps.len() / 2], gaps[gaps.len() - 1]];
-    println!("rounds {median:?} apart, at most {longest:?}; {grown_mb:.1} MB more");
+    println!(
+        "rounds {median:?} apart, at most {longest:?}, the machine stood still for {stood_still:?}; {grown_mb:.1} MB more"
+    );
     assert!(median < Duration::from_millis(130), "{gaps:?}");
-    assert!(longest < Duration::from_millis(500), "{gaps:?}");
+    assert!(longest < Duration::from_millis(500) + stood_still, "{stood_still:?} {gaps:?}");
     assert!(grown_mb < 16.0, "{grown_mb}");
     for index in 0..VEHICLES {
         assert!(shed(&edge, &format!("v{index}")) > 100, "{:?}", edge.counters().all_shed());
     }
     tasks.shutdown().await;
     edge.stop().await;
+}
+
+/// Threads that do nothing but sleep. A scheduler that is fair lets such a thread run as soon as it wakes, however busy
+/// the process is: what it waits for is a machine that stands still, as a virtual one does whose host is busy.
+struct Sleepers {
+    wanted: Arc<AtomicBool>,
+    threads: Vec<thread::JoinHandle<Duration>>,
+}
+
+impl Sleepers {
+    const NAP: Duration = Duration::from_millis(5);
+
+    /// Two for each processor.
+    fn start() -> Self {
+        let wanted = Arc::new(AtomicBool::new(true));
+        let sleep = |_| {
+            let wanted = Arc::clone(&wanted);
+            thread::spawn(move || {
+                let mut longest = Duration::ZERO;
+                while wanted.load(Ordering::Relaxed) {
+                    let begun = Instant::now();
+                    thread::sleep(Self::NAP);
+                    longest = longest.max(begun.elapsed().saturating_sub(Self::NAP));
+                }
+                longest
+            })
+        };
+        let count = 2 * thread::available_parallelism().map_or(1, NonZero::get);
+        Self { threads: (0..count).map(sleep).collect(), wanted }
+    }
+
+    /// Ends them; by how much any of them woke too late.
+    fn longest_delay(self) -> Duration {
+        self.wanted.store(false, Ordering::Relaxed);
+        self.threads.into_iter().map(|thread| thread.join().unwrap()).max().unwrap_or_default()
+    }
 }
 
 /// Memory of this process, node and vehicles together.

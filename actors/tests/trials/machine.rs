@@ -1,20 +1,28 @@
 //! Processor time that a hypervisor withholds: what a cell misses for want of it tells nothing of the cell.
 //!
 //! Where the host of a virtual machine is busy, processes that could run stand still, all at once and for longer than a
-//! leader may be silent. Linux counts that time (steal, proc_stat(5)): time in which something could have run.
+//! leader may be silent. Linux counts that time (steal, proc_stat(5)) where it is told of it: time in which something could
+//! have run. Where it is not, whoever does nothing but sleep wakes too late; busy neighbours of one machine do not make it so.
 
 use std::fs;
 use std::num::NonZero;
 use std::time::Duration;
 
 use anyhow::Context;
-use tokio::time::{Instant, sleep};
+use tokio::time::{Instant, sleep_until};
 
 /// Least time over which withheld time is added up.
 const WINDOW: Duration = Duration::from_millis(500);
 
 /// Time between readings.
 const PERIOD: Duration = Duration::from_millis(50);
+
+/// Largest part of the processors' time that may be withheld in half a second: on two processors as much as the closest
+/// bar of a trial leaves beyond the time between two rounds.
+const MOST_WITHHELD: f64 = 0.1;
+
+/// By how much a sleeper may wake too late: a round.
+const LONGEST_DELAY: Duration = Duration::from_millis(100);
 
 /// Ticks of /proc/stat per second, on all common architectures.
 const TICKS_PER_S: u64 = 100;
@@ -24,6 +32,8 @@ const TICKS_PER_S: u64 = 100;
 pub(crate) struct Machine {
     /// When, and time withheld from all processors since the machine was started.
     readings: Vec<(Instant, Duration)>,
+    /// By how much it woke too late at most.
+    longest_delay: Duration,
 }
 
 impl Machine {
@@ -36,12 +46,19 @@ impl Machine {
             if now >= deadline {
                 return Ok(());
             }
-            sleep(PERIOD.min(deadline - now)).await;
+            let wake = deadline.min(now + PERIOD);
+            sleep_until(wake).await;
+            self.longest_delay = self.longest_delay.max(wake.elapsed());
         }
     }
 
+    /// Whether what comes late may be late for want of processor time.
+    pub(crate) fn is_starved(&self) -> bool {
+        self.most_withheld() > MOST_WITHHELD || self.longest_delay > LONGEST_DELAY
+    }
+
     /// The largest part of the processors' time that was withheld over half a second, 0 to 1.
-    pub(crate) fn most_withheld(&self) -> f64 {
+    fn most_withheld(&self) -> f64 {
         let processors = std::thread::available_parallelism().map_or(1, NonZero::get);
         let part = |(index, (from, before)): (usize, &(Instant, Duration))| {
             let later = &self.readings[index..];
@@ -75,7 +92,7 @@ mod tests {
     fn machine(readings: impl IntoIterator<Item = (u64, u64)>) -> Machine {
         let start = Instant::now();
         let reading = |(at, withheld)| (start + Duration::from_millis(at), Duration::from_millis(withheld));
-        Machine { readings: readings.into_iter().map(reading).collect() }
+        Machine { readings: readings.into_iter().map(reading).collect(), ..Machine::default() }
     }
 
     #[test]
@@ -90,6 +107,16 @@ mod tests {
         assert_eq!(part(&[(0, 0), (50, 0), (2050, 400)]), 20.0, "the reader stood still as well");
         assert_eq!(part(&[(0, 0), (100, 50)]), 10.0);
         assert_eq!(part(&[]), 0.0);
+    }
+
+    #[tokio::test]
+    async fn a_machine_that_stands_still_wakes_nobody_in_time() {
+        let mut machine = Machine::default();
+        let (watch, _) = tokio::join!(machine.sleep(3 * PERIOD), async {
+            std::thread::sleep(PERIOD + 2 * LONGEST_DELAY);
+        });
+        watch.unwrap();
+        assert!(machine.is_starved(), "{machine:?}");
     }
 
     #[test]
