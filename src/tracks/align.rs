@@ -170,6 +170,8 @@ impl Alignment {
 /// rotation and delay, which are the columns of a matrix: no more than these blocks has to be summed.
 #[derive(Default)]
 struct Normal {
+    /// With w for the weights, r for the residuals and D for their derivatives by rotation and delay: Σw, ΣwD, ΣwDᵀD,
+    /// Σwr, ΣwDᵀr.
     weight: f64,
     first: Matrix2<f64>,
     second: Matrix2<f64>,

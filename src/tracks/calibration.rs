@@ -48,8 +48,12 @@ pub(super) struct Calibration {
 
 /// Log-odds of a confidence, bounded.
 pub(super) fn log_odds(confidence: f64) -> f64 {
-    let confidence = confidence.clamp(0.01, 0.99);
+    let confidence = bounded(confidence);
     (confidence / (1.0 - confidence)).ln()
+}
+
+fn bounded(confidence: f64) -> f64 {
+    confidence.clamp(0.01, 0.99)
 }
 
 impl Calibration {
@@ -64,9 +68,10 @@ impl Calibration {
         (self.slope * (log_odds - self.even)).clamp(-4.0, 4.0)
     }
 
-    /// Confidence above which detections are likelier real than not.
-    pub(super) fn even_confidence(&self) -> f64 {
-        logistic(self.even)
+    /// Whether detections of a confidence are likelier real than not.
+    pub(super) fn likely(&self) -> impl Fn(f64) -> bool + use<> {
+        let even_confidence = logistic(self.even);
+        move |confidence| bounded(confidence) > even_confidence
     }
 
     /// A detection of so many log-odds came again at the next look, or did not.

@@ -58,10 +58,11 @@ impl Grid {
         }
     }
 
+    /// Number of the line of cells that a coordinate lies in.
     fn line(&self, coordinate_m: f64) -> i32 {
         let cells = coordinate_m / self.cell_m;
         // What `floor` says, which is a call where the processor may have no instruction for it.
         let toward_zero = cells as i32;
-        toward_zero - i32::from(f64::from(toward_zero) > cells)
+        toward_zero.saturating_sub(i32::from(f64::from(toward_zero) > cells))
     }
 }

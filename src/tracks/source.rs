@@ -111,8 +111,9 @@ pub(super) struct View {
     stated: Option<FieldOfView>,
     /// The pose, or the middle of what it sees.
     centre: Option<Vector2<f64>>,
-    /// Detections by direction from the heading, fading, and how many it takes for it to see that way.
+    /// Detections by direction from the heading, fading.
     directions: [f32; Self::DIRECTIONS],
+    /// It sees that way where there are more.
     least: f32,
     /// By distance from the centre.
     rates: [Bin; Self::BINS],
@@ -200,7 +201,7 @@ impl View {
         self.stated.map_or(self.farthest_m, |view| view.range_m).min(Self::BIN_M * Self::BINS as f64)
     }
 
-    /// How surely it detects what is at a reported position and not hidden; `None` out of its view.
+    /// How surely it detects what is at a reported position, if nothing hides it; `None` out of its view.
     pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<Rates> {
         let offset = reported - self.centre?;
         let distance_m = offset.norm();

@@ -86,9 +86,9 @@ impl Tracker {
             source.alignment.turn_about(centre);
         }
         let is_trusted = taking.trust > 0.0;
-        let even_confidence = source.calibration.even_confidence();
+        let is_likely = source.calibration.likely();
         let mut shadows = Shadows::new(source.view.position());
-        for object in report.objects.iter().filter(|object| object.confidence > even_confidence) {
+        for object in report.objects.iter().filter(|object| is_likely(object.confidence)) {
             shadows.cast(object, self.config.vehicle_radius_m);
         }
         // What a proven liar says is judged where others say something of it, and counts for nothing.
@@ -222,7 +222,8 @@ impl Tracker {
         continued.sort_unstable();
         let mut matched = chosen.iter().map(|pairing| pairing.detection as usize).peekable();
         let left = seen.iter().enumerate().filter(|(detection, _)| matched.next_if_eq(detection).is_none());
-        let likely = left.filter(|(_, seen)| source.calibration.nats(seen.log_odds) > 0.0);
+        let is_likely = source.calibration.likely();
+        let likely = left.filter(|(_, seen)| is_likely(seen.object.confidence));
         let mut pairings = Vec::new();
         for (detection, seen) in likely.take(MOST_FAST) {
             self.grid.around(&seen.measurement.position, reach_m, |&Point { number: track, .. }| {
@@ -300,7 +301,8 @@ impl Tracker {
         }
     }
 
-    /// What is in the vehicle's view and is none of the `detected`, by number.
+    /// What is in the vehicle's view, where the index has it, and is none of the `detected`, by number: what the round's
+    /// reports moved it by does not matter, unless it is somewhere else all at once.
     fn look(&mut self, taking: &mut Taking<'_>, shadows: &Shadows, detected: &[u32]) {
         let (number, at) = (taking.number, taking.at);
         let Some(centre) = taking.source.view.centre() else { return };
@@ -317,7 +319,8 @@ impl Tracker {
         });
         for (candidate, position, rates) in in_view {
             let track = &mut self.tracks[candidate as usize];
-            if track.vehicle == Some(number) {
+            let has_gone_elsewhere = (track.motion.position_at(at) - position).norm() > self.config.gate_m;
+            if track.vehicle == Some(number) || has_gone_elsewhere {
                 continue;
             }
             let witness = track.witnesses.get(number);

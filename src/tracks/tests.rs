@@ -136,6 +136,29 @@ fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
     assert_eq!(ids.len(), 1);
 }
 
+#[test]
+fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
+    let existence = |watchers: u32| {
+        let mut tracker = tracker();
+        let mut round = TracksRound::default();
+        for frame in 0..=20 {
+            let pose = |x_m| Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+            let place = pose(if frame < 20 { 0.0 } else { 500.0 });
+            tracker.observe(ObjectReport { pose: place, ..report("euclid", frame, vec![]) }, at(frame));
+            let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+            for watcher in (0..watchers).filter(|_| frame == 20) {
+                let node = format!("watcher-{watcher}");
+                let report = ObjectReport { pose: pose(10.0), view, ..report(&node, frame, vec![]) };
+                tracker.observe(report, at(frame));
+            }
+            round = tracker.close(at(frame));
+        }
+        round.objects.iter().find(|object| object.vehicle == Some(name("euclid"))).and_then(|object| object.existence)
+    };
+    assert!(existence(0).is_some());
+    assert_eq!(existence(5), existence(0));
+}
+
 /// A vehicle's first pose counts once: half of what a second one says.
 #[test]
 fn the_pose_that_founds_a_track_is_not_counted_twice() {

@@ -34,7 +34,8 @@ impl Tracker {
         }
         let index = self.tracks.len();
         self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        self.grid.insert(Point { at: position, velocity: track.motion.velocity, number: index as u32 });
+        let (at, velocity) = (track.motion.position_at(self.indexed_at), track.motion.velocity);
+        self.grid.insert(Point { at, velocity, number: index as u32 });
         self.tracks.push(track);
         Some(index)
     }

@@ -1,8 +1,9 @@
 //! Processor time that a hypervisor withholds: what a cell misses for want of it tells nothing of the cell.
 //!
 //! Where the host of a virtual machine is busy, processes that could run stand still, all at once and for longer than a
-//! leader may be silent. Linux counts that time (steal, proc_stat(5)) where it is told of it: time in which something could
-//! have run. Where it is not, whoever does nothing but sleep wakes too late; busy neighbours of one machine do not make it so.
+//! leader may be silent. Linux counts that time (steal, proc_stat(5)) where it is told of it: time in which something
+//! could have run. Where it is not, whoever does nothing but sleep wakes too late; other busy processes of the same
+//! machine delay a sleeper by milliseconds.
 
 use std::fs;
 use std::num::NonZero;
@@ -55,6 +56,12 @@ impl Machine {
     /// Whether what comes late may be late for want of processor time.
     pub(crate) fn is_starved(&self) -> bool {
         self.most_withheld() > MOST_WITHHELD || self.longest_delay > LONGEST_DELAY
+    }
+
+    /// What was seen of that.
+    pub(crate) fn account(&self) -> String {
+        let (withheld, delay) = (100.0 * self.most_withheld(), self.longest_delay);
+        format!("{withheld:.0} % of the processors' time withheld, a sleeper late by {} ms", delay.as_millis())
     }
 
     /// The largest part of the processors' time that was withheld over half a second, 0 to 1.

@@ -146,6 +146,9 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
         (Some(before), Some(after)) => after.epoch <= before.epoch || after.reputations != before.reputations,
         (before, after) => before.is_some() || after.is_some(),
     };
+    if machine.is_starved() {
+        println!("the machine stood still: {}", machine.account());
+    }
     Ok(Verdict { reputations_changed, is_void: machine.is_starved(), ..judge(&cell.runs()?, &phases) })
 }
 

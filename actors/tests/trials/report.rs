@@ -110,7 +110,8 @@ pub(crate) fn table(outcomes: &[Outcome]) -> String {
         );
     }
     text + "gaps in ms, of the worst vehicle, the period of 100 ms included; bar: the most that p99 may be\n\
-            void: missed a bar while a tenth of the processors' time was withheld for half a second, or a sleeper woke 100 ms late\n"
+            void: missed a bar while more than a tenth of the processors' time was withheld for half a second,\n\
+            or the harness woke more than 100 ms too late\n"
 }
 
 fn number(value: Option<u64>) -> String {
