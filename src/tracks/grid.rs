@@ -18,6 +18,7 @@ pub(super) struct Point {
     pub(super) at: Vector2<f64>,
     /// m/s.
     pub(super) velocity: Vector2<f64>,
+    /// What it is called by whoever made the grid.
     pub(super) number: u32,
 }
 
@@ -64,5 +65,18 @@ impl Grid {
         // What `floor` says, which is a call where the processor may have no instruction for it.
         let toward_zero = cells as i32;
         toward_zero.saturating_sub(i32::from(f64::from(toward_zero) > cells))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_coordinate_lies_in_the_cell_that_begins_at_or_below_it() {
+        let grid = Grid::new(24.0);
+        for coordinate_m in [-1e12, -48.0, -24.000_000_1, -24.0, -23.9, -0.5, -0.0, 0.0, 0.5, 23.9, 24.0, 1e8, 1e12] {
+            assert_eq!(grid.line(coordinate_m), (coordinate_m / 24.0).floor() as i32, "{coordinate_m}");
+        }
     }
 }
