@@ -47,7 +47,7 @@ pub struct EpochGate {
 }
 
 impl EpochGate {
-    /// A gate that has admitted nothing and refuses terms below `floor`; see [`crate::election::Election::floor`].
+    /// A gate that has admitted nothing and refuses terms below `floor`; see [`crate::leadership::election::Election::floor`].
     pub fn new(floor: u64) -> Self {
         Self { floor, latest: None }
     }

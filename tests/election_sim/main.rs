@@ -10,7 +10,7 @@ mod world;
 use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use ecod::election::ElectionConfig;
+use ecod::leadership::election::ElectionConfig;
 use ecod::wire::Role;
 use node::Fault;
 use random::Random;

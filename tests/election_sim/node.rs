@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use ecod::election::{Election, ElectionConfig};
 use ecod::epoch::{Epoch, EpochGate};
+use ecod::leadership::election::{Election, ElectionConfig};
 use ecod::names::NodeName;
 use ecod::round::{RoundClose, RoundConfig, RoundTrigger};
 use ecod::time::Timestamp;

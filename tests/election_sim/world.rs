@@ -3,8 +3,8 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
 
-use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::epoch::{Epoch, EpochGate};
+use ecod::leadership::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::names::NodeName;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;

@@ -44,30 +44,30 @@
 
 #![deny(clippy::indexing_slicing)]
 
-mod claiming;
-mod clock;
+mod awake_clock;
 mod config;
 mod following;
 mod handover;
+mod interface;
 mod leading;
 mod message;
 mod peers;
-mod step;
+mod seeking;
 
 use crate::epoch::Epoch;
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::SCHEMA_VERSION;
 
-pub use clock::Clock;
+pub use awake_clock::AwakeClock;
 pub use config::ElectionConfig;
-pub use message::{Body, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM, Standing};
-pub use step::{Effect, Health, Input};
+pub use interface::{Effect, Health, Input};
+pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM};
 
-use claiming::{Questions, Seeking};
 use following::Following;
 use leading::Leading;
 use peers::Peers;
+use seeking::{Questions, Seeking};
 
 /// One node's part in the election.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -76,7 +76,7 @@ pub struct Election {
     id: NodeName,
     run: u64,
     seq: u64,
-    clock: Clock,
+    clock: AwakeClock,
     terms: Terms,
     /// The highest epoch followed or led.
     epoch: Option<Epoch>,
@@ -114,7 +114,7 @@ impl Election {
     /// A node that starts; it listens for `join_ms` before it leads. `persisted_term` is the last
     /// [`Effect::PersistTerm`] of earlier runs, 0 without any.
     pub fn new(config: ElectionConfig, id: NodeName, persisted_term: u64, now: Timestamp) -> Self {
-        let clock = Clock::new(now, std::time::Duration::from_millis(config.stall_ms));
+        let clock = AwakeClock::new(now, std::time::Duration::from_millis(config.stall_ms));
         let persisted = persisted_term.min(MAX_TERM);
         let join = std::time::Duration::from_millis(config.join_ms);
         Self {
@@ -128,7 +128,7 @@ impl Election {
             round: 0,
             health: Health::default(),
             load: 0,
-            peers: Peers::new(config.contact(), config.patience()),
+            peers: Peers::new(config.contact_timeout(), config.response_timeout()),
             questions: Questions::default(),
             state: State::Seeking(Seeking::new(now + join, Vec::new(), now)),
             effects: Vec::new(),
@@ -247,7 +247,7 @@ impl Election {
         match message.body {
             Body::Status { over } => self.take_status(&from, over.as_ref(), now),
             Body::Ask { ask } => self.answer(&from, ask, now),
-            Body::Vouch { ask, age_ms } => self.take_vouch(&from, epoch, ask, age_ms, now),
+            Body::LeaderEvidence { ask, age_ms } => self.take_leader_evidence(&from, epoch, ask, age_ms, now),
             Body::Beat { every_ms, round, followers, after, successors } => {
                 if let Some(epoch) = epoch.filter(|epoch| epoch.leader == from) {
                     let beat = Beat { epoch, hears_us: hears_you, every_ms, round, followers, after, successors };
@@ -269,7 +269,7 @@ impl Election {
         if self.is_leading() {
             self.send_beat(peer, now);
         } else {
-            self.greet(peer, now);
+            self.send_status(peer, now);
         }
     }
 
@@ -286,7 +286,7 @@ impl Election {
             State::Leading(_) => self.resign(now),
             State::Following(following) => {
                 let leader = following.epoch.leader.clone();
-                self.greet(&leader, now);
+                self.send_status(&leader, now);
             }
             State::Seeking(_) => {}
         }
@@ -298,8 +298,8 @@ impl Election {
         self.set_health(Health { load_percent, ..Health::default() }, now);
     }
 
-    fn standing(&self) -> Standing {
-        Standing { role: self.config.role, priority: self.config.priority, load: self.load, fit: self.health.is_fit() }
+    fn candidacy(&self) -> Candidacy {
+        Candidacy { role: self.config.role, priority: self.config.priority, load: self.load, fit: self.health.is_fit() }
     }
 
     /// The epoch followed or led now.
@@ -319,7 +319,7 @@ impl Election {
         self.over = self.over.take().max(Some(epoch));
     }
 
-    fn greet(&mut self, to: &NodeName, now: Timestamp) {
+    fn send_status(&mut self, to: &NodeName, now: Timestamp) {
         self.send(to, Body::Status { over: self.over.clone() }, now);
     }
 
@@ -332,7 +332,7 @@ impl Election {
             from: self.id.clone(),
             run: self.run,
             seq: self.seq,
-            standing: self.standing(),
+            candidacy: self.candidacy(),
             term: self.terms.seen,
             epoch: self.current_epoch().cloned(),
             hears_you,

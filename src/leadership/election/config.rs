@@ -77,12 +77,12 @@ impl ElectionConfig {
     }
 
     /// How long a peer that is spoken to every `idle_beat_ms` may be silent before it counts as not heard.
-    pub(super) fn contact(&self) -> Duration {
+    pub(super) fn contact_timeout(&self) -> Duration {
         self.idle_beat() * 5 / 2
     }
 
     /// How long anything may take that those concerned do at once: an answer, a claim, a restart.
-    pub(super) fn patience(&self) -> Duration {
+    pub(super) fn response_timeout(&self) -> Duration {
         self.beat() * self.silence_beats * 4
     }
 

@@ -4,8 +4,8 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::election::message::{ElectionMessage, Standing};
 use crate::epoch::Epoch;
+use crate::leadership::election::message::{Candidacy, ElectionMessage};
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::Role;
@@ -13,7 +13,7 @@ use crate::wire::Role;
 /// What is worth a handover: edge before auto, then the higher priority.
 pub(super) type Class = (bool, Reverse<u8>);
 
-impl Standing {
+impl Candidacy {
     pub(super) fn class(&self) -> Class {
         (self.role != Role::Edge, Reverse(self.priority))
     }
@@ -26,7 +26,7 @@ impl Standing {
 /// Another node.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Peer {
-    pub(super) standing: Option<Standing>,
+    pub(super) candidacy: Option<Candidacy>,
     /// The epoch it said to follow or lead.
     pub(super) epoch: Option<Epoch>,
     /// Whether our last message to it said that we hear it.
@@ -47,16 +47,16 @@ pub(super) struct Peer {
 pub(super) struct Peers {
     table: BTreeMap<NodeName, Peer>,
     contact: Duration,
-    patience: Duration,
+    response_timeout: Duration,
     /// When to look for peers that were given up and not heard since.
     forget_at: Option<Timestamp>,
 }
 
 impl Peers {
-    /// `contact` is how long a peer may be silent and still count as heard, `patience` how long one that the membership
+    /// `contact` is how long a peer may be silent and still count as heard, `response_timeout` how long one that the membership
     /// gave up.
-    pub(super) fn new(contact: Duration, patience: Duration) -> Self {
-        Self { table: BTreeMap::new(), contact, patience, forget_at: None }
+    pub(super) fn new(contact: Duration, response_timeout: Duration) -> Self {
+        Self { table: BTreeMap::new(), contact, response_timeout, forget_at: None }
     }
 
     pub(super) fn add(&mut self, name: &NodeName) {
@@ -86,8 +86,8 @@ impl Peers {
         if !newer && (message.run == peer.run || !silent) {
             return false;
         }
-        let same = peer.standing.is_some_and(|standing| standing.class() == message.standing.class());
-        if !message.standing.fit {
+        let same = peer.candidacy.is_some_and(|candidacy| candidacy.class() == message.candidacy.class());
+        if !message.candidacy.fit {
             peer.fit_since = None;
         } else if silent || !same || message.run != peer.run || peer.fit_since.is_none() {
             peer.fit_since = Some(now);
@@ -98,7 +98,7 @@ impl Peers {
         peer.seq = message.seq;
         peer.heard_at = Some(now);
         peer.given_up_at = None;
-        peer.standing = Some(message.standing);
+        peer.candidacy = Some(message.candidacy);
         peer.epoch = message.epoch.clone();
         true
     }
@@ -106,7 +106,7 @@ impl Peers {
     /// Marks a peer whose process is gone.
     pub(super) fn gone(&mut self, name: &NodeName, now: Timestamp) {
         if let Some(peer) = self.table.get_mut(name) {
-            peer.gone_until = Some(now + self.patience);
+            peer.gone_until = Some(now + self.response_timeout);
             peer.fit_since = None;
             peer.heard_at = None;
         }
@@ -115,11 +115,11 @@ impl Peers {
     /// Forgets a peer that the membership gave up: at once if it has been silent, else if it stays so.
     pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
         let Some(peer) = self.table.get_mut(name) else { return };
-        if peer.heard_at.is_none_or(|at| now.since(at) > self.patience / 2) {
+        if peer.heard_at.is_none_or(|at| now.since(at) > self.response_timeout / 2) {
             self.table.remove(name);
         } else {
             peer.given_up_at = Some(now);
-            self.forget_at.get_or_insert(now + self.patience / 2);
+            self.forget_at.get_or_insert(now + self.response_timeout / 2);
         }
     }
 
@@ -128,7 +128,7 @@ impl Peers {
         if self.forget_at.is_none_or(|at| now < at) {
             return;
         }
-        let wait = self.patience / 2;
+        let wait = self.response_timeout / 2;
         self.table.retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
         self.forget_at = self.table.values().filter_map(|peer| peer.given_up_at).min().map(|at| at + wait);
     }
@@ -158,7 +158,7 @@ impl Peers {
     /// Whether a peer could lead, as far as is known without having heard it lately.
     pub(super) fn may_lead(&self, name: &NodeName, now: Timestamp) -> bool {
         self.table.get(name).is_some_and(|peer| {
-            peer.standing.is_some_and(|standing| standing.may_lead())
+            peer.candidacy.is_some_and(|candidacy| candidacy.may_lead())
                 && peer.gone_until.is_none_or(|until| now >= until)
         })
     }
@@ -166,33 +166,34 @@ impl Peers {
     /// Whether a peer that a leader named its successor could still lead: the leader's word outweighs what the peer
     /// said of itself long ago.
     pub(super) fn may_succeed(&self, name: &NodeName, now: Timestamp) -> bool {
-        let unfit = |peer: &Peer| peer.standing.is_some_and(|standing| !standing.may_lead()) && self.hears(name, now);
+        let unfit =
+            |peer: &Peer| peer.candidacy.is_some_and(|candidacy| !candidacy.may_lead()) && self.hears(name, now);
         self.table.get(name).is_some_and(|peer| peer.gone_until.is_none_or(|until| now >= until) && !unfit(peer))
     }
 
     /// Everyone who could lead, in no order of preference.
-    pub(super) fn candidates(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, Standing)> {
+    pub(super) fn candidates(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, Candidacy)> {
         self.table
             .iter()
             .filter(move |(name, _)| self.may_lead(name, now))
-            .filter_map(|(name, peer)| Some((name, peer.standing?)))
+            .filter_map(|(name, peer)| Some((name, peer.candidacy?)))
     }
 
     /// The leader's successors: heard lately and fit, the best first. Who was given up has to have been heard within
     /// the beats that a standby may miss: the membership may hear less than the election does.
     pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
-        let silence = self.patience / 4;
+        let silence = self.response_timeout / 4;
         let given_up = |name: &NodeName| {
             self.table.get(name).is_some_and(|peer| peer.given_up_at.is_some())
                 && !self.heard_since(name, now - silence)
         };
         let mut fit: Vec<_> =
             self.candidates(now).filter(|(name, _)| self.hears(name, now) && !given_up(name)).collect();
-        fit.sort_by_key(|&(name, standing)| (standing.class(), standing.load, name.clone()));
+        fit.sort_by_key(|&(name, candidacy)| (candidacy.class(), candidacy.load, name.clone()));
         fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
     }
 
-    /// The best peer that has been fit for `stable` and should have the lead of `leader` with `standing`.
+    /// The best peer that has been fit for `stable` and should have the lead of `leader` with `candidacy`.
     ///
     /// Load never takes the lead from a living leader: leading is load, and moving for it would swing. It is only
     /// respected: among equals the lesser name is handed the lead unless it is busier, once the leader has led `since`
@@ -200,18 +201,18 @@ impl Peers {
     /// lead would move twice.
     pub(super) fn challenger(
         &self,
-        (leader, standing): (&NodeName, Standing),
+        (leader, candidacy): (&NodeName, Candidacy),
         since: Timestamp,
         stable: Duration,
         now: Timestamp,
     ) -> Option<(NodeName, Timestamp)> {
-        let ours = standing.class();
+        let ours = candidacy.class();
         let present = || self.candidates(now).filter(|(name, _)| self.hears(name, now));
         let is_best = present().all(|(_, other)| other.class() >= ours);
         present()
             .filter(|&(name, other)| {
                 let theirs = other.class();
-                theirs < ours || (is_best && theirs == ours && other.load <= standing.load && name < leader)
+                theirs < ours || (is_best && theirs == ours && other.load <= candidacy.load && name < leader)
             })
             .filter_map(|(name, other)| {
                 let fit_since = self.table.get(name)?.fit_since?;

@@ -3,11 +3,11 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use crate::election::leading::Leading;
-use crate::election::message::{Body, MAX_SUCCESSORS, Standing};
-use crate::election::step::Effect;
-use crate::election::{Election, State};
 use crate::epoch::Epoch;
+use crate::leadership::election::interface::Effect;
+use crate::leadership::election::leading::Leading;
+use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
+use crate::leadership::election::{Election, State};
 use crate::names::NodeName;
 use crate::round::FirstRound;
 use crate::time::Timestamp;
@@ -71,7 +71,7 @@ impl Election {
             self.lead(self.epoch.clone(), now);
         } else if now >= seeking.ask_at {
             self.ask_all(now);
-            let ask_at = now + self.config.patience() / 4;
+            let ask_at = now + self.config.response_timeout() / 4;
             if let State::Seeking(seeking) = &mut self.state {
                 seeking.ask_at = ask_at;
             }
@@ -110,27 +110,34 @@ impl Election {
     pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
         match &self.state {
             State::Leading(_) => self.send_beat(from, now),
-            State::Following(following) if now.since(following.evidence_at()) <= self.config.patience() => {
+            State::Following(following) if now.since(following.evidence_at()) <= self.config.response_timeout() => {
                 let age = now.since(following.evidence_at()).as_micros().div_ceil(1000);
-                self.send(from, Body::Vouch { ask, age_ms: u64::try_from(age).unwrap_or(u64::MAX) }, now);
+                self.send(from, Body::LeaderEvidence { ask, age_ms: u64::try_from(age).unwrap_or(u64::MAX) }, now);
             }
-            State::Following(_) | State::Seeking(_) => self.greet(from, now),
+            State::Following(_) | State::Seeking(_) => self.send_status(from, now),
         }
     }
 
-    pub(super) fn take_vouch(&mut self, from: &NodeName, epoch: Option<Epoch>, ask: u64, age_ms: u64, now: Timestamp) {
+    pub(super) fn take_leader_evidence(
+        &mut self,
+        from: &NodeName,
+        epoch: Option<Epoch>,
+        ask: u64,
+        age_ms: u64,
+        now: Timestamp,
+    ) {
         let (Some(epoch), Some(asked_at)) = (epoch, self.questions.asked_at(ask)) else { return };
         let heard_at = asked_at - Duration::from_millis(age_ms);
         if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) {
             return;
         }
-        let believable = heard_at + self.config.patience() > now;
+        let believable = heard_at + self.config.response_timeout() > now;
         let doubtful = match &mut self.state {
             State::Following(following) if following.epoch == epoch => {
-                following.hearsay_at = following.hearsay_at.max(heard_at);
+                following.indirect_heard_at = following.indirect_heard_at.max(heard_at);
                 return;
             }
-            State::Following(following) => now >= following.doubt_at(&self.config),
+            State::Following(following) => now >= following.suspect_at(&self.config),
             State::Seeking(seeking) => Some(&epoch) != self.epoch.as_ref() || heard_at > seeking.known_until,
             State::Leading(_) => false,
         };
@@ -169,7 +176,7 @@ impl Election {
         let order = std::mem::take(&mut leading.successors);
         self.close(epoch.clone());
         self.effects.push(Effect::StopPublishing { epoch: epoch.clone() });
-        self.seek(order, now + self.config.patience(), now);
+        self.seek(order, now + self.config.response_timeout(), now);
         self.send_all(&Body::Resign { epoch, last_round: self.round }, now);
     }
 
@@ -181,7 +188,7 @@ impl Election {
         let turn = |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
         let in_order = turn(None);
         let among_present = seeking.asked_at.map(|at| turn(Some(at)).max(at + self.config.claim_step() * 2));
-        self.standing().may_lead().then(|| among_present.map_or(in_order, |at| at.min(in_order)))
+        self.candidacy().may_lead().then(|| among_present.map_or(in_order, |at| at.min(in_order)))
     }
 
     /// How many would claim before this node, of those heard at `since` or later if it is given.
@@ -194,8 +201,8 @@ impl Election {
         let there = |name: &&NodeName| **name == self.id || self.peers.may_succeed(name, now) && present(name);
         let named: Vec<&NodeName> = order.iter().filter(there).collect();
         let before = named.iter().position(|name| **name == self.id).unwrap_or_else(|| {
-            let place = |name: &NodeName, standing: Standing| (standing.class(), standing.load, name.clone());
-            let own = place(&self.id, self.standing());
+            let place = |name: &NodeName, candidacy: Candidacy| (candidacy.class(), candidacy.load, name.clone());
+            let own = place(&self.id, self.candidacy());
             let others = self.peers.candidates(now).filter(|(name, _)| !named.contains(name) && present(name));
             named.len() + others.filter(|&(name, other)| place(name, other) < own).count()
         });

@@ -35,8 +35,9 @@ pub struct ElectionMessage {
     #[n(3)]
     pub seq: u64,
     /// The sender as a candidate.
+    #[serde(rename = "standing")]
     #[n(4)]
-    pub standing: Standing,
+    pub candidacy: Candidacy,
     /// The highest term that the sender knows to have been used.
     #[n(5)]
     pub term: u64,
@@ -54,7 +55,7 @@ pub struct ElectionMessage {
 
 /// What makes a node a better or worse leader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
-pub struct Standing {
+pub struct Candidacy {
     /// The role it was started with.
     #[n(0)]
     pub role: Role,
@@ -77,11 +78,11 @@ pub struct Standing {
 /// ```
 ///
 /// A node without a leader, or whose leader has missed two beats, asks around; the leader answers `Beat`, a node that
-/// hears the leader `Vouch`, any other `Status`. A claim to lead is a `Beat` of a higher epoch:
+/// hears the leader `LeaderEvidence`, any other `Status`. A claim to lead is a `Beat` of a higher epoch:
 ///
 /// ```text
 /// seeker    -> all         Ask
-/// follower  -> seeker      Vouch     "I heard it 12 ms ago"
+/// follower  -> seeker      LeaderEvidence     "I heard it 12 ms ago"
 /// claimant  -> all         Beat      epoch + 1, after = the epoch it succeeds
 /// ```
 ///
@@ -116,8 +117,9 @@ pub enum Body {
         ask: u64,
     },
     /// "I hear the leader of my epoch": the answer to [`Body::Ask`].
+    #[serde(rename = "vouch")]
     #[n(2)]
-    Vouch {
+    LeaderEvidence {
         /// The question answered.
         #[n(0)]
         ask: u64,
@@ -202,7 +204,7 @@ impl ElectionMessage {
                 leads && known(after) && successors.len() <= MAX_SUCCESSORS && (1..=60_000).contains(every_ms)
             }
             Body::Resign { epoch, .. } => epoch.term <= self.term && epoch.leader == self.from,
-            Body::Ask { .. } | Body::Vouch { .. } | Body::Offer | Body::Ready | Body::Yield { .. } => true,
+            Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready | Body::Yield { .. } => true,
         };
         body && self.term <= MAX_TERM && known(&self.epoch)
     }
@@ -219,7 +221,7 @@ mod tests {
             from: NodeName::new("edge").unwrap(),
             run: 1_732_154_400_000_000,
             seq: 9,
-            standing: Standing { role: Role::Edge, priority: 100, load: 1, fit: true },
+            candidacy: Candidacy { role: Role::Edge, priority: 100, load: 1, fit: true },
             term,
             epoch: Some(Epoch::new(4, NodeName::new(leader).unwrap())),
             hears_you: true,

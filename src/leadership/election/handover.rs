@@ -4,10 +4,10 @@
 //! nearly a whole period for the few packets it takes; the new leader goes on with the next round. Should every one of
 //! those packets be lost for a period, the old leader publishes that round too, and yields again after it.
 
-use crate::election::message::{Body, MAX_TERM};
-use crate::election::step::Effect;
-use crate::election::{Election, State};
 use crate::epoch::Epoch;
+use crate::leadership::election::interface::Effect;
+use crate::leadership::election::message::{Body, MAX_TERM};
+use crate::leadership::election::{Election, State};
 use crate::names::NodeName;
 use crate::time::Timestamp;
 
@@ -24,7 +24,7 @@ pub(super) struct Handover {
 impl Election {
     /// Starts a handover when a better candidate has been there long enough.
     pub(super) fn start_handover(&mut self, now: Timestamp) {
-        let own = (&self.id, self.standing());
+        let own = (&self.id, self.candidacy());
         let State::Leading(leading) = &mut self.state else { return };
         let challenger = self.peers.challenger(own, leading.since, self.config.stable(), now);
         let Some((to, _)) = challenger.filter(|(_, from)| leading.handover.is_none() && now >= *from) else { return };
@@ -88,12 +88,12 @@ impl Election {
     }
 
     pub(super) fn take_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
-        let may_lead = self.standing().may_lead();
+        let may_lead = self.candidacy().may_lead();
         let State::Following(following) = &mut self.state else { return };
         if following.epoch.leader != *from || epoch != Some(&following.epoch) || !may_lead {
             return;
         }
-        let fresh = following.offered_at.is_some_and(|at| now.since(at) <= self.config.patience());
+        let fresh = following.offered_at.is_some_and(|at| now.since(at) <= self.config.response_timeout());
         following.offered_at = Some(now);
         if !fresh {
             following.prepared = false;
@@ -116,7 +116,7 @@ impl Election {
     pub(super) fn take_yield(&mut self, from: &NodeName, epoch: Option<&Epoch>, last_round: u64, now: Timestamp) {
         let State::Following(following) = &self.state else { return };
         let ours = following.epoch.leader == *from && epoch == Some(&following.epoch) && following.prepared;
-        if ours && self.standing().may_lead() {
+        if ours && self.candidacy().may_lead() {
             let after = following.epoch.clone();
             self.round = self.round.max(last_round);
             self.lead(Some(after), now);

@@ -10,13 +10,13 @@ use crate::time::Timestamp;
 /// not listen is no silence of others. So time passes only up to the deadline that was planned plus a tolerance, and
 /// never backwards.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub struct Clock {
+pub struct AwakeClock {
     outside: Timestamp,
     inside: Timestamp,
     tolerance: Duration,
 }
 
-impl Clock {
+impl AwakeClock {
     /// A clock that starts at `now` and takes a delay of up to `tolerance` for time.
     pub fn new(now: Timestamp, tolerance: Duration) -> Self {
         Self { outside: now, inside: now, tolerance }
@@ -50,7 +50,7 @@ mod tests {
     #[test]
     fn stalls_and_set_clocks_are_not_time() {
         let at = |ms: u64| Timestamp(1_000_000 + ms * MS);
-        let mut clock = Clock::new(at(0), Duration::from_millis(40));
+        let mut clock = AwakeClock::new(at(0), Duration::from_millis(40));
         assert_eq!(clock.advance(at(30), at(80)), at(30));
         assert_eq!(clock.advance(at(90), at(80)), at(90), "a little late is time");
         assert_eq!(clock.advance(at(5_000), at(100)), at(140), "a stall is not");

@@ -1,7 +1,7 @@
 //! What goes into the election and what comes out.
 
-use crate::election::message::ElectionMessage;
 use crate::epoch::Epoch;
+use crate::leadership::election::message::ElectionMessage;
 use crate::names::NodeName;
 use crate::round::FirstRound;
 
@@ -23,7 +23,7 @@ pub enum Input {
         /// The node.
         peer: NodeName,
     },
-    /// The membership gave a node up. The leader's own beats weigh more, see [`crate::election`].
+    /// The membership gave a node up. The leader's own beats weigh more, see [`crate::leadership::election`].
     PeerDown {
         /// The node.
         peer: NodeName,
@@ -77,7 +77,7 @@ pub enum Effect {
     /// Write the term to disk; it must be there before an [`Effect::Lead`] in it, and all that follows that, is carried
     /// out. It mostly comes long before.
     PersistTerm {
-        /// To be given to [`crate::election::Election::new`] after a restart.
+        /// To be given to [`crate::leadership::election::Election::new`] after a restart.
         term: u64,
     },
     /// Send a message once, without waiting.

@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use crate::election::config::ElectionConfig;
-use crate::election::message::{Body, ElectionMessage};
-use crate::election::step::Effect;
-use crate::election::{Beat, Election, State};
 use crate::epoch::Epoch;
+use crate::leadership::election::config::ElectionConfig;
+use crate::leadership::election::interface::Effect;
+use crate::leadership::election::message::{Body, ElectionMessage};
+use crate::leadership::election::{Beat, Election, State};
 use crate::names::NodeName;
 use crate::round::EARLY_ROUNDS;
 use crate::time::Timestamp;
@@ -18,19 +18,19 @@ pub(super) struct Following {
     pub(super) epoch: Epoch,
     pub(super) successors: Vec<NodeName>,
     /// How often the leader beats for this node.
-    every: Duration,
+    beat_interval: Duration,
     /// When its last round was taken.
     round_at: Option<Timestamp>,
-    /// Short gaps between its first rounds, which were not taken for its rhythm.
+    /// Short gaps between its first rounds, which were not taken for its round_interval.
     early_gaps: usize,
     /// How far apart its rounds come, as long as they come.
-    rhythm: Option<Duration>,
+    round_interval: Option<Duration>,
     /// When the leader was heard.
     direct_at: Timestamp,
     /// When the leader said that it hears this node.
-    mutual_at: Timestamp,
+    bidirectional_at: Timestamp,
     /// When others heard the leader, at least.
-    pub(super) hearsay_at: Timestamp,
+    pub(super) indirect_heard_at: Timestamp,
     /// Whether the membership gave the leader up since it was last heard.
     given_up: bool,
     /// When it was first asked for since it was last heard.
@@ -44,13 +44,13 @@ pub(super) struct Following {
 impl Following {
     /// When the leader was last alive for certain.
     pub(super) fn evidence_at(&self) -> Timestamp {
-        self.direct_at.max(self.hearsay_at)
+        self.direct_at.max(self.indirect_heard_at)
     }
 
     /// From when on the leader is doubted: a round is overdue by half, or worse.
-    pub(super) fn doubt_at(&self, config: &ElectionConfig) -> Timestamp {
+    pub(super) fn suspect_at(&self, config: &ElectionConfig) -> Timestamp {
         let silent_at = self.silent_at(config);
-        self.rhythm().map_or(silent_at, |gap| silent_at.min(self.direct_at + gap * 3 / 2))
+        self.round_interval().map_or(silent_at, |gap| silent_at.min(self.direct_at + gap * 3 / 2))
     }
 
     /// From when on more than a round is missing: the leader missed two beats and published no round, does not hear
@@ -59,20 +59,27 @@ impl Following {
         if self.given_up {
             return self.direct_at;
         }
-        (self.direct_at + self.every * 2).min(self.mutual_at + (self.every * 2).max(config.patience() / 2))
+        (self.direct_at + self.beat_interval * 2)
+            .min(self.bidirectional_at + (self.beat_interval * 2).max(config.response_timeout() / 2))
     }
 
     /// How far apart rounds come, where they tell more than beats do.
-    fn rhythm(&self) -> Option<Duration> {
-        self.rhythm.filter(|gap| *gap < self.every)
+    fn round_interval(&self) -> Option<Duration> {
+        self.round_interval.filter(|gap| *gap < self.beat_interval)
     }
 
     /// From when on this node's own ear no longer counts.
-    fn deaf_at(&self, config: &ElectionConfig) -> Timestamp {
-        let silence = self.every * config.silence_beats;
-        let deaf_at = (self.direct_at + silence).min(self.mutual_at + silence.max(config.patience()));
-        let deaf_at = self.rhythm().map_or(deaf_at, |gap| deaf_at.min(self.direct_at + gap * 5 / 2));
-        if self.given_up { deaf_at.min(self.direct_at + config.patience() / 2) } else { deaf_at }
+    fn direct_timeout_at(&self, config: &ElectionConfig) -> Timestamp {
+        let silence = self.beat_interval * config.silence_beats;
+        let direct_timeout_at =
+            (self.direct_at + silence).min(self.bidirectional_at + silence.max(config.response_timeout()));
+        let direct_timeout_at =
+            self.round_interval().map_or(direct_timeout_at, |gap| direct_timeout_at.min(self.direct_at + gap * 5 / 2));
+        if self.given_up {
+            direct_timeout_at.min(self.direct_at + config.response_timeout() / 2)
+        } else {
+            direct_timeout_at
+        }
     }
 
     /// The leader was heard, or what it published.
@@ -82,23 +89,23 @@ impl Following {
         self.asked_at = None;
     }
 
-    /// A round of the leader's was taken. The rhythm follows a slower one at once, and a faster one in time.
+    /// A round of the leader's was taken. The round_interval follows a slower one at once, and a faster one in time.
     pub(super) fn take_round(&mut self, least: Duration, now: Timestamp) {
         if let Some(last) = self.round_at.replace(now) {
             let gap = now.since(last);
             if gap < least * 3 / 2 && self.early_gaps < EARLY_ROUNDS {
                 self.early_gaps += 1;
             } else {
-                let known = self.rhythm.unwrap_or_default();
-                self.rhythm = Some(gap.max(known * 7 / 8).max(least));
+                let known = self.round_interval.unwrap_or_default();
+                self.round_interval = Some(gap.max(known * 7 / 8).max(least));
             }
         }
         self.hear(now);
     }
 
     /// Rounds that have not come for long are not waited for.
-    fn forget_rhythm(&mut self, now: Timestamp) {
-        self.rhythm.take_if(|gap| self.round_at.is_none_or(|last| now.since(last) > *gap * PATIENT_GAPS));
+    fn forget_round_interval(&mut self, now: Timestamp) {
+        self.round_interval.take_if(|gap| self.round_at.is_none_or(|last| now.since(last) > *gap * PATIENT_GAPS));
     }
 
     /// From when on the leader is lost.
@@ -106,22 +113,22 @@ impl Following {
     /// Others that heard the leader well after this node did prove the link broken rather than the leader; then their
     /// word is enough, and allowed to be as old as the leader's slowest beat makes it.
     fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
-        let deaf_at = self.deaf_at(config);
-        let late = self.rhythm().map(|gap| gap * 3 / 2);
-        let margin = late.unwrap_or(if self.given_up { config.beat() } else { self.every });
-        let hears_us_until = self.mutual_at + late.map_or(margin, |late| self.every + late);
-        if self.hearsay_at > (self.direct_at + margin).min(hears_us_until) {
-            deaf_at.max(self.hearsay_at + config.patience())
+        let direct_timeout_at = self.direct_timeout_at(config);
+        let late = self.round_interval().map(|gap| gap * 3 / 2);
+        let margin = late.unwrap_or(if self.given_up { config.beat() } else { self.beat_interval });
+        let hears_us_until = self.bidirectional_at + late.map_or(margin, |late| self.beat_interval + late);
+        if self.indirect_heard_at > (self.direct_at + margin).min(hears_us_until) {
+            direct_timeout_at.max(self.indirect_heard_at + config.response_timeout())
         } else if late.is_some() {
             // The standby, which hears more, gives the leader up first.
-            deaf_at.max(self.hearsay_at + config.beat() * config.silence_beats)
+            direct_timeout_at.max(self.indirect_heard_at + config.beat() * config.silence_beats)
         } else {
-            deaf_at
+            direct_timeout_at
         }
     }
 }
 
-/// So many gaps after the last round, rounds no longer come in a rhythm.
+/// So many gaps after the last round, rounds no longer come in a round_interval.
 const PATIENT_GAPS: u32 = 8;
 
 impl Election {
@@ -155,20 +162,20 @@ impl Election {
 
     fn ask_at(&self, following: &Following) -> Timestamp {
         let now = self.clock.now();
-        let pause = if now >= following.deaf_at(&self.config) {
-            self.config.patience() / 4
+        let pause = if now >= following.direct_timeout_at(&self.config) {
+            self.config.response_timeout() / 4
         } else if now < following.silent_at(&self.config) {
             self.config.beat()
         } else {
             self.config.beat() / 2
         };
-        following.doubt_at(&self.config).max(self.questions.last_at() + pause)
+        following.suspect_at(&self.config).max(self.questions.last_at() + pause)
     }
 
     /// Takes a leader's sign of life, or its claim.
     pub(super) fn take_beat(&mut self, beat: Beat, now: Timestamp) {
         if self.is_over(&beat.epoch) {
-            self.greet(&beat.epoch.leader, now);
+            self.send_status(&beat.epoch.leader, now);
             return;
         }
         match &mut self.state {
@@ -176,15 +183,15 @@ impl Election {
             State::Leading(_) => self.meet_leader(beat, now),
             State::Seeking(_) if Some(&beat.epoch) >= self.epoch.as_ref() => self.follow(beat, now),
             State::Following(following) if beat.epoch > following.epoch => {
-                let content = now < following.doubt_at(&self.config);
+                let content = now < following.suspect_at(&self.config);
                 let rightful = beat.followers > 0 || beat.after.as_ref() >= Some(&following.epoch);
                 if content && !(beat.hears_us && rightful) {
-                    self.greet(&beat.epoch.leader, now);
+                    self.send_status(&beat.epoch.leader, now);
                 } else {
                     self.follow(beat, now);
                 }
             }
-            State::Following(_) => self.greet(&beat.epoch.leader, now),
+            State::Following(_) => self.send_status(&beat.epoch.leader, now),
             // It is lower than what was followed last: that one is lost, and has to be outdone.
             State::Seeking(_) => {
                 let over = self.epoch.clone().max(self.over.clone());
@@ -204,8 +211,8 @@ impl Election {
                 self.close(own.clone());
                 self.effects.push(Effect::StopPublishing { epoch: own });
                 self.effects.push(Effect::SendState { to: beat.epoch.leader.clone() });
-                self.seek(vec![beat.epoch.leader.clone()], now + self.config.patience(), now);
-                self.greet(&beat.epoch.leader, now);
+                self.seek(vec![beat.epoch.leader.clone()], now + self.config.response_timeout(), now);
+                self.send_status(&beat.epoch.leader, now);
             } else {
                 self.send_beat(&beat.epoch.leader, now);
             }
@@ -238,19 +245,19 @@ impl Election {
         self.state = State::Following(Following {
             epoch: beat.epoch,
             successors: beat.successors,
-            every: Duration::from_millis(beat.every_ms),
+            beat_interval: Duration::from_millis(beat.every_ms),
             round_at: None,
             early_gaps: 0,
-            rhythm: None,
+            round_interval: None,
             direct_at: now,
-            mutual_at: now,
-            hearsay_at: Timestamp::default(),
+            bidirectional_at: now,
+            indirect_heard_at: Timestamp::default(),
             given_up: false,
             asked_at: None,
             offered_at: None,
             prepared: false,
         });
-        self.greet(&leader, now);
+        self.send_status(&leader, now);
     }
 
     /// Follows a leader that is known from others only; its own beat makes it complete.
@@ -261,37 +268,37 @@ impl Election {
         self.state = State::Following(Following {
             epoch,
             successors: Vec::new(),
-            every: self.config.beat(),
+            beat_interval: self.config.beat(),
             round_at: None,
             early_gaps: 0,
-            rhythm: None,
+            round_interval: None,
             direct_at: Timestamp::default(),
-            mutual_at: Timestamp::default(),
-            hearsay_at: heard_at,
+            bidirectional_at: Timestamp::default(),
+            indirect_heard_at: heard_at,
             given_up: false,
             asked_at: None,
             offered_at: None,
             prepared: false,
         });
         self.peers.add(&leader);
-        self.greet(&leader, now);
+        self.send_status(&leader, now);
     }
 
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
         let State::Following(following) = &mut self.state else { return };
         self.round = self.round.max(beat.round);
-        following.every = Duration::from_millis(beat.every_ms);
+        following.beat_interval = Duration::from_millis(beat.every_ms);
         following.hear(now);
-        following.forget_rhythm(now);
+        following.forget_round_interval(now);
         if beat.hears_us {
-            following.mutual_at = now;
+            following.bidirectional_at = now;
         }
         if following.successors.first() != beat.successors.first() {
             let standby = beat.successors.first().cloned();
             self.effects.push(Effect::Follow { epoch: beat.epoch.clone(), standby });
         }
         following.successors = beat.successors;
-        self.greet(&beat.epoch.leader, now);
+        self.send_status(&beat.epoch.leader, now);
     }
 
     /// What any message tells about leadership, whatever it says.
@@ -344,7 +351,7 @@ impl Election {
         if self.is_leading() {
             self.send_beat(from, now);
         } else {
-            self.greet(from, now);
+            self.send_status(from, now);
         }
     }
 

@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use crate::election::handover::Handover;
-use crate::election::message::{Body, MAX_SUCCESSORS, Standing};
-use crate::election::step::Effect;
-use crate::election::{Election, State};
 use crate::epoch::Epoch;
+use crate::leadership::election::handover::Handover;
+use crate::leadership::election::interface::Effect;
+use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
+use crate::leadership::election::{Election, State};
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::Role;
@@ -70,7 +70,7 @@ impl Election {
     /// One of ours knows a later term, or holds this epoch for over. If that is for want of a newer leader rather than
     /// because one is just taking over, lead on in a term that nobody can refuse.
     pub(super) fn renew_later(&mut self, now: Timestamp) {
-        let at = now + self.config.patience() / 2;
+        let at = now + self.config.response_timeout() / 2;
         if let State::Leading(leading) = &mut self.state {
             leading.renew_at.get_or_insert(at);
         }
@@ -96,11 +96,12 @@ impl Election {
 
     /// How far apart a peer's beats are. One that is better but not yet fit is to be heard soon when it is.
     fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
-        let outranks = |standing: Standing| standing.role != Role::Cav && standing.class() < self.standing().class();
+        let outranks =
+            |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.class() < self.candidacy().class();
         match leading.successors.iter().position(|name| name == to) {
             Some(0) => self.config.beat(),
             Some(_) => self.config.near_beat(),
-            None if self.peers.get(to).and_then(|peer| peer.standing).is_some_and(outranks)
+            None if self.peers.get(to).and_then(|peer| peer.candidacy).is_some_and(outranks)
                 && self.peers.hears(to, self.clock.now()) =>
             {
                 self.config.near_beat()

@@ -1,0 +1,2 @@
+//! Who leads the cell, and whose rounds are taken.
+pub mod election;
