@@ -50,6 +50,7 @@ mod following;
 mod handover;
 mod interface;
 mod leading;
+mod liveness;
 mod message;
 mod peers;
 mod seeking;
@@ -64,8 +65,8 @@ pub use config::ElectionConfig;
 pub use interface::{Effect, Health, Input};
 pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM};
 
-use following::Following;
 use leading::Leading;
+use liveness::Following;
 use peers::Peers;
 use seeking::{Questions, Seeking};
 
@@ -128,7 +129,7 @@ impl Election {
             round: 0,
             health: Health::default(),
             load: 0,
-            peers: Peers::new(config.contact_timeout(), config.response_timeout()),
+            peers: Peers::new(&config),
             questions: Questions::default(),
             state: State::Seeking(Seeking::new(now + join, Vec::new(), now)),
             effects: Vec::new(),
@@ -164,6 +165,11 @@ impl Election {
     /// When to call [`Self::tick`] next, on the caller's clock.
     pub fn next_deadline(&self) -> Timestamp {
         self.clock.outside(self.deadline())
+    }
+
+    /// The node's name.
+    pub fn name(&self) -> &NodeName {
+        &self.id
     }
 
     /// The highest epoch followed or led so far.

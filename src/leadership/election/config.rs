@@ -1,7 +1,5 @@
 //! The election's settings.
 
-use std::time::Duration;
-
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
@@ -75,45 +73,7 @@ impl ElectionConfig {
         ms("handover_ms", self.handover_ms, 10.0, 600_000.0)?;
         ms("stall_ms", self.stall_ms, 1.0, 10_000.0)
     }
-
-    /// How long a peer that is spoken to every `idle_beat_ms` may be silent before it counts as not heard.
-    pub(super) fn contact_timeout(&self) -> Duration {
-        self.idle_beat() * 5 / 2
-    }
-
-    /// How long anything may take that those concerned do at once: an answer, a claim, a restart.
-    pub(super) fn response_timeout(&self) -> Duration {
-        self.beat() * self.silence_beats * 4
-    }
-
-    /// Time between two beats to a successor other than the standby.
-    pub(super) fn near_beat(&self) -> Duration {
-        (self.beat() * NEAR_BEATS).min(self.idle_beat())
-    }
-
-    pub(super) fn beat(&self) -> Duration {
-        Duration::from_millis(self.beat_ms)
-    }
-
-    pub(super) fn idle_beat(&self) -> Duration {
-        Duration::from_millis(self.idle_beat_ms)
-    }
-
-    pub(super) fn claim_step(&self) -> Duration {
-        Duration::from_millis(self.claim_step_ms)
-    }
-
-    pub(super) fn stable(&self) -> Duration {
-        Duration::from_millis(self.stable_ms)
-    }
-
-    pub(super) fn handover(&self) -> Duration {
-        Duration::from_millis(self.handover_ms)
-    }
 }
-
-/// How many beats apart a successor other than the standby gets one.
-pub(super) const NEAR_BEATS: u32 = 8;
 
 #[cfg(test)]
 mod tests {

@@ -3,133 +3,13 @@
 use std::time::Duration;
 
 use crate::epoch::Epoch;
-use crate::leadership::election::config::ElectionConfig;
 use crate::leadership::election::interface::Effect;
+use crate::leadership::election::liveness::Following;
 use crate::leadership::election::message::{Body, ElectionMessage};
 use crate::leadership::election::{Beat, Election, State};
 use crate::names::NodeName;
-use crate::round::EARLY_ROUNDS;
 use crate::time::Timestamp;
 use crate::wire::Role;
-
-/// A node that follows a leader, by its beats or by others' word.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) struct Following {
-    pub(super) epoch: Epoch,
-    pub(super) successors: Vec<NodeName>,
-    /// How often the leader beats for this node.
-    beat_interval: Duration,
-    /// When its last round was taken.
-    round_at: Option<Timestamp>,
-    /// Short gaps between its first rounds, which were not taken for its round_interval.
-    early_gaps: usize,
-    /// How far apart its rounds come, as long as they come.
-    round_interval: Option<Duration>,
-    /// When the leader was heard.
-    direct_at: Timestamp,
-    /// When the leader said that it hears this node.
-    bidirectional_at: Timestamp,
-    /// When others heard the leader, at least.
-    pub(super) indirect_heard_at: Timestamp,
-    /// Whether the membership gave the leader up since it was last heard.
-    given_up: bool,
-    /// When it was first asked for since it was last heard.
-    pub(super) asked_at: Option<Timestamp>,
-    /// When the leader last offered the lead.
-    pub(super) offered_at: Option<Timestamp>,
-    /// Whether this node is ready to take it.
-    pub(super) prepared: bool,
-}
-
-impl Following {
-    /// When the leader was last alive for certain.
-    pub(super) fn evidence_at(&self) -> Timestamp {
-        self.direct_at.max(self.indirect_heard_at)
-    }
-
-    /// From when on the leader is doubted: a round is overdue by half, or worse.
-    pub(super) fn suspect_at(&self, config: &ElectionConfig) -> Timestamp {
-        let silent_at = self.silent_at(config);
-        self.round_interval().map_or(silent_at, |gap| silent_at.min(self.direct_at + gap * 3 / 2))
-    }
-
-    /// From when on more than a round is missing: the leader missed two beats and published no round, does not hear
-    /// this node, or was given up by the membership.
-    fn silent_at(&self, config: &ElectionConfig) -> Timestamp {
-        if self.given_up {
-            return self.direct_at;
-        }
-        (self.direct_at + self.beat_interval * 2)
-            .min(self.bidirectional_at + (self.beat_interval * 2).max(config.response_timeout() / 2))
-    }
-
-    /// How far apart rounds come, where they tell more than beats do.
-    fn round_interval(&self) -> Option<Duration> {
-        self.round_interval.filter(|gap| *gap < self.beat_interval)
-    }
-
-    /// From when on this node's own ear no longer counts.
-    fn direct_timeout_at(&self, config: &ElectionConfig) -> Timestamp {
-        let silence = self.beat_interval * config.silence_beats;
-        let direct_timeout_at =
-            (self.direct_at + silence).min(self.bidirectional_at + silence.max(config.response_timeout()));
-        let direct_timeout_at =
-            self.round_interval().map_or(direct_timeout_at, |gap| direct_timeout_at.min(self.direct_at + gap * 5 / 2));
-        if self.given_up {
-            direct_timeout_at.min(self.direct_at + config.response_timeout() / 2)
-        } else {
-            direct_timeout_at
-        }
-    }
-
-    /// The leader was heard, or what it published.
-    fn hear(&mut self, now: Timestamp) {
-        self.direct_at = now;
-        self.given_up = false;
-        self.asked_at = None;
-    }
-
-    /// A round of the leader's was taken. The round_interval follows a slower one at once, and a faster one in time.
-    pub(super) fn take_round(&mut self, least: Duration, now: Timestamp) {
-        if let Some(last) = self.round_at.replace(now) {
-            let gap = now.since(last);
-            if gap < least * 3 / 2 && self.early_gaps < EARLY_ROUNDS {
-                self.early_gaps += 1;
-            } else {
-                let known = self.round_interval.unwrap_or_default();
-                self.round_interval = Some(gap.max(known * 7 / 8).max(least));
-            }
-        }
-        self.hear(now);
-    }
-
-    /// Rounds that have not come for long are not waited for.
-    fn forget_round_interval(&mut self, now: Timestamp) {
-        self.round_interval.take_if(|gap| self.round_at.is_none_or(|last| now.since(last) > *gap * PATIENT_GAPS));
-    }
-
-    /// From when on the leader is lost.
-    ///
-    /// Others that heard the leader well after this node did prove the link broken rather than the leader; then their
-    /// word is enough, and allowed to be as old as the leader's slowest beat makes it.
-    fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
-        let direct_timeout_at = self.direct_timeout_at(config);
-        let late = self.round_interval().map(|gap| gap * 3 / 2);
-        let margin = late.unwrap_or(if self.given_up { config.beat() } else { self.beat_interval });
-        let hears_us_until = self.bidirectional_at + late.map_or(margin, |late| self.beat_interval + late);
-        if self.indirect_heard_at > (self.direct_at + margin).min(hears_us_until) {
-            direct_timeout_at.max(self.indirect_heard_at + config.response_timeout())
-        } else if late.is_some() {
-            // The standby, which hears more, gives the leader up first.
-            direct_timeout_at.max(self.indirect_heard_at + config.beat() * config.silence_beats)
-        } else {
-            direct_timeout_at
-        }
-    }
-}
-
-/// So many gaps after the last round, rounds no longer come in a round_interval.
-const PATIENT_GAPS: u32 = 8;
 
 impl Election {
     pub(super) fn following_deadline(&self, following: &Following) -> Timestamp {
@@ -163,7 +43,7 @@ impl Election {
     fn ask_at(&self, following: &Following) -> Timestamp {
         let now = self.clock.now();
         let pause = if now >= following.direct_timeout_at(&self.config) {
-            self.config.response_timeout() / 4
+            self.config.ask_period()
         } else if now < following.silent_at(&self.config) {
             self.config.beat()
         } else {
@@ -242,21 +122,9 @@ impl Election {
         self.round = self.round.max(beat.round);
         let leader = beat.epoch.leader.clone();
         self.effects.push(Effect::Follow { epoch: beat.epoch.clone(), standby: beat.successors.first().cloned() });
-        self.state = State::Following(Following {
-            epoch: beat.epoch,
-            successors: beat.successors,
-            beat_interval: Duration::from_millis(beat.every_ms),
-            round_at: None,
-            early_gaps: 0,
-            round_interval: None,
-            direct_at: now,
-            bidirectional_at: now,
-            indirect_heard_at: Timestamp::default(),
-            given_up: false,
-            asked_at: None,
-            offered_at: None,
-            prepared: false,
-        });
+        let beat_interval = Duration::from_millis(beat.every_ms);
+        self.state =
+            State::Following(Following::new(beat.epoch, beat.successors, beat_interval, now, Timestamp::default()));
         self.send_status(&leader, now);
     }
 
@@ -265,21 +133,8 @@ impl Election {
         let leader = epoch.leader.clone();
         self.epoch = Some(epoch.clone());
         self.effects.push(Effect::Follow { epoch: epoch.clone(), standby: None });
-        self.state = State::Following(Following {
-            epoch,
-            successors: Vec::new(),
-            beat_interval: self.config.beat(),
-            round_at: None,
-            early_gaps: 0,
-            round_interval: None,
-            direct_at: Timestamp::default(),
-            bidirectional_at: Timestamp::default(),
-            indirect_heard_at: heard_at,
-            given_up: false,
-            asked_at: None,
-            offered_at: None,
-            prepared: false,
-        });
+        let unheard = Timestamp::default();
+        self.state = State::Following(Following::new(epoch, Vec::new(), self.config.beat(), unheard, heard_at));
         self.peers.add(&leader);
         self.send_status(&leader, now);
     }

@@ -38,7 +38,6 @@ impl Election {
     /// Repeats what the challenger has to know, or gives the handover up.
     pub(super) fn drive_handover(&mut self, now: Timestamp) {
         let limit = self.config.handover();
-        let beat = self.config.beat();
         let State::Leading(leading) = &mut self.state else { return };
         let Some(handover) = &mut leading.handover else { return };
         let to = handover.to.clone();
@@ -52,8 +51,8 @@ impl Election {
             return;
         }
         // A cell that publishes no rounds has none to miss.
-        handover.yielded |= handover.ready_at.is_some_and(|at| now.since(at) > limit / 3);
-        handover.retry_at = if handover.yielded { now + beat / 4 } else { now + beat };
+        handover.yielded |= handover.ready_at.is_some_and(|at| now.since(at) > self.config.roundless_yield());
+        handover.retry_at = now + self.config.handover_retry(handover.yielded);
         let last_round = self.round;
         if handover.yielded {
             self.send(&to, Body::Yield { last_round }, now);

@@ -70,7 +70,7 @@ impl Election {
     /// One of ours knows a later term, or holds this epoch for over. If that is for want of a newer leader rather than
     /// because one is just taking over, lead on in a term that nobody can refuse.
     pub(super) fn renew_later(&mut self, now: Timestamp) {
-        let at = now + self.config.response_timeout() / 2;
+        let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
             leading.renew_at.get_or_insert(at);
         }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::epoch::Epoch;
+use crate::leadership::election::config::ElectionConfig;
 use crate::leadership::election::message::{Candidacy, ElectionMessage};
 use crate::names::NodeName;
 use crate::time::Timestamp;
@@ -46,17 +47,25 @@ pub(super) struct Peer {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Peers {
     table: BTreeMap<NodeName, Peer>,
-    contact: Duration,
+    contact_timeout: Duration,
     response_timeout: Duration,
+    given_up_timeout: Duration,
+    standby_silence: Duration,
     /// When to look for peers that were given up and not heard since.
     forget_at: Option<Timestamp>,
 }
 
 impl Peers {
-    /// `contact` is how long a peer may be silent and still count as heard, `response_timeout` how long one that the membership
-    /// gave up.
-    pub(super) fn new(contact: Duration, response_timeout: Duration) -> Self {
-        Self { table: BTreeMap::new(), contact, response_timeout, forget_at: None }
+    /// No peers; timeouts are those of `config`.
+    pub(super) fn new(config: &ElectionConfig) -> Self {
+        Self {
+            table: BTreeMap::new(),
+            contact_timeout: config.contact_timeout(),
+            response_timeout: config.response_timeout(),
+            given_up_timeout: config.given_up_timeout(),
+            standby_silence: config.standby_silence(),
+            forget_at: None,
+        }
     }
 
     pub(super) fn add(&mut self, name: &NodeName) {
@@ -79,9 +88,9 @@ impl Peers {
 
     /// Notes what every message says about its sender; false for one that is repeated or overtaken.
     pub(super) fn note(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
-        let contact = self.contact;
+        let contact_timeout = self.contact_timeout;
         let peer = self.table.entry(message.from.clone()).or_default();
-        let silent = peer.heard_at.is_none_or(|at| now.since(at) > contact);
+        let silent = peer.heard_at.is_none_or(|at| now.since(at) > contact_timeout);
         let newer = (message.run, message.seq) > (peer.run, peer.seq);
         if !newer && (message.run == peer.run || !silent) {
             return false;
@@ -115,11 +124,11 @@ impl Peers {
     /// Forgets a peer that the membership gave up: at once if it has been silent, else if it stays so.
     pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
         let Some(peer) = self.table.get_mut(name) else { return };
-        if peer.heard_at.is_none_or(|at| now.since(at) > self.response_timeout / 2) {
+        if peer.heard_at.is_none_or(|at| now.since(at) > self.given_up_timeout) {
             self.table.remove(name);
         } else {
             peer.given_up_at = Some(now);
-            self.forget_at.get_or_insert(now + self.response_timeout / 2);
+            self.forget_at.get_or_insert(now + self.given_up_timeout);
         }
     }
 
@@ -128,7 +137,7 @@ impl Peers {
         if self.forget_at.is_none_or(|at| now < at) {
             return;
         }
-        let wait = self.response_timeout / 2;
+        let wait = self.given_up_timeout;
         self.table.retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
         self.forget_at = self.table.values().filter_map(|peer| peer.given_up_at).min().map(|at| at + wait);
     }
@@ -142,7 +151,7 @@ impl Peers {
 
     /// Whether a peer was heard lately.
     pub(super) fn hears(&self, name: &NodeName, now: Timestamp) -> bool {
-        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| now.since(at) <= self.contact)
+        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| now.since(at) <= self.contact_timeout)
     }
 
     /// Whether a peer was heard at `since` or later.
@@ -182,7 +191,7 @@ impl Peers {
     /// The leader's successors: heard lately and fit, the best first. Who was given up has to have been heard within
     /// the beats that a standby may miss: the membership may hear less than the election does.
     pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
-        let silence = self.response_timeout / 4;
+        let silence = self.standby_silence;
         let given_up = |name: &NodeName| {
             self.table.get(name).is_some_and(|peer| peer.given_up_at.is_some())
                 && !self.heard_since(name, now - silence)

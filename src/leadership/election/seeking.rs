@@ -71,7 +71,7 @@ impl Election {
             self.lead(self.epoch.clone(), now);
         } else if now >= seeking.ask_at {
             self.ask_all(now);
-            let ask_at = now + self.config.response_timeout() / 4;
+            let ask_at = now + self.config.ask_period();
             if let State::Seeking(seeking) = &mut self.state {
                 seeking.ask_at = ask_at;
             }
@@ -85,7 +85,7 @@ impl Election {
             State::Seeking(_) | State::Leading(_) => (now, None),
         };
         // Whoever is first in turn is heard before everyone has to ask.
-        let ask_at = now + self.config.claim_step() * 2;
+        let ask_at = now + self.config.answer_time();
         self.state = State::Seeking(Seeking { known_until, asked_at, ..Seeking::new(since, order, ask_at) });
         self.effects.push(Effect::Seek);
     }
@@ -187,7 +187,7 @@ impl Election {
     fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
         let turn = |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
         let in_order = turn(None);
-        let among_present = seeking.asked_at.map(|at| turn(Some(at)).max(at + self.config.claim_step() * 2));
+        let among_present = seeking.asked_at.map(|at| turn(Some(at)).max(at + self.config.answer_time()));
         self.candidacy().may_lead().then(|| among_present.map_or(in_order, |at| at.min(in_order)))
     }
 
