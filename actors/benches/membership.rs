@@ -13,12 +13,13 @@ use std::time::{Duration, Instant};
 
 use ecod::names::NodeName;
 use ecod::wire::Role;
-use ecod_actors::clock;
-use ecod_actors::gateway::Secret;
-use ecod_actors::membership::{
-    FrameCounters, FrameEvent, Member, Membership, MembershipArguments, MembershipConfig, MembershipEvent,
-    MembershipMessage, MulticastConfig,
+use ecod_actors::actors::membership::{Membership, MembershipArguments};
+use ecod_actors::messages::membership::MembershipMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::gossip::{
+    FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
+use ecod_actors::transport::mqtt::Secret;
 use figures::Figures;
 use ractor::{Actor, call_t};
 use tokio::sync::watch;

@@ -10,13 +10,15 @@ use anyhow::Context;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
-use ecod_actors::bench::two_hop::{self, Load};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::clock;
-use ecod_actors::counters::Counters;
-use ecod_actors::gateway::{
-    BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion,
-    Part, ReportKind, Security,
+use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
+use ecod_actors::bench::two_hop;
+use ecod_actors::bench::two_hop::Load;
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::Counters;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::mqtt::{
+    BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, MqttVersion, Part, ReportKind, Security,
 };
 use figures::Figures;
 use hdrhistogram::Histogram;

@@ -18,9 +18,13 @@
 //! A part that ends is started anew, and the others go on: they reach each other through seats. A node whose parts end
 //! more often than [`MAX_RESTARTS`] times in [`RESTART_SPAN`] gives up, so that the service manager starts it afresh.
 
+#[cfg(feature = "camera")]
+pub mod camera;
+pub mod config;
 mod parts;
 mod restarts;
 mod seats;
+pub mod service;
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -33,19 +37,17 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::MissedTickBehavior;
 
-use crate::clock;
-use crate::config::NodeConfig;
-use crate::counters::Counters;
-use crate::follower::{Newest, Received, ReceivedMap};
-use crate::gateway::Security;
-use crate::leader_election::Leadership;
-use crate::membership::Member;
-use crate::readiness::{Readiness, Vitals};
-use crate::service::ServiceManager;
-
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
 pub use seats::{Part, Seats};
 
+use crate::messages::leadership::Leadership;
+use crate::messages::newest::{Newest, Received, ReceivedMap};
+use crate::node::config::NodeConfig;
+use crate::node::service::ServiceManager;
+use crate::observe::readiness::{Readiness, Vitals};
+use crate::platform::clock;
+use crate::telemetry::counters::Counters;
+use crate::transport::gossip::Member;
 use parts::{Assembly, cause};
 use restarts::Restarts;
 
@@ -109,7 +111,7 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 /// # Errors
 /// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
 pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
-    let security = Security::of(&config).map_err(|error| NodeError::Failed(error.to_string()))?;
+    let security = config.security().map_err(|error| NodeError::Failed(error.to_string()))?;
     let (failed, failure) = watch::channel(None);
     let assembly = Assembly::new(config, security, failed);
     let (newest, broker, gossip) = (assembly.newest(), assembly.broker_address(), assembly.gossip_address());

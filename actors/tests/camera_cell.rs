@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::testbed::Testbed;
-use ecod_actors::counters::Event;
-use ecod_actors::frame_source::SourceConfig;
-use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::camera::frame_source::SourceConfig;
+use ecod_actors::node;
+use ecod_actors::node::NodeHandle;
+use ecod_actors::telemetry::counters::Event;
 use ecod_actors::testbed::setup;
 use tokio::time::timeout;
 

@@ -7,11 +7,12 @@ use std::time::Duration;
 use ecod::aggregator::Algorithms;
 use ecod::names::NodeName;
 use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::GatewayMessage;
-use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::node;
+use ecod_actors::node::NodeHandle;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::Event;
 use tokio::time::timeout;
 use uuid::Uuid;
 

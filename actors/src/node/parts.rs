@@ -16,26 +16,35 @@ use tokio::sync::watch;
 use uuid::Uuid;
 
 use super::seats::{Part, Seats};
-use crate::broker::{Broker, BrokerError, BrokerMessage, EmbeddedBroker, Guard};
-use crate::clock;
-use crate::config::NodeConfig;
-use crate::counters::Counters;
-use crate::dashboard::{Dashboard, Feed};
-use crate::follower::{Follower, Newest};
-use crate::fuser::{Fuser, Intake};
-use crate::gateway::{Gateway, Security};
-use crate::leader_election::{LeaderElection, LeaderElectionMessage, Leadership};
-use crate::membership::{BindError, FrameCounters, Member, Membership, MembershipMessage};
-use crate::recorder::{Recorder, Recording};
-use crate::reputation_keeper::{ReputationKeeper, SharedBook};
-use crate::seat::Seat;
+use crate::actors::broker::Broker;
+use crate::actors::dashboard::Dashboard;
 #[cfg(feature = "camera")]
-use crate::{
-    camera,
-    detector::Detector,
-    projector::{Projector, ProjectorArguments},
-    recorder::Pictures,
-};
+use crate::actors::detector::Detector;
+use crate::actors::follower::Follower;
+use crate::actors::fuser::{Fuser, Intake};
+use crate::actors::gateway::Gateway;
+use crate::actors::leader_election::LeaderElection;
+use crate::actors::membership::Membership;
+#[cfg(feature = "camera")]
+use crate::actors::projector::{Projector, ProjectorArguments};
+use crate::actors::recorder::Recorder;
+use crate::actors::reputation_keeper::{ReputationKeeper, SharedBook};
+use crate::messages::actor_slot::Seat;
+use crate::messages::broker::BrokerMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::messages::leadership::Leadership;
+use crate::messages::membership::MembershipMessage;
+use crate::messages::newest::Newest;
+use crate::node::config::NodeConfig;
+use crate::observe::dashboard::Feed;
+#[cfg(feature = "camera")]
+use crate::observe::recorder::Pictures;
+use crate::observe::recorder::Recording;
+use crate::platform::clock;
+use crate::telemetry::counters::Counters;
+use crate::transport::broker::{BrokerError, EmbeddedBroker, Guard};
+use crate::transport::gossip::{BindError, FrameCounters, Member};
+use crate::transport::mqtt::Security;
 
 /// What the parts are made from; kept to make them again.
 pub(super) struct Assembly {
@@ -196,9 +205,9 @@ impl Assembly {
             #[cfg(feature = "camera")]
             Part::Projector => {
                 let arguments = ProjectorArguments {
-                    perception: camera::perception(&self.config).map_err(in_full)?,
+                    perception: crate::node::camera::perception(&self.config).map_err(in_full)?,
                     poses: self.config.pose.listen,
-                    algorithms: camera::algorithms(&self.config),
+                    algorithms: crate::node::camera::algorithms(&self.config),
                     gateway: self.seats.gateway.clone(),
                     counters: self.counters(),
                 };
@@ -208,7 +217,7 @@ impl Assembly {
             Part::Detector => {
                 let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.seats.projector.clone();
-                let arguments = camera::detector(&self.config, projector, pictures, self.counters());
+                let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
                 let arguments = arguments.map_err(in_full)?;
                 seat(&self.seats.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }

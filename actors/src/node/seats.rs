@@ -1,17 +1,19 @@
 //! The parts of a node and where each is reached.
 
-use crate::broker::BrokerMessage;
-use crate::dashboard::DashboardMessage;
-use crate::follower::FollowerMessage;
-use crate::fuser::FuserMessage;
-use crate::gateway::GatewayMessage;
-use crate::leader_election::LeaderElectionMessage;
-use crate::membership::MembershipMessage;
-use crate::recorder::RecorderMessage;
-use crate::reputation_keeper::ReputationKeeperMessage;
-use crate::seat::Seat;
+use crate::messages::actor_slot::Seat;
+use crate::messages::broker::BrokerMessage;
+use crate::messages::dashboard::DashboardMessage;
 #[cfg(feature = "camera")]
-use crate::{detector::DetectorMessage, projector::ProjectorMessage};
+use crate::messages::detector::DetectorMessage;
+use crate::messages::follower::FollowerMessage;
+use crate::messages::fuser::FuserMessage;
+use crate::messages::gateway::GatewayMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::messages::membership::MembershipMessage;
+#[cfg(feature = "camera")]
+use crate::messages::projector::ProjectorMessage;
+use crate::messages::recorder::RecorderMessage;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
 
 /// A part of a node, in the order of starting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

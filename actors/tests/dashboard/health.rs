@@ -3,8 +3,8 @@
 use std::net::TcpListener;
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
-use ecod_actors::dashboard::{DEFAULT_ADDRESS, DashboardConfig};
+use ecod_actors::observe::dashboard::{DEFAULT_ADDRESS, DashboardConfig};
+use ecod_actors::telemetry::counters::Event;
 
 use crate::cell::{config, join, start, until};
 use crate::http::{get, try_request};

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
+use ecod_actors::telemetry::counters::Event;
 use serde_json::Value;
 
 use crate::cell::{Vehicles, config, start, until};

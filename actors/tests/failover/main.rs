@@ -11,9 +11,9 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::config::NodeConfig;
-use ecod_actors::leader_election::Position;
+use ecod_actors::messages::leadership::Position;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
 
 use cell::Cell;
 use path::Path;

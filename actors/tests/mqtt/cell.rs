@@ -7,11 +7,12 @@ use std::time::Duration;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::counters::Counters;
-use ecod_actors::gateway::{
-    BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, Part,
-    ReportKind, Security,
+use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Counters;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::mqtt::{
+    BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, Part, ReportKind, Security,
 };
 use ractor::{Actor, ActorRef};
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use ecod::wire::{Encoding, RejectReason, encode};
-use ecod_actors::gateway::{GatewayMessage, LinkState, MqttConfig, MqttVersion, Part};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::transport::mqtt::{LinkState, MqttConfig, MqttVersion, Part};
 
 use crate::cell::{Node, Stranger, embedded, name, report, topic, until};
 use crate::mosquitto::Mosquitto;

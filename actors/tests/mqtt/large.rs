@@ -3,9 +3,10 @@
 use std::sync::Arc;
 
 use ecod::wire::{Encoding, GlobalMap, LandmarkState, RejectReason};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, MqttConfig, Part};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, MqttConfig, Part};
 
 use crate::cell::{LOOPBACK, Node, Stranger, embedded, map, name, topic, until};
 
@@ -91,7 +92,7 @@ async fn each_flaw_of_a_map_is_counted_and_good_maps_go_on() {
     ];
     for (round, (spoil, reason)) in (1..).zip(flaws) {
         let mut spoiled = GlobalMap::clone(&large_map(round, 1));
-        spoiled.fused_at_us = ecod_actors::clock::now();
+        spoiled.fused_at_us = ecod_actors::platform::clock::now();
         spoil(&mut spoiled);
         edge.send(GatewayMessage::PublishMap { map: Arc::new(spoiled) });
         until(reason.as_str(), || euclid.counters.rejects(reason) == 1).await;

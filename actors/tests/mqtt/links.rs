@@ -3,9 +3,10 @@
 use std::time::{Duration, Instant};
 
 use ecod::wire::Encoding;
-use ecod_actors::broker::Mqtt;
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion, Part, Secret};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::broker::Mqtt;
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, Part, Secret};
 use tokio::task::JoinHandle;
 
 use crate::cell::{LOOPBACK, Node, embedded, map, name, until};

@@ -1,9 +1,10 @@
 //! Statuses: retained, with a last will.
 
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
-use ecod_actors::broker::Mqtt;
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion, Part};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::broker::Mqtt;
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, Part};
 
 use crate::cell::{LOOPBACK, Node, Stranger, embedded, topic, until};
 use crate::mosquitto::Mosquitto;

@@ -9,12 +9,13 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use ecod::names::NodeName;
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 use tempfile::TempDir;
 
 use crate::analysis::{Accepted, NodeRun};
 use crate::logs;
-use crate::network::{self, Bridged};
+use crate::network;
+use crate::network::Bridged;
 use crate::process::{Process, command};
 use crate::settings::{Addresses, DETECTIONS, Ports, configuration, frame};
 

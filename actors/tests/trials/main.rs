@@ -23,13 +23,13 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::analysis::{Phase, Verdict, judge};
 use crate::cell::{Cell, EDGE, Plan};
 use crate::machine::Machine;
-use crate::report::{Outcome, table};
+use crate::observe::report::{Outcome, table};
 use crate::scenario::{Cure, Fault, Needs, SCENARIOS, Scenario, Step, Who};
 use crate::voters::Voters;
 

@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, ensure};
 use ecod::names::NodeName;
 use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
-use ecod_actors::clock;
-use ecod_actors::gateway::{
-    Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, ReportKind, Security,
-};
+use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::mqtt::{Delivery, Incoming, MqttConfig, Part, ReportKind, Security};
 use ractor::{Actor, ActorRef};
 use uuid::Uuid;
 

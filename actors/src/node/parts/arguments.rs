@@ -11,19 +11,29 @@ use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
 use super::Assembly;
-use crate::clock;
-use crate::counters::ShedReason;
-use crate::dashboard::{DashboardArguments, LandmarkFacts, NodeFacts, Sources};
-use crate::follower::{FollowerArguments, FollowerMessage};
-use crate::fuser::{FuserArguments, FuserMessage};
-use crate::gateway::{self, GatewayArguments, Incoming, Subscriber};
-use crate::leader_election::{LeaderElectionArguments, LeaderElectionMessage, Parts, Position, saved_term};
-use crate::membership::{EventSink, MembershipArguments, MembershipConfig};
+use crate::actors::dashboard::DashboardArguments;
+use crate::actors::follower::FollowerArguments;
+use crate::actors::fuser::FuserArguments;
+use crate::actors::gateway::GatewayArguments;
+use crate::actors::leader_election::{LeaderElectionArguments, Parts, saved_term};
+use crate::actors::membership::MembershipArguments;
+use crate::actors::recorder::RecorderArguments;
+use crate::actors::reputation_keeper::ReputationKeeperArguments;
+use crate::messages::follower::FollowerMessage;
+use crate::messages::fuser::FuserMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::messages::leadership::Position;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::Seats;
-use crate::readiness::{Vitals, patience};
-use crate::recorder::{Identity, RecorderArguments};
-use crate::reputation_keeper::{ReputationKeeperArguments, ReputationKeeperMessage};
-use crate::state_file::StateFile;
+use crate::node::config::NodeConfig;
+use crate::observe::dashboard::{LandmarkFacts, NodeFacts, Sources};
+use crate::observe::readiness::{Vitals, patience};
+use crate::observe::recorder::Identity;
+use crate::platform::clock;
+use crate::platform::state_file::StateFile;
+use crate::telemetry::counters::ShedReason;
+use crate::transport::gossip::{EventSink, MembershipConfig};
+use crate::transport::mqtt::{Incoming, Subscriber, SubscriptionRole};
 
 impl Assembly {
     pub(super) fn membership_arguments(&self) -> MembershipArguments {
@@ -59,20 +69,28 @@ impl Assembly {
         }
     }
 
-    fn gateway_part(&self) -> gateway::Part {
+    fn gateway_part(&self) -> SubscriptionRole {
         if self.config.may_lead() {
-            gateway::Part::Candidate
+            SubscriptionRole::Candidate
         } else if self.config.record.as_ref().is_some_and(|record| record.reports) {
-            gateway::Part::Observer
+            SubscriptionRole::Observer
         } else {
-            gateway::Part::Follower
+            SubscriptionRole::Follower
         }
+    }
+
+    /// The identity of the node's log; `record.name` stands for the node's name where it is set.
+    fn log_identity(&self) -> Identity {
+        let NodeConfig { cell, fusion, landmarks, record, .. } = &self.config;
+        let named = record.as_ref().and_then(|record| record.name.clone());
+        let node = named.unwrap_or_else(|| self.name.clone());
+        Identity::new(node, self.run, cell.clone(), fusion.clone(), landmarks.clone())
     }
 
     pub(super) fn recorder_arguments(&self) -> Option<RecorderArguments> {
         Some(RecorderArguments {
             config: self.config.record.clone()?,
-            identity: Identity::of(&self.config, &self.name, self.run),
+            identity: self.log_identity(),
             recording: self.recording.clone(),
             leadership: self.leadership(),
             counters: self.counters(),
@@ -233,7 +251,7 @@ impl Assembly {
             newest: self.newest.clone(),
             leadership: self.leadership(),
             plane: self.config.data_plane(),
-            patience: patience(&self.config),
+            patience: patience(&self.config.fusion),
             gateway: self.seats.gateway.clone(),
             broker: self.seats.broker.clone(),
         }
@@ -269,9 +287,9 @@ mod tests {
     use tokio::sync::watch;
 
     use super::*;
-    use crate::config::NodeConfig;
-    use crate::follower::ReceivedMap;
-    use crate::gateway::Security;
+    use crate::messages::newest::ReceivedMap;
+    use crate::node::config::NodeConfig;
+    use crate::transport::mqtt::Security;
 
     #[test]
     fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {

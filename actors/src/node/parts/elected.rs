@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use ecod::names::NodeName;
 use tokio::sync::watch;
 
-use crate::broker::Elected;
-use crate::leader_election::Leadership;
+use crate::messages::leadership::Leadership;
+use crate::transport::broker::Elected;
 
 /// How long after it was last heard a leader that is not elected any more may still speak: its last round is under way
 /// when its successor is known already.
@@ -54,7 +54,7 @@ mod tests {
     use ecod::epoch::Epoch;
 
     use super::*;
-    use crate::leader_election::Position;
+    use crate::messages::leadership::Position;
 
     #[test]
     fn the_elected_speaks_and_the_one_before_says_farewell() {
