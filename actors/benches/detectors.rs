@@ -18,9 +18,10 @@ use ecod_actors::camera::detect::coco::{CocoConfig, CocoDetector};
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
 use ecod_actors::camera::frame::Frame;
 use ecod_actors::testbed::TestbedCamera;
-use figures::Figures;
 use nalgebra::Point2;
 use opencv::imgcodecs;
+
+use figures::Figures;
 
 const FRAMES: usize = 20;
 

@@ -20,9 +20,10 @@ use ecod_actors::transport::gossip::{
     FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
 use ecod_actors::transport::mqtt::Secret;
-use figures::Figures;
 use ractor::{Actor, call_t};
 use tokio::sync::watch;
+
+use figures::Figures;
 
 #[tokio::main(flavor = "multi_thread", worker_threads = 2)]
 async fn main() {

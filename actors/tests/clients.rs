@@ -10,9 +10,8 @@ use std::time::Duration;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::wire::Role;
-use ecod_actors::node;
-use ecod_actors::node::NodeHandle;
 use ecod_actors::node::config::NodeConfig;
+use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
 

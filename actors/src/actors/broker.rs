@@ -84,7 +84,10 @@ fn answer<T: Send + 'static>(reply: RpcReplyPort<T>, value: T) {
 
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
+
     use super::*;
+    use crate::transport::broker::BrokerError;
 
     #[derive(Debug)]
     struct Fallen;

@@ -18,7 +18,7 @@ use tokio::task::{JoinHandle, spawn_blocking};
 use crate::camera::detect::Detect;
 use crate::camera::frame_source::capture::{Capture, CaptureConfig, Opener};
 use crate::camera::image_size::{ImageSize, SizeMismatch};
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::observe::recorder::Pictures;
@@ -35,7 +35,7 @@ pub struct DetectorArguments {
     /// The image that the camera's optics describe; detections are handed on as of this size.
     pub optics: ImageSize,
     /// Gets the detections.
-    pub projector: Seat<ProjectorMessage>,
+    pub projector: ActorSlot<ProjectorMessage>,
     /// Gets the frames that were looked at, to record some.
     pub pictures: Option<Pictures>,
     /// The node's counters.
@@ -55,7 +55,7 @@ pub struct DetectorState {
     mismatch: Option<SizeMismatch>,
     /// Whether the last frame could not be looked at: the first in a row is told of.
     failing: bool,
-    projector: Seat<ProjectorMessage>,
+    projector: ActorSlot<ProjectorMessage>,
     pictures: Option<Pictures>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,

@@ -24,7 +24,7 @@ use ecod::wire::{GlobalMap, RejectReason, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::leadership::Leadership;
@@ -50,9 +50,9 @@ pub struct FollowerArguments {
     /// Who leads.
     pub leadership: watch::Receiver<Leadership>,
     /// Is told of the rounds taken.
-    pub election: Seat<LeaderElectionMessage>,
+    pub election: ActorSlot<LeaderElectionMessage>,
     /// Goes on from the maps taken, when the node leads.
-    pub fuser: Seat<FuserMessage>,
+    pub fuser: ActorSlot<FuserMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -72,8 +72,8 @@ pub struct FollowerState {
     log: Option<BufWriter<File>>,
     recording: Recording,
     leadership: watch::Receiver<Leadership>,
-    election: Seat<LeaderElectionMessage>,
-    fuser: Seat<FuserMessage>,
+    election: ActorSlot<LeaderElectionMessage>,
+    fuser: ActorSlot<FuserMessage>,
     counters: Arc<Counters>,
 }
 
@@ -215,8 +215,8 @@ mod tests {
             least_term: 0,
             term: watch::channel(7).1,
             leadership: watch::channel(leadership).1,
-            election: Seat::default(),
-            fuser: Seat::default(),
+            election: ActorSlot::default(),
+            fuser: ActorSlot::default(),
             counters: Arc::default(),
         };
         FollowerState::new(arguments, None)

@@ -30,7 +30,7 @@ use tokio::task::AbortHandle;
 
 pub use intake::{Intake, Put};
 
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::observe::recorder::Recording;
@@ -51,9 +51,9 @@ pub struct FuserArguments {
     /// Where the aggregator's inputs are recorded.
     pub recording: Recording,
     /// Where maps and verdicts are published.
-    pub gateway: Seat<GatewayMessage>,
+    pub gateway: ActorSlot<GatewayMessage>,
     /// Is told what rounds say about vehicles.
-    pub keeper: Seat<ReputationKeeperMessage>,
+    pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -71,8 +71,8 @@ pub struct FuserState {
     term: watch::Receiver<u64>,
     intake: Intake,
     recording: Recording,
-    gateway: Seat<GatewayMessage>,
-    keeper: Seat<ReputationKeeperMessage>,
+    gateway: ActorSlot<GatewayMessage>,
+    keeper: ActorSlot<ReputationKeeperMessage>,
     counters: Arc<Counters>,
     /// The newest map of another aggregator or an earlier run, and when it came.
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,

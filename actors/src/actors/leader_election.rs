@@ -35,7 +35,7 @@ pub use driver::ElectionDriver;
 
 pub use terms::saved_term;
 
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
@@ -50,15 +50,15 @@ use crate::transport::mqtt::Incoming;
 #[derive(Debug, Clone, Default)]
 pub struct Parts {
     /// Sends messages to other nodes.
-    pub membership: Seat<MembershipMessage>,
+    pub membership: ActorSlot<MembershipMessage>,
     /// Keeps the links.
-    pub gateway: Seat<GatewayMessage>,
+    pub gateway: ActorSlot<GatewayMessage>,
     /// Makes maps and verdicts.
-    pub fuser: Seat<FuserMessage>,
+    pub fuser: ActorSlot<FuserMessage>,
     /// Holds the reputations.
-    pub keeper: Seat<ReputationKeeperMessage>,
+    pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The node's own broker.
-    pub broker: Seat<BrokerMessage>,
+    pub broker: ActorSlot<BrokerMessage>,
 }
 
 /// What an election needs at its start.

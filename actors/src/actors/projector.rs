@@ -21,7 +21,7 @@ use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::JoinSet;
 
 use crate::camera::perception::Perception;
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::telemetry::counters::{Counters, Event};
 use ecod::wire::ReportKind;
@@ -35,7 +35,7 @@ pub struct ProjectorArguments {
     /// The algorithms that reports are for.
     pub algorithms: Algorithms,
     /// Where reports are published.
-    pub gateway: Seat<GatewayMessage>,
+    pub gateway: ActorSlot<GatewayMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -50,7 +50,7 @@ pub struct ProjectorState {
     /// Where a vehicle that moves has been.
     motion: Option<Motion>,
     algorithms: Algorithms,
-    gateway: Seat<GatewayMessage>,
+    gateway: ActorSlot<GatewayMessage>,
     counters: Arc<Counters>,
     /// Ends with the actor.
     _feed: JoinSet<()>,

@@ -43,7 +43,7 @@ pub use book::read_saved;
 pub use book::{Book, SharedBook};
 pub use config::ReputationKeeperConfig;
 
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leadership::Leadership;
@@ -79,9 +79,9 @@ pub struct ReputationKeeperArguments {
     /// The highest term that the election knows.
     pub term: watch::Receiver<u64>,
     /// Where reputations and shares are published.
-    pub gateway: Seat<GatewayMessage>,
+    pub gateway: ActorSlot<GatewayMessage>,
     /// Starts from evidence of others.
-    pub fuser: Seat<FuserMessage>,
+    pub fuser: ActorSlot<FuserMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }

@@ -1,54 +1,54 @@
-//! Where an actor of a node is reached, whichever run of it sits there.
+//! Address of an actor of a node across its restarts.
 
 use std::fmt;
 use std::sync::{Arc, PoisonError, RwLock};
 
 use ractor::{ActorRef, Message};
 
-/// The place of an actor in its node. The supervisor seats each new run; a message to an empty seat is dropped, as it
-/// would be with the actor that just ended.
-pub struct Seat<M> {
-    holder: Arc<RwLock<Option<ActorRef<M>>>>,
+/// Address of an actor that survives the actor's restarts. The supervisor sets each new run. A message to an empty
+/// slot is dropped, as it would be by an actor that has just ended.
+pub struct ActorSlot<M> {
+    actor: Arc<RwLock<Option<ActorRef<M>>>>,
 }
 
-impl<M: Message> Seat<M> {
-    /// Seats a run of the actor in place of the one before.
-    pub fn take(&self, actor: ActorRef<M>) {
-        *self.holder.write().unwrap_or_else(PoisonError::into_inner) = Some(actor);
+impl<M: Message> ActorSlot<M> {
+    /// Replaces the run of the actor.
+    pub fn set(&self, actor: ActorRef<M>) {
+        *self.actor.write().unwrap_or_else(PoisonError::into_inner) = Some(actor);
     }
 
-    /// Who sits there.
-    pub fn holder(&self) -> Option<ActorRef<M>> {
-        self.holder.read().unwrap_or_else(PoisonError::into_inner).clone()
+    /// The present run of the actor, if there is one.
+    pub fn get(&self) -> Option<ActorRef<M>> {
+        self.actor.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Sends to whoever sits there; false when nobody does or the actor has just ended.
+    /// Sends to the present run; false when the slot is empty or the actor has just ended.
     pub fn send(&self, message: M) -> bool {
-        self.holder().is_some_and(|actor| actor.cast(message).is_ok())
+        self.get().is_some_and(|actor| actor.cast(message).is_ok())
     }
 }
 
-impl<M> Clone for Seat<M> {
+impl<M> Clone for ActorSlot<M> {
     fn clone(&self) -> Self {
-        Self { holder: Arc::clone(&self.holder) }
+        Self { actor: Arc::clone(&self.actor) }
     }
 }
 
-impl<M> Default for Seat<M> {
+impl<M> Default for ActorSlot<M> {
     fn default() -> Self {
-        Self { holder: Arc::default() }
+        Self { actor: Arc::default() }
     }
 }
 
-impl<M> fmt::Debug for Seat<M> {
+impl<M> fmt::Debug for ActorSlot<M> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Seat").finish_non_exhaustive()
+        f.debug_struct("ActorSlot").finish_non_exhaustive()
     }
 }
 
 #[cfg(test)]
 pub(crate) mod listening {
-    //! A seat whose messages a test reads.
+    //! A slot whose messages a test reads.
 
     use std::marker::PhantomData;
 
@@ -82,11 +82,11 @@ pub(crate) mod listening {
         }
     }
 
-    /// The seat, and what is sent to it.
-    pub(crate) async fn seat<M: Message>() -> (Seat<M>, UnboundedReceiver<M>) {
+    /// The slot, and what is sent to it.
+    pub(crate) async fn slot<M: Message>() -> (ActorSlot<M>, UnboundedReceiver<M>) {
         let (sender, receiver) = unbounded_channel();
-        let seat = Seat::default();
-        seat.take(Actor::spawn(None, Listener(PhantomData), sender).await.unwrap().0);
-        (seat, receiver)
+        let slot = ActorSlot::default();
+        slot.set(Actor::spawn(None, Listener(PhantomData), sender).await.unwrap().0);
+        (slot, receiver)
     }
 }

@@ -10,7 +10,7 @@ use ecod::landmark::LandmarkIndex;
 use crate::actors::detector::DetectorArguments;
 use crate::camera::image_size::ImageSize;
 use crate::camera::perception::{Perception, Vantage};
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::config::NodeConfig;
 use crate::observe::recorder::Pictures;
@@ -53,7 +53,7 @@ pub fn algorithms(config: &NodeConfig) -> Algorithms {
 /// When there is no camera or the detector's files cannot be used.
 pub fn detector(
     config: &NodeConfig,
-    projector: Seat<ProjectorMessage>,
+    projector: ActorSlot<ProjectorMessage>,
     pictures: Option<Pictures>,
     counters: Arc<Counters>,
 ) -> anyhow::Result<DetectorArguments> {

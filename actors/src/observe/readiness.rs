@@ -12,7 +12,7 @@ use ractor::{Message, RpcReplyPort};
 use serde::Serialize;
 use tokio::sync::watch;
 
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leadership::Leadership;
@@ -42,9 +42,9 @@ pub struct Vitals {
     /// How old the newest round of a live aggregator may be; none where rounds come only with reports.
     pub patience: Option<Duration>,
     /// Tells how links are.
-    pub gateway: Seat<GatewayMessage>,
+    pub gateway: ActorSlot<GatewayMessage>,
     /// Tells whether the node's own broker serves.
-    pub broker: Seat<BrokerMessage>,
+    pub broker: ActorSlot<BrokerMessage>,
 }
 
 /// What the gateway and the broker answered.
@@ -108,8 +108,11 @@ pub fn newest_round(map: Option<&ReceivedMap>, verdicts: Option<&Received<Verdic
     map.into_iter().chain(verdicts).max_by_key(|(_, received_at)| *received_at)
 }
 
-async fn ask<M: Message, T: Send + 'static>(seat: &Seat<M>, question: impl FnOnce(RpcReplyPort<T>) -> M) -> Option<T> {
-    let answer = seat.holder()?.call(question, Some(ANSWER_PATIENCE)).await;
+async fn ask<M: Message, T: Send + 'static>(
+    slot: &ActorSlot<M>,
+    question: impl FnOnce(RpcReplyPort<T>) -> M,
+) -> Option<T> {
+    let answer = slot.get()?.call(question, Some(ANSWER_PATIENCE)).await;
     answer.ok()?.success_or(()).ok()
 }
 

@@ -6,8 +6,7 @@ use std::time::{Duration, Instant};
 use ecod::wire::Role;
 use ecod_actors::transport::mqtt::Secret;
 
-use crate::cell;
-use crate::cell::{Stray, Vehicles, config};
+use crate::cell::{self, Stray, Vehicles, config};
 use crate::http::Events;
 use crate::processes::{Place, free_places, start};
 use crate::webdriver::Browser;

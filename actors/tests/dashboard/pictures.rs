@@ -12,8 +12,7 @@ use uuid::Uuid;
 
 use crate::cell::{Vehicles, config, join, start, until};
 use crate::http::{Events, get, try_request};
-use crate::processes;
-use crate::processes::{Place, free_places};
+use crate::processes::{self, Place, free_places};
 
 fn sees(picture: &Value, vehicle: &str) -> bool {
     picture["vehicles"].as_array().unwrap().iter().any(|sighting| sighting["report"]["node"] == vehicle)

@@ -95,9 +95,9 @@ async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
     }
     cell.served_by("euclid").await;
     cell.standby_is_named().await;
-    let seats = cell.node("euclid").seats().clone();
+    let slots = cell.node("euclid").slots().clone();
     let kills: [(&str, &dyn Fn()); 2] =
-        [("broker", &|| seats.broker.holder().unwrap().kill()), ("fuser", &|| seats.fuser.holder().unwrap().kill())];
+        [("broker", &|| slots.broker.get().unwrap().kill()), ("fuser", &|| slots.fuser.get().unwrap().kill())];
     for (part, kill) in kills {
         kill();
         eprintln!("killed the leader's {part}");

@@ -10,7 +10,7 @@ use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::telemetry::counters::{Counters, Event};
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
-use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, Part, Security};
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, SubscriptionRole};
 use ecod_actors::transport::pki::Credentials;
 use ractor::Actor;
 use tokio::sync::mpsc;
@@ -45,7 +45,7 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
     let counters = Arc::<Counters>::default();
     let arguments = GatewayArguments {
         cell: node("lot"),
-        part: Part::Follower,
+        part: SubscriptionRole::Follower,
         status: NodeStatus::starting(node("gauss"), Uuid::now_v7(), Role::Cav, "0.1.0"),
         mqtt: config.mqtt.clone(),
         security: config.security().unwrap(),

@@ -14,8 +14,7 @@ use tempfile::TempDir;
 
 use crate::analysis::{Accepted, NodeRun};
 use crate::logs;
-use crate::network;
-use crate::network::Bridged;
+use crate::network::{self, Bridged};
 use crate::process::{Process, command};
 use crate::settings::{Addresses, DETECTIONS, Ports, configuration, frame};
 

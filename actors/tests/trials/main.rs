@@ -29,7 +29,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use crate::analysis::{Phase, Verdict, judge};
 use crate::cell::{Cell, EDGE, Plan};
 use crate::machine::Machine;
-use crate::observe::report::{Outcome, table};
+use crate::report::{Outcome, table};
 use crate::scenario::{Cure, Fault, Needs, SCENARIOS, Scenario, Step, Who};
 use crate::voters::Voters;
 

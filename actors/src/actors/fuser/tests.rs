@@ -1,6 +1,9 @@
 //! What a new leader goes on from.
 
+use std::collections::BTreeMap;
+
 use ecod::aggregator::FusionConfig;
+use ecod::names::NodeName;
 use ecod::wire::SCHEMA_VERSION;
 
 use super::*;
@@ -37,7 +40,7 @@ fn map(epoch: Epoch, round: u64) -> FollowerMessage {
 async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
     let elected = Leadership { position: Position::Following, epoch: Some(epoch(7, "edge")), standby: None };
     for leadership in [elected, Leadership::default()] {
-        let (fuser, mut told) = listening::seat().await;
+        let (fuser, mut told) = listening::slot().await;
         let arguments = FollowerArguments {
             newest: Newest::default(),
             log: None,
@@ -45,7 +48,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             least_term: 0,
             term: watch::channel(7).1,
             leadership: watch::channel(leadership.clone()).1,
-            election: Seat::default(),
+            election: ActorSlot::default(),
             fuser: fuser.clone(),
             counters: Arc::default(),
         };
@@ -55,7 +58,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             follower.cast(map(epoch(u64::MAX, "gauss"), round)).unwrap();
         }
         follower.drain_and_wait(None).await.unwrap();
-        fuser.holder().unwrap().drain_and_wait(None).await.unwrap();
+        fuser.get().unwrap().drain_and_wait(None).await.unwrap();
 
         let mut fuser = FuserState::new(FuserArguments {
             aggregator: Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
@@ -63,8 +66,8 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             intake: Intake::default(),
             newest: None,
             recording: Recording::default(),
-            gateway: Seat::default(),
-            keeper: Seat::default(),
+            gateway: ActorSlot::default(),
+            keeper: ActorSlot::default(),
             counters: Arc::default(),
         });
         let mut maps = 0;

@@ -11,7 +11,7 @@ use tokio::time::timeout;
 
 use super::routes::Brokers;
 use super::{HEALTH_PERIOD, Parts};
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::{HealthSample, LeaderElectionMessage};
@@ -132,7 +132,7 @@ impl HealthMonitor {
 /// Asks the parts how they are, without waiting, and tells the election.
 pub(super) fn probe(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
     let (broker, gateway) = (parts.broker.clone(), parts.gateway.clone());
-    let fuser_runs = parts.fuser.holder().is_some_and(|fuser| fuser.get_status() == ActorStatus::Running);
+    let fuser_runs = parts.fuser.get().is_some_and(|fuser| fuser.get_status() == ActorStatus::Running);
     tokio::spawn(async move {
         let (health, links) = tokio::join!(
             ask(&broker, |reply| BrokerMessage::Health { reply }),
@@ -146,8 +146,11 @@ pub(super) fn probe(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
     });
 }
 
-async fn ask<M: Message, T: Send + 'static>(seat: &Seat<M>, question: impl FnOnce(RpcReplyPort<T>) -> M) -> Option<T> {
-    let holder = seat.holder()?;
+async fn ask<M: Message, T: Send + 'static>(
+    slot: &ActorSlot<M>,
+    question: impl FnOnce(RpcReplyPort<T>) -> M,
+) -> Option<T> {
+    let holder = slot.get()?;
     let answer = holder.call(question, None);
     tokio::pin!(answer);
     for _ in 0..ANSWER_STEPS {
@@ -266,10 +269,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_part_that_was_stopped_with_the_node_is_still_waited_for() {
-        let seat = Seat::default();
+        let slot = ActorSlot::default();
         let (actor, _) = Actor::spawn(None, Held, ()).await.unwrap();
-        seat.take(actor);
-        assert_eq!(ask(&seat, |reply| BrokerMessage::Health { reply }).await, Some(BrokerHealth::Stopped));
+        slot.set(actor);
+        assert_eq!(ask(&slot, |reply| BrokerMessage::Health { reply }).await, Some(BrokerHealth::Stopped));
     }
 
     #[test]

@@ -28,7 +28,7 @@ struct Scene {
 
 impl Scene {
     async fn new() -> Self {
-        let (gateway, published) = listening::seat().await;
+        let (gateway, published) = listening::slot().await;
         let roles = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)];
         let members = roles.map(|(node, role)| member(node, role)).to_vec();
         let epoch = Some(Epoch::new(7, name("edge")));
@@ -46,7 +46,7 @@ impl Scene {
             leadership: watch::channel(leadership).1,
             term: watch::channel(7).1,
             gateway,
-            fuser: Seat::default(),
+            fuser: ActorSlot::default(),
             counters: Arc::clone(&counters),
         });
         let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
@@ -100,7 +100,7 @@ async fn leaders_that_change_with_every_share_are_not_answered_each_time() {
     scene.hear("gauss", Some(u64::MAX), Vec::new(), 1000);
     scene.hear("edge", Some(7), Vec::new(), 6000);
     scene.hear("edge", Some(7), Vec::new(), 20_000);
-    scene.keeper.arguments.gateway.holder().unwrap().drain_and_wait(None).await.unwrap();
+    scene.keeper.arguments.gateway.get().unwrap().drain_and_wait(None).await.unwrap();
     let share = |message| match message {
         GatewayMessage::PublishShare { share } => Some(share),
         _ => None,

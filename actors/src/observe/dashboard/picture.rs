@@ -212,7 +212,7 @@ mod tests {
     use uuid::Uuid;
 
     use super::*;
-    use crate::actors::dashboard::feed::Feed;
+    use crate::observe::dashboard::Feed;
     use crate::transport::mqtt::Incoming;
 
     #[test]

@@ -38,7 +38,7 @@ impl ElectionDriver {
                 }
                 Effect::Prepare { leader } => {
                     tracing::info!(%leader, "preparing to take over");
-                    let has_state = self.parts.keeper.holder().is_none();
+                    let has_state = self.parts.keeper.get().is_none();
                     self.preparing = Some(Preparing { leader, since: clock::now(), has_state });
                     self.myself.send_after(CONNECT_TIME, || LeaderElectionMessage::CheckPrepared);
                 }

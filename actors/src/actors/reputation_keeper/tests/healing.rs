@@ -20,7 +20,7 @@ struct Keeper {
 
 impl Keeper {
     async fn new(name: &'static str) -> Self {
-        let (gateway, published) = listening::seat().await;
+        let (gateway, published) = listening::slot().await;
         let arguments = ReputationKeeperArguments {
             name: NodeName::from_static(name),
             cell: NodeName::from_static("lot-1"),
@@ -33,7 +33,7 @@ impl Keeper {
             leadership: watch::channel(Leadership::default()).1,
             term: watch::channel(u64::MAX).1,
             gateway,
-            fuser: Seat::default(),
+            fuser: ActorSlot::default(),
             counters: Arc::default(),
         };
         Self { state: ReputationKeeperState::new(arguments), published }

@@ -1,6 +1,6 @@
 //! The parts of a node and where each is reached.
 
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::dashboard::DashboardMessage;
 #[cfg(feature = "camera")]
@@ -17,7 +17,7 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 
 /// A part of a node, in the order of starting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Part {
+pub enum ActorKind {
     /// The writer of the log.
     Recorder,
     /// The embedded broker.
@@ -46,29 +46,29 @@ pub enum Part {
 
 /// Where the parts of a node are reached.
 #[derive(Debug, Clone, Default)]
-pub struct Seats {
+pub struct ActorSlots {
     /// The recorder's.
-    pub recorder: Seat<RecorderMessage>,
+    pub recorder: ActorSlot<RecorderMessage>,
     /// The embedded broker's.
-    pub broker: Seat<BrokerMessage>,
+    pub broker: ActorSlot<BrokerMessage>,
     /// The membership's.
-    pub membership: Seat<MembershipMessage>,
+    pub membership: ActorSlot<MembershipMessage>,
     /// The gateway's.
-    pub gateway: Seat<GatewayMessage>,
+    pub gateway: ActorSlot<GatewayMessage>,
     /// The follower's.
-    pub follower: Seat<FollowerMessage>,
+    pub follower: ActorSlot<FollowerMessage>,
     /// The reputation keeper's.
-    pub keeper: Seat<ReputationKeeperMessage>,
+    pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The fuser's.
-    pub fuser: Seat<FuserMessage>,
+    pub fuser: ActorSlot<FuserMessage>,
     /// The election's.
-    pub election: Seat<LeaderElectionMessage>,
+    pub election: ActorSlot<LeaderElectionMessage>,
     /// The dashboard's.
-    pub dashboard: Seat<DashboardMessage>,
+    pub dashboard: ActorSlot<DashboardMessage>,
     /// The projector's.
     #[cfg(feature = "camera")]
-    pub projector: Seat<ProjectorMessage>,
+    pub projector: ActorSlot<ProjectorMessage>,
     /// The detector's.
     #[cfg(feature = "camera")]
-    pub detector: Seat<DetectorMessage>,
+    pub detector: ActorSlot<DetectorMessage>,
 }

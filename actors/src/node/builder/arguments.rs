@@ -10,7 +10,7 @@ use ecod::landmark::Landmark;
 use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
-use super::Assembly;
+use super::NodeBuilder;
 use crate::actors::dashboard::DashboardArguments;
 use crate::actors::follower::FollowerArguments;
 use crate::actors::fuser::FuserArguments;
@@ -24,7 +24,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::leadership::Position;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
-use crate::node::Seats;
+use crate::node::ActorSlots;
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::{LandmarkFacts, NodeFacts, Sources};
 use crate::observe::readiness::{Vitals, patience};
@@ -35,9 +35,9 @@ use crate::telemetry::counters::ShedReason;
 use crate::transport::gossip::{EventSink, MembershipConfig};
 use crate::transport::mqtt::{Incoming, Subscriber, SubscriptionRole};
 
-impl Assembly {
+impl NodeBuilder {
     pub(super) fn membership_arguments(&self) -> MembershipArguments {
-        let election = self.seats.election.clone();
+        let election = self.slots.election.clone();
         let events: EventSink = Arc::new(move |event| {
             election.send(LeaderElectionMessage::Membership { event });
         });
@@ -100,7 +100,7 @@ impl Assembly {
     /// Takes what comes in to the part that deals with it. Reports are recorded by the fuser where there is one: in the
     /// order in which they are fused.
     fn subscriber(&self) -> Subscriber {
-        let Seats { fuser, follower, keeper, election, .. } = self.seats.clone();
+        let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
         let (name, feed, leadership) = (self.name.clone(), Arc::clone(&self.feed), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
         let (intake, counters) = (self.intake.clone(), self.counters());
@@ -158,8 +158,8 @@ impl Assembly {
             least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
             term: self.term.subscribe(),
             leadership: self.leadership(),
-            election: self.seats.election.clone(),
-            fuser: self.seats.fuser.clone(),
+            election: self.slots.election.clone(),
+            fuser: self.slots.fuser.clone(),
             counters: self.counters(),
         }
     }
@@ -176,8 +176,8 @@ impl Assembly {
             members: self.members(),
             leadership: self.leadership(),
             term: self.term.subscribe(),
-            gateway: self.seats.gateway.clone(),
-            fuser: self.seats.fuser.clone(),
+            gateway: self.slots.gateway.clone(),
+            fuser: self.slots.fuser.clone(),
             counters: self.counters(),
         }
     }
@@ -195,14 +195,14 @@ impl Assembly {
             recording: self.recording.clone(),
             intake: self.intake.clone(),
             newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
-            gateway: self.seats.gateway.clone(),
-            keeper: self.seats.keeper.clone(),
+            gateway: self.slots.gateway.clone(),
+            keeper: self.slots.keeper.clone(),
             counters: self.counters(),
         }
     }
 
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
-        let Seats { membership, gateway, fuser, keeper, broker, .. } = self.seats.clone();
+        let ActorSlots { membership, gateway, fuser, keeper, broker, .. } = self.slots.clone();
         LeaderElectionArguments {
             config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
             term_file: self.state_file("term"),
@@ -252,8 +252,8 @@ impl Assembly {
             leadership: self.leadership(),
             plane: self.config.data_plane(),
             patience: patience(&self.config.fusion),
-            gateway: self.seats.gateway.clone(),
-            broker: self.seats.broker.clone(),
+            gateway: self.slots.gateway.clone(),
+            broker: self.slots.broker.clone(),
         }
     }
 
@@ -304,8 +304,8 @@ mod tests {
         ] {
             let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
             (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
-            let assembly = Assembly::new(config, Security::default(), watch::Sender::new(None));
-            let keeps = assembly.parts().contains(&crate::node::seats::Part::ReputationKeeper);
+            let builder = NodeBuilder::new(config, Security::default(), watch::Sender::new(None));
+            let keeps = builder.parts().contains(&crate::node::slots::ActorKind::ReputationKeeper);
             assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
         }
     }
@@ -313,8 +313,8 @@ mod tests {
     #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
-        let assembly = Assembly::new(config, Security::default(), watch::Sender::new(None));
-        assert_eq!((assembly.status().epoch, assembly.status().aggregator), (0, None));
+        let builder = NodeBuilder::new(config, Security::default(), watch::Sender::new(None));
+        assert_eq!((builder.status().epoch, builder.status().aggregator), (0, None));
         let map = GlobalMap {
             schema: SCHEMA_VERSION,
             aggregator: NodeName::from_static("edge"),
@@ -326,9 +326,9 @@ mod tests {
             objects: Vec::new(),
             pose_corrections: Default::default(),
         };
-        assembly.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
+        builder.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
         assert_eq!(
-            (assembly.status().epoch, assembly.status().aggregator.as_ref().map(NodeName::as_str)),
+            (builder.status().epoch, builder.status().aggregator.as_ref().map(NodeName::as_str)),
             (7, Some("edge"))
         );
     }

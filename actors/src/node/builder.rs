@@ -15,7 +15,7 @@ use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, S
 use tokio::sync::watch;
 use uuid::Uuid;
 
-use super::seats::{Part, Seats};
+use super::slots::{ActorKind, ActorSlots};
 use crate::actors::broker::Broker;
 use crate::actors::dashboard::Dashboard;
 #[cfg(feature = "camera")]
@@ -29,7 +29,7 @@ use crate::actors::membership::Membership;
 use crate::actors::projector::{Projector, ProjectorArguments};
 use crate::actors::recorder::Recorder;
 use crate::actors::reputation_keeper::{ReputationKeeper, SharedBook};
-use crate::messages::actor_slot::Seat;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::leadership::Leadership;
@@ -47,13 +47,13 @@ use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
 /// What the parts are made from; kept to make them again.
-pub(super) struct Assembly {
+pub(super) struct NodeBuilder {
     config: NodeConfig,
     security: Security,
     name: NodeName,
     run: Uuid,
     started_at: Timestamp,
-    seats: Seats,
+    slots: ActorSlots,
     counters: Arc<Counters>,
     newest: Newest,
     book: SharedBook,
@@ -78,7 +78,7 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
-impl Assembly {
+impl NodeBuilder {
     pub(super) fn new(config: NodeConfig, security: Security, failed: watch::Sender<Option<String>>) -> Self {
         let by_evidence = config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote();
         let counters = Arc::<Counters>::default();
@@ -88,7 +88,7 @@ impl Assembly {
             security,
             run: Uuid::now_v7(),
             started_at: clock::now(),
-            seats: Seats::default(),
+            slots: ActorSlots::default(),
             recording: Recording::new(Arc::clone(&counters)),
             counters,
             newest: Newest::default(),
@@ -106,8 +106,8 @@ impl Assembly {
         }
     }
 
-    pub(super) fn seats(&self) -> &Seats {
-        &self.seats
+    pub(super) fn slots(&self) -> &ActorSlots {
+        &self.slots
     }
 
     pub(super) fn counters(&self) -> Arc<Counters> {
@@ -147,79 +147,83 @@ impl Assembly {
     }
 
     /// The parts that this node has, in the order of starting.
-    pub(super) fn parts(&self) -> Vec<Part> {
+    pub(super) fn parts(&self) -> Vec<ActorKind> {
         let leads = self.config.may_lead();
         let mut parts = Vec::new();
-        parts.extend(self.config.record.is_some().then_some(Part::Recorder));
-        parts.extend((leads && self.config.data_plane().embedded).then_some(Part::Broker));
-        parts.extend([Part::Membership, Part::Gateway, Part::Follower]);
+        parts.extend(self.config.record.is_some().then_some(ActorKind::Recorder));
+        parts.extend((leads && self.config.data_plane().embedded).then_some(ActorKind::Broker));
+        parts.extend([ActorKind::Membership, ActorKind::Gateway, ActorKind::Follower]);
         if leads {
             let rates = self.config.fusion.rates_vehicles(!self.config.landmarks.is_empty());
-            parts.extend(rates.then_some(Part::ReputationKeeper));
-            parts.push(Part::Fuser);
+            parts.extend(rates.then_some(ActorKind::ReputationKeeper));
+            parts.push(ActorKind::Fuser);
         }
-        parts.push(Part::LeaderElection);
-        parts.extend(self.config.dashboard.enabled.then_some(Part::Dashboard));
+        parts.push(ActorKind::LeaderElection);
+        parts.extend(self.config.dashboard.enabled.then_some(ActorKind::Dashboard));
         #[cfg(feature = "camera")]
         if self.config.camera.is_some() {
-            parts.extend([Part::Projector, Part::Detector]);
+            parts.extend([ActorKind::Projector, ActorKind::Detector]);
         }
         parts
     }
 
-    /// Starts one part below the supervisor and seats it.
-    pub(super) async fn start(&mut self, part: Part, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+    /// Starts one part below the supervisor and slots it.
+    pub(super) async fn start(
+        &mut self,
+        part: ActorKind,
+        supervisor: ActorCell,
+    ) -> Result<ActorId, ActorProcessingErr> {
         match part {
-            Part::Recorder => self.start_recorder(supervisor).await,
-            Part::Broker => self.start_broker(supervisor).await,
-            Part::Membership => self.start_membership(supervisor).await,
-            Part::Gateway => {
+            ActorKind::Recorder => self.start_recorder(supervisor).await,
+            ActorKind::Broker => self.start_broker(supervisor).await,
+            ActorKind::Membership => self.start_membership(supervisor).await,
+            ActorKind::Gateway => {
                 let started = Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
-                let id = seat(&self.seats.gateway, started)?;
-                self.seats.election.send(LeaderElectionMessage::NoteGatewayRestart);
+                let id = slot(&self.slots.gateway, started)?;
+                self.slots.election.send(LeaderElectionMessage::NoteGatewayRestart);
                 Ok(id)
             }
-            Part::Follower => {
+            ActorKind::Follower => {
                 let started = Actor::spawn_linked(None, Follower, self.follower_arguments(), supervisor).await;
-                seat(&self.seats.follower, started)
+                slot(&self.slots.follower, started)
             }
-            Part::ReputationKeeper => {
+            ActorKind::ReputationKeeper => {
                 let arguments = self.keeper_arguments();
                 let started = Actor::spawn_linked(None, ReputationKeeper, arguments, supervisor).await;
-                seat(&self.seats.keeper, started)
+                slot(&self.slots.keeper, started)
             }
-            Part::Fuser => {
+            ActorKind::Fuser => {
                 let started = Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
-                let id = seat(&self.seats.fuser, started)?;
-                self.seats.election.send(LeaderElectionMessage::NoteFuserRestart);
+                let id = slot(&self.slots.fuser, started)?;
+                self.slots.election.send(LeaderElectionMessage::NoteFuserRestart);
                 Ok(id)
             }
-            Part::LeaderElection => {
+            ActorKind::LeaderElection => {
                 let started = Actor::spawn_linked(None, LeaderElection, self.election_arguments(), supervisor).await;
-                seat(&self.seats.election, started)
+                slot(&self.slots.election, started)
             }
-            Part::Dashboard => {
+            ActorKind::Dashboard => {
                 let arguments = self.dashboard_arguments();
-                seat(&self.seats.dashboard, Actor::spawn_linked(None, Dashboard, arguments, supervisor).await)
+                slot(&self.slots.dashboard, Actor::spawn_linked(None, Dashboard, arguments, supervisor).await)
             }
             #[cfg(feature = "camera")]
-            Part::Projector => {
+            ActorKind::Projector => {
                 let arguments = ProjectorArguments {
                     perception: crate::node::camera::perception(&self.config).map_err(in_full)?,
                     poses: self.config.pose.listen,
                     algorithms: crate::node::camera::algorithms(&self.config),
-                    gateway: self.seats.gateway.clone(),
+                    gateway: self.slots.gateway.clone(),
                     counters: self.counters(),
                 };
-                seat(&self.seats.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
+                slot(&self.slots.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
             }
             #[cfg(feature = "camera")]
-            Part::Detector => {
+            ActorKind::Detector => {
                 let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
-                let projector = self.seats.projector.clone();
+                let projector = self.slots.projector.clone();
                 let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
                 let arguments = arguments.map_err(in_full)?;
-                seat(&self.seats.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
+                slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }
         }
     }
@@ -228,18 +232,18 @@ impl Assembly {
     pub(super) async fn stop_all(&self) {
         #[cfg(feature = "camera")]
         {
-            stop(&self.seats.detector).await;
-            stop(&self.seats.projector).await;
+            stop(&self.slots.detector).await;
+            stop(&self.slots.projector).await;
         }
-        stop(&self.seats.dashboard).await;
-        stop(&self.seats.election).await;
-        stop(&self.seats.fuser).await;
-        stop(&self.seats.keeper).await;
-        stop(&self.seats.follower).await;
-        stop(&self.seats.gateway).await;
-        stop(&self.seats.membership).await;
-        stop(&self.seats.broker).await;
-        stop(&self.seats.recorder).await;
+        stop(&self.slots.dashboard).await;
+        stop(&self.slots.election).await;
+        stop(&self.slots.fuser).await;
+        stop(&self.slots.keeper).await;
+        stop(&self.slots.follower).await;
+        stop(&self.slots.gateway).await;
+        stop(&self.slots.membership).await;
+        stop(&self.slots.broker).await;
+        stop(&self.slots.recorder).await;
     }
 
     async fn start_recorder(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
@@ -247,7 +251,7 @@ impl Assembly {
         if !self.config.may_lead() && !arguments.config.reports {
             tracing::info!("reports of other vehicles are not recorded, key `record.reports` is false");
         }
-        seat(&self.seats.recorder, Actor::spawn_linked(None, Recorder, arguments, supervisor).await)
+        slot(&self.slots.recorder, Actor::spawn_linked(None, Recorder, arguments, supervisor).await)
     }
 
     /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
@@ -267,7 +271,7 @@ impl Assembly {
         };
         self.broker_address.send_replace(Some(bound));
         let id = broker.get_id();
-        self.seats.broker.take(broker);
+        self.slots.broker.set(broker);
         Ok(id)
     }
 
@@ -305,18 +309,18 @@ impl Assembly {
         let address = ractor::call!(actor, |reply| MembershipMessage::Address { reply })?;
         self.gossip_address.send_replace(Some(address));
         let id = actor.get_id();
-        self.seats.membership.take(actor);
+        self.slots.membership.set(actor);
         Ok(id)
     }
 }
 
-fn seat<M: Message>(
-    seat: &Seat<M>,
+fn slot<M: Message>(
+    slot: &ActorSlot<M>,
     spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
 ) -> Result<ActorId, ActorProcessingErr> {
     let (actor, _) = spawned.map_err(cause)?;
     let id = actor.get_id();
-    seat.take(actor);
+    slot.set(actor);
     Ok(id)
 }
 
@@ -335,8 +339,8 @@ fn in_full(error: anyhow::Error) -> ActorProcessingErr {
     format!("{error:#}").into()
 }
 
-async fn stop<M: Message>(seat: &Seat<M>) {
-    let Some(actor) = seat.holder() else { return };
+async fn stop<M: Message>(slot: &ActorSlot<M>) {
+    let Some(actor) = slot.get() else { return };
     if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT)).await {
         tracing::debug!(%error, "part did not stop in time");
         actor.kill();
