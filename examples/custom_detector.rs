@@ -12,12 +12,12 @@ use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ecod::wire::Role;
-use ecod_actors::camera::{CameraConfig, OpticsConfig};
-use ecod_actors::config::NodeConfig;
-use ecod_actors::detect::{CustomDetector, Detect, DetectError, DetectorConfig};
-use ecod_actors::frame::Frame;
-use ecod_actors::frame_source::SourceConfig;
+use ecod_actors::camera::config::{CameraConfig, OpticsConfig};
+use ecod_actors::camera::detect::{CustomDetector, Detect, DetectError, DetectorConfig};
+use ecod_actors::camera::frame::Frame;
+use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::node;
+use ecod_actors::node::config::NodeConfig;
 use opencv::core::{self, CV_8UC3, Mat, Point, Scalar, Vector};
 use opencv::{imgcodecs, imgproc};
 

@@ -12,15 +12,16 @@ use ecod::geometry::Pose;
 use ecod::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig};
 use ecod::testbed::Testbed;
 use ecod::time::Timestamp;
-use ecod_actors::corner_pose::locate_target;
-use ecod_actors::detect::Detect;
-use ecod_actors::detect::coco::{CocoConfig, CocoDetector};
-use ecod_actors::detect::placard::{PlacardConfig, PlacardDetector};
-use ecod_actors::frame::Frame;
+use ecod_actors::camera::corner_pose::locate_target;
+use ecod_actors::camera::detect::Detect;
+use ecod_actors::camera::detect::coco::{CocoConfig, CocoDetector};
+use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
+use ecod_actors::camera::frame::Frame;
 use ecod_actors::testbed::TestbedCamera;
-use figures::Figures;
 use nalgebra::Point2;
 use opencv::imgcodecs;
+
+use figures::Figures;
 
 const FRAMES: usize = 20;
 

@@ -13,15 +13,17 @@ use std::time::{Duration, Instant};
 
 use ecod::names::NodeName;
 use ecod::wire::Role;
-use ecod_actors::clock;
-use ecod_actors::gateway::Secret;
-use ecod_actors::membership::{
-    FrameCounters, FrameEvent, Member, Membership, MembershipArguments, MembershipConfig, MembershipEvent,
-    MembershipMessage, MulticastConfig,
+use ecod_actors::actors::membership::{Membership, MembershipArguments};
+use ecod_actors::messages::membership::MembershipMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::gossip::{
+    FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
-use figures::Figures;
+use ecod_actors::transport::mqtt::Secret;
 use ractor::{Actor, call_t};
 use tokio::sync::watch;
+
+use figures::Figures;
 
 #[tokio::main(flavor = "multi_thread", worker_threads = 2)]
 async fn main() {

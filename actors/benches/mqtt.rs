@@ -9,20 +9,22 @@ use std::time::Duration;
 use anyhow::Context;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, ReportKind, Role, SCHEMA_VERSION};
+use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::bench::two_hop::{self, Load};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::clock;
-use ecod_actors::counters::Counters;
-use ecod_actors::gateway::{
-    BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion,
-    Part, ReportKind, Security,
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::Counters;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::mqtt::{
+    BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, MqttVersion, Security, SubscriptionRole,
 };
-use figures::Figures;
 use hdrhistogram::Histogram;
 use ractor::{Actor, ActorRef};
 use tokio::sync::mpsc;
 use uuid::Uuid;
+
+use figures::Figures;
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
@@ -48,8 +50,8 @@ fn take(figures: &mut Figures, path: &str, histogram: &Histogram<u64>) {
 
 /// Times from a report's publication to the arrival of the map that answers it, in nanoseconds.
 async fn through_gateways(broker: &BrokerAddress, version: MqttVersion, load: Load) -> anyhow::Result<Histogram<u64>> {
-    let (edge, mut reports) = join("edge", Part::Candidate, version, broker).await?;
-    let (euclid, mut maps) = join("euclid", Part::Follower, version, broker).await?;
+    let (edge, mut reports) = join("edge", SubscriptionRole::Candidate, version, broker).await?;
+    let (euclid, mut maps) = join("euclid", SubscriptionRole::Follower, version, broker).await?;
     let aggregator = edge.clone();
     let answer = tokio::spawn(async move {
         while let Some(delivery) = reports.recv().await {
@@ -93,7 +95,7 @@ async fn through_gateways(broker: &BrokerAddress, version: MqttVersion, load: Lo
 
 async fn join(
     name: &str,
-    part: Part,
+    part: SubscriptionRole,
     version: MqttVersion,
     broker: &BrokerAddress,
 ) -> anyhow::Result<(ActorRef<GatewayMessage>, mpsc::UnboundedReceiver<Delivery>)> {

@@ -10,6 +10,7 @@ mod doctor;
 mod eval;
 #[cfg(feature = "camera")]
 mod intersection;
+mod lines;
 mod logging;
 mod logs;
 mod pki;

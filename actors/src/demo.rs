@@ -25,17 +25,18 @@ use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ReportKind, Role};
 
 pub use self::observer::ObservedReport;
-use self::observer::Observer;
 pub use self::reign::Reign;
+
+use self::observer::Observer;
 use self::reign::reigns;
-use crate::clock;
-use crate::config::NodeConfig;
-use crate::follower::ReceivedMap;
-use crate::frame_source::SourceConfig;
-use crate::membership::MembershipConfig;
+use crate::camera::frame_source::SourceConfig;
+use crate::messages::newest::ReceivedMap;
+use crate::node::config::NodeConfig;
 use crate::node_process::NodeProcess;
+use crate::platform::clock;
 use crate::testbed::score::{SceneResult, Score};
 use crate::testbed::setup;
+use crate::transport::gossip::MembershipConfig;
 
 /// One scene to be run live.
 #[derive(Debug, Clone, Copy)]

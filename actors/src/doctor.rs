@@ -14,7 +14,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::config::NodeConfig;
+use crate::node::config::NodeConfig;
 
 /// What was found out about one thing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -86,7 +86,7 @@ mod tests {
     use ecod::wire::Role;
 
     use super::*;
-    use crate::recorder::RecordConfig;
+    use crate::observe::recorder::RecordConfig;
 
     fn config() -> NodeConfig {
         let mut config =
@@ -121,14 +121,14 @@ mod tests {
     #[tokio::test]
     async fn a_revocation_list_without_a_list_is_named() {
         let directory = tempfile::tempdir().unwrap();
-        let (mut config, now) = (config(), crate::clock::now());
+        let (mut config, now) = (config(), crate::platform::clock::now());
         let name = NodeName::from_static("edge");
-        let mut authority = crate::pki::Authority::init(directory.path(), &config.cell, now).unwrap();
+        let mut authority = crate::transport::pki::Authority::init(directory.path(), &config.cell, now).unwrap();
         authority.issue(&name, Role::Edge, std::time::Duration::from_secs(86_400), now).unwrap();
         let ((certificate, key), list) = (authority.files_of(&name), authority.revocation_list());
         std::fs::write(&list, "").unwrap();
         let (ca, revocation_list) = (authority.ca(), Some(list));
-        config.tls = Some(crate::pki::TlsConfig { ca, certificate, key, revocation_list });
+        config.tls = Some(crate::transport::pki::TlsConfig { ca, certificate, key, revocation_list });
         let finding = finding(&config, "certificates").await;
         assert_eq!(finding.verdict, Verdict::Broken);
         assert!(finding.seen.contains("revoked.pem") && finding.fix.unwrap().contains("revoked.pem"));
@@ -166,7 +166,7 @@ mod tests {
     #[tokio::test]
     async fn a_page_that_can_have_another_port_is_not_broken_and_one_switched_off_is_not_looked_for() {
         // Somebody has it: this test or another.
-        let _taken = TcpListener::bind(crate::dashboard::DEFAULT_ADDRESS);
+        let _taken = TcpListener::bind(crate::observe::dashboard::DEFAULT_ADDRESS);
         let mut config = config();
         config.dashboard.enabled = true;
         assert!(finding(&config, "dashboard").await.verdict < Verdict::Broken);

@@ -1,60 +1,36 @@
 //! ECOD nodes: the actors, transports and cameras around the core of [`ecod`].
+//!
+//! Rooms by floor, the top first; imports run downward only:
+//!
+//! ```text
+//! cli          the program
+//! doctor, top  what an operator asks
+//! node         supervisor and configuration of a whole node
+//! actors       one file or folder per actor
+//! observe      page, metrics, health, logs, reports
+//! messages     what actors say to each other
+//! transport    MQTT, embedded broker, gossip, certificates     camera  frames, detectors, lens
+//! telemetry    counters
+//! platform     clock, files, throttles
+//! ```
 
 #![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
+pub mod actors;
 pub mod bench;
-pub mod broker;
-#[cfg(feature = "camera")]
-pub mod calibrate;
-#[cfg(feature = "camera")]
 pub mod camera;
 pub mod cli;
-pub mod clock;
-pub mod config;
-#[cfg(feature = "camera")]
-pub mod corner_pose;
-pub mod counters;
-pub mod dashboard;
 #[cfg(feature = "camera")]
 pub mod demo;
-#[cfg(feature = "camera")]
-pub mod detect;
-#[cfg(feature = "camera")]
-pub mod detector;
 pub mod doctor;
-pub mod follower;
-#[cfg(feature = "camera")]
-pub mod frame;
-#[cfg(feature = "camera")]
-pub mod frame_source;
-pub mod fuser;
-pub mod gateway;
-#[cfg(feature = "camera")]
-pub mod image_size;
-#[cfg(feature = "camera")]
-pub mod latest_slot;
-pub mod leader_election;
-#[cfg(feature = "camera")]
-pub mod lens;
-pub mod lines;
-pub mod membership;
+pub mod messages;
 pub mod node;
 pub mod node_process;
-#[cfg(feature = "camera")]
-pub mod perception;
-pub mod pki;
-#[cfg(feature = "camera")]
-pub mod projector;
-pub mod readiness;
-pub mod recorder;
-pub mod report;
-pub mod reputation_keeper;
-pub mod seat;
-pub mod service;
-pub mod state_file;
+pub mod observe;
+pub mod platform;
+pub mod telemetry;
 #[cfg(feature = "camera")]
 pub mod testbed;
-mod throttles;
 pub mod top;
-pub mod vehicle_pose;
+pub mod transport;

@@ -15,12 +15,16 @@
 //! └─ Detector          frames -> detections               with a camera
 //! ```
 //!
-//! A part that ends is started anew, and the others go on: they reach each other through seats. A node whose parts end
+//! A part that ends is started anew, and the others go on: they reach each other through slots. A node whose parts end
 //! more often than [`MAX_RESTARTS`] times in [`RESTART_SPAN`] gives up, so that the service manager starts it afresh.
 
-mod parts;
+mod builder;
+#[cfg(feature = "camera")]
+pub mod camera;
+pub mod config;
 mod restarts;
-mod seats;
+pub mod service;
+mod slots;
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -33,20 +37,18 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::MissedTickBehavior;
 
-use crate::clock;
-use crate::config::NodeConfig;
-use crate::counters::Counters;
-use crate::follower::{Newest, Received, ReceivedMap};
-use crate::gateway::Security;
-use crate::leader_election::Leadership;
-use crate::membership::Member;
-use crate::readiness::{Readiness, Vitals};
-use crate::service::ServiceManager;
-
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
-pub use seats::{Part, Seats};
+pub use slots::{ActorKind, ActorSlots};
 
-use parts::{Assembly, cause};
+use crate::messages::leadership::Leadership;
+use crate::messages::newest::{Newest, Received, ReceivedMap};
+use crate::node::config::NodeConfig;
+use crate::node::service::ServiceManager;
+use crate::observe::readiness::{Readiness, Vitals};
+use crate::platform::clock;
+use crate::telemetry::counters::Counters;
+use crate::transport::gossip::Member;
+use builder::{NodeBuilder, cause};
 use restarts::Restarts;
 
 /// What the supervisor is asked to do; it stops by [`NodeHandle::stop`].
@@ -72,8 +74,8 @@ struct Node;
 
 /// The running parts.
 struct NodeState {
-    assembly: Assembly,
-    running: HashMap<ActorId, Part>,
+    builder: NodeBuilder,
+    running: HashMap<ActorId, ActorKind>,
     restarts: Restarts,
     manager: Option<ServiceManager>,
 }
@@ -97,7 +99,7 @@ pub struct NodeHandle {
     members: watch::Receiver<Vec<Member>>,
     leadership: watch::Receiver<Leadership>,
     dashboard: watch::Receiver<Option<SocketAddr>>,
-    seats: Seats,
+    slots: ActorSlots,
     counters: Arc<Counters>,
 }
 
@@ -109,14 +111,14 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 /// # Errors
 /// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
 pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
-    let security = Security::of(&config).map_err(|error| NodeError::Failed(error.to_string()))?;
+    let security = config.security().map_err(|error| NodeError::Failed(error.to_string()))?;
     let (failed, failure) = watch::channel(None);
-    let assembly = Assembly::new(config, security, failed);
-    let (newest, broker, gossip) = (assembly.newest(), assembly.broker_address(), assembly.gossip_address());
-    let (members, leadership) = (assembly.members(), assembly.leadership());
-    let dashboard = assembly.dashboard_address();
-    let (seats, counters) = (assembly.seats().clone(), assembly.counters());
-    let started = Actor::spawn(None, Node, assembly).await;
+    let builder = NodeBuilder::new(config, security, failed);
+    let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());
+    let (members, leadership) = (builder.members(), builder.leadership());
+    let dashboard = builder.dashboard_address();
+    let (slots, counters) = (builder.slots().clone(), builder.counters());
+    let started = Actor::spawn(None, Node, builder).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
     Ok(NodeHandle {
@@ -129,7 +131,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
         members,
         leadership,
         dashboard,
-        seats,
+        slots,
         counters,
     })
 }
@@ -176,8 +178,8 @@ impl NodeHandle {
     }
 
     /// Where the node's actors are reached.
-    pub fn seats(&self) -> &Seats {
-        &self.seats
+    pub fn slots(&self) -> &ActorSlots {
+        &self.slots
     }
 
     /// The node's counters.
@@ -212,15 +214,15 @@ impl NodeHandle {
 impl Actor for Node {
     type Msg = NodeMessage;
     type State = NodeState;
-    type Arguments = Assembly;
+    type Arguments = NodeBuilder;
 
     async fn pre_start(
         &self,
         myself: ActorRef<Self::Msg>,
-        assembly: Self::Arguments,
+        builder: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let mut state = NodeState { assembly, running: HashMap::new(), restarts: Restarts::default(), manager: None };
-        for part in state.assembly.parts() {
+        let mut state = NodeState { builder, running: HashMap::new(), restarts: Restarts::default(), manager: None };
+        for part in state.builder.parts() {
             state.start(part, &myself.get_cell()).await?;
         }
         Ok(state)
@@ -236,7 +238,7 @@ impl Actor for Node {
             NodeMessage::LogHealth => state.log_health(),
             NodeMessage::ReportTo { mut manager } => {
                 manager.started();
-                tokio::spawn(watch_readiness(state.assembly.vitals(), manager.period(), myself));
+                tokio::spawn(watch_readiness(state.builder.vitals(), manager.period(), myself));
                 state.manager = Some(manager);
             }
             NodeMessage::NoteReadiness { readiness } => {
@@ -271,7 +273,7 @@ impl Actor for Node {
             Err(format!("parts ended more than {MAX_RESTARTS} times in {RESTART_SPAN:?}, the last: {part:?}: {why}")
                 .into())
         };
-        restarted.inspect_err(|error| state.assembly.give_up(error.to_string()))
+        restarted.inspect_err(|error| state.builder.give_up(error.to_string()))
     }
 
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
@@ -279,21 +281,21 @@ impl Actor for Node {
             manager.stopping();
         }
         state.running.clear();
-        state.assembly.stop_all().await;
+        state.builder.stop_all().await;
         Ok(())
     }
 }
 
 impl NodeState {
     fn log_health(&self) {
-        let snapshot = self.assembly.counters().snapshot();
-        let frames = self.assembly.frames().snapshot();
-        let shed = self.assembly.counters().all_shed();
+        let snapshot = self.builder.counters().snapshot();
+        let frames = self.builder.frames().snapshot();
+        let shed = self.builder.counters().all_shed();
         tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?shed, ?frames, "health");
     }
 
-    async fn start(&mut self, part: Part, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
-        let actor = self.assembly.start(part, supervisor.clone()).await?;
+    async fn start(&mut self, part: ActorKind, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+        let actor = self.builder.start(part, supervisor.clone()).await?;
         self.running.insert(actor, part);
         Ok(())
     }

@@ -11,7 +11,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use tokio::process::{Child, Command};
 
-use crate::config::NodeConfig;
+use crate::node::config::NodeConfig;
 
 /// A running `ecod-node`; killed when dropped.
 #[derive(Debug)]

@@ -13,13 +13,13 @@ use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
-use crate::config::NodeConfig;
-use crate::counters::CounterSnapshot;
-use crate::follower::{Received, ReceivedMap};
-use crate::leader_election::Leadership;
-use crate::membership::Member;
+use crate::messages::leadership::Leadership;
+use crate::messages::newest::{Received, ReceivedMap};
 use crate::node::NodeHandle;
-use crate::readiness::{newest_round, patience};
+use crate::node::config::NodeConfig;
+use crate::observe::readiness::{newest_round, patience};
+use crate::telemetry::counters::CounterSnapshot;
+use crate::transport::gossip::Member;
 
 /// Leaderships that are remembered.
 const HISTORY: usize = 5;
@@ -57,7 +57,7 @@ impl View {
         let (history, scroll) = before.map(|before| (before.history, before.scroll)).unwrap_or_default();
         let mut view = Self {
             cell: config.cell.clone(),
-            patience: patience(config),
+            patience: patience(&config.fusion),
             now,
             leadership: node.leadership().borrow().clone(),
             history,
@@ -245,8 +245,8 @@ mod tests {
     use ratatui::backend::TestBackend;
 
     use super::*;
-    use crate::counters::{Counters, ShedReason};
-    use crate::leader_election::Position;
+    use crate::messages::leadership::Position;
+    use crate::telemetry::counters::{Counters, ShedReason};
 
     fn name(text: &str) -> NodeName {
         NodeName::new(text).unwrap()

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::testbed::Testbed;
-use ecod_actors::counters::Event;
-use ecod_actors::frame_source::SourceConfig;
+use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::telemetry::counters::Event;
 use ecod_actors::testbed::setup;
 use tokio::time::timeout;
 
@@ -56,8 +56,8 @@ async fn a_plate_goes_from_pixels_to_the_map_though_detector_and_projector_are_k
 
     let plate = scene.spots[0].truth.as_deref().unwrap();
     plate_on_a_new_map(&vehicle, plate).await;
-    let detector = vehicle.seats().detector.holder().unwrap().get_cell();
-    let projector = vehicle.seats().projector.holder().unwrap().get_cell();
+    let detector = vehicle.slots().detector.get().unwrap().get_cell();
+    let projector = vehicle.slots().projector.get().unwrap().get_cell();
     for part in [detector, projector] {
         part.kill();
         more_frames(&vehicle).await;

@@ -5,13 +5,13 @@ use std::time::Duration;
 
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
-use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, Role};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::gateway::{GatewayMessage, ReportKind};
-use ecod_actors::leader_election::Position;
+use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::messages::leadership::Position;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::recorder::RecordConfig;
+use ecod_actors::observe::recorder::RecordConfig;
+use ecod_actors::platform::clock;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -74,7 +74,7 @@ async fn reported(
     let settled = async {
         loop {
             let message = GatewayMessage::PublishReport { kind: ReportKind::Detections, report: make() };
-            reporter.seats().gateway.send(message);
+            reporter.slots().gateway.send(message);
             tokio::time::sleep(Duration::from_millis(50)).await;
             if newest.borrow().as_ref().is_some_and(|received| wanted(&received.map)) {
                 return;
@@ -125,15 +125,15 @@ async fn the_cell_goes_on_when_any_part_is_killed() {
     reported(&euclid, &euclid, sees("before"), |map| label(map, 2) == Some("before")).await;
 
     let kills: [(&str, &dyn Fn()); 9] = [
-        ("election", &|| edge.seats().election.holder().unwrap().kill()),
-        ("membership", &|| edge.seats().membership.holder().unwrap().kill()),
-        ("recorder", &|| edge.seats().recorder.holder().unwrap().kill()),
-        ("fuser", &|| edge.seats().fuser.holder().unwrap().kill()),
-        ("edge-gateway", &|| edge.seats().gateway.holder().unwrap().kill()),
-        ("edge-follower", &|| edge.seats().follower.holder().unwrap().kill()),
-        ("broker", &|| edge.seats().broker.holder().unwrap().kill()),
-        ("gateway", &|| euclid.seats().gateway.holder().unwrap().kill()),
-        ("follower", &|| euclid.seats().follower.holder().unwrap().kill()),
+        ("election", &|| edge.slots().election.get().unwrap().kill()),
+        ("membership", &|| edge.slots().membership.get().unwrap().kill()),
+        ("recorder", &|| edge.slots().recorder.get().unwrap().kill()),
+        ("fuser", &|| edge.slots().fuser.get().unwrap().kill()),
+        ("edge-gateway", &|| edge.slots().gateway.get().unwrap().kill()),
+        ("edge-follower", &|| edge.slots().follower.get().unwrap().kill()),
+        ("broker", &|| edge.slots().broker.get().unwrap().kill()),
+        ("gateway", &|| euclid.slots().gateway.get().unwrap().kill()),
+        ("follower", &|| euclid.slots().follower.get().unwrap().kill()),
     ];
     for (part, kill) in kills {
         let term = edge.leadership().borrow().epoch.clone().unwrap().term;
@@ -167,7 +167,7 @@ async fn the_cell_goes_on_under_another_candidate_when_a_supervisor_is_killed() 
         leadership.wait_for(|leadership| leadership.position == Position::StandingBy).await.map(drop)
     };
     timeout(PATIENCE, standby).await.expect("gauss stands by").unwrap();
-    edge.seats().fuser.holder().unwrap().try_get_supervisor().unwrap().kill();
+    edge.slots().fuser.get().unwrap().try_get_supervisor().unwrap().kill();
     reported(euclid, euclid, || report("euclid", "x", 0), led_by("gauss")).await;
     for node in others {
         node.stop().await;
@@ -178,11 +178,11 @@ async fn the_cell_goes_on_under_another_candidate_when_a_supervisor_is_killed() 
 async fn a_part_that_keeps_ending_makes_the_node_give_up() {
     let mut edge = edge().await;
     for _ in 0..=node::MAX_RESTARTS {
-        let fuser = edge.seats().fuser.holder().unwrap();
+        let fuser = edge.slots().fuser.get().unwrap();
         fuser.kill();
-        let seats = edge.seats().clone();
+        let slots = edge.slots().clone();
         let replaced = async {
-            while seats.fuser.holder().unwrap().get_id() == fuser.get_id() {
+            while slots.fuser.get().unwrap().get_id() == fuser.get_id() {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
         };
@@ -198,7 +198,7 @@ async fn a_part_that_keeps_ending_makes_the_node_give_up() {
 async fn a_killed_supervisor_fails_the_node_and_takes_its_parts_with_it() {
     let mut edge = edge().await;
     let address = edge.broker_address().unwrap();
-    let supervisor = edge.seats().fuser.holder().unwrap().try_get_supervisor().unwrap();
+    let supervisor = edge.slots().fuser.get().unwrap().try_get_supervisor().unwrap();
     supervisor.kill();
     let error = timeout(Duration::from_secs(5), edge.failed()).await.expect("within bounds").unwrap_err();
     assert!(error.to_string().contains("supervisor"), "{error}");

@@ -10,10 +10,10 @@ use std::time::Duration;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::wire::Role;
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::pki::{Authority, TlsConfig};
+use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::{Authority, TlsConfig};
 
 /// An edge of the cell that the documentation speaks of.
 async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {

@@ -6,7 +6,7 @@ use std::io::Write;
 use std::path::Path;
 
 use ecod::wire::Role;
-use ecod_actors::config::NodeConfig;
+use ecod_actors::node::config::NodeConfig;
 
 fn load(name: &str) -> NodeConfig {
     let file = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/node")).join(name);

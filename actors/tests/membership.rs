@@ -8,12 +8,13 @@ use std::time::Duration;
 use bytes::Bytes;
 use ecod::names::NodeName;
 use ecod::wire::Role;
-use ecod_actors::clock;
-use ecod_actors::gateway::Secret;
-use ecod_actors::membership::{
-    FrameCounters, FrameEvent, Member, Membership, MembershipArguments, MembershipConfig, MembershipEvent,
-    MembershipMessage, MulticastConfig,
+use ecod_actors::actors::membership::{Membership, MembershipArguments};
+use ecod_actors::messages::membership::MembershipMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::gossip::{
+    FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
+use ecod_actors::transport::mqtt::Secret;
 use ractor::{Actor, ActorRef, call_t};
 use tokio::net::UdpSocket;
 use tokio::sync::watch;

@@ -12,10 +12,10 @@ use std::time::{Duration, Instant};
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::wire::{Encoding, ObjectReport, PerceivedObject, Role, encode};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::counters::ShedReason;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::ShedReason;
 use rumqttc::{AsyncClient, ClientError, MqttOptions, QoS};
 use tokio::sync::Mutex;
 use tokio::task::JoinSet;
@@ -96,7 +96,7 @@ async fn answers(edge: &NodeHandle, client: &AsyncClient, first: u64) -> Vec<Wai
         let mut maps = edge.newest_map();
         let sent = Instant::now();
         publish(client, "euclid", seq, x_m).await.unwrap();
-        let shows = |received: &Option<ecod_actors::follower::ReceivedMap>| {
+        let shows = |received: &Option<ecod_actors::messages::newest::ReceivedMap>| {
             received.as_ref().is_some_and(|received| (received.map.landmarks[1].x_m - x_m).abs() < 1e-4)
         };
         tokio::time::timeout(PATIENCE, maps.wait_for(shows)).await.expect("every report is answered").unwrap();

@@ -7,11 +7,11 @@ use std::time::Duration;
 use ecod::aggregator::Algorithms;
 use ecod::names::NodeName;
 use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::GatewayMessage;
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::Event;
 use tokio::time::timeout;
 use uuid::Uuid;
 
@@ -53,7 +53,7 @@ fn see(reporter: &NodeHandle, ago: Duration) {
         let report =
             ObjectReport { objects, ..ObjectReport::new(NodeName::from_static(node), seq, clock::now() - ago) };
         let message = GatewayMessage::PublishReport { kind: ReportKind::Detections, report: Arc::new(report) };
-        reporter.seats().gateway.send(message);
+        reporter.slots().gateway.send(message);
     }
 }
 
@@ -83,9 +83,9 @@ async fn a_cell_that_only_tracks_rates_its_vehicles_and_keeps_identities_when_it
     let before = ids(&map(&euclid).unwrap());
     assert_eq!(before.len(), 2);
 
-    let fuser = edge.seats().fuser.holder().unwrap();
+    let fuser = edge.slots().fuser.get().unwrap();
     fuser.kill();
-    let restarted = || edge.seats().fuser.holder().is_some_and(|holder| holder.get_id() != fuser.get_id());
+    let restarted = || edge.slots().fuser.get().is_some_and(|holder| holder.get_id() != fuser.get_id());
     until("a new fuser", look, restarted).await;
     let since = clock::now();
     until("a map of the new fuser", look, || map(&euclid).is_some_and(|map| map.fused_at_us > since)).await;

@@ -9,13 +9,15 @@ use ecod::aggregator::Algorithms;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::vote::VoteMode;
-use ecod::wire::{ObjectReport, PerceivedObject, RejectReason, Reputation, Reputations, Role, Verdict, decode};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::{GatewayMessage, ReportKind};
+use ecod::wire::{
+    ObjectReport, PerceivedObject, RejectReason, ReportKind, Reputation, Reputations, Role, Verdict, decode,
+};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::messages::reputation_keeper::ReputationKeeperMessage;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::reputation_keeper::ReputationKeeperMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::Event;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -104,7 +106,7 @@ fn disagree(reporter: &NodeHandle) {
     for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
         let message =
             GatewayMessage::PublishReport { kind: ReportKind::VoteDetections, report: report(node, label, "ball") };
-        reporter.seats().gateway.send(message);
+        reporter.slots().gateway.send(message);
     }
 }
 
@@ -222,7 +224,7 @@ async fn killing_the_keeper_or_the_fuser_loses_nothing_that_was_published() {
     let euclid = cav("euclid", &edge).await;
     unmasked(&euclid, &euclid).await;
     let kills: [&dyn Fn(); 2] =
-        [&|| edge.seats().keeper.holder().unwrap().kill(), &|| edge.seats().fuser.holder().unwrap().kill()];
+        [&|| edge.slots().keeper.get().unwrap().kill(), &|| edge.slots().fuser.get().unwrap().kill()];
     for kill in kills {
         let before = reputations(&euclid).unwrap();
         let known = before.reputations[&name("liar")];
@@ -259,7 +261,7 @@ async fn another_candidate_leads_with_the_same_reputations() {
     // A candidate that was not there before is told all.
     let late = member("late", Role::Auto, &standby, |_| ()).await;
     let tell = || {
-        standby.seats().keeper.send(ReputationKeeperMessage::SendSnapshot { to: name("late") });
+        standby.slots().keeper.send(ReputationKeeperMessage::SendSnapshot { to: name("late") });
     };
     until("a snapshot", tell, || late.counters().events(Event::LedgerMerged) > 0).await;
     for node in [late, standby, euclid] {
@@ -277,7 +279,7 @@ async fn a_cell_runs_what_it_is_told_and_counts_the_rest() {
         let euclid = cav("euclid", &edge).await;
         let send = |kind, label: &str, landmark: &str| {
             let report = report("euclid", label, landmark);
-            euclid.seats().gateway.send(GatewayMessage::PublishReport { kind, report });
+            euclid.slots().gateway.send(GatewayMessage::PublishReport { kind, report });
         };
         let both = || {
             send(kind, "cup", "ball");
@@ -304,7 +306,7 @@ async fn votes_that_cannot_count_are_counted() {
     let euclid = cav("euclid", &edge).await;
     let send = |report: &Arc<ObjectReport>| {
         let (kind, report) = (ReportKind::VoteDetections, Arc::clone(report));
-        euclid.seats().gateway.send(GatewayMessage::PublishReport { kind, report });
+        euclid.slots().gateway.send(GatewayMessage::PublishReport { kind, report });
     };
     let events = |event| edge.counters().events(event);
     let rejects = |reason| edge.counters().rejects(reason);

@@ -10,12 +10,12 @@ use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::follower::ReceivedMap;
-use ecod_actors::gateway::GatewayMessage;
+use ecod_actors::messages::actor_slot::ActorSlot;
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::messages::newest::ReceivedMap;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::seat::Seat;
+use ecod_actors::platform::clock;
 use tempfile::TempDir;
 use tokio::runtime::{Builder, Runtime};
 
@@ -67,7 +67,7 @@ impl Cell {
         let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
         let node = runtime.spawn(node::start(config)).await??;
         if let Some((_, seen)) = SEEN.iter().find(|(vehicle, _)| *vehicle == name) {
-            runtime.spawn(report(NodeName::new(name)?, seen, node.seats().gateway.clone()));
+            runtime.spawn(report(NodeName::new(name)?, seen, node.slots().gateway.clone()));
         }
         self.nodes.insert(name, (node, runtime));
         Ok(())
@@ -140,7 +140,7 @@ impl Cell {
 }
 
 /// Publishes for ever what a vehicle sees: for the map, with all places in view, and as votes.
-async fn report(node: NodeName, seen: &[(usize, &str)], gateway: Seat<GatewayMessage>) {
+async fn report(node: NodeName, seen: &[(usize, &str)], gateway: ActorSlot<GatewayMessage>) {
     let mut ticks = tokio::time::interval(REPORT_PERIOD);
     for seq in 0.. {
         ticks.tick().await;

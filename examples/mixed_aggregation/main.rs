@@ -16,7 +16,7 @@ use anyhow::{Context, ensure};
 use ecod::epoch::Epoch;
 use ecod::time::Timestamp;
 use ecod::wire::Role;
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 use tokio::runtime::Builder;
 
 use cell::{Cell, Record};

@@ -5,8 +5,8 @@ use rumqttc::{
     Transport,
 };
 
-use crate::config::NodeConfig;
-use crate::gateway::{BrokerAddress, Security};
+use crate::node::config::NodeConfig;
+use crate::transport::mqtt::{BrokerAddress, Security};
 
 /// A broker, and what it and the cell behind it ask of clients: TLS, a user's name and password, signed payloads.
 #[derive(Debug, Clone)]
@@ -29,7 +29,7 @@ pub enum AccessError {
     Closed(BrokerAddress),
     /// Certificates or the cell's key cannot be used.
     #[error(transparent)]
-    Security(#[from] crate::gateway::SecurityError),
+    Security(#[from] crate::transport::mqtt::SecurityError),
 }
 
 impl Access {
@@ -48,7 +48,7 @@ impl Access {
         }
         let password = config.mqtt.password.as_ref().map_or("", |password| password.reveal());
         let login = config.mqtt.user.as_ref().map(|user| (user.clone(), password.to_owned()));
-        Ok(Self { broker, login, security: Security::of(config)? })
+        Ok(Self { broker, login, security: config.security()? })
     }
 
     /// The payload as it travels on a topic.
@@ -102,8 +102,8 @@ const MAX_PACKET_BYTES: usize = 1 << 20;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gateway::Secret;
-    use crate::membership::MembershipConfig;
+    use crate::transport::gossip::MembershipConfig;
+    use crate::transport::mqtt::Secret;
 
     fn address(text: &str) -> BrokerAddress {
         text.parse().unwrap()
@@ -112,7 +112,7 @@ mod tests {
     #[test]
     fn a_cell_whose_certificates_speak_for_one_vehicle_each_is_refused_in_words() {
         let mut config = NodeConfig {
-            tls: Some(crate::pki::TlsConfig {
+            tls: Some(crate::transport::pki::TlsConfig {
                 ca: "ca.pem".into(),
                 certificate: "euclid.pem".into(),
                 key: "euclid.key".into(),
@@ -137,7 +137,7 @@ mod tests {
         config.mqtt.sign = true;
         let signing = Access::of(address("10.0.0.2:1883"), &config).unwrap();
         let sealed = signing.seal("a/b", b"{}".to_vec());
-        assert_eq!(sealed.len(), crate::gateway::ENVELOPE_BYTES + 2);
+        assert_eq!(sealed.len(), crate::transport::mqtt::ENVELOPE_BYTES + 2);
         assert_eq!(signing.unseal(&sealed), b"{}");
         assert_eq!(signing.unseal(b"{}"), b"");
     }

@@ -13,9 +13,9 @@ use tokio::net::TcpStream;
 use super::access::Access;
 use super::load::landmarks;
 use super::measurement::Target;
-use crate::config::NodeConfig;
+use crate::node::config::NodeConfig;
 use crate::node_process::{NodeProcess, free_address};
-use crate::recorder::RecordConfig;
+use crate::observe::recorder::RecordConfig;
 
 /// All vehicles of the largest load vote.
 const MOST_VOTERS: usize = 1000;

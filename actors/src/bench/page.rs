@@ -7,8 +7,6 @@ use anyhow::{Context, ensure};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use crate::dashboard;
-
 /// What the page weighs and how long it takes.
 #[derive(Debug, Clone, Copy)]
 pub struct PageFigures {
@@ -31,7 +29,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 pub async fn fetch(page: SocketAddr) -> anyhow::Result<PageFigures> {
     let begun = Instant::now();
     let mut bytes = 0;
-    for path in dashboard::page_paths() {
+    for path in crate::observe::dashboard::page_paths() {
         bytes += body(page, path, None).await.with_context(|| format!("http://{page}{path}"))?;
     }
     let picture = body(page, "/api/events", Some(EVENT_END)).await.context("the first picture")?;

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use ecod::time::Timestamp;
 
-use crate::clock;
+use crate::platform::clock;
 
 /// Ticks of equal length; fixed before the first, whatever becomes of the load.
 #[derive(Debug, Clone, Copy)]

@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 
 use super::access::Access;
-use crate::gateway::BrokerAddress;
+use crate::transport::mqtt::BrokerAddress;
 
 /// What is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

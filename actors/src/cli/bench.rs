@@ -22,8 +22,8 @@ use crate::bench::load::Load;
 use crate::bench::measurement::{Measurement, Target, measure};
 use crate::bench::page;
 use crate::bench::saturation::{self, AggregatorShares, Saturation, Step};
-use crate::config::NodeConfig;
-use crate::gateway::BrokerAddress;
+use crate::node::config::NodeConfig;
+use crate::transport::mqtt::BrokerAddress;
 
 /// Flags of `bench`.
 #[derive(Debug, Args)]

@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::Args;
 
 use super::{Failure, print};
-use crate::calibrate::{Chessboard, calibrate, photographs};
+use crate::camera::calibrate::{Chessboard, calibrate, photographs};
 
 /// Flags of `calibrate`.
 #[derive(Debug, Args)]

@@ -23,7 +23,7 @@ pub(super) fn columns(rows: &[Vec<String>]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::tracks::percent;
+    use crate::observe::report::tracks::percent;
 
     #[test]
     fn numbers_end_in_one_column() {

@@ -8,8 +8,8 @@ use anyhow::Context;
 use clap::Args;
 
 use super::{Failure, print};
-use crate::config::NodeConfig;
 use crate::doctor::{Finding, Verdict, examine};
+use crate::node::config::NodeConfig;
 
 /// Flags of `doctor`.
 #[derive(Debug, Args)]

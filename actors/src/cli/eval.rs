@@ -17,8 +17,8 @@ use serde::Deserialize;
 use super::columns::columns;
 use super::replay::cell;
 use super::{Failure, write_json};
-use crate::lines::{self, LineRead, read_line};
-use crate::report::tracks::percent;
+use crate::cli::lines::{self, LineRead, read_line};
+use crate::observe::report::tracks::percent;
 
 /// Flags of `eval`.
 #[derive(Debug, Args)]

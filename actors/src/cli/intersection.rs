@@ -10,7 +10,7 @@ use tracing::subscriber::NoSubscriber;
 use super::columns::columns;
 use super::testbed::{Results, TestbedArguments, check_writable};
 use super::{Failure, print, write_json};
-use crate::report::tracks::percent;
+use crate::observe::report::tracks::percent;
 use crate::testbed::intersection::generate::Confusion;
 use crate::testbed::intersection::{self, IntersectionResult};
 

@@ -8,7 +8,7 @@ use clap::Args;
 use ecod::names::NodeName;
 
 use super::Failure;
-use crate::recorder::{self, LogError, LogReader};
+use crate::observe::recorder::{LogError, LogReader};
 
 /// Chooses among logs that lie together.
 #[derive(Debug, Args)]
@@ -38,7 +38,8 @@ impl Logs {
         let mut logs = Vec::new();
         for input in inputs {
             if input.is_dir() {
-                let found = recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
+                let found =
+                    crate::observe::recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
                 for path in found.map_err(Failure::usage)? {
                     logs.push(LogFile::look_into(path)?);
                 }

@@ -9,8 +9,8 @@ use ecod::names::NodeName;
 use ecod::wire::Role;
 
 use super::{Failure, print};
-use crate::clock;
-use crate::pki::{Authority, DEFAULT_DAYS};
+use crate::platform::clock;
+use crate::transport::pki::{Authority, DEFAULT_DAYS};
 
 /// What `pki` can do.
 #[derive(Debug, Subcommand)]

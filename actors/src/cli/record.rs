@@ -8,7 +8,7 @@ use ecod::names::NodeName;
 
 use super::Failure;
 use super::run::{ObserverArguments, run_node};
-use crate::recorder::RecordConfig;
+use crate::observe::recorder::RecordConfig;
 
 /// Flags of `record`.
 #[derive(Debug, Args)]

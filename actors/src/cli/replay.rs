@@ -10,14 +10,15 @@ use clap::Args;
 use ecod::replay::{FusedLine, Rejections, Replay, ReplayConfig, Summary};
 use ecod::wire::Limits;
 
-use super::Failure;
-use super::logs::{Logs, NodeArguments};
-use crate::config::NodeConfig;
-use crate::lines::{self, LineRead, read_line};
-use crate::recorder::LogReader;
-use log::LogReplay;
 #[cfg(fuzzing)]
 pub use log::rounds_of_log;
+
+use super::Failure;
+use super::logs::{Logs, NodeArguments};
+use crate::cli::lines::{self, LineRead, read_line};
+use crate::node::config::NodeConfig;
+use crate::observe::recorder::LogReader;
+use log::LogReplay;
 
 /// Flags of `replay`.
 #[derive(Debug, Args)]

@@ -10,8 +10,8 @@ use ecod::eval::tracks::TrackTruth;
 
 use super::Failure;
 use super::logs::{Logs, NodeArguments};
-use crate::lines;
-use crate::report::Report;
+use crate::cli::lines;
+use crate::observe::report::Report;
 
 /// Flags of `report`.
 #[derive(Debug, Args)]

@@ -14,11 +14,11 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
 use super::{Failure, print};
-use crate::config::NodeConfig;
-use crate::gateway::BrokerAddress;
 use crate::node;
-use crate::pki::OBSERVER_MARK;
-use crate::service::ServiceManager;
+use crate::node::config::NodeConfig;
+use crate::node::service::ServiceManager;
+use crate::transport::mqtt::BrokerAddress;
+use crate::transport::pki::OBSERVER_MARK;
 
 /// Flags of a node; each overrides the key of its name in the configuration file.
 #[derive(Debug, Default, Args, Serialize)]
@@ -131,7 +131,7 @@ pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Fail
     // A detector may be busy for good; whoever restarts the node must not wait for it.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     #[cfg(feature = "camera")]
-    crate::frame_source::capture::wait_for_readers(SHUTDOWN_TIMEOUT);
+    crate::camera::frame_source::capture::wait_for_readers(SHUTDOWN_TIMEOUT);
     Ok(served?)
 }
 

@@ -10,7 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
 use super::{Failure, intersection, print, write_json};
-use crate::lines;
+use crate::cli::lines;
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 use crate::testbed::trial::Trial;

@@ -9,9 +9,9 @@ use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind, KeyModifiers
 
 use super::Failure;
 use super::run::ObserverArguments;
-use crate::clock;
-use crate::config::NodeConfig;
+use crate::node::config::NodeConfig;
 use crate::node::{self, NodeHandle};
+use crate::platform::clock;
 use crate::top::{View, draw};
 
 /// Flags of `top`.

@@ -10,9 +10,9 @@ use ractor::{Actor, ActorRef};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-use crate::gateway::{
-    BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, Security,
-};
+use crate::actors::gateway::{Gateway, GatewayArguments};
+use crate::messages::gateway::GatewayMessage;
+use crate::transport::mqtt::{BrokerAddress, Delivery, Incoming, MqttConfig, Security, SubscriptionRole};
 
 /// A report and when it came.
 #[derive(Debug, Clone)]
@@ -44,7 +44,7 @@ impl Observer {
         let status = NodeStatus::starting(name, Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static("testbed"),
-            part: Part::Candidate,
+            part: SubscriptionRole::Candidate,
             status,
             mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },
             security: Security::default(),

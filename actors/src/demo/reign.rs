@@ -8,7 +8,7 @@ use ecod::testbed::{Scene, Testbed};
 use ecod::time::Timestamp;
 use ecod::wire::GlobalMap;
 
-use crate::follower::ReceivedMap;
+use crate::messages::newest::ReceivedMap;
 use crate::testbed::score::Score;
 
 /// A leadership as the vehicles saw it.

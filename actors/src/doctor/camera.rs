@@ -3,10 +3,10 @@
 use std::time::Duration;
 
 use super::Finding;
-use crate::camera::CameraConfig;
-use crate::config::NodeConfig;
-use crate::frame_source::SourceConfig;
-use crate::image_size::ImageSize;
+use crate::camera::config::CameraConfig;
+use crate::camera::frame_source::SourceConfig;
+use crate::camera::image_size::ImageSize;
+use crate::node::config::NodeConfig;
 
 /// How long a camera may take to its first frame; network cameras take seconds.
 const PATIENCE: Duration = Duration::from_secs(10);

@@ -4,9 +4,9 @@ use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
 
 use super::Finding;
-use crate::clock;
-use crate::config::NodeConfig;
-use crate::pki::{Credentials, CredentialsError, Identity};
+use crate::node::config::NodeConfig;
+use crate::platform::clock;
+use crate::transport::pki::{Credentials, CredentialsError, Identity};
 
 /// Time before its end from which on a certificate should be replaced.
 const SOON: Duration = Duration::from_secs(30 * 86_400);

@@ -8,10 +8,9 @@ use ecod::names::NodeName;
 use tokio::time::timeout;
 
 use super::Finding;
-use crate::config::NodeConfig;
-use crate::dashboard::DEFAULT_ADDRESS;
-use crate::gateway::{self, Security};
-use crate::membership::{self, DEFAULT_PORT};
+use crate::node::config::NodeConfig;
+use crate::observe::dashboard::DEFAULT_ADDRESS;
+use crate::transport::gossip::DEFAULT_PORT;
 
 /// How long a datagram to oneself may take.
 const PATIENCE: Duration = Duration::from_millis(500);
@@ -25,8 +24,8 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
     let plane = config.data_plane();
     if let Some(address) = &plane.external {
         let node = config.name.as_ref().map_or("node", NodeName::as_str);
-        let asked = match Security::of(config) {
-            Ok(security) => gateway::probe(address, node, &config.mqtt, &security).await,
+        let asked = match config.security() {
+            Ok(security) => crate::transport::mqtt::probe(address, node, &config.mqtt, &security).await,
             Err(error) => Err(error.to_string()),
         };
         findings.push(match asked {
@@ -60,7 +59,7 @@ pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
     let ipv4 = config.membership.bind.is_none_or(|bind| bind.is_ipv4());
     let mut findings = Vec::new();
     for seed in &config.membership.seeds {
-        let found = timeout(LOOKUP_PATIENCE, membership::look_up(seed, ipv4)).await;
+        let found = timeout(LOOKUP_PATIENCE, crate::transport::gossip::look_up(seed, ipv4)).await;
         let found = found.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         findings.push(match found {
             Ok(addresses) => {

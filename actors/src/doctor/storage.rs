@@ -1,15 +1,14 @@
 //! The cell's key and the directories that are written.
 
-use std::fs;
-use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::{fs, io};
 
 use super::Finding;
-use crate::config::NodeConfig;
-use crate::membership::{KeyError, check_key};
-use crate::recorder::free_bytes;
+use crate::node::config::NodeConfig;
+use crate::observe::recorder::free_bytes;
+use crate::transport::gossip::{KeyError, check_key};
 
 /// Free space in bytes below which a directory of state is doubtful.
 const LITTLE: u64 = 100_000_000;

@@ -28,8 +28,8 @@ use nalgebra::Point2;
 use serde::Serialize;
 use serde_json::json;
 
-use crate::lens::Lens;
-use crate::perception::{Perception, Vantage};
+use crate::camera::lens::Lens;
+use crate::camera::perception::{Perception, Vantage};
 
 /// When virtual time begins.
 const START: Timestamp = Timestamp(1_700_000_000_000_000);

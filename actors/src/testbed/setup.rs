@@ -15,17 +15,17 @@ use ecod::view::ViewConfig;
 use ecod::window::WindowConfig;
 use ecod::wire::Role;
 
-use crate::camera::{CameraConfig, MountConfig, OpticsConfig};
-use crate::config::NodeConfig;
-use crate::dashboard::DashboardConfig;
-use crate::detect::DetectorConfig;
-use crate::detect::placard::PlacardConfig;
-use crate::frame_source::SourceConfig;
-use crate::frame_source::capture::CaptureConfig;
-use crate::lens::Lens;
-use crate::membership::{MembershipConfig, MulticastConfig};
-use crate::perception::{Perception, Vantage};
-use crate::vehicle_pose::PoseConfig;
+use crate::camera::config::{CameraConfig, MountConfig, OpticsConfig};
+use crate::camera::detect::DetectorConfig;
+use crate::camera::detect::placard::PlacardConfig;
+use crate::camera::frame_source::SourceConfig;
+use crate::camera::frame_source::capture::CaptureConfig;
+use crate::camera::lens::Lens;
+use crate::camera::perception::{Perception, Vantage};
+use crate::camera::vehicle_pose::PoseConfig;
+use crate::node::config::NodeConfig;
+use crate::observe::dashboard::DashboardConfig;
+use crate::transport::gossip::{MembershipConfig, MulticastConfig};
 
 /// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
 const GATE_M: f64 = 0.032;

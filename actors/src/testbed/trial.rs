@@ -13,12 +13,11 @@ use ecod::testbed::{Cav, Scene, Testbed};
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, ReportKind};
 
-use super::TestbedCamera;
 use super::score::{SceneResult, Score};
-use super::setup;
-use crate::detect::Detect;
-use crate::detect::placard::{PlacardConfig, PlacardDetector};
-use crate::frame::Frame;
+use super::{TestbedCamera, setup};
+use crate::camera::detect::Detect;
+use crate::camera::detect::placard::{PlacardConfig, PlacardDetector};
+use crate::camera::frame::Frame;
 
 /// One scene to be run.
 #[derive(Debug, Clone, Copy)]

@@ -7,9 +7,9 @@ use std::time::Duration;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::wire::{Encoding, FieldOfView, ObjectReport, PerceivedObject, Role, WirePose, encode};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::platform::clock;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::task::JoinSet;
 

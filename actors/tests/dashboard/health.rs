@@ -3,8 +3,8 @@
 use std::net::TcpListener;
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
-use ecod_actors::dashboard::{DEFAULT_ADDRESS, DashboardConfig};
+use ecod_actors::observe::dashboard::{DEFAULT_ADDRESS, DashboardConfig};
+use ecod_actors::telemetry::counters::Event;
 
 use crate::cell::{config, join, start, until};
 use crate::http::{get, try_request};
@@ -69,7 +69,7 @@ async fn a_page_that_is_switched_off_is_not_there() {
     config.dashboard.enabled = false;
     let node = ecod_actors::node::start(config).await.unwrap();
     until("the node leads", || async { node.leadership().borrow().is_leading() }).await;
-    assert!(node.seats().dashboard.holder().is_none());
+    assert!(node.slots().dashboard.get().is_none());
     assert_eq!(*node.dashboard_address().borrow(), None);
     node.stop().await;
 }
@@ -77,7 +77,7 @@ async fn a_page_that_is_switched_off_is_not_there() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_page_that_was_killed_comes_back_where_it_was() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;
-    node.seats().dashboard.holder().unwrap().kill();
+    node.slots().dashboard.get().unwrap().kill();
     until("it answers again", || async {
         let answer = try_request(page, "GET", "/healthz", &[("Host", "localhost")], "").await;
         answer.is_ok_and(|answer| answer.status == 200)

@@ -4,10 +4,10 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
-use ecod_actors::dashboard::DashboardConfig;
-use ecod_actors::gateway::Secret;
 use ecod_actors::node::NodeHandle;
+use ecod_actors::observe::dashboard::DashboardConfig;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::mqtt::Secret;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::task::JoinSet;

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
+use ecod_actors::telemetry::counters::Event;
 use serde_json::Value;
 
 use crate::cell::{Vehicles, config, start, until};
@@ -118,7 +118,7 @@ fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
     ];
     let left_out: BTreeSet<_> =
         Event::ALL.into_iter().filter(|event| !USUAL.contains(event)).map(Event::as_str).collect();
-    let page = include_str!("../../src/dashboard/page/tables.js");
+    let page = include_str!("../../src/observe/dashboard/page/tables.js");
     let drops = page.split_once("const DROPS = {").and_then(|(_, rest)| rest.split_once("};")).unwrap().0;
     let shown =
         drops.split('"').step_by(2).filter_map(|between| between.trim_matches([',', ' ', '\n']).strip_suffix(':'));

@@ -11,9 +11,9 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::config::NodeConfig;
-use ecod_actors::leader_election::Position;
+use ecod_actors::messages::leadership::Position;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
 
 use cell::Cell;
 use path::Path;
@@ -95,9 +95,9 @@ async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
     }
     cell.served_by("euclid").await;
     cell.standby_is_named().await;
-    let seats = cell.node("euclid").seats().clone();
+    let slots = cell.node("euclid").slots().clone();
     let kills: [(&str, &dyn Fn()); 2] =
-        [("broker", &|| seats.broker.holder().unwrap().kill()), ("fuser", &|| seats.fuser.holder().unwrap().kill())];
+        [("broker", &|| slots.broker.get().unwrap().kill()), ("fuser", &|| slots.fuser.get().unwrap().kill())];
     for (part, kill) in kills {
         kill();
         eprintln!("killed the leader's {part}");

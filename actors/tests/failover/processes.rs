@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use ecod::names::NodeName;
 use ecod::wire::Role;
-use ecod_actors::clock;
-use ecod_actors::pki::{Authority, TlsConfig};
+use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::{Authority, TlsConfig};
 use tempfile::TempDir;
 
 use crate::cell::{PATIENCE, config, free_address};

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use ecod::epoch::Epoch;
-use ecod_actors::follower::ReceivedMap;
+use ecod_actors::messages::newest::ReceivedMap;
 
 /// The maps that a node took, in their order.
 pub(crate) struct Record {

@@ -2,7 +2,9 @@
 
 use std::net::SocketAddr;
 
-use ecod_actors::broker::{Broker, BrokerConfig, BrokerError, BrokerHealth, BrokerMessage, EmbeddedBroker};
+use ecod_actors::actors::broker::Broker;
+use ecod_actors::messages::broker::BrokerMessage;
+use ecod_actors::transport::broker::{BrokerConfig, BrokerError, BrokerHealth, EmbeddedBroker};
 use ractor::{Actor, call};
 
 #[tokio::test]

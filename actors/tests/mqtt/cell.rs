@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::counters::Counters;
-use ecod_actors::gateway::{
-    BrokerAddress, Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, MqttConfig, Part,
-    ReportKind, Security,
+use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, ReportKind, Role, SCHEMA_VERSION};
+use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Counters;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::mqtt::{
+    BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, Security, SubscriptionRole,
 };
 use ractor::{Actor, ActorRef};
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};
@@ -47,7 +48,7 @@ pub(crate) struct Node {
 
 impl Node {
     /// A node whose links are up.
-    pub(crate) async fn join(node: &str, part: Part, mqtt: MqttConfig, brokers: &[&BrokerAddress]) -> Self {
+    pub(crate) async fn join(node: &str, part: SubscriptionRole, mqtt: MqttConfig, brokers: &[&BrokerAddress]) -> Self {
         let mut node = Self::start(node, part, mqtt).await;
         node.send(GatewayMessage::SetBrokers { addresses: brokers.iter().copied().cloned().collect() });
         for _ in brokers {
@@ -56,7 +57,7 @@ impl Node {
         node
     }
 
-    pub(crate) async fn start(node: &str, part: Part, mqtt: MqttConfig) -> Self {
+    pub(crate) async fn start(node: &str, part: SubscriptionRole, mqtt: MqttConfig) -> Self {
         let (sender, deliveries) = mpsc::unbounded_channel();
         let counters = Arc::new(Counters::default());
         let status = NodeStatus { epoch: 1, ..NodeStatus::starting(name(node), Uuid::new_v4(), Role::Auto, "0.1.0") };

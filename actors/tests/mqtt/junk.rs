@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use ecod::wire::{Encoding, RejectReason, encode};
-use ecod_actors::gateway::{GatewayMessage, LinkState, MqttConfig, MqttVersion, Part};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::transport::mqtt::{LinkState, MqttConfig, MqttVersion, SubscriptionRole};
 
 use crate::cell::{Node, Stranger, embedded, name, report, topic, until};
 use crate::mosquitto::Mosquitto;
@@ -48,8 +49,8 @@ async fn each_kind_of_junk_has_its_counter_and_good_reports_go_on() {
     for version in [MqttVersion::V311, MqttVersion::V5] {
         let (_broker, address) = embedded();
         let mqtt = MqttConfig { version, ..MqttConfig::default() };
-        let mut edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[&address]).await;
-        let euclid = Node::join("euclid", Part::Follower, mqtt, &[&address]).await;
+        let mut edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[&address]).await;
+        let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
         edge.next_state_of("euclid").await;
         let mut mallory = Stranger::connect(&address).await;
         let mut expected = BTreeMap::new();
@@ -69,8 +70,8 @@ async fn each_kind_of_junk_has_its_counter_and_good_reports_go_on() {
 #[tokio::test]
 async fn the_embedded_broker_cuts_off_who_sends_a_million_objects() {
     let (_broker, address) = embedded();
-    let mut edge = Node::join("edge", Part::Candidate, MqttConfig::default(), &[&address]).await;
-    let euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut edge = Node::join("edge", SubscriptionRole::Candidate, MqttConfig::default(), &[&address]).await;
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     edge.next_state_of("euclid").await;
     let mut mallory = Stranger::connect(&address).await;
     assert!(!mallory.publish(&topic("detections/mallory"), false, objects(1_000_000)).await);
@@ -82,8 +83,8 @@ async fn the_embedded_broker_cuts_off_who_sends_a_million_objects() {
 async fn a_million_objects_through_a_foreign_broker_cost_at_most_a_new_connection() {
     let broker = Mosquitto::start();
     let address = broker.address();
-    let mut edge = Node::join("edge", Part::Candidate, MqttConfig::default(), &[&address]).await;
-    let euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut edge = Node::join("edge", SubscriptionRole::Candidate, MqttConfig::default(), &[&address]).await;
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     edge.next_state_of("euclid").await;
     let mut mallory = Stranger::connect(&address).await;
     assert!(mallory.publish(&topic("detections/mallory"), false, objects(1_000_000)).await);

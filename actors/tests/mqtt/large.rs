@@ -3,9 +3,10 @@
 use std::sync::Arc;
 
 use ecod::wire::{Encoding, GlobalMap, LandmarkState, RejectReason};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, MqttConfig, Part};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, MqttConfig, SubscriptionRole};
 
 use crate::cell::{LOOPBACK, Node, Stranger, embedded, map, name, topic, until};
 
@@ -37,8 +38,8 @@ async fn a_follower_gets_the_map_of_a_cell_with_16384_known_locations() {
     let (_broker, address) = embedded();
     for encoding in [Encoding::Json, Encoding::Cbor] {
         let mqtt = MqttConfig { encoding, ..MqttConfig::default() };
-        let edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[&address]).await;
-        let mut euclid = Node::join("euclid", Part::Follower, mqtt, &[&address]).await;
+        let edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[&address]).await;
+        let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
         euclid.next_state_of("edge").await;
         for (round, landmarks) in [(1, 4096), (2, 16_384)] {
             let sent = large_map(round, landmarks);
@@ -54,8 +55,8 @@ async fn a_follower_gets_the_map_of_a_cell_with_16384_known_locations() {
 async fn a_map_beyond_the_limit_is_counted_and_told_of_and_costs_no_link() {
     let mqtt = MqttConfig { max_map_bytes: 4096, ..MqttConfig::default() };
     let (_broker, address) = embedded();
-    let edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[&address]).await;
-    let mut euclid = Node::join("euclid", Part::Follower, mqtt, &[&address]).await;
+    let edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[&address]).await;
+    let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
     euclid.next_state_of("edge").await;
     edge.send(GatewayMessage::PublishMap { map: large_map(1, 100) });
     edge.send(GatewayMessage::PublishMap { map: large_map(2, 1) });
@@ -78,8 +79,8 @@ async fn the_embedded_broker_cuts_off_who_sends_more_than_its_own_limit() {
 async fn each_flaw_of_a_map_is_counted_and_good_maps_go_on() {
     let (_broker, address) = embedded();
     let mqtt = MqttConfig { encoding: Encoding::Cbor, ..MqttConfig::default() };
-    let mut euclid = Node::join("euclid", Part::Follower, mqtt.clone(), &[&address]).await;
-    let edge = Node::join("edge", Part::Candidate, mqtt, &[&address]).await;
+    let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt.clone(), &[&address]).await;
+    let edge = Node::join("edge", SubscriptionRole::Candidate, mqtt, &[&address]).await;
     euclid.next_state_of("edge").await;
     type Flaw = (fn(&mut GlobalMap), RejectReason);
     let flaws: [Flaw; 5] = [
@@ -91,7 +92,7 @@ async fn each_flaw_of_a_map_is_counted_and_good_maps_go_on() {
     ];
     for (round, (spoil, reason)) in (1..).zip(flaws) {
         let mut spoiled = GlobalMap::clone(&large_map(round, 1));
-        spoiled.fused_at_us = ecod_actors::clock::now();
+        spoiled.fused_at_us = ecod_actors::platform::clock::now();
         spoil(&mut spoiled);
         edge.send(GatewayMessage::PublishMap { map: Arc::new(spoiled) });
         until(reason.as_str(), || euclid.counters.rejects(reason) == 1).await;

@@ -3,17 +3,20 @@
 use std::time::{Duration, Instant};
 
 use ecod::wire::Encoding;
-use ecod_actors::broker::Mqtt;
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion, Part, Secret};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::broker::Mqtt;
+use ecod_actors::transport::mqtt::{
+    BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, Secret, SubscriptionRole,
+};
 use tokio::task::JoinHandle;
 
 use crate::cell::{LOOPBACK, Node, embedded, map, name, until};
 use crate::mosquitto::Mosquitto;
 
 async fn report_and_map_pass(broker: &BrokerAddress, mqtt: MqttConfig) {
-    let mut edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[broker]).await;
-    let mut euclid = Node::join("euclid", Part::Follower, mqtt, &[broker]).await;
+    let mut edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[broker]).await;
+    let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[broker]).await;
     settle(&mut edge, &euclid).await;
     euclid.report(1);
     assert_eq!(edge.next_report().await, (name("euclid"), 1));
@@ -52,8 +55,8 @@ async fn reports_and_maps_pass_mosquitto_in_both_versions() {
 async fn versions_mix_at_one_broker() {
     let (_broker, address) = embedded();
     let v5 = MqttConfig { version: MqttVersion::V5, ..MqttConfig::default() };
-    let mut edge = Node::join("edge", Part::Candidate, v5, &[&address]).await;
-    let euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut edge = Node::join("edge", SubscriptionRole::Candidate, v5, &[&address]).await;
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     settle(&mut edge, &euclid).await;
     euclid.report(3);
     assert_eq!(edge.next_report().await, (name("euclid"), 3));
@@ -71,7 +74,7 @@ async fn user_and_password_are_presented() {
         };
         report_and_map_pass(&broker.address(), right.clone()).await;
         let wrong = MqttConfig { password: Some(Secret::new("loud")), ..right };
-        let intruder = Node::start("mallory", Part::Follower, wrong).await;
+        let intruder = Node::start("mallory", SubscriptionRole::Follower, wrong).await;
         intruder.send(GatewayMessage::SetBrokers { addresses: vec![broker.address()] });
         until("refusals are counted", || intruder.counters.events(Event::ConnectFailed) >= 2).await;
         assert_eq!(intruder.counters.events(Event::Connected), 0);
@@ -92,8 +95,8 @@ async fn a_node_that_may_not_publish_is_told_though_the_broker_keeps_silent() {
             connect_timeout_ms: 500,
             ..MqttConfig::default()
         };
-        let gauss = Node::join("gauss", Part::Follower, mqtt.clone(), &[&permitted.address()]).await;
-        let euclid = Node::join("euclid", Part::Follower, mqtt, &[&denied.address()]).await;
+        let gauss = Node::join("gauss", SubscriptionRole::Follower, mqtt.clone(), &[&permitted.address()]).await;
+        let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&denied.address()]).await;
         until("told of the refusal", || euclid.counters.events(Event::BrokerRefused) == 1).await;
         until("gauss hears itself", || gauss.counters.events(Event::Echo) > 0).await;
         assert_eq!(gauss.counters.events(Event::BrokerRefused), 0);
@@ -103,9 +106,9 @@ async fn a_node_that_may_not_publish_is_told_though_the_broker_keeps_silent() {
 #[tokio::test]
 async fn a_node_speaks_on_all_its_links_and_hears_itself_once() {
     let ((_first, one), (_second, two)) = (embedded(), embedded());
-    let mut edge = Node::join("edge", Part::Candidate, MqttConfig::default(), &[&one, &two]).await;
-    let mut left = Node::join("left", Part::Follower, MqttConfig::default(), &[&one]).await;
-    let mut right = Node::join("right", Part::Follower, MqttConfig::default(), &[&two]).await;
+    let mut edge = Node::join("edge", SubscriptionRole::Candidate, MqttConfig::default(), &[&one, &two]).await;
+    let mut left = Node::join("left", SubscriptionRole::Follower, MqttConfig::default(), &[&one]).await;
+    let mut right = Node::join("right", SubscriptionRole::Follower, MqttConfig::default(), &[&two]).await;
     settle(&mut left, &edge).await;
     settle(&mut right, &edge).await;
     for round in [1, 2] {
@@ -132,8 +135,8 @@ async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
         let mut broker = Mosquitto::start();
         let address = broker.address();
         let mqtt = MqttConfig { version, ..MqttConfig::default() };
-        let mut edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[&address]).await;
-        let mut euclid = Node::join("euclid", Part::Follower, mqtt, &[&address]).await;
+        let mut edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[&address]).await;
+        let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
         settle(&mut edge, &euclid).await;
 
         broker.kill();
@@ -154,8 +157,8 @@ async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
 #[tokio::test]
 async fn a_restarted_embedded_broker_is_found_again() {
     let (mut broker, address) = embedded();
-    let mut edge = Node::join("edge", Part::Candidate, MqttConfig::default(), &[&address]).await;
-    let mut euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut edge = Node::join("edge", SubscriptionRole::Candidate, MqttConfig::default(), &[&address]).await;
+    let mut euclid = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     for seq in 1..=3 {
         broker.restart(LOOPBACK).unwrap();
         edge.link(LinkState::Up).await;
@@ -169,8 +172,8 @@ async fn a_restarted_embedded_broker_is_found_again() {
 #[tokio::test]
 async fn an_observer_takes_reports_whoever_stops_looking_at_them() {
     let (_broker, address) = embedded();
-    let mut observer = Node::join("recorder", Part::Observer, MqttConfig::default(), &[&address]).await;
-    let euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut observer = Node::join("recorder", SubscriptionRole::Observer, MqttConfig::default(), &[&address]).await;
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     settle(&mut observer, &euclid).await;
     for wanted in [true, false] {
         observer.send(GatewayMessage::WatchReports { wanted });
@@ -190,7 +193,7 @@ async fn a_broker_that_hangs_is_noticed_by_what_does_not_come_back() {
         let address = broker.address();
         // Long enough for the protocol's own signs of life to tell nothing in here.
         let mqtt = MqttConfig { version, keep_alive_s: 600, ..MqttConfig::default() };
-        let mut edge = Node::join("edge", Part::Candidate, mqtt.clone(), &[&address]).await;
+        let mut edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[&address]).await;
         let publishing = publish_maps(&edge);
         tokio::time::sleep(Duration::from_secs(2)).await;
         broker.freeze();

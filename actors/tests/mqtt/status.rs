@@ -1,25 +1,26 @@
 //! Statuses: retained, with a last will.
 
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
-use ecod_actors::broker::Mqtt;
-use ecod_actors::counters::Event;
-use ecod_actors::gateway::{BrokerAddress, GatewayMessage, Incoming, LinkState, MqttConfig, MqttVersion, Part};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::broker::Mqtt;
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, SubscriptionRole};
 
 use crate::cell::{LOOPBACK, Node, Stranger, embedded, topic, until};
 use crate::mosquitto::Mosquitto;
 
 async fn latecomers_see_the_living_and_the_dead(broker: &BrokerAddress, version: MqttVersion) {
     let mqtt = MqttConfig { version, ..MqttConfig::default() };
-    let euclid = Node::join("euclid", Part::Follower, mqtt.clone(), &[broker]).await;
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt.clone(), &[broker]).await;
     euclid.send(GatewayMessage::PublishStatus {
         status: NodeStatus { state: NodeState::Aggregating, ..euclid.status.clone() },
     });
-    let mut gauss = Node::join("gauss", Part::Follower, mqtt.clone(), &[broker]).await;
+    let mut gauss = Node::join("gauss", SubscriptionRole::Follower, mqtt.clone(), &[broker]).await;
     while gauss.next_state_of("euclid").await != NodeState::Aggregating {}
 
     euclid.kill().await;
     assert_eq!(gauss.next_state_of("euclid").await, NodeState::Offline);
-    let mut late = Node::join("riemann", Part::Follower, mqtt.clone(), &[broker]).await;
+    let mut late = Node::join("riemann", SubscriptionRole::Follower, mqtt.clone(), &[broker]).await;
     assert_eq!(late.next_state_of("euclid").await, NodeState::Offline, "the will is retained");
 
     gauss.stop().await;
@@ -53,11 +54,11 @@ async fn mosquitto_v5() {
 #[tokio::test]
 async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() {
     let (_broker, address) = embedded();
-    let first = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
-    let mut watcher = Node::join("gauss", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let first = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
+    let mut watcher = Node::join("gauss", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
     assert_eq!(first.counters.events(Event::NameConflict), 0);
-    let second = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let second = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     for node in [&first, &second] {
         until("both know", || node.counters.events(Event::NameConflict) > 0).await;
     }
@@ -69,9 +70,9 @@ async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() 
         assert!(node.counters.events(Event::NameConflict) <= 2, "each is answered once");
     }
     second.stop().await;
-    let restarted = Node::join("riemann", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let restarted = Node::join("riemann", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     restarted.stop().await;
-    let restarted = Node::join("riemann", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let restarted = Node::join("riemann", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     until("it hears itself", || restarted.counters.events(Event::Echo) > 0).await;
     assert_eq!(restarted.counters.events(Event::NameConflict), 0, "a run that is over is no conflict");
 }
@@ -79,11 +80,11 @@ async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() 
 #[tokio::test]
 async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
     let (mut broker, address) = embedded();
-    let mut euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut euclid = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     euclid.send(GatewayMessage::PublishStatus { status: NodeStatus { epoch: 7, ..euclid.status.clone() } });
     broker.restart(LOOPBACK).unwrap();
     euclid.link(LinkState::Up).await;
-    let mut watcher = Node::join("gauss", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let mut watcher = Node::join("gauss", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
     euclid.kill().await;
     let epoch = watcher
@@ -98,8 +99,8 @@ async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
 #[tokio::test]
 async fn a_will_that_fires_late_is_put_right() {
     let (_broker, address) = embedded();
-    let euclid = Node::join("euclid", Part::Follower, MqttConfig::default(), &[&address]).await;
-    let mut watcher = Node::join("gauss", Part::Follower, MqttConfig::default(), &[&address]).await;
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
+    let mut watcher = Node::join("gauss", SubscriptionRole::Follower, MqttConfig::default(), &[&address]).await;
     assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
 
     let will = NodeStatus { state: NodeState::Offline, ..euclid.status.clone() };

@@ -9,12 +9,12 @@ use std::time::Duration;
 use ecod::landmark::LandmarkConfig;
 use ecod::names::NodeName;
 use ecod::replay::FusedLine;
-use ecod::wire::{ObjectReport, PerceivedObject, Role, WirePose};
-use ecod_actors::clock;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::gateway::{GatewayMessage, ReportKind};
+use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role, WirePose};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::recorder::{Identity, LogEvent, LogMessage, LogReader, RecordConfig, SchemaName, files};
+use ecod_actors::observe::recorder::{Identity, LogEvent, LogMessage, LogReader, RecordConfig, SchemaName, files};
+use ecod_actors::platform::clock;
 use tempfile::TempDir;
 use tokio::runtime::{Builder, Runtime};
 use tracing_subscriber::EnvFilter;
@@ -127,7 +127,7 @@ impl Cell {
                 let report = Arc::new(report(node, self.seq, number));
                 for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
                     let message = GatewayMessage::PublishReport { kind, report: Arc::clone(&report) };
-                    handle.seats().gateway.send(message);
+                    handle.slots().gateway.send(message);
                 }
             }
             tokio::time::sleep(Duration::from_millis(30)).await;

@@ -5,9 +5,9 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
 use ecod_actors::node;
-use ecod_actors::recorder::{RecordConfig, SchemaName, files};
+use ecod_actors::observe::recorder::{RecordConfig, SchemaName, files};
+use ecod_actors::telemetry::counters::Event;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
@@ -68,7 +68,7 @@ fn a_log_outlives_the_kill_of_its_process() {
     let mut process = edge(directory.path(), "");
     wait_until("maps are on the disk", directory.path(), || maps(&dir) >= 20);
     process.0.kill().unwrap();
-    let killed_at = ecod_actors::clock::now();
+    let killed_at = ecod_actors::platform::clock::now();
     process.0.wait().unwrap();
     let log = Log::read(&dir);
     assert!(log.count(SchemaName::GlobalMap) >= 20 && log.identity.is_some());
@@ -94,7 +94,7 @@ fn a_disk_that_refuses_bytes_costs_entries_and_nothing_else() {
     assert!(said.contains("not recording, the node goes on"), "{said}");
     process.terminate();
     let log = Log::read(&dir);
-    let is = |message: &&ecod_actors::recorder::LogMessage, text: &str| {
+    let is = |message: &&ecod_actors::observe::recorder::LogMessage, text: &str| {
         message.schema == SchemaName::JournalEntry && String::from_utf8_lossy(&message.json).contains(text)
     };
     assert!(log.messages.iter().any(|message| is(&message, "\"continue\"")), "the second file says where it begins");

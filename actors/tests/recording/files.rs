@@ -90,7 +90,8 @@ fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
     assert!(code == 0 && said.contains("damaged.mcap is damaged"), "{said}");
 
     for length in 0..whole.len() {
-        let reader = ecod_actors::recorder::LogReader::open(&file(&folder, "any.mcap", &whole[..length])).unwrap();
+        let reader =
+            ecod_actors::observe::recorder::LogReader::open(&file(&folder, "any.mcap", &whole[..length])).unwrap();
         assert!(reader.take(1000).count() < 1000, "cut at {length}, reading ends");
     }
 }

@@ -5,8 +5,8 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::time::Duration;
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
 use ecod_actors::node;
+use ecod_actors::telemetry::counters::Event;
 
 use crate::cell::{config, free_address};
 

@@ -17,7 +17,7 @@ use std::time::Duration;
 use ecod::landmark::LandmarkConfig;
 use ecod::replay::FusedLine;
 use ecod::wire::Role;
-use ecod_actors::recorder::{SchemaName, files};
+use ecod_actors::observe::recorder::{SchemaName, files};
 
 use cell::{Cell, Log, name};
 

@@ -5,9 +5,9 @@ use std::time::Duration;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
 use ecod_actors::node;
-use ecod_actors::recorder::SchemaName;
+use ecod_actors::observe::recorder::SchemaName;
+use ecod_actors::telemetry::counters::Event;
 use serde_json::Value;
 
 use crate::cell::{Log, config, free_address};

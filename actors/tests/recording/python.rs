@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use ecod_actors::recorder::{SchemaName, files};
+use ecod_actors::observe::recorder::{SchemaName, files};
 
 use crate::cell::Log;
 use crate::disk::{edge, maps, wait_until};

@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::wire::{NodeStatus, Role, Topics};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
-use ecod_actors::config::NodeConfig;
-use ecod_actors::counters::{Counters, Event};
-use ecod_actors::gateway::{
-    BrokerAddress, Gateway, GatewayArguments, GatewayMessage, Incoming, LinkState, Part, Security,
-};
-use ecod_actors::pki::Credentials;
+use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::telemetry::counters::{Counters, Event};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, SubscriptionRole};
+use ecod_actors::transport::pki::Credentials;
 use ractor::Actor;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
@@ -45,10 +45,10 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
     let counters = Arc::<Counters>::default();
     let arguments = GatewayArguments {
         cell: node("lot"),
-        part: Part::Follower,
+        part: SubscriptionRole::Follower,
         status: NodeStatus::starting(node("gauss"), Uuid::now_v7(), Role::Cav, "0.1.0"),
         mqtt: config.mqtt.clone(),
-        security: Security::of(&config).unwrap(),
+        security: config.security().unwrap(),
         counters: Arc::clone(&counters),
         subscriber: Arc::new(move |delivery| {
             if let Incoming::Link { broker, state } = delivery.message {
@@ -64,7 +64,7 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
         assert_eq!(state, LinkState::Up);
     }
 
-    cell.pki.authority.revoke(&node("stolen"), ecod_actors::clock::now()).unwrap();
+    cell.pki.authority.revoke(&node("stolen"), ecod_actors::platform::clock::now()).unwrap();
     let lost = timeout(SOON, links.recv()).await.expect("still connected");
     assert_eq!(lost, Some((stolen.clone(), LinkState::Down)));
     let refused = async {

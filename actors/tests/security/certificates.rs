@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
-use ecod_actors::pki::{BROKER_NAME, TlsConfig, external_broker};
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::pki::{BROKER_NAME, TlsConfig, external_broker};
 use rustls::pki_types::ServerName;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -75,7 +75,7 @@ async fn who_is_revoked_is_cut_off_and_stays_out_and_the_broker_runs_on() {
     let tls = client_config("gauss", &files);
     let mut gauss = Client::new(cell.address, "gauss", &tls);
     gauss.log_in().await.unwrap();
-    cell.pki.authority.revoke(&crate::fixture::node("gauss"), ecod_actors::clock::now()).unwrap();
+    cell.pki.authority.revoke(&crate::fixture::node("gauss"), ecod_actors::platform::clock::now()).unwrap();
     timeout(SOON, gauss.drive()).await.expect("still connected");
     cell.counted(Event::ClientExpelled, 1).await;
     let refused = Client::new(cell.address, "gauss", &tls).log_in().await;
@@ -90,7 +90,7 @@ async fn who_is_revoked_is_cut_off_and_stays_out_and_the_broker_runs_on() {
 async fn a_client_trusts_no_broker_with_the_certificate_of_a_mere_vehicle() {
     let mut cell = Cell::start().await;
     let (cav, gauss) = (cell.pki.issue("euclid", Role::Cav, DAY), cell.pki.issue("gauss", Role::Auto, DAY));
-    let posing = ecod_actors::pki::Credentials::load(&cav, &crate::fixture::node("euclid")).unwrap();
+    let posing = ecod_actors::transport::pki::Credentials::load(&cav, &crate::fixture::node("euclid")).unwrap();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let server = tokio_rustls::TlsAcceptor::from(Arc::clone(&posing.current().server));

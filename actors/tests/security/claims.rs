@@ -1,7 +1,7 @@
 //! Clients with a certificate of the cell that claim to be somebody else.
 
 use ecod::wire::Role;
-use ecod_actors::counters::Event;
+use ecod_actors::telemetry::counters::Event;
 use rumqttc::{LastWill, QoS};
 use uuid::Uuid;
 

@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use ecod::names::NodeName;
 use ecod::wire::{Limits, Role, Topics};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
-use ecod_actors::clock;
-use ecod_actors::counters::{Counters, Event};
-use ecod_actors::pki::{Authority, Credentials, TlsConfig};
+use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::{Counters, Event};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
 use rumqttc::{AsyncClient, EventLoop, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
 use rustls::ClientConfig;
 use tempfile::TempDir;

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::wire::Role;
-use ecod_actors::broker::BrokerConfig;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::counters::Event;
-use ecod_actors::pki::BROKER_NAME;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::broker::BrokerConfig;
+use ecod_actors::transport::pki::BROKER_NAME;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustls::pki_types::ServerName;
@@ -233,8 +233,8 @@ async fn limits_hold_on_loopback_as_they_come() {
 #[tokio::test]
 async fn limits_hold_without_certificates_too() {
     use ecod::wire::Topics;
-    use ecod_actors::broker::{EmbeddedBroker, Guard, Mqtt};
-    use ecod_actors::counters::Counters;
+    use ecod_actors::telemetry::counters::Counters;
+    use ecod_actors::transport::broker::{EmbeddedBroker, Guard, Mqtt};
 
     let counters = Arc::<Counters>::default();
     let guard = Guard {

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::wire::Role;
-use ecod_actors::clock;
-use ecod_actors::gateway::Secret;
-use ecod_actors::membership::{
-    FrameCounters, FrameEvent, Membership, MembershipArguments, MembershipConfig, MembershipEvent, MembershipMessage,
-};
+use ecod_actors::actors::membership::{Membership, MembershipArguments};
+use ecod_actors::messages::membership::MembershipMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::gossip::{FrameCounters, FrameEvent, MembershipConfig, MembershipEvent};
+use ecod_actors::transport::mqtt::Secret;
 use ractor::{Actor, ActorRef, call_t};
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
@@ -23,7 +23,7 @@ struct Node {
     address: SocketAddr,
     payloads: Arc<Mutex<Vec<Bytes>>>,
     counters: Arc<FrameCounters>,
-    members: watch::Receiver<Vec<ecod_actors::membership::Member>>,
+    members: watch::Receiver<Vec<ecod_actors::transport::gossip::Member>>,
 }
 
 async fn start(name: &str, seed: Option<SocketAddr>) -> Node {

@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
 use ecod::wire::{Role, Topics};
-use ecod_actors::broker::{BrokerConfig, BrokerHealth, EmbeddedBroker, Guard, Mqtt};
-use ecod_actors::pki::Credentials;
+use ecod_actors::transport::broker::{BrokerConfig, BrokerHealth, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::transport::pki::Credentials;
 use tokio::time::{sleep, timeout};
 
 use crate::fixture::{Client, DAY, Pki, SOON, client_config, node};

@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use ecod::landmark::LandmarkConfig;
 use ecod::wire::{RejectReason, Role};
-use ecod_actors::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::config::NodeConfig;
-use ecod_actors::gateway::Secret;
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::mqtt::Secret;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::time::{Instant, sleep, timeout};
 

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use ecod::names::NodeName;
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 use tempfile::TempDir;
 
 use crate::analysis::{Accepted, NodeRun};

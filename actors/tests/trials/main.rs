@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::analysis::{Phase, Verdict, judge};

@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::Path;
 
 use anyhow::bail;
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 
 use crate::cell::{EDGE, Plan};
 use crate::network;

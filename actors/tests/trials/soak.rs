@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod::time::Timestamp;
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;

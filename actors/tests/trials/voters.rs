@@ -6,11 +6,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use ecod::names::NodeName;
-use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, Reputations, Role, SCHEMA_VERSION};
-use ecod_actors::clock;
-use ecod_actors::gateway::{
-    Delivery, Gateway, GatewayArguments, GatewayMessage, Incoming, MqttConfig, Part, ReportKind, Security,
-};
+use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, ReportKind, Reputations, Role, SCHEMA_VERSION};
+use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
+use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::mqtt::{Delivery, Incoming, MqttConfig, Security, SubscriptionRole};
 use ractor::{Actor, ActorRef};
 use uuid::Uuid;
 
@@ -40,7 +40,7 @@ impl Voters {
             NodeStatus::starting(NodeName::from_static("voters"), Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static(CELL),
-            part: Part::Follower,
+            part: SubscriptionRole::Follower,
             status,
             mqtt: MqttConfig::default(),
             security: Security::default(),

@@ -6,7 +6,7 @@ use ecod::replay::FusedLine;
 use serde::Serialize;
 
 use super::{EvalArguments, Failure, columns, read_output, write_json};
-use crate::report::tracks::{tables, without_map};
+use crate::observe::report::tracks::{tables, without_map};
 
 /// What is written beside what came of locations.
 #[derive(Serialize)]

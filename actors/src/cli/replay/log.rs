@@ -11,7 +11,7 @@ use ecod::replay::{FusedLine, JournalEntry, Replay, ReplayConfig, Rerun};
 use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
 
 use super::{Failure, report, write_all};
-use crate::recorder::{Identity, LogError, LogEvent, LogMessage, LogReader, SchemaName};
+use crate::observe::recorder::{Identity, LogError, LogEvent, LogMessage, LogReader, SchemaName};
 
 /// What was live was within the limits of its node; here they only bound memory.
 const LIMITS: Limits = Limits { payload_bytes: 1 << 28, map_bytes: 1 << 28, objects: usize::MAX };

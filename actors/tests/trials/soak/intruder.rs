@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::Context;
 use ecod::names::NodeName;
 use ecod::wire::{Encoding, ObjectReport, PerceivedObject, encode};
-use ecod_actors::clock;
+use ecod_actors::platform::clock;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rumqttc::{AsyncClient, MqttOptions, QoS};

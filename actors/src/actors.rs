@@ -1,0 +1,15 @@
+//! The actors of a node: each carries out what the core decides.
+
+pub mod broker;
+pub mod dashboard;
+#[cfg(feature = "camera")]
+pub mod detector;
+pub mod follower;
+pub mod fuser;
+pub mod gateway;
+pub mod leader_election;
+pub mod membership;
+#[cfg(feature = "camera")]
+pub mod projector;
+pub mod recorder;
+pub mod reputation_keeper;

@@ -1,0 +1,114 @@
+//! The actor that owns the embedded MQTT broker.
+//!
+//! ```text
+//! Node
+//! └─ Broker            Start, Stop, Health
+//!    └─ EmbeddedBroker  a thread of its own; clients see only its socket
+//! ```
+//!
+//! A broker that cannot start is an answer to whoever asked, not a failure of the actor: the node decides whether
+//! another address, an external broker or giving up is right. One that ended by itself, or hangs, ends the actor as
+//! soon as anyone asks how it is, so that the node starts both anew. One that hangs keeps its port, so that the node
+//! then ends: only a new process is rid of it.
+
+#![deny(clippy::indexing_slicing)]
+
+use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
+
+use crate::messages::broker::BrokerMessage;
+use crate::transport::broker::{BrokerHealth, Mqtt};
+
+/// Owns the embedded broker; stops it when the actor ends, however it ends.
+#[derive(Debug, Default)]
+pub struct Broker;
+
+impl Actor for Broker {
+    type Msg = BrokerMessage;
+    type State = Box<dyn Mqtt>;
+    type Arguments = Box<dyn Mqtt>;
+
+    async fn pre_start(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        broker: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        Ok(broker)
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        broker: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        match message {
+            BrokerMessage::Start { address, reply } => {
+                broker.stop();
+                let started = broker.start(address);
+                match &started {
+                    Ok(bound) => tracing::info!(address = %bound, "broker serves"),
+                    Err(error) => tracing::warn!(%error, "broker did not start"),
+                }
+                answer(reply, started);
+            }
+            BrokerMessage::Stop { reply } => {
+                broker.stop();
+                answer(reply, ());
+            }
+            BrokerMessage::Health { reply } => {
+                let health = broker.health();
+                answer(reply, health);
+                if health == BrokerHealth::Dead {
+                    return Err("broker ended by itself or hangs".into());
+                }
+            }
+        }
+        Ok(())
+    }
+
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        broker: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        broker.stop();
+        Ok(())
+    }
+}
+
+fn answer<T: Send + 'static>(reply: RpcReplyPort<T>, value: T) {
+    if reply.send(value).is_err() {
+        tracing::debug!("nobody waited for the broker's answer");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::SocketAddr;
+
+    use super::*;
+    use crate::transport::broker::BrokerError;
+
+    #[derive(Debug)]
+    struct Fallen;
+
+    impl Mqtt for Fallen {
+        fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
+            Ok(address)
+        }
+
+        fn stop(&mut self) {}
+
+        fn health(&self) -> BrokerHealth {
+            BrokerHealth::Dead
+        }
+    }
+
+    #[tokio::test]
+    async fn a_broker_that_ended_by_itself_ends_its_actor_so_that_it_is_started_anew() {
+        let (actor, ended) = Actor::spawn(None, Broker, Box::new(Fallen) as Box<dyn Mqtt>).await.unwrap();
+        let health = ractor::call!(actor, |reply| BrokerMessage::Health { reply }).unwrap();
+        assert_eq!(health, BrokerHealth::Dead);
+        ended.await.unwrap();
+    }
+}

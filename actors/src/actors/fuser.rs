@@ -1,0 +1,246 @@
+//! The actor that closes the rounds: reports in, maps and verdicts out while the node leads.
+//!
+//! ```text
+//! Gateway ── reports ──> Intake ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
+//! Gateway ── TakeReports ──────────> │ ▲
+//! Follower ── TakeMap ─────────────> │ │
+//! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
+//! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
+//! ```
+
+use crate::messages::fuser::FuserMessage;
+
+mod intake;
+#[cfg(test)]
+mod tests;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::aggregator::{Aggregator, Command, Fused};
+use ecod::epoch::Epoch;
+use ecod::replay::JournalEvent;
+use ecod::round::FirstRound;
+use ecod::time::Timestamp;
+use ecod::tracks::TracksLosses;
+use ecod::wire::GlobalMap;
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
+use tokio::task::AbortHandle;
+
+pub use intake::{Intake, Put};
+
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::gateway::GatewayMessage;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::observe::recorder::Recording;
+use crate::platform::clock;
+use crate::telemetry::counters::{Counters, Event};
+use crate::transport::mqtt::{Delivery, Incoming};
+
+/// What a fuser needs at its start.
+pub struct FuserArguments {
+    /// The aggregator it drives.
+    pub aggregator: Aggregator,
+    /// The highest term that the election knows.
+    pub term: watch::Receiver<u64>,
+    /// Where vehicles' reports wait.
+    pub intake: Intake,
+    /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
+    pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
+    /// Where the aggregator's inputs are recorded.
+    pub recording: Recording,
+    /// Where maps and verdicts are published.
+    pub gateway: ActorSlot<GatewayMessage>,
+    /// Is told what rounds say about vehicles.
+    pub keeper: ActorSlot<ReputationKeeperMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// How old a map may be whose objects a new leader goes on with.
+const FRESH_MAP: Duration = Duration::from_secs(1);
+
+/// Drives an [`Aggregator`] with the clock and the gateway.
+#[derive(Debug, Default)]
+pub struct Fuser;
+
+/// The aggregator and its alarm.
+pub struct FuserState {
+    aggregator: Aggregator,
+    term: watch::Receiver<u64>,
+    intake: Intake,
+    recording: Recording,
+    gateway: ActorSlot<GatewayMessage>,
+    keeper: ActorSlot<ReputationKeeperMessage>,
+    counters: Arc<Counters>,
+    /// The newest map of another aggregator or an earlier run, and when it came.
+    last_map: Option<(Arc<GlobalMap>, Timestamp)>,
+    alarm: Timestamp,
+    timer: Option<AbortHandle>,
+    /// What the aggregator has left out so far and is counted already.
+    losses: [u64; 4],
+}
+
+impl Actor for Fuser {
+    type Msg = FuserMessage;
+    type State = FuserState;
+    type Arguments = FuserArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let mut state = FuserState::new(arguments);
+        state.set_alarm(&myself);
+        Ok(state)
+    }
+
+    async fn handle(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        match message {
+            FuserMessage::TakeReports => state.take_reports(),
+            FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
+            FuserMessage::CloseRound => {
+                state.counters.count(Event::RoundDue);
+                state.alarm = Timestamp(u64::MAX);
+                // Also those of which only the run before this one was told.
+                state.take_reports();
+                state.tick();
+            }
+            FuserMessage::Lead { epoch, first_round, first } => state.lead(epoch, first_round, first),
+            FuserMessage::HoldRound => {
+                state.command(Command::Hold);
+                state.alarm = Timestamp(u64::MAX);
+            }
+            FuserMessage::StopPublishing => {
+                state.command(Command::StandBy);
+                state.keeper.send(ReputationKeeperMessage::StandBy);
+            }
+            FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
+            FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
+        }
+        state.count_losses();
+        state.set_alarm(&myself);
+        Ok(())
+    }
+}
+
+impl FuserState {
+    fn new(arguments: FuserArguments) -> Self {
+        let FuserArguments { aggregator, term, intake, newest, recording, gateway, keeper, counters } = arguments;
+        Self {
+            aggregator,
+            term,
+            intake,
+            recording,
+            gateway,
+            keeper,
+            counters,
+            last_map: newest,
+            alarm: Timestamp(u64::MAX),
+            timer: None,
+            losses: [0; 4],
+        }
+    }
+
+    fn take_reports(&mut self) {
+        for delivery in self.intake.take_all() {
+            self.take(&delivery);
+        }
+    }
+
+    fn take(&mut self, delivery: &Delivery) {
+        let Incoming::Report { kind, report } = &delivery.message else { return };
+        self.recording.report(*kind, report, delivery.received_at);
+        let taken = self.aggregator.report(*kind, report, delivery.received_at);
+        match taken {
+            Ok(fused) => self.publish(fused, delivery.received_at),
+            Err(reason) => {
+                tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
+                self.counters.reject(reason);
+            }
+        }
+    }
+
+    /// Keeps the map that was admitted last. While nobody is known to lead, the gate admits any epoch: one that the
+    /// election does not know is nobody's to go on from.
+    fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
+        if self.aggregator.leads().is_none() && map.epoch <= *self.term.borrow() {
+            self.last_map = Some((map, received_at));
+        }
+    }
+
+    fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
+        self.keeper
+            .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
+        if let Some((map, received_at)) = self.last_map.take()
+            && clock::now().since(received_at) < FRESH_MAP
+        {
+            self.command(Command::AdoptMap { map, received_at });
+        }
+        self.command(Command::Lead { epoch, first_round, first });
+        self.tick();
+    }
+
+    fn tick(&mut self) {
+        self.command(Command::Tick);
+    }
+
+    /// Tells the aggregator; a tick that is not due says nothing and is not recorded.
+    fn command(&mut self, command: Command) {
+        let now = clock::now();
+        if command != Command::Tick || now >= self.aggregator.deadline() {
+            let fused = self.aggregator.command(&command, now);
+            self.recording.journal(now, JournalEvent::Command(command));
+            self.publish(fused, now);
+        }
+    }
+
+    /// Counts what the aggregator has left out since it was last asked.
+    fn count_losses(&mut self) {
+        let TracksLosses { late, refused } = self.aggregator.tracks_losses();
+        let now = [
+            (Event::VoteIgnored, self.aggregator.ignored_votes()),
+            (Event::ReportOvertaken, self.aggregator.overtaken()),
+            (Event::ReportLate, late),
+            (Event::ObjectRefused, refused),
+        ];
+        for ((event, total), counted) in now.into_iter().zip(&mut self.losses) {
+            self.counters.add(event, total.saturating_sub(*counted));
+            *counted = total;
+        }
+    }
+
+    fn publish(&self, fused: Option<Fused>, now: Timestamp) {
+        let Some(Fused { epoch, round, map, verdicts, evidence, reputations }) = fused else { return };
+        self.recording.round(round, now);
+        let has_verdicts = verdicts.is_some();
+        if let Some(map) = map {
+            self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });
+        }
+        if let Some(verdicts) = verdicts {
+            self.gateway.send(GatewayMessage::PublishVerdicts { verdicts: Arc::new(verdicts) });
+        }
+        if has_verdicts || !evidence.is_empty() {
+            self.keeper.send(ReputationKeeperMessage::Record { epoch, round, evidence, reputations });
+        }
+    }
+
+    /// One alarm is enough unless the deadline has moved to before it; an early alarm closes nothing and is set anew.
+    fn set_alarm(&mut self, myself: &ActorRef<FuserMessage>) {
+        let deadline = self.aggregator.deadline();
+        if deadline < self.alarm {
+            self.alarm = deadline;
+            let timer = myself.send_after(deadline.since(clock::now()), || FuserMessage::CloseRound);
+            if let Some(superseded) = self.timer.replace(timer.abort_handle()) {
+                superseded.abort();
+            }
+        }
+    }
+}

@@ -1,0 +1,83 @@
+//! What a new leader goes on from.
+
+use std::collections::BTreeMap;
+
+use ecod::aggregator::FusionConfig;
+use ecod::names::NodeName;
+use ecod::wire::SCHEMA_VERSION;
+
+use super::*;
+use crate::actors::follower::{Follower, FollowerArguments};
+use crate::messages::actor_slot::listening;
+use crate::messages::follower::FollowerMessage;
+use crate::messages::leadership::{Leadership, Position};
+use crate::messages::newest::Newest;
+
+fn epoch(term: u64, leader: &'static str) -> Epoch {
+    Epoch::new(term, NodeName::from_static(leader))
+}
+
+fn global_map(Epoch { term, leader }: Epoch, round: u64) -> Arc<GlobalMap> {
+    Arc::new(GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: leader,
+        epoch: term,
+        round,
+        fused_at_us: Timestamp(0),
+        oldest_capture_us: None,
+        landmarks: Vec::new(),
+        objects: Vec::new(),
+        pose_corrections: BTreeMap::new(),
+    })
+}
+
+fn map(epoch: Epoch, round: u64) -> FollowerMessage {
+    let map = global_map(epoch, round);
+    FollowerMessage::TakeMap { delivery: Delivery::local(Incoming::Map(map), Timestamp(round)) }
+}
+
+#[tokio::test]
+async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
+    let elected = Leadership { position: Position::Following, epoch: Some(epoch(7, "edge")), standby: None };
+    for leadership in [elected, Leadership::default()] {
+        let (fuser, mut told) = listening::slot().await;
+        let arguments = FollowerArguments {
+            newest: Newest::default(),
+            log: None,
+            recording: Recording::default(),
+            least_term: 0,
+            term: watch::channel(7).1,
+            leadership: watch::channel(leadership.clone()).1,
+            election: ActorSlot::default(),
+            fuser: fuser.clone(),
+            counters: Arc::default(),
+        };
+        let (follower, _) = Actor::spawn(None, Follower, arguments).await.unwrap();
+        for round in 1..=3 {
+            follower.cast(map(epoch(7, "edge"), round)).unwrap();
+            follower.cast(map(epoch(u64::MAX, "gauss"), round)).unwrap();
+        }
+        follower.drain_and_wait(None).await.unwrap();
+        fuser.get().unwrap().drain_and_wait(None).await.unwrap();
+
+        let mut fuser = FuserState::new(FuserArguments {
+            aggregator: Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
+            term: watch::channel(7).1,
+            intake: Intake::default(),
+            newest: None,
+            recording: Recording::default(),
+            gateway: ActorSlot::default(),
+            keeper: ActorSlot::default(),
+            counters: Arc::default(),
+        });
+        let mut maps = 0;
+        while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {
+            fuser.take_map(map, received_at);
+            maps += 1;
+        }
+        // The gate believes who goes on publishing while nobody leads; the fuser does not.
+        fuser.take_map(global_map(epoch(u64::MAX, "gauss"), 4), Timestamp(4));
+        let kept = fuser.last_map.map(|(map, _)| (map.epoch, map.round));
+        assert_eq!((kept, maps), (Some((7, 3)), 3), "{leadership:?}");
+    }
+}

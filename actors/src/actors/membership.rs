@@ -1,0 +1,245 @@
+//! The actor that owns the node's gossip socket: who is alive, independent of MQTT, and small datagrams between nodes.
+//!
+//! ```text
+//! LeaderElection ── Send ──> Membership <──── UDP ────> other nodes
+//!                                └──> MembershipEvent, watch of all members
+//! ```
+
+#![deny(clippy::indexing_slicing)]
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::Role;
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use ring::rand::{SecureRandom, SystemRandom};
+use tokio::sync::{Notify, watch};
+use tokio::task::JoinSet;
+
+use crate::messages::membership::MembershipMessage;
+use crate::platform::clock;
+use crate::transport::gossip::key::{CellKey, SessionId};
+use crate::transport::gossip::machine::{Machine, Output, Setup};
+use crate::transport::gossip::node_id::NodeId;
+use crate::transport::gossip::socket::GossipSocket;
+use crate::transport::gossip::{
+    EventSink, FrameCounters, FrameEvent, MAX_PAYLOAD_BYTES, Member, MembershipConfig, MembershipEvent, MulticastConfig,
+};
+
+/// What a membership needs at its start.
+pub struct MembershipArguments {
+    /// The node's name.
+    pub name: NodeName,
+    /// The cell; nodes of others are not heard.
+    pub cell: NodeName,
+    /// When the node started, in Unix microseconds.
+    pub run: u64,
+    /// The role it was started with.
+    pub role: Role,
+    /// Where the node's broker listens, if it has one; others put what they see of this node in place of 0.0.0.0.
+    pub broker: Option<SocketAddr>,
+    /// Timings, seeds and limits.
+    pub config: MembershipConfig,
+    /// Gets every event.
+    pub events: EventSink,
+    /// Holds all living nodes but this one, by name.
+    pub members: watch::Sender<Vec<Member>>,
+    /// The counters of the gossip socket.
+    pub counters: Arc<FrameCounters>,
+}
+
+/// Owns the gossip socket.
+#[derive(Debug, Default)]
+pub struct Membership;
+
+/// The membership and its socket.
+pub struct MembershipState {
+    machine: Machine,
+    socket: Arc<GossipSocket>,
+    deadline: watch::Sender<Option<Timestamp>>,
+    /// Tells the watch over the socket that a [`MembershipMessage::Wake`] was handled.
+    handled: Arc<Notify>,
+    events: EventSink,
+    members: watch::Sender<Vec<Member>>,
+    counters: Arc<FrameCounters>,
+    /// End with the actor.
+    _tasks: JoinSet<()>,
+}
+
+impl Actor for Membership {
+    type Msg = MembershipMessage;
+    type State = MembershipState;
+    type Arguments = MembershipArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let MembershipArguments { name, cell, run, role, broker, config, events, members, counters } = arguments;
+        let key = CellKey::load(&config, &cell)?;
+        let socket = Arc::new(GossipSocket::bind(&config)?);
+        let address = socket.address();
+        say_who_can_take_part(&config, address);
+        let now = clock::now();
+        let gossip = config.advertise.unwrap_or(address);
+        let own = NodeId { name, run, life: run.max(now.micros()), role, gossip, broker };
+        let (session, secret, seed) = draw_secrets()?;
+        let setup = Setup { own, key, session, secret, seed, counters: Arc::clone(&counters) };
+        let machine = Machine::new(setup, &config, now);
+        let (deadline, deadlines) = watch::channel(machine.next_deadline());
+        let handled = Arc::new(Notify::new());
+        let mut tasks = JoinSet::new();
+        tasks.spawn(watch_socket(Arc::clone(&socket), deadlines, Arc::clone(&handled), myself.clone()));
+        if !join_group(&socket, &config.multicast) {
+            tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
+        }
+        if !config.seeds.is_empty() {
+            tasks.spawn(crate::transport::gossip::seeds::resolve(config.seeds, address.is_ipv4(), move |addresses| {
+                myself.cast(MembershipMessage::SetSeeds { addresses }).is_ok()
+            }));
+        }
+        members.send_replace(Vec::new());
+        Ok(MembershipState { machine, socket, deadline, handled, events, members, counters, _tasks: tasks })
+    }
+
+    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+        state.machine.leave(clock::now());
+        state.carry_out();
+        Ok(())
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let now = clock::now();
+        match message {
+            MembershipMessage::Send { to, payload } => state.machine.send(&to, &payload, now),
+            MembershipMessage::SetSeeds { addresses } => state.machine.set_seeds(addresses),
+            MembershipMessage::Address { reply } => drop(reply.send(state.socket.address())),
+            MembershipMessage::Wake => state.wake(),
+        }
+        state.carry_out();
+        Ok(())
+    }
+}
+
+impl MembershipState {
+    /// Takes what waits before anything that is due: after a stall, signs of life come before suspicions.
+    fn wake(&mut self) {
+        let mut buffer = [0; 2 * MAX_PAYLOAD_BYTES];
+        for _ in 0..MOST_AT_ONCE {
+            let Some((length, from)) = self.socket.receive(&mut buffer) else { break };
+            self.machine.receive(buffer.get(..length).unwrap_or_default(), from, clock::now());
+            self.carry_out();
+        }
+        self.machine.tick(clock::now());
+        self.handled.notify_one();
+    }
+
+    fn carry_out(&mut self) {
+        let mut changed = false;
+        while let Some(output) = self.machine.poll() {
+            let sent = match output {
+                Output::Send { to, frame } => Some(self.socket.send(&frame, to)),
+                Output::Multicast { frame } => self.socket.multicast(&frame),
+                Output::Tell(event) => {
+                    changed |= !matches!(event, MembershipEvent::Received { .. });
+                    (self.events)(event);
+                    None
+                }
+            };
+            match sent {
+                Some(Ok(())) => self.counters.count(FrameEvent::Sent),
+                Some(Err(error)) => {
+                    self.counters.count(FrameEvent::SendFailed);
+                    tracing::debug!(%error, "gossip frame not sent");
+                }
+                None => (),
+            }
+        }
+        if changed {
+            self.members.send_replace(self.machine.members());
+        }
+        self.deadline.send_replace(self.machine.next_deadline());
+    }
+}
+
+/// Most datagrams taken before what is due is done: a flood does not keep the node from that.
+const MOST_AT_ONCE: usize = 1024;
+
+/// Wakes the actor when datagrams wait or something is due; never twice before it has woken.
+async fn watch_socket(
+    socket: Arc<GossipSocket>,
+    mut deadline: watch::Receiver<Option<Timestamp>>,
+    handled: Arc<Notify>,
+    membership: ActorRef<MembershipMessage>,
+) {
+    loop {
+        let due = *deadline.borrow_and_update();
+        let wait = due.map_or(Duration::MAX, |due| due.since(clock::now()));
+        tokio::select! {
+            _ = socket.readable() => (),
+            () = tokio::time::sleep(wait.min(LONGEST_SLEEP)) => (),
+            changed = deadline.changed() => match changed {
+                Ok(()) => continue,
+                Err(_) => return,
+            },
+        }
+        if membership.cast(MembershipMessage::Wake).is_err() {
+            return;
+        }
+        handled.notified().await;
+    }
+}
+
+/// Time between two attempts to join the multicast group.
+const REJOIN_PERIOD: Duration = Duration::from_secs(5);
+
+/// Joins the multicast group, if there is to be one; false when that does not work here, or not yet.
+fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
+    if config.enabled && socket.address().is_ipv6() {
+        tracing::warn!("key `membership.bind`: no discovery by multicast on IPv6, which takes `membership.seeds`");
+    }
+    match socket.join(config) {
+        Ok(()) => true,
+        Err(error) => {
+            tracing::warn!(%error, group = %config.group, "no discovery by multicast, tried again");
+            false
+        }
+    }
+}
+
+/// A machine that starts may have its network later than its node.
+async fn join_later(socket: Arc<GossipSocket>, config: MulticastConfig) {
+    loop {
+        tokio::time::sleep(REJOIN_PERIOD).await;
+        if socket.join(&config).is_ok() {
+            return tracing::info!(group = %config.group, "discovery by multicast works");
+        }
+    }
+}
+
+const LONGEST_SLEEP: Duration = Duration::from_secs(60);
+
+fn draw_secrets() -> Result<(SessionId, [u8; 32], u64), ActorProcessingErr> {
+    let random = SystemRandom::new();
+    let (mut session, mut secret, mut seed) = (SessionId::default(), [0; 32], [0; 8]);
+    let drawn = random.fill(&mut session).and_then(|()| random.fill(&mut secret)).and_then(|()| random.fill(&mut seed));
+    drawn.map_err(|_| "the system gives no random numbers")?;
+    Ok((session, secret, u64::from_le_bytes(seed)))
+}
+
+fn say_who_can_take_part(config: &MembershipConfig, address: SocketAddr) {
+    match (config.has_key(), address.ip().is_loopback()) {
+        (true, _) => tracing::info!(%address, "gossiping with whoever has the cell's key"),
+        (false, true) => tracing::info!(%address, "gossiping on this machine only: no cell key is set"),
+        (false, false) => tracing::warn!(%address, "gossiping with anyone: no cell key is set"),
+    }
+}

@@ -1,0 +1,123 @@
+//! The actor that places detections in the world and reports them.
+//!
+//! ```text
+//! localisation ── UDP ──> pose feed ── TakePose ──┐
+//! Detector ── Report ────────────────────────> Projector ── PublishReport ──> Gateway
+//! ```
+
+use crate::messages::projector::ProjectorMessage;
+
+mod pose_feed;
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use ecod::aggregator::Algorithms;
+use ecod::detection::Detection;
+use ecod::motion::Motion;
+use ecod::time::Timestamp;
+use ecod::wire::ObjectReport;
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::task::JoinSet;
+
+use crate::camera::perception::Perception;
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::gateway::GatewayMessage;
+use crate::telemetry::counters::{Counters, Event};
+use ecod::wire::ReportKind;
+
+/// What a projector needs at its start.
+pub struct ProjectorArguments {
+    /// Camera, pose and known locations.
+    pub perception: Perception,
+    /// Where poses are told, of a vehicle that moves.
+    pub poses: Option<SocketAddr>,
+    /// The algorithms that reports are for.
+    pub algorithms: Algorithms,
+    /// Where reports are published.
+    pub gateway: ActorSlot<GatewayMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// Turns each frame's detections into a report for each algorithm.
+#[derive(Debug, Default)]
+pub struct Projector;
+
+/// The vehicle as it is now.
+pub struct ProjectorState {
+    perception: Perception,
+    /// Where a vehicle that moves has been.
+    motion: Option<Motion>,
+    algorithms: Algorithms,
+    gateway: ActorSlot<GatewayMessage>,
+    counters: Arc<Counters>,
+    /// Ends with the actor.
+    _feed: JoinSet<()>,
+}
+
+impl Actor for Projector {
+    type Msg = ProjectorMessage;
+    type State = ProjectorState;
+    type Arguments = ProjectorArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let ProjectorArguments { perception, poses, algorithms, gateway, counters } = arguments;
+        let mut feed = JoinSet::new();
+        if let Some(address) = poses {
+            feed.spawn(pose_feed::listen(address, myself, Arc::clone(&counters)));
+        }
+        let motion = poses.map(|_| Motion::default());
+        Ok(ProjectorState { perception, motion, algorithms, gateway, counters, _feed: feed })
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        match message {
+            ProjectorMessage::Report { detections, captured_at } => state.report(detections, captured_at),
+            ProjectorMessage::TakePose { at, pose } => {
+                if state.motion.as_mut().is_some_and(|motion| !motion.take(at, pose)) {
+                    state.counters.count(Event::PoseRejected);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl ProjectorState {
+    fn report(&mut self, detections: Vec<Detection>, captured_at: Timestamp) {
+        if let Some(motion) = &self.motion {
+            let Some(pose) = motion.at(captured_at) else { return self.counters.count(Event::FrameWithoutPose) };
+            self.perception.set_pose(pose);
+        }
+        let found = detections.len();
+        let report = self.perception.report(detections, captured_at);
+        self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
+        if self.algorithms.vote() {
+            self.publish(ReportKind::VoteDetections, votes(&report));
+        }
+        if self.algorithms.pace() {
+            self.publish(ReportKind::Detections, report);
+        }
+    }
+
+    fn publish(&self, kind: ReportKind, report: ObjectReport) {
+        self.gateway.send(GatewayMessage::PublishReport { kind, report: Arc::new(report) });
+    }
+}
+
+/// What a report has to say in a vote: the objects at known locations.
+fn votes(report: &ObjectReport) -> ObjectReport {
+    let objects = report.objects.iter().filter(|object| object.landmark.is_some()).cloned().collect();
+    let ObjectReport { node, seq, captured_at_us, pose, .. } = report;
+    ObjectReport { pose: *pose, objects, ..ObjectReport::new(node.clone(), *seq, *captured_at_us) }
+}

@@ -1,0 +1,294 @@
+//! Camera calibration from photographs of a chessboard, and the file that keeps it.
+
+use std::path::{Path, PathBuf};
+
+use ecod::camera::Intrinsics;
+use opencv::core::{Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector};
+use opencv::{calib3d, imgcodecs, imgproc};
+use serde::{Deserialize, Serialize};
+
+use crate::camera::frame_source::images;
+use crate::camera::lens::Lens;
+
+/// Views of the board below which a calibration is refused.
+pub const MIN_VIEWS: usize = 5;
+
+/// A printed chessboard.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Chessboard {
+    /// Inner corners along a row: squares less one.
+    pub columns: u16,
+    /// Inner corners along a column: squares less one.
+    pub rows: u16,
+    /// Side of a square in millimetres.
+    pub square_mm: f64,
+}
+
+/// A calibrated camera, as kept in a TOML file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    /// Image width in pixels.
+    pub image_width: u32,
+    /// Image height in pixels.
+    pub image_height: u32,
+    /// Horizontal focal length in pixels.
+    pub fx: f64,
+    /// Vertical focal length in pixels.
+    pub fy: f64,
+    /// Column of the principal point in pixels.
+    pub cx: f64,
+    /// Row of the principal point in pixels.
+    pub cy: f64,
+    /// OpenCV's k1, k2, p1, p2, k3.
+    pub distortion: [f64; 5],
+    /// Root mean square distance in pixels between found and reprojected corners; good is below 0.5.
+    pub rms_px: f64,
+    /// The photographs it rests on.
+    pub images: Vec<PathBuf>,
+}
+
+/// The result of [`calibrate`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct CalibrationReport {
+    /// The calibrated camera.
+    pub calibration: Calibration,
+    /// Photographs in which the whole board was not found.
+    pub without_board: Vec<PathBuf>,
+}
+
+/// Why a camera is not calibrated, or a calibration not read.
+#[derive(Debug, thiserror::Error)]
+pub enum CalibrationError {
+    /// The board is too small to be one.
+    #[error("chessboard of {columns}x{rows} inner corners and {square_mm} mm squares: need at least 3x3 and a size")]
+    InvalidBoard {
+        /// Inner corners along a row.
+        columns: u16,
+        /// Inner corners along a column.
+        rows: u16,
+        /// Side of a square in millimetres.
+        square_mm: f64,
+    },
+    /// Not an image that OpenCV reads.
+    #[error("cannot read image {0:?}")]
+    UnreadableImage(PathBuf),
+    /// All photographs must be of one size.
+    #[error("image {path:?} is {width}x{height}, the others are {expected_width}x{expected_height}")]
+    SizeDiffers {
+        /// The image.
+        path: PathBuf,
+        /// Its width in pixels.
+        width: i32,
+        /// Its height in pixels.
+        height: i32,
+        /// Width of the first image.
+        expected_width: i32,
+        /// Height of the first image.
+        expected_height: i32,
+    },
+    /// The board was found in too few photographs.
+    #[error("the chessboard was found in {found} images, need {MIN_VIEWS}; not in {without_board:?}")]
+    TooFewViews {
+        /// Photographs with the board.
+        found: usize,
+        /// Photographs without.
+        without_board: Vec<PathBuf>,
+    },
+    /// OpenCV failed, in the named image where it was about one.
+    #[error("opencv failed on {what}")]
+    OpenCv {
+        /// An image or a step.
+        what: String,
+        /// OpenCV's own words.
+        #[source]
+        source: opencv::Error,
+    },
+    /// A directory of photographs cannot be listed.
+    #[error("cannot list images in {path:?}")]
+    Directory {
+        /// The directory.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The calibration file cannot be read or written.
+    #[error("calibration file {path:?}")]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The calibration file does not hold a calibration.
+    #[error("calibration file {path:?}: {reason}")]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// The photographs that are meant by paths of files and directories; a directory gives its images by name.
+///
+/// # Errors
+/// [`CalibrationError::Directory`] when one cannot be listed.
+pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> {
+    let mut photographs = Vec::new();
+    for path in paths {
+        if path.is_dir() {
+            let listed = images::in_directory(path);
+            photographs.extend(listed.map_err(|source| CalibrationError::Directory { path: path.clone(), source })?);
+        } else {
+            photographs.push(path.clone());
+        }
+    }
+    Ok(photographs)
+}
+
+/// Calibrates a camera from photographs of a chessboard, held at different angles and all over the image (Zhang 2000).
+///
+/// # Errors
+/// [`CalibrationError`], naming the image it is about.
+pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationReport, CalibrationError> {
+    let Chessboard { columns, rows, square_mm } = *board;
+    if columns < 3 || rows < 3 || !(square_mm.is_finite() && square_mm > 0.0) {
+        return Err(CalibrationError::InvalidBoard { columns, rows, square_mm });
+    }
+    let (mut used, mut without_board) = (Vec::new(), Vec::new());
+    let mut views = Vector::<Vector<Point2f>>::new();
+    let mut size = None;
+    for path in images {
+        let image = imgcodecs::imread(path, imgcodecs::IMREAD_GRAYSCALE)
+            .ok()
+            .filter(|image| !image.empty())
+            .ok_or_else(|| CalibrationError::UnreadableImage(path.clone()))?;
+        let found = Size::new(image.cols(), image.rows());
+        let expected = *size.get_or_insert(found);
+        if found != expected {
+            return Err(CalibrationError::SizeDiffers {
+                path: path.clone(),
+                width: found.width,
+                height: found.height,
+                expected_width: expected.width,
+                expected_height: expected.height,
+            });
+        }
+        let corners = find_board(&image, board)
+            .map_err(|source| CalibrationError::OpenCv { what: format!("image {path:?}"), source })?;
+        match corners {
+            Some(corners) => {
+                views.push(corners);
+                used.push(path.clone());
+            }
+            None => without_board.push(path.clone()),
+        }
+    }
+    let size = size.unwrap_or_default();
+    if used.len() < MIN_VIEWS {
+        return Err(CalibrationError::TooFewViews { found: used.len(), without_board });
+    }
+    let calibration = solve(&views, size, board, used)
+        .map_err(|source| CalibrationError::OpenCv { what: "calibration".into(), source })?;
+    Ok(CalibrationReport { calibration, without_board })
+}
+
+impl Calibration {
+    /// The camera with its distortion.
+    pub fn lens(&self) -> Lens {
+        let Self { image_width: width, image_height: height, fx, fy, cx, cy, distortion, .. } = *self;
+        let distorts = distortion.iter().any(|k| *k != 0.0);
+        Lens { intrinsics: Intrinsics { width, height, fx, fy, cx, cy }, distortion: distorts.then_some(distortion) }
+    }
+
+    /// Reads a calibration file.
+    ///
+    /// # Errors
+    /// [`CalibrationError::File`] or [`CalibrationError::Malformed`].
+    pub fn read(path: &Path) -> Result<Self, CalibrationError> {
+        let text =
+            std::fs::read_to_string(path).map_err(|source| CalibrationError::File { path: path.to_owned(), source })?;
+        let malformed = |reason| CalibrationError::Malformed { path: path.to_owned(), reason };
+        let read: Self = toml::from_str(&text).map_err(|e| malformed(e.to_string()))?;
+        let focal = [read.fx, read.fy].iter().all(|f| f.is_finite() && *f > 0.0);
+        let rest = [read.cx, read.cy].iter().chain(&read.distortion).all(|v| v.is_finite());
+        if !focal || !rest || read.image_width == 0 || read.image_height == 0 {
+            return Err(malformed("image size and focal lengths must be positive, all numbers finite".into()));
+        }
+        Ok(read)
+    }
+
+    /// Writes a calibration file.
+    ///
+    /// # Errors
+    /// [`CalibrationError::File`] when it cannot be written.
+    pub fn write(&self, path: &Path) -> Result<(), CalibrationError> {
+        let text = toml::to_string(self)
+            .map_err(|e| CalibrationError::Malformed { path: path.to_owned(), reason: e.to_string() })?;
+        std::fs::write(path, text).map_err(|source| CalibrationError::File { path: path.to_owned(), source })
+    }
+}
+
+/// The board's inner corners to a fraction of a pixel, if all are there.
+fn find_board(image: &Mat, board: &Chessboard) -> opencv::Result<Option<Vector<Point2f>>> {
+    let mut corners = Vector::<Point2f>::new();
+    let pattern = Size::new(board.columns.into(), board.rows.into());
+    if !calib3d::find_chessboard_corners_def(image, pattern, &mut corners)? {
+        return Ok(None);
+    }
+    let none = Size::new(-1, -1);
+    imgproc::corner_sub_pix(image, &mut corners, Size::new(5, 5), none, until(30, 1e-3)?)?;
+    Ok(Some(corners))
+}
+
+fn solve(
+    views: &Vector<Vector<Point2f>>,
+    size: Size,
+    board: &Chessboard,
+    images: Vec<PathBuf>,
+) -> opencv::Result<Calibration> {
+    let square = board.square_mm as f32;
+    let corners: Vector<Point3f> = (0..board.rows)
+        .flat_map(|row| (0..board.columns).map(move |column| (column, row)))
+        .map(|(column, row)| Point3f::new(f32::from(column) * square, f32::from(row) * square, 0.0))
+        .collect();
+    let boards: Vector<Vector<Point3f>> = views.iter().map(|_| corners.clone()).collect();
+    let (mut camera, mut distortion) = (Mat::default(), Mat::default());
+    let rms_px = calib3d::calibrate_camera(
+        &boards,
+        views,
+        size,
+        &mut camera,
+        &mut distortion,
+        &mut Vector::<Mat>::new(),
+        &mut Vector::<Mat>::new(),
+        0,
+        until(100, 1e-9)?,
+    )?;
+    let entry = |row, column| camera.at_2d::<f64>(row, column).copied();
+    let mut coefficients = [0.0; 5];
+    for (index, coefficient) in (0..).zip(&mut coefficients) {
+        *coefficient = *distortion.at::<f64>(index)?;
+    }
+    Ok(Calibration {
+        image_width: size.width.unsigned_abs(),
+        image_height: size.height.unsigned_abs(),
+        fx: entry(0, 0)?,
+        fy: entry(1, 1)?,
+        cx: entry(0, 2)?,
+        cy: entry(1, 2)?,
+        distortion: coefficients,
+        rms_px,
+        images,
+    })
+}
+
+fn until(iterations: i32, change: f64) -> opencv::Result<TermCriteria> {
+    TermCriteria::new(TermCriteria_Type::COUNT as i32 | TermCriteria_Type::EPS as i32, iterations, change)
+}
+
+#[cfg(test)]
+mod tests;

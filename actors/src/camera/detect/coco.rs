@@ -1,0 +1,241 @@
+//! Everyday objects by SSDLite-MobileNetV2 with the 80 classes of COCO, run by OpenCV.
+//!
+//! The weights are compiled into the program; see `models/README.md` for their source, inputs and outputs.
+
+mod anchors;
+mod labels;
+
+use std::path::PathBuf;
+
+use ecod::config::{ConfigError, check_range};
+use ecod::detection::{BoundingBox, Detection};
+use opencv::core::{CV_8UC1, CV_8UC3, CV_32F, Mat, Rect, Rect2d, Scalar, Size, Vector};
+use opencv::dnn::{self, Net};
+use opencv::imgproc;
+use opencv::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use self::anchors::Anchor;
+use super::{Detect, DetectError};
+use crate::camera::frame::Frame;
+
+/// How COCO objects are found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CocoConfig {
+    /// ONNX file with the inputs and outputs of the built-in weights; default none: the built-in weights.
+    pub model: Option<PathBuf>,
+    /// Least confidence of a detection; default 0.4. Less finds more, also what is not there.
+    pub threshold: f64,
+    /// Overlap (intersection over union) from which two boxes of one class are the same object; default 0.5.
+    pub max_overlap: f64,
+    /// Whether to look at four overlapping quarters of the image besides the whole; default false. Finds objects of
+    /// half the size and takes five times as long.
+    pub tiling: bool,
+}
+
+impl Default for CocoConfig {
+    fn default() -> Self {
+        Self { model: None, threshold: 0.4, max_overlap: 0.5, tiling: false }
+    }
+}
+
+impl CocoConfig {
+    /// Checks every value; the model is checked when it is loaded.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first key out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("threshold", self.threshold, 0.01, 1.0)?;
+        check_range("max_overlap", self.max_overlap, 0.0, 1.0)
+    }
+}
+
+/// A model that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// The file cannot be read.
+    #[error("cannot read model {path:?}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// OpenCV does not take the file for a network, or the network does not fit the detector.
+    #[error("model {path} is no ssdlite network that opencv can run: {reason}")]
+    Unusable {
+        /// The file, or `built-in`.
+        path: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+static BUILT_IN: &[u8] =
+    include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/ssdlite_mobilenet_v2_coco.onnx"));
+
+/// Side of the network's input in pixels.
+const INPUT_PX: i32 = 300;
+/// Share of the image's sides that a tile takes, so that neighbours share a fifth of it.
+const TILE_SHARE: f64 = 0.6;
+/// A box this near to a tile's inner edge, as a share of the tile's side, is taken as cut by it.
+const CUT_SHARE: f64 = 0.02;
+
+/// Finds COCO objects.
+pub struct CocoDetector {
+    config: CocoConfig,
+    net: Net,
+    anchors: Vec<Anchor>,
+}
+
+impl CocoDetector {
+    /// Loads the model and runs it once, so that a wrong one is found now.
+    ///
+    /// # Errors
+    /// [`ModelError`] naming the file.
+    pub fn new(config: CocoConfig) -> Result<Self, ModelError> {
+        let name = config.model.as_ref().map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
+        let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason };
+        let weights = match &config.model {
+            Some(path) => {
+                let bytes =
+                    std::fs::read(path).map_err(|source| ModelError::Unreadable { path: path.clone(), source })?;
+                Vector::from_slice(&bytes)
+            }
+            None => Vector::from_slice(BUILT_IN),
+        };
+        let net = dnn::read_net_from_onnx_buffer(&weights).map_err(|e| unusable(e.message))?;
+        let mut detector = Self { config, net, anchors: anchors::all() };
+        let black = Mat::new_rows_cols_with_default(INPUT_PX, INPUT_PX, CV_8UC3, Scalar::all(0.0));
+        black.and_then(|image| detector.look(&image)).map_err(|e| unusable(e.message))?;
+        Ok(detector)
+    }
+
+    /// Runs the network on one image; boxes are shares of its sides.
+    fn look(&mut self, image: &Mat) -> opencv::Result<Vec<Candidate>> {
+        let (scale, middle) = (1.0 / 127.5, Scalar::all(127.5));
+        let blob = dnn::blob_from_image(image, scale, Size::new(INPUT_PX, INPUT_PX), middle, true, false, CV_32F)?;
+        self.net.set_input_def(&blob)?;
+        let mut outputs = Vector::<Mat>::new();
+        let names: Vector<String> = ["boxes", "scores"].into_iter().collect();
+        self.net.forward(&mut outputs, &names)?;
+        let (boxes, scores) = (outputs.get(0)?, outputs.get(1)?);
+        let (boxes, scores) = (boxes.data_typed::<f32>()?, scores.data_typed::<f32>()?);
+        let (count, classes) = (self.anchors.len(), labels::CLASSES);
+        if boxes.len() != count * 4 || scores.len() != count * classes {
+            let message = format!("outputs of {} and {} numbers", boxes.len(), scores.len());
+            return Err(opencv::Error::new(opencv::core::StsUnmatchedSizes, message));
+        }
+        let anchors = self.anchors.iter().zip(boxes.chunks_exact(4)).zip(scores.chunks_exact(classes));
+        Ok(anchors
+            .filter_map(|((anchor, offsets), scores)| {
+                let (class, score) = best_class(scores)?;
+                let bounds = anchor.decode(offsets);
+                (f64::from(score) >= self.config.threshold).then_some(Candidate { class, score, bounds })
+            })
+            .collect())
+    }
+
+    fn look_everywhere(&mut self, image: &Mat) -> opencv::Result<Vec<Candidate>> {
+        let (width, height) = (f64::from(image.cols()), f64::from(image.rows()));
+        let mut found = self.look(image)?;
+        for candidate in &mut found {
+            candidate.bounds = placed(&candidate.bounds, 0.0, 0.0, width, height);
+        }
+        if self.config.tiling {
+            for (right, lower) in [(false, false), (true, false), (false, true), (true, true)] {
+                let (tile_width, tile_height) = ((width * TILE_SHARE).floor(), (height * TILE_SHARE).floor());
+                let x = if right { width - tile_width } else { 0.0 };
+                let y = if lower { height - tile_height } else { 0.0 };
+                let area = Rect::new(x as i32, y as i32, tile_width as i32, tile_height as i32);
+                let tile = Mat::roi(image, area)?.try_clone()?;
+                let whole = self.look(&tile)?.into_iter().filter(|c| !is_cut(&c.bounds, right, lower));
+                found
+                    .extend(whole.map(|c| Candidate { bounds: placed(&c.bounds, x, y, tile_width, tile_height), ..c }));
+            }
+        }
+        found.retain_mut(|candidate| {
+            let b = &mut candidate.bounds;
+            (b.x_min, b.x_max) = (b.x_min.clamp(0.0, width), b.x_max.clamp(0.0, width));
+            (b.y_min, b.y_max) = (b.y_min.clamp(0.0, height), b.y_max.clamp(0.0, height));
+            b.is_valid()
+        });
+        Ok(found)
+    }
+
+    /// The best box of every object, class by class.
+    fn suppress(&self, candidates: &[Candidate]) -> opencv::Result<Vec<Detection>> {
+        let mut detections = Vec::new();
+        for (class, label) in labels::all() {
+            let of_class: Vec<&Candidate> = candidates.iter().filter(|c| c.class == class).collect();
+            let boxes: Vector<Rect2d> = of_class
+                .iter()
+                .map(|c| Rect2d::new(c.bounds.x_min, c.bounds.y_min, c.bounds.width(), c.bounds.height()))
+                .collect();
+            let scores: Vector<f32> = of_class.iter().map(|c| c.score).collect();
+            let mut kept = Vector::<i32>::new();
+            let CocoConfig { threshold, max_overlap, .. } = self.config;
+            dnn::nms_boxes_f64(&boxes, &scores, threshold as f32, max_overlap as f32, &mut kept, 1.0, 0)?;
+            detections.extend(kept.iter().filter_map(|index| of_class.get(index as usize)).map(|c| Detection {
+                label: label.into(),
+                confidence: f64::from(c.score).clamp(0.0, 1.0),
+                bounding_box: c.bounds,
+                corners: None,
+            }));
+        }
+        Ok(detections)
+    }
+}
+
+impl Detect for CocoDetector {
+    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+        let image = &frame.image;
+        let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
+        let failed = |step| move |source| DetectError::OpenCv { step, source };
+        let candidates = match image.typ() {
+            _ if image.empty() => return Err(unusable("no pixels".into())),
+            CV_8UC3 => self.look_everywhere(image),
+            CV_8UC1 => {
+                let mut colour = Mat::default();
+                imgproc::cvt_color_def(image, &mut colour, imgproc::COLOR_GRAY2BGR)
+                    .map_err(failed("gray to colour"))?;
+                self.look_everywhere(&colour)
+            }
+            other => return Err(unusable(format!("pixels of opencv type {other}"))),
+        };
+        self.suppress(&candidates.map_err(failed("the coco network"))?).map_err(failed("non-maximum suppression"))
+    }
+}
+
+/// What one anchor sees.
+#[derive(Debug, Clone, Copy)]
+struct Candidate {
+    class: usize,
+    score: f32,
+    bounds: BoundingBox,
+}
+
+fn best_class(scores: &[f32]) -> Option<(usize, f32)> {
+    scores.iter().copied().enumerate().skip(1).max_by(|a, b| a.1.total_cmp(&b.1))
+}
+
+/// A box given as shares of a tile's sides, in pixels of the image.
+fn placed(b: &BoundingBox, x: f64, y: f64, width: f64, height: f64) -> BoundingBox {
+    BoundingBox {
+        x_min: x + b.x_min * width,
+        y_min: y + b.y_min * height,
+        x_max: x + b.x_max * width,
+        y_max: y + b.y_max * height,
+    }
+}
+
+/// Whether an inner edge of a tile cuts the box; the neighbour or the whole image shows all of it.
+fn is_cut(b: &BoundingBox, right: bool, lower: bool) -> bool {
+    let cut = |low: f64, high: f64, second: bool| if second { low < CUT_SHARE } else { high > 1.0 - CUT_SHARE };
+    cut(b.x_min, b.x_max, right) || cut(b.y_min, b.y_max, lower)
+}
+
+#[cfg(test)]
+mod tests;

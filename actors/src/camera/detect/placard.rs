@@ -1,0 +1,205 @@
+//! Placards: square QR codes that name a slot or a vehicle, read by zxing-cpp.
+//!
+//! The frame is read as it is and then enlarged, pass by pass. A code that was read is painted over before the next
+//! pass, so that no code is read twice and later passes only search for what is still missing.
+
+use ecod::config::{ConfigError, check_range};
+use ecod::detection::{BoundingBox, Detection};
+use ecod::names::{Label, MAX_NAME_BYTES};
+use nalgebra::Point2;
+use opencv::core::{CV_8UC1, CV_8UC3, Mat, Point, Scalar, Size, Vector};
+use opencv::imgproc;
+use opencv::prelude::*;
+use serde::{Deserialize, Serialize};
+use zxingcpp::{Barcode, BarcodeFormat, BarcodeReader, ImageFormat, ImageView};
+
+use super::{Detect, DetectError};
+use crate::camera::frame::Frame;
+
+/// How placards are read.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PlacardConfig {
+    /// Enlargements of the frame to read, cheapest first; default 1x1, 2x2 and 4x2. More passes read smaller and more
+    /// slanted codes; the time of a pass grows with its area.
+    pub passes: Vec<Pass>,
+    /// Most codes to read in one frame, 1 to 255; default 32. The passes end early once they are found.
+    pub max_codes: u8,
+}
+
+/// One reading of the whole frame, enlarged by cubic interpolation.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pass {
+    /// Horizontal enlargement, 1 to 4. Codes on upright placards seen at a slant are narrow, so this one is the larger.
+    pub stretch_x: f64,
+    /// Vertical enlargement, 1 to 4.
+    pub stretch_y: f64,
+}
+
+impl Default for PlacardConfig {
+    fn default() -> Self {
+        let pass = |stretch_x, stretch_y| Pass { stretch_x, stretch_y };
+        Self { passes: vec![pass(1.0, 1.0), pass(2.0, 2.0), pass(4.0, 2.0)], max_codes: 32 }
+    }
+}
+
+impl PlacardConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first key out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if !(1..=MAX_PASSES).contains(&self.passes.len()) {
+            return Err(ConfigError::new("passes", self.passes.len(), format!("1 to {MAX_PASSES} passes")));
+        }
+        for (index, pass) in self.passes.iter().enumerate() {
+            check_range(&format!("passes.{index}.stretch_x"), pass.stretch_x, 1.0, 4.0)?;
+            check_range(&format!("passes.{index}.stretch_y"), pass.stretch_y, 1.0, 4.0)?;
+        }
+        check_range("max_codes", self.max_codes.into(), 1.0, 255.0)
+    }
+}
+
+/// Most passes a configuration may ask for.
+const MAX_PASSES: usize = 8;
+/// Module sizes between which confidence rises, in pixels.
+const CONFIDENCE_MODULES_PX: (f64, f64) = (1.0, 4.0);
+/// Confidence at those sizes.
+const CONFIDENCES: (f64, f64) = (0.5, 0.99);
+
+/// Reads placards.
+///
+/// A decoded text is checked by the code's own error correction, so a detection is hardly ever wrong. Its confidence
+/// says how far to trust its corners: it rises from 0.5 for modules of one pixel along the code's shortest side to 0.99
+/// for modules of four pixels.
+///
+/// The lower right corner has no finder pattern and is extrapolated by the decoder: in codes of version 1 it is
+/// typically off by 0.45 modules, the other corners by 0.2.
+///
+/// Texts that could not be a label are left out: empty, longer than 64 bytes, not UTF-8, or with control characters.
+pub struct PlacardDetector {
+    config: PlacardConfig,
+}
+
+impl PlacardDetector {
+    /// A detector for a validated configuration.
+    pub fn new(config: PlacardConfig) -> Self {
+        Self { config }
+    }
+}
+
+impl Detect for PlacardDetector {
+    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+        let mut gray = gray(frame)?;
+        let reader = zxingcpp::read()
+            .formats(BarcodeFormat::QRCode)
+            .max_number_of_symbols(self.config.max_codes)
+            .try_harder(true)
+            .try_rotate(false)
+            .try_invert(false)
+            .try_downscale(false);
+        let mut codes: Vec<Code> = Vec::new();
+        for &pass in &self.config.passes {
+            let found = read(&reader, &gray, pass)?;
+            for code in &found {
+                paint_over(&mut gray, code)
+                    .map_err(|source| DetectError::OpenCv { step: "painting over a code", source })?;
+            }
+            codes.extend(found);
+            if codes.len() >= self.config.max_codes.into() {
+                break;
+            }
+        }
+        codes.truncate(self.config.max_codes.into());
+        Ok(codes.into_iter().filter_map(Code::into_detection).collect())
+    }
+}
+
+/// Codes in one enlargement of the image, with corners in pixels of the image itself.
+fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, DetectError> {
+    let opencv_error = |source| DetectError::OpenCv { step: "enlarging a frame", source };
+    let enlarged = enlarge(image, pass).map_err(opencv_error)?;
+    let pixels = enlarged.data_bytes().map_err(opencv_error)?;
+    let view = ImageView::from_slice(pixels, enlarged.cols(), enlarged.rows(), ImageFormat::Lum);
+    let codes = view.and_then(|view| reader.from(&view));
+    let codes = codes.map_err(|error| DetectError::Decoder(error.to_string()))?;
+    Ok(codes.iter().filter(|code| code.is_valid()).map(|code| Code::of(code, pass)).collect())
+}
+
+/// One decoded code.
+struct Code {
+    text: Vec<u8>,
+    /// Modules along a side.
+    modules: f64,
+    corners: [Point2<f64>; 4],
+}
+
+impl Code {
+    /// zxing-cpp puts the centre of the first pixel at (0.5, 0.5) and rounds the outer corners of the code to whole
+    /// numbers; enlarging by OpenCV keeps the edges of the image in place, so both coordinates only scale.
+    fn of(barcode: &Barcode, pass: Pass) -> Self {
+        let position = barcode.position();
+        let corners = [position.top_left, position.top_right, position.bottom_right, position.bottom_left];
+        let corners = corners.map(|c| Point2::new(f64::from(c.x) / pass.stretch_x, f64::from(c.y) / pass.stretch_y));
+        let version: u8 = barcode.extra_with_key("Version").parse().unwrap_or(1);
+        Self { text: barcode.bytes(), modules: 17.0 + 4.0 * f64::from(version), corners }
+    }
+
+    fn into_detection(self) -> Option<Detection> {
+        let label = label(self.text)?;
+        let bounding_box = BoundingBox::around(&self.corners);
+        let confidence = confidence(&self.corners, self.modules);
+        bounding_box.is_valid().then_some(Detection { label, confidence, bounding_box, corners: Some(self.corners) })
+    }
+}
+
+fn label(text: Vec<u8>) -> Option<Label> {
+    let text = String::from_utf8(text).ok()?;
+    let usable = (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control);
+    usable.then(|| Label::from(text))
+}
+
+fn confidence(corners: &[Point2<f64>; 4], modules: f64) -> f64 {
+    let side = (0..4).map(|i| nalgebra::distance(&corners[i], &corners[(i + 1) % 4])).fold(f64::INFINITY, f64::min);
+    let (small, large) = CONFIDENCE_MODULES_PX;
+    let share = ((side / modules - small) / (large - small)).clamp(0.0, 1.0);
+    CONFIDENCES.0 + share * (CONFIDENCES.1 - CONFIDENCES.0)
+}
+
+/// The frame in shades of gray, in memory of its own without gaps.
+fn gray(frame: &Frame) -> Result<Mat, DetectError> {
+    let image = &frame.image;
+    let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
+    if image.empty() || image.dims() != 2 {
+        return Err(unusable("no pixels".into()));
+    }
+    let converted = match image.typ() {
+        CV_8UC1 => image.try_clone(),
+        CV_8UC3 => {
+            let mut gray = Mat::default();
+            imgproc::cvt_color_def(image, &mut gray, imgproc::COLOR_BGR2GRAY).map(|()| gray)
+        }
+        other => return Err(unusable(format!("opencv pixel type {other}"))),
+    };
+    converted.map_err(|source| DetectError::OpenCv { step: "converting a frame to gray", source })
+}
+
+fn enlarge(image: &Mat, pass: Pass) -> opencv::Result<Mat> {
+    if pass.stretch_x == 1.0 && pass.stretch_y == 1.0 {
+        return image.try_clone();
+    }
+    let mut enlarged = Mat::default();
+    let (size, interpolation) = (Size::default(), imgproc::INTER_CUBIC);
+    imgproc::resize(image, &mut enlarged, size, pass.stretch_x, pass.stretch_y, interpolation)?;
+    Ok(enlarged)
+}
+
+fn paint_over(image: &mut Mat, code: &Code) -> opencv::Result<()> {
+    let corners: Vector<Point> =
+        code.corners.iter().map(|c| Point::new(c.x.round() as i32, c.y.round() as i32)).collect();
+    imgproc::fill_convex_poly_def(image, &corners, Scalar::all(255.0))
+}
+
+#[cfg(test)]
+mod tests;

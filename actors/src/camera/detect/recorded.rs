@@ -1,0 +1,133 @@
+//! Detections from a file, in place of a detector: for recordings and for nodes without a usable model.
+//!
+//! The file is JSON Lines: line n holds what was detected in frame n, as an array of
+//! [`ecod::detection::Detection`]s, empty when nothing was:
+//!
+//! ```text
+//! [{"label":"cup","confidence":0.93,"bounding_box":{"x_min":12.5,"y_min":80,"x_max":96,"y_max":171}}]
+//! []
+//! ```
+
+use std::path::{Path, PathBuf};
+
+use ecod::detection::{Detection, detections_in};
+use serde::{Deserialize, Serialize};
+
+use super::{Detect, DetectError};
+use crate::camera::frame::Frame;
+
+/// Where recorded detections come from.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedConfig {
+    /// The JSON Lines file.
+    pub path: PathBuf,
+    /// Whether to start again after the last line; default false: nothing is detected from then on.
+    #[serde(default)]
+    pub looping: bool,
+}
+
+/// A recording that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordingError {
+    /// The file cannot be read.
+    #[error("cannot read recorded detections {path:?}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        #[source]
+        source: std::io::Error,
+    },
+    /// A line is not an array of detections.
+    #[error("recorded detections {path:?}, line {line}: {reason}")]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// Line number, from 1.
+        line: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// Plays recorded detections back, one line for each frame.
+#[derive(Debug)]
+pub struct RecordedDetector {
+    frames: Vec<Vec<Detection>>,
+    looping: bool,
+    next: usize,
+}
+
+impl RecordedDetector {
+    /// Reads the whole recording.
+    ///
+    /// # Errors
+    /// [`RecordingError`] naming the file and the first bad line.
+    pub fn open(config: &RecordedConfig) -> Result<Self, RecordingError> {
+        let path = &config.path;
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RecordingError::Unreadable { path: path.clone(), source })?;
+        let frames = text.lines().enumerate().map(|(index, line)| read_line(path, index + 1, line));
+        Ok(Self { frames: frames.collect::<Result<_, _>>()?, looping: config.looping, next: 0 })
+    }
+}
+
+impl Detect for RecordedDetector {
+    fn detect(&mut self, _frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+        if self.looping && self.next >= self.frames.len() {
+            self.next = 0;
+        }
+        let detections = self.frames.get(self.next).cloned().unwrap_or_default();
+        self.next = self.next.saturating_add(1);
+        Ok(detections)
+    }
+}
+
+fn read_line(path: &Path, line: usize, text: &str) -> Result<Vec<Detection>, RecordingError> {
+    detections_in(text).map_err(|reason| RecordingError::Malformed { path: path.to_owned(), line, reason })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use ecod::time::Timestamp;
+    use opencv::core::Mat;
+
+    use super::*;
+
+    const CUP: &str =
+        r#"[{"label":"cup","confidence":0.9,"bounding_box":{"x_min":1,"y_min":2,"x_max":30,"y_max":40}}]"#;
+
+    fn open(text: &str, looping: bool) -> Result<RecordedDetector, RecordingError> {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(text.as_bytes()).unwrap();
+        RecordedDetector::open(&RecordedConfig { path: file.path().to_owned(), looping })
+    }
+
+    fn counts(mut detector: RecordedDetector, frames: usize) -> Vec<usize> {
+        let frame = Frame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 };
+        (0..frames).map(|_| detector.detect(&frame).unwrap().len()).collect()
+    }
+
+    #[test]
+    fn plays_one_line_per_frame_once_or_again_and_again() {
+        let text = format!("{CUP}\n[]\n{CUP}\n");
+        assert_eq!(counts(open(&text, false).unwrap(), 5), [1, 0, 1, 0, 0]);
+        assert_eq!(counts(open(&text, true).unwrap(), 5), [1, 0, 1, 1, 0]);
+        assert_eq!(counts(open("", true).unwrap(), 2), [0, 0]);
+    }
+
+    #[test]
+    fn a_bad_recording_is_named_with_its_line() {
+        for bad in
+            ["{", r#"{"label":"cup"}"#, &CUP.replace("0.9", "1.9"), &CUP.replace("30", "0"), &CUP.replace("cup", "")]
+        {
+            let error = open(&format!("[]\n{bad}\n"), false).expect_err("malformed").to_string();
+            assert!(error.contains("line 2: "), "{error}");
+        }
+        let missing = RecordedConfig { path: "no/such/file.jsonl".into(), looping: false };
+        assert!(RecordedDetector::open(&missing).expect_err("missing").to_string().contains("no/such/file.jsonl"));
+    }
+}

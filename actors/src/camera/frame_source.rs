@@ -1,0 +1,222 @@
+//! Where frames come from. One trait, one file per family of sources; [`capture`] runs a source on its own thread.
+
+pub mod capture;
+pub(crate) mod images;
+mod testbed;
+mod video;
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use ecod::config::{ConfigError, check_range};
+use ecod::names::NodeName;
+use serde::{Deserialize, Serialize};
+
+use self::images::ImageSequence;
+use self::testbed::TestbedVehicle;
+use self::video::Video;
+use crate::camera::frame::Frame;
+
+/// Gives one frame after the other.
+pub trait FrameSource: Send {
+    /// Waits for the next frame; may block for as long as the camera does.
+    ///
+    /// # Errors
+    /// [`FrameError`]; the source is of no further use and is to be opened again, unless it ended or the error is
+    /// [`FrameError::Unusable`], after which it goes on.
+    fn next_frame(&mut self) -> Result<Frame, FrameError>;
+}
+
+/// Why there is no frame.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum FrameError {
+    /// The source cannot be opened.
+    #[error("cannot open {origin}: {reason}")]
+    Open {
+        /// Device, pipeline, address or path.
+        origin: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// One frame of a recording is no image; the next may well be one.
+    #[error("cannot use {origin}: {reason}")]
+    Unusable {
+        /// Path of the frame.
+        origin: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A live source stopped giving frames.
+    #[error("lost {origin}: {reason}")]
+    Lost {
+        /// Device, pipeline, address or path.
+        origin: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A live source gave no frame for too long.
+    #[error("no frame for {0:?}")]
+    Stalled(Duration),
+    /// A file or sequence came to its end.
+    #[error("{origin} ended")]
+    Ended {
+        /// Its path.
+        origin: String,
+    },
+}
+
+/// One source of frames.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum SourceConfig {
+    /// A camera of the Linux kernel, such as a USB camera.
+    V4l2 {
+        /// Device file; default `/dev/video0`.
+        #[serde(default = "default_device")]
+        device: PathBuf,
+        /// Image width in pixels to ask for; default the camera's own.
+        #[serde(default)]
+        width: Option<u32>,
+        /// Image height in pixels to ask for; default the camera's own.
+        #[serde(default)]
+        height: Option<u32>,
+        /// Frames per second to ask for; default the camera's own.
+        #[serde(default)]
+        fps: Option<f64>,
+    },
+    /// A GStreamer pipeline that ends in `appsink`, such as one from `libcamerasrc` on a Raspberry Pi.
+    Gstreamer {
+        /// The pipeline as for `gst-launch-1.0`; BGR, with `appsink drop=true max-buffers=1`.
+        pipeline: String,
+    },
+    /// A network camera.
+    Url {
+        /// Its `rtsp://` or `http://` address.
+        url: String,
+    },
+    /// A video file, played at its own pace.
+    Video {
+        /// The file.
+        path: PathBuf,
+        /// Whether to start again at the end; default false.
+        #[serde(default)]
+        looping: bool,
+    },
+    /// Images in the order of their names.
+    Images {
+        /// A directory, or a pattern such as `frames/%04d.png` counting up from 0 or 1.
+        path: PathBuf,
+        /// Frames per second; default 10.
+        #[serde(default = "default_fps")]
+        fps: f64,
+        /// Whether to start again at the end; default false.
+        #[serde(default)]
+        looping: bool,
+    },
+    /// A vehicle of a testbed scene, rendered at the rate of its camera.
+    Testbed {
+        /// The scene file.
+        scenes: PathBuf,
+        /// Name of the scene.
+        scene: String,
+        /// Name of the vehicle.
+        cav: NodeName,
+        /// Seed of everything that varies from frame to frame; default 1.
+        #[serde(default = "default_seed")]
+        seed: u64,
+    },
+}
+
+impl SourceConfig {
+    /// Opens the source; may block for as long as the camera does. A network camera is given `patience`.
+    ///
+    /// # Errors
+    /// [`FrameError::Open`] naming the source and what is wrong.
+    pub fn open(&self, patience: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
+        match self {
+            Self::V4l2 { device, width, height, fps } => Ok(Box::new(Video::device(device, *width, *height, *fps)?)),
+            Self::Gstreamer { pipeline } => Ok(Box::new(Video::pipeline(pipeline)?)),
+            Self::Url { url } => Ok(Box::new(Video::url(url, patience)?)),
+            Self::Video { path, looping } => Ok(Box::new(Video::file(path, *looping)?)),
+            Self::Images { path, fps, looping } => Ok(Box::new(ImageSequence::open(path, *fps, *looping)?)),
+            Self::Testbed { scenes, scene, cav, seed } => {
+                Ok(Box::new(TestbedVehicle::open(scenes, scene, cav, *seed)?))
+            }
+        }
+    }
+
+    /// Takes user and password out of an address; true when there were some.
+    pub(crate) fn forget_credentials(&mut self) -> bool {
+        let Self::Url { url } = self else { return false };
+        let bare = video::without_credentials(url);
+        let had = bare != *url;
+        *url = bare;
+        had
+    }
+
+    /// Checks every value; whether the source exists is found when it is opened.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first key out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        match self {
+            Self::V4l2 { width, height, fps, .. } => {
+                for (key, wish) in [("width", width), ("height", height)] {
+                    wish.map_or(Ok(()), |pixels| check_range(key, f64::from(pixels), 1.0, 16_384.0))?;
+                }
+                fps.map_or(Ok(()), |fps| check_range("fps", fps, 0.01, 1000.0))
+            }
+            Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
+            Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => {
+                Err(ConfigError::new("pipeline", pipeline, "a pipeline that ends in appsink"))
+            }
+            Self::Url { url } if !has_known_scheme(url) => Err(ConfigError::new(
+                "url",
+                video::without_credentials(url),
+                "an address that begins with rtsp://, rtsps://, http:// or https://",
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn default_device() -> PathBuf {
+    "/dev/video0".into()
+}
+
+fn default_fps() -> f64 {
+    10.0
+}
+
+fn default_seed() -> u64 {
+    1
+}
+
+/// Lets recorded frames out at their own rate.
+#[derive(Debug)]
+struct Pace {
+    period: Duration,
+    due: Option<Instant>,
+}
+
+impl Pace {
+    fn new(fps: f64) -> Self {
+        Self { period: Duration::from_secs_f64(1.0 / fps), due: None }
+    }
+
+    /// Sleeps until the next frame is due.
+    fn wait(&mut self) {
+        let now = Instant::now();
+        let due = self.due.unwrap_or(now);
+        std::thread::sleep(due.saturating_duration_since(now));
+        self.due = Some(due.max(now) + self.period);
+    }
+}
+
+fn has_known_scheme(url: &str) -> bool {
+    let scheme = url.split_once("://").map(|(scheme, _)| scheme.to_ascii_lowercase());
+    scheme.is_some_and(|scheme| matches!(&*scheme, "rtsp" | "rtsps" | "http" | "https"))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,328 @@
+//! Runs a source on threads of its own: latest frame wins, and a source that fails or stalls is opened again.
+//!
+//! ```text
+//! reader thread (one per opening) --frames, errors--> keeper thread --latest frame--> slot --> detector
+//! ```
+//!
+//! OpenCV may block for good. The keeper then leaves the reader behind, which ends as soon as OpenCV returns, and
+//! opens the source on a new one.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use ecod::config::{ConfigError, check_range};
+use serde::{Deserialize, Serialize};
+use tokio::sync::watch;
+
+use super::{FrameError, FrameSource};
+use crate::camera::frame::Frame;
+use crate::platform::latest_slot::LatestSlot;
+
+/// When a source counts as stalled and how often it is opened again.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CaptureConfig {
+    /// Seconds without a frame, also while opening, after which a source is opened again; default 5. Must exceed the
+    /// time that the camera takes to start.
+    pub stall_timeout_s: f64,
+    /// Seconds before the first new attempt; doubles with each failure in a row; default 0.5.
+    pub retry_min_s: f64,
+    /// Most seconds between two attempts; default 30.
+    pub retry_max_s: f64,
+}
+
+impl Default for CaptureConfig {
+    fn default() -> Self {
+        Self { stall_timeout_s: 5.0, retry_min_s: 0.5, retry_max_s: 30.0 }
+    }
+}
+
+impl CaptureConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first key out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("stall_timeout_s", self.stall_timeout_s, 0.01, 3600.0)?;
+        check_range("retry_min_s", self.retry_min_s, 0.001, 3600.0)?;
+        check_range("retry_max_s", self.retry_max_s, self.retry_min_s, 3600.0)
+    }
+
+    /// The wait after `failures` failures in a row, from 1.
+    fn retry_after(&self, failures: u32) -> Duration {
+        let doubled = self.retry_min_s * 2f64.powi(failures.saturating_sub(1).min(60) as i32);
+        Duration::from_secs_f64(doubled.min(self.retry_max_s))
+    }
+}
+
+/// How a source is doing.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum CaptureStatus {
+    /// Opened, without a frame yet.
+    #[default]
+    Opening,
+    /// Frames come.
+    Running,
+    /// It failed and will be opened again.
+    Failed {
+        /// What happened.
+        error: FrameError,
+        /// Failures in a row.
+        failures: u32,
+        /// Time to the next attempt.
+        retry_after: Duration,
+    },
+    /// A file came to its end.
+    Ended,
+}
+
+/// Opens a source, again and again.
+pub type Opener = Arc<dyn Fn() -> Result<Box<dyn FrameSource>, FrameError> + Send + Sync>;
+
+/// A running capture; ends when dropped.
+#[derive(Debug)]
+pub struct Capture {
+    slot: Arc<LatestSlot<Frame>>,
+    status: watch::Receiver<CaptureStatus>,
+    events: SyncSender<Event>,
+    unusable: Arc<AtomicU64>,
+    failures: Arc<AtomicU64>,
+}
+
+impl Capture {
+    /// Starts to capture; `open` is called on threads of the capture.
+    ///
+    /// # Errors
+    /// The system's, when it has no thread to give.
+    pub fn start(open: Opener, config: CaptureConfig) -> std::io::Result<Self> {
+        let slot = Arc::new(LatestSlot::default());
+        let (status_sender, status) = watch::channel(CaptureStatus::default());
+        let (events, inbox) = mpsc::sync_channel(1);
+        let keeper = Keeper {
+            open,
+            config,
+            slot: Arc::clone(&slot),
+            status: status_sender,
+            events: events.clone(),
+            inbox,
+            opening: Arc::default(),
+            left_behind: Vec::new(),
+            captured: 0,
+            unusable: Arc::default(),
+            failures: Arc::default(),
+        };
+        let (unusable, failures) = (Arc::clone(&keeper.unusable), Arc::clone(&keeper.failures));
+        thread::Builder::new().name("capture".into()).spawn(move || keeper.run())?;
+        Ok(Self { slot, status, events, unusable, failures })
+    }
+
+    /// The latest frame, waiting for one; `None` once the source has ended. Frames are numbered across openings.
+    pub async fn next_frame(&self) -> Option<Frame> {
+        self.slot.take().await
+    }
+
+    /// Frames that were replaced by a later one before anyone took them.
+    pub fn skipped(&self) -> u64 {
+        self.slot.skipped()
+    }
+
+    /// Frames of a recording that were no images and were passed over.
+    pub fn unusable(&self) -> u64 {
+        self.unusable.load(Ordering::Relaxed)
+    }
+
+    /// How often the source failed or stalled and was to be opened again.
+    pub fn failures(&self) -> u64 {
+        self.failures.load(Ordering::Relaxed)
+    }
+
+    /// How the source is doing, now and from now on.
+    pub fn status(&self) -> watch::Receiver<CaptureStatus> {
+        self.status.clone()
+    }
+}
+
+impl Drop for Capture {
+    fn drop(&mut self) {
+        // The keeper is gone already when the source has ended.
+        let _ = self.events.send(Event::Stop);
+    }
+}
+
+/// Readers of this process that may be in OpenCV.
+static READERS: AtomicUsize = AtomicUsize::new(0);
+
+/// Counts a reader as long as it runs.
+struct Running;
+
+impl Running {
+    fn begin() -> Self {
+        READERS.fetch_add(1, Ordering::SeqCst);
+        Self
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        READERS.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+/// Waits until no reader runs, `patience` at most: a process that ends takes down OpenCV, which must not be in use then.
+pub fn wait_for_readers(patience: Duration) {
+    let until = Instant::now() + patience;
+    while READERS.load(Ordering::SeqCst) > 0 && Instant::now() < until {
+        thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Blocked readers from which on no new one is started.
+const MAX_LEFT_BEHIND: usize = 4;
+
+enum Event {
+    /// From the reader of the given opening.
+    Read(u64, Result<Frame, FrameError>),
+    Stop,
+}
+
+/// Why a reader is no longer listened to.
+enum Outcome {
+    Failed(FrameError),
+    Stopped,
+}
+
+struct Keeper {
+    open: Opener,
+    config: CaptureConfig,
+    slot: Arc<LatestSlot<Frame>>,
+    status: watch::Sender<CaptureStatus>,
+    events: SyncSender<Event>,
+    inbox: Receiver<Event>,
+    /// The opening whose reader is listened to.
+    opening: Arc<AtomicU64>,
+    left_behind: Vec<JoinHandle<()>>,
+    captured: u64,
+    unusable: Arc<AtomicU64>,
+    failures: Arc<AtomicU64>,
+}
+
+impl Keeper {
+    fn run(mut self) {
+        let mut failures = 0;
+        loop {
+            let captured = self.captured;
+            let outcome = self.read_until_failure();
+            self.opening.fetch_add(1, Ordering::SeqCst);
+            let error = match outcome {
+                Outcome::Stopped => break,
+                Outcome::Failed(FrameError::Ended { origin }) => {
+                    tracing::info!(origin, "frame source ended");
+                    self.status.send_replace(CaptureStatus::Ended);
+                    break;
+                }
+                Outcome::Failed(error) => error,
+            };
+            failures = if self.captured > captured { 1 } else { failures + 1 };
+            let retry_after = self.config.retry_after(failures);
+            self.failures.fetch_add(1, Ordering::Relaxed);
+            tracing::warn!(%error, failures, ?retry_after, "frame source failed");
+            self.status.send_replace(CaptureStatus::Failed { error, failures, retry_after });
+            if self.is_stopped_within(retry_after) {
+                break;
+            }
+        }
+        self.opening.fetch_add(1, Ordering::SeqCst);
+        self.slot.close();
+    }
+
+    /// Opens the source and passes its frames on.
+    fn read_until_failure(&mut self) -> Outcome {
+        let stall_timeout = Duration::from_secs_f64(self.config.stall_timeout_s);
+        self.left_behind.retain(|reader| !reader.is_finished());
+        if self.left_behind.len() >= MAX_LEFT_BEHIND {
+            return Outcome::Failed(FrameError::Stalled(stall_timeout));
+        }
+        let opening = self.opening.load(Ordering::SeqCst);
+        let reader = Reader { opening, current: Arc::clone(&self.opening), events: self.events.clone() };
+        let open = Arc::clone(&self.open);
+        let running = Running::begin();
+        let read = move || {
+            let _running = running;
+            reader.run(&open);
+        };
+        match thread::Builder::new().name("camera".into()).spawn(read) {
+            Ok(reader) => self.left_behind.push(reader),
+            Err(e) => return Outcome::Failed(FrameError::Open { origin: "a thread".into(), reason: e.to_string() }),
+        }
+        let mut deadline = Instant::now() + stall_timeout;
+        loop {
+            match self.inbox.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+                Ok(Event::Stop) | Err(RecvTimeoutError::Disconnected) => return Outcome::Stopped,
+                Err(RecvTimeoutError::Timeout) => return Outcome::Failed(FrameError::Stalled(stall_timeout)),
+                Ok(Event::Read(from, _)) if from != opening => {}
+                Ok(Event::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
+                    tracing::warn!(%error, "frame passed over");
+                    self.unusable.fetch_add(1, Ordering::Relaxed);
+                }
+                Ok(Event::Read(_, Err(error))) => return Outcome::Failed(error),
+                Ok(Event::Read(_, Ok(frame))) => {
+                    deadline = Instant::now() + stall_timeout;
+                    if matches!(*self.status.borrow(), CaptureStatus::Failed { .. }) {
+                        tracing::info!("frame source runs again");
+                    }
+                    self.status.send_if_modified(|status| {
+                        std::mem::replace(status, CaptureStatus::Running) != CaptureStatus::Running
+                    });
+                    self.slot.put(Frame { seq: self.captured, ..frame });
+                    self.captured += 1;
+                }
+            }
+        }
+    }
+
+    fn is_stopped_within(&self, time: Duration) -> bool {
+        let deadline = Instant::now() + time;
+        loop {
+            match self.inbox.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+                Ok(Event::Read(..)) => {}
+                Err(RecvTimeoutError::Timeout) => return false,
+                Ok(Event::Stop) | Err(RecvTimeoutError::Disconnected) => return true,
+            }
+        }
+    }
+}
+
+/// Reads one opening of the source until it fails or is left behind.
+struct Reader {
+    opening: u64,
+    current: Arc<AtomicU64>,
+    events: SyncSender<Event>,
+}
+
+impl Reader {
+    fn run(self, open: &Opener) {
+        let mut source = match open() {
+            Ok(source) => source,
+            Err(error) => return self.tell(Err(error)),
+        };
+        while self.current.load(Ordering::SeqCst) == self.opening {
+            let read = source.next_frame();
+            let failed = read.as_ref().is_err_and(|error| !matches!(error, FrameError::Unusable { .. }));
+            self.tell(read);
+            if failed {
+                return;
+            }
+        }
+    }
+
+    fn tell(&self, read: Result<Frame, FrameError>) {
+        // Nobody listens any more once the keeper has ended.
+        let _ = self.events.send(Event::Read(self.opening, read));
+    }
+}
+
+#[cfg(test)]
+mod tests;

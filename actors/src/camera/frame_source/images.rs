@@ -1,0 +1,82 @@
+//! Frames from image files.
+
+use std::path::{Path, PathBuf};
+
+use opencv::core::MatTraitConst;
+use opencv::imgcodecs;
+
+use super::{FrameError, FrameSource, Pace};
+use crate::camera::frame::Frame;
+use crate::platform::clock;
+
+const EXTENSIONS: [&str; 7] = ["bmp", "jpeg", "jpg", "pgm", "png", "ppm", "webp"];
+
+/// Images in the order of their names.
+pub(super) struct ImageSequence {
+    origin: String,
+    files: Vec<PathBuf>,
+    looping: bool,
+    pace: Pace,
+    /// Files looked at, also those that were no images.
+    next: u64,
+}
+
+impl ImageSequence {
+    /// Lists the images of a directory or a numbered pattern.
+    pub(super) fn open(path: &Path, fps: f64, looping: bool) -> Result<Self, FrameError> {
+        let origin = path.display().to_string();
+        let failed = |reason: String| FrameError::Open { origin: origin.clone(), reason };
+        let files = if origin.contains('%') {
+            numbered(&origin).ok_or_else(|| failed("need one %d or %0Nd in the pattern".into()))?
+        } else {
+            in_directory(path).map_err(|e| failed(e.to_string()))?
+        };
+        if files.is_empty() {
+            return Err(failed("no images there".into()));
+        }
+        Ok(Self { origin, files, looping, pace: Pace::new(fps), next: 0 })
+    }
+}
+
+impl FrameSource for ImageSequence {
+    fn next_frame(&mut self) -> Result<Frame, FrameError> {
+        let count = self.files.len() as u64;
+        if self.next >= count && !self.looping {
+            return Err(FrameError::Ended { origin: self.origin.clone() });
+        }
+        let file = &self.files[(self.next % count) as usize];
+        let seq = self.next;
+        self.next += 1;
+        self.pace.wait();
+        let unusable = |reason: String| FrameError::Unusable { origin: file.display().to_string(), reason };
+        let image = imgcodecs::imread(file, imgcodecs::IMREAD_COLOR).map_err(|e| unusable(e.message))?;
+        if image.empty() {
+            let reason = std::fs::File::open(file).map_or_else(|error| error.to_string(), |_| "not an image".into());
+            return Err(unusable(reason));
+        }
+        Ok(Frame { image, captured_at: clock::now(), seq })
+    }
+}
+
+/// The images of a directory in the order of their names.
+pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(directory)?.map(|entry| Ok(entry?.path()));
+    let mut files = entries.collect::<std::io::Result<Vec<PathBuf>>>()?;
+    let is_image = |path: &PathBuf| {
+        let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+        extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()))
+    };
+    files.retain(is_image);
+    files.sort();
+    Ok(files)
+}
+
+/// The files of `before%04dafter` that exist, counting up without a gap.
+fn numbered(pattern: &str) -> Option<Vec<PathBuf>> {
+    let (before, rest) = pattern.split_once('%')?;
+    let (digits, after) = rest.split_once('d')?;
+    let width: usize = if digits.is_empty() { 0 } else { digits.parse().ok()? };
+    let file = |number: u64| PathBuf::from(format!("{before}{number:0width$}{after}"));
+    let first = if file(0).is_file() { 0 } else { 1 };
+    Some((first..).map(file).take_while(|path| path.is_file()).collect())
+}

@@ -1,0 +1,18 @@
+//! What the actors of a node say to each other, and where each is reached. Imports no actor.
+
+pub mod actor_slot;
+pub mod broker;
+pub mod dashboard;
+#[cfg(feature = "camera")]
+pub mod detector;
+pub mod follower;
+pub mod fuser;
+pub mod gateway;
+pub mod leader_election;
+pub mod leadership;
+pub mod membership;
+pub mod newest;
+#[cfg(feature = "camera")]
+pub mod projector;
+pub mod recorder;
+pub mod reputation_keeper;

@@ -1,0 +1,50 @@
+//! Messages to the actor of this name.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::reputation::ReputationLedger;
+use ecod::round::FirstRound;
+use ecod::time::Timestamp;
+use ecod::wire::{GlobalMap, Reputation};
+
+/// What the fuser is asked to do.
+#[derive(Debug)]
+pub enum FuserMessage {
+    /// Fuse the reports that wait in the intake.
+    TakeReports,
+    /// Keep another aggregator's map, which the follower's gate admitted, to go on from when leading.
+    TakeMap {
+        /// The map.
+        map: Arc<GlobalMap>,
+        /// When it came.
+        received_at: Timestamp,
+    },
+    /// Close the round if it is due.
+    CloseRound,
+    /// Publish from now on.
+    Lead {
+        /// The leadership.
+        epoch: Epoch,
+        /// Number of the next round.
+        first_round: u64,
+        /// When it is due.
+        first: FirstRound,
+    },
+    /// Let the present round last its whole length: another node is about to lead from the next one on.
+    HoldRound,
+    /// Publish nothing more; go on fusing, to be ready.
+    StopPublishing,
+    /// Start from evidence that came from elsewhere.
+    Adopt {
+        /// All evidence that is known.
+        ledger: Arc<ReputationLedger>,
+    },
+    /// Go on, in VOTE's `paper` mode, from reputations that were published.
+    Resume {
+        /// The reputations.
+        reputations: BTreeMap<NodeName, Reputation>,
+    },
+}

@@ -1,0 +1,31 @@
+//! Messages to the actor of this name.
+
+use std::net::SocketAddr;
+
+use bytes::Bytes;
+use ecod::names::NodeName;
+use ractor::RpcReplyPort;
+
+/// What the membership is asked to do.
+#[derive(Debug)]
+pub enum MembershipMessage {
+    /// Send a datagram to a node, once and without waiting; it may be lost.
+    Send {
+        /// The addressee.
+        to: NodeName,
+        /// At most [`MAX_PAYLOAD_BYTES`].
+        payload: Bytes,
+    },
+    /// Tell where the node gossips: the bound address, which may be unspecified.
+    Address {
+        /// Gets the answer.
+        reply: RpcReplyPort<SocketAddr>,
+    },
+    /// Greet these addresses too; sent by the membership to itself.
+    SetSeeds {
+        /// The seeds, resolved.
+        addresses: Vec<SocketAddr>,
+    },
+    /// Take the datagrams that wait, and do what is due; sent by the membership to itself.
+    Wake,
+}

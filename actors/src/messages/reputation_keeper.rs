@@ -1,0 +1,47 @@
+//! Messages to the actor of this name.
+
+use std::collections::BTreeMap;
+
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::reputation::Evidence;
+use ecod::wire::Reputation;
+
+use crate::transport::mqtt::Delivery;
+
+/// What the keeper is asked to do.
+#[derive(Debug)]
+pub enum ReputationKeeperMessage {
+    /// Publish in the node's own leadership from now on.
+    Lead {
+        /// The leadership.
+        epoch: Epoch,
+        /// Number of the last round before it.
+        last_round: u64,
+    },
+    /// Record what a round of the node's own leadership says about vehicles.
+    Record {
+        /// The leadership.
+        epoch: Epoch,
+        /// The round.
+        round: u64,
+        /// Votes that were settled by it.
+        evidence: Vec<Evidence>,
+        /// In VOTE's `paper` mode, the reputations after it.
+        reputations: Option<BTreeMap<NodeName, Reputation>>,
+    },
+    /// Publish nothing more.
+    StandBy,
+    /// Take in another candidate's evidence.
+    Merge {
+        /// The share and when it came.
+        delivery: Delivery,
+    },
+    /// Share all evidence: a node needs it to lead, or to remain the leader.
+    SendSnapshot {
+        /// The node; other candidates get it too.
+        to: NodeName,
+    },
+    /// Save, publish and pass on what has changed.
+    Tick,
+}

@@ -1,0 +1,348 @@
+//! How the parts of a node are made, connected, started and stopped.
+
+mod arguments;
+mod elected;
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::vote::VoteMode;
+use ecod::wire::Topics;
+use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
+use tokio::sync::watch;
+use uuid::Uuid;
+
+use super::slots::{ActorKind, ActorSlots};
+use crate::actors::broker::Broker;
+use crate::actors::dashboard::Dashboard;
+#[cfg(feature = "camera")]
+use crate::actors::detector::Detector;
+use crate::actors::follower::Follower;
+use crate::actors::fuser::{Fuser, Intake};
+use crate::actors::gateway::Gateway;
+use crate::actors::leader_election::LeaderElection;
+use crate::actors::membership::Membership;
+#[cfg(feature = "camera")]
+use crate::actors::projector::{Projector, ProjectorArguments};
+use crate::actors::recorder::Recorder;
+use crate::actors::reputation_keeper::{ReputationKeeper, SharedBook};
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::broker::BrokerMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::messages::leadership::Leadership;
+use crate::messages::membership::MembershipMessage;
+use crate::messages::newest::Newest;
+use crate::node::config::NodeConfig;
+use crate::observe::dashboard::Feed;
+#[cfg(feature = "camera")]
+use crate::observe::recorder::Pictures;
+use crate::observe::recorder::Recording;
+use crate::platform::clock;
+use crate::telemetry::counters::Counters;
+use crate::transport::broker::{BrokerError, EmbeddedBroker, Guard};
+use crate::transport::gossip::{BindError, FrameCounters, Member};
+use crate::transport::mqtt::Security;
+
+/// What the parts are made from; kept to make them again.
+pub(super) struct NodeBuilder {
+    config: NodeConfig,
+    security: Security,
+    name: NodeName,
+    run: Uuid,
+    started_at: Timestamp,
+    slots: ActorSlots,
+    counters: Arc<Counters>,
+    newest: Newest,
+    book: SharedBook,
+    recording: Recording,
+    intake: Intake,
+    broker_address: watch::Sender<Option<SocketAddr>>,
+    gossip_address: watch::Sender<Option<SocketAddr>>,
+    frames: Arc<FrameCounters>,
+    members: watch::Sender<Vec<Member>>,
+    leadership: watch::Sender<Leadership>,
+    /// The highest term that the election knows.
+    term: watch::Sender<u64>,
+    feed: Arc<Feed>,
+    dashboard_address: watch::Sender<Option<SocketAddr>>,
+    failed: watch::Sender<Option<String>>,
+}
+
+/// How long a part may take to stop.
+const STOP_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// How often, and how far apart, a broker or membership started anew tries to get its address back.
+const REBIND_ATTEMPTS: usize = 40;
+const REBIND_WAIT: Duration = Duration::from_millis(50);
+
+impl NodeBuilder {
+    pub(super) fn new(config: NodeConfig, security: Security, failed: watch::Sender<Option<String>>) -> Self {
+        let by_evidence = config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote();
+        let counters = Arc::<Counters>::default();
+        Self {
+            name: config.name.clone().unwrap_or(NodeName::from_static("node")),
+            config,
+            security,
+            run: Uuid::now_v7(),
+            started_at: clock::now(),
+            slots: ActorSlots::default(),
+            recording: Recording::new(Arc::clone(&counters)),
+            counters,
+            newest: Newest::default(),
+            intake: Intake::default(),
+            book: SharedBook::new(by_evidence),
+            broker_address: watch::Sender::new(None),
+            gossip_address: watch::Sender::new(None),
+            frames: Arc::default(),
+            members: watch::Sender::new(Vec::new()),
+            leadership: watch::Sender::default(),
+            term: watch::Sender::default(),
+            feed: Arc::default(),
+            dashboard_address: watch::Sender::new(None),
+            failed,
+        }
+    }
+
+    pub(super) fn slots(&self) -> &ActorSlots {
+        &self.slots
+    }
+
+    pub(super) fn counters(&self) -> Arc<Counters> {
+        Arc::clone(&self.counters)
+    }
+
+    pub(super) fn newest(&self) -> Newest {
+        self.newest.clone()
+    }
+
+    pub(super) fn broker_address(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.broker_address.subscribe()
+    }
+
+    pub(super) fn gossip_address(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.gossip_address.subscribe()
+    }
+
+    pub(super) fn dashboard_address(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.dashboard_address.subscribe()
+    }
+
+    pub(super) fn frames(&self) -> Arc<FrameCounters> {
+        Arc::clone(&self.frames)
+    }
+
+    pub(super) fn members(&self) -> watch::Receiver<Vec<Member>> {
+        self.members.subscribe()
+    }
+
+    pub(super) fn leadership(&self) -> watch::Receiver<Leadership> {
+        self.leadership.subscribe()
+    }
+
+    pub(super) fn give_up(&self, why: String) {
+        self.failed.send_replace(Some(why));
+    }
+
+    /// The parts that this node has, in the order of starting.
+    pub(super) fn parts(&self) -> Vec<ActorKind> {
+        let leads = self.config.may_lead();
+        let mut parts = Vec::new();
+        parts.extend(self.config.record.is_some().then_some(ActorKind::Recorder));
+        parts.extend((leads && self.config.data_plane().embedded).then_some(ActorKind::Broker));
+        parts.extend([ActorKind::Membership, ActorKind::Gateway, ActorKind::Follower]);
+        if leads {
+            let rates = self.config.fusion.rates_vehicles(!self.config.landmarks.is_empty());
+            parts.extend(rates.then_some(ActorKind::ReputationKeeper));
+            parts.push(ActorKind::Fuser);
+        }
+        parts.push(ActorKind::LeaderElection);
+        parts.extend(self.config.dashboard.enabled.then_some(ActorKind::Dashboard));
+        #[cfg(feature = "camera")]
+        if self.config.camera.is_some() {
+            parts.extend([ActorKind::Projector, ActorKind::Detector]);
+        }
+        parts
+    }
+
+    /// Starts one part below the supervisor and slots it.
+    pub(super) async fn start(
+        &mut self,
+        part: ActorKind,
+        supervisor: ActorCell,
+    ) -> Result<ActorId, ActorProcessingErr> {
+        match part {
+            ActorKind::Recorder => self.start_recorder(supervisor).await,
+            ActorKind::Broker => self.start_broker(supervisor).await,
+            ActorKind::Membership => self.start_membership(supervisor).await,
+            ActorKind::Gateway => {
+                let started = Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
+                let id = slot(&self.slots.gateway, started)?;
+                self.slots.election.send(LeaderElectionMessage::NoteGatewayRestart);
+                Ok(id)
+            }
+            ActorKind::Follower => {
+                let started = Actor::spawn_linked(None, Follower, self.follower_arguments(), supervisor).await;
+                slot(&self.slots.follower, started)
+            }
+            ActorKind::ReputationKeeper => {
+                let arguments = self.keeper_arguments();
+                let started = Actor::spawn_linked(None, ReputationKeeper, arguments, supervisor).await;
+                slot(&self.slots.keeper, started)
+            }
+            ActorKind::Fuser => {
+                let started = Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
+                let id = slot(&self.slots.fuser, started)?;
+                self.slots.election.send(LeaderElectionMessage::NoteFuserRestart);
+                Ok(id)
+            }
+            ActorKind::LeaderElection => {
+                let started = Actor::spawn_linked(None, LeaderElection, self.election_arguments(), supervisor).await;
+                slot(&self.slots.election, started)
+            }
+            ActorKind::Dashboard => {
+                let arguments = self.dashboard_arguments();
+                slot(&self.slots.dashboard, Actor::spawn_linked(None, Dashboard, arguments, supervisor).await)
+            }
+            #[cfg(feature = "camera")]
+            ActorKind::Projector => {
+                let arguments = ProjectorArguments {
+                    perception: crate::node::camera::perception(&self.config).map_err(in_full)?,
+                    poses: self.config.pose.listen,
+                    algorithms: crate::node::camera::algorithms(&self.config),
+                    gateway: self.slots.gateway.clone(),
+                    counters: self.counters(),
+                };
+                slot(&self.slots.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
+            }
+            #[cfg(feature = "camera")]
+            ActorKind::Detector => {
+                let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
+                let projector = self.slots.projector.clone();
+                let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
+                let arguments = arguments.map_err(in_full)?;
+                slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
+            }
+        }
+    }
+
+    /// Stops all parts, the last started first.
+    pub(super) async fn stop_all(&self) {
+        #[cfg(feature = "camera")]
+        {
+            stop(&self.slots.detector).await;
+            stop(&self.slots.projector).await;
+        }
+        stop(&self.slots.dashboard).await;
+        stop(&self.slots.election).await;
+        stop(&self.slots.fuser).await;
+        stop(&self.slots.keeper).await;
+        stop(&self.slots.follower).await;
+        stop(&self.slots.gateway).await;
+        stop(&self.slots.membership).await;
+        stop(&self.slots.broker).await;
+        stop(&self.slots.recorder).await;
+    }
+
+    async fn start_recorder(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let Some(arguments) = self.recorder_arguments() else { return Err("no [record] is configured".into()) };
+        if !self.config.may_lead() && !arguments.config.reports {
+            tracing::info!("reports of other vehicles are not recorded, key `record.reports` is false");
+        }
+        slot(&self.slots.recorder, Actor::spawn_linked(None, Recorder, arguments, supervisor).await)
+    }
+
+    /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
+    /// leave it.
+    async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let (broker, _) =
+            Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor).await.map_err(cause)?;
+        let before = *self.broker_address.borrow();
+        let address = before.unwrap_or(self.config.broker_listen());
+        let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
+        let bound = loop {
+            attempts -= 1;
+            match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
+                Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
+                outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
+            }
+        };
+        self.broker_address.send_replace(Some(bound));
+        let id = broker.get_id();
+        self.slots.broker.set(broker);
+        Ok(id)
+    }
+
+    /// The broker behind its gate: also where only this machine reaches it, who connects and says nothing would hold
+    /// the node's file descriptors.
+    fn embedded_broker(&self) -> EmbeddedBroker {
+        let (config, listen) = (self.config.broker(), self.config.broker_listen());
+        let credentials = self.security.credentials.clone();
+        match (&credentials, listen.ip().is_loopback()) {
+            (None, true) if self.config.data_plane().external.is_some() => tracing::warn!(
+                "mqtt.fallback_to_embedded serves this machine only: without certificates in [tls] or \
+                 broker.allow_plaintext other machines are without maps when the external broker is gone"
+            ),
+            (None, true) => tracing::info!("broker for this machine only: no certificates are configured"),
+            (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
+            (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
+        }
+        let (topics, elected) = (Topics::new(&self.config.cell), elected::rule(self.leadership()));
+        let (limits, counters) = (self.config.mqtt.limits(), self.counters());
+        EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
+    }
+
+    /// The membership comes back at the address it had, as the broker does.
+    async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let mut attempts = if self.gossip_address.borrow().is_some() { REBIND_ATTEMPTS } else { 1 };
+        let actor = loop {
+            attempts -= 1;
+            let arguments = self.membership_arguments();
+            match Actor::spawn_linked(None, Membership, arguments, supervisor.clone()).await.map_err(cause) {
+                Ok((actor, _)) => break actor,
+                Err(error) if attempts > 0 && error.is::<BindError>() => tokio::time::sleep(REBIND_WAIT).await,
+                Err(error) => return Err(error),
+            }
+        };
+        let address = ractor::call!(actor, |reply| MembershipMessage::Address { reply })?;
+        self.gossip_address.send_replace(Some(address));
+        let id = actor.get_id();
+        self.slots.membership.set(actor);
+        Ok(id)
+    }
+}
+
+fn slot<M: Message>(
+    slot: &ActorSlot<M>,
+    spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
+) -> Result<ActorId, ActorProcessingErr> {
+    let (actor, _) = spawned.map_err(cause)?;
+    let id = actor.get_id();
+    slot.set(actor);
+    Ok(id)
+}
+
+/// Why an actor did not start, without the framework's own words around it.
+pub(super) fn cause(error: SpawnErr) -> ActorProcessingErr {
+    match error {
+        SpawnErr::StartupFailed(cause) => cause,
+        other => other.into(),
+    }
+}
+
+/// An error with all its causes, which the actor framework would leave out.
+#[cfg(feature = "camera")]
+#[expect(clippy::needless_pass_by_value, reason = "takes what map_err gives")]
+fn in_full(error: anyhow::Error) -> ActorProcessingErr {
+    format!("{error:#}").into()
+}
+
+async fn stop<M: Message>(slot: &ActorSlot<M>) {
+    let Some(actor) = slot.get() else { return };
+    if let Err(error) = actor.stop_and_wait(None, Some(STOP_TIMEOUT)).await {
+        tracing::debug!(%error, "part did not stop in time");
+        actor.kill();
+    }
+}

@@ -1,0 +1,335 @@
+//! What each part is given at its start.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::aggregator::Aggregator;
+use ecod::election::ElectionConfig;
+use ecod::epoch::Epoch;
+use ecod::landmark::Landmark;
+use ecod::replay::JournalEvent;
+use ecod::wire::{NodeState as NodeCondition, NodeStatus};
+
+use super::NodeBuilder;
+use crate::actors::dashboard::DashboardArguments;
+use crate::actors::follower::FollowerArguments;
+use crate::actors::fuser::FuserArguments;
+use crate::actors::gateway::GatewayArguments;
+use crate::actors::leader_election::{LeaderElectionArguments, Parts, saved_term};
+use crate::actors::membership::MembershipArguments;
+use crate::actors::recorder::RecorderArguments;
+use crate::actors::reputation_keeper::ReputationKeeperArguments;
+use crate::messages::follower::FollowerMessage;
+use crate::messages::fuser::FuserMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::messages::leadership::Position;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::node::ActorSlots;
+use crate::node::config::NodeConfig;
+use crate::observe::dashboard::{LandmarkFacts, NodeFacts, Sources};
+use crate::observe::readiness::{Vitals, patience};
+use crate::observe::recorder::Identity;
+use crate::platform::clock;
+use crate::platform::state_file::StateFile;
+use crate::telemetry::counters::ShedReason;
+use crate::transport::gossip::{EventSink, MembershipConfig};
+use crate::transport::mqtt::{Incoming, Subscriber, SubscriptionRole};
+
+impl NodeBuilder {
+    pub(super) fn membership_arguments(&self) -> MembershipArguments {
+        let election = self.slots.election.clone();
+        let events: EventSink = Arc::new(move |event| {
+            election.send(LeaderElectionMessage::Membership { event });
+        });
+        let membership = &self.config.membership;
+        MembershipArguments {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+            run: clock::now().micros(),
+            role: self.config.role,
+            broker: *self.broker_address.borrow(),
+            // Others look for it where it was.
+            config: MembershipConfig { bind: self.gossip_address.borrow().or(membership.bind), ..membership.clone() },
+            events,
+            members: self.members.clone(),
+            counters: self.frames(),
+        }
+    }
+
+    pub(super) fn gateway_arguments(&self) -> GatewayArguments {
+        GatewayArguments {
+            cell: self.config.cell.clone(),
+            part: self.gateway_part(),
+            status: self.status(),
+            mqtt: self.config.mqtt.clone(),
+            security: self.security.clone(),
+            counters: self.counters(),
+            subscriber: self.subscriber(),
+            seed: self.run.as_u64_pair().1,
+        }
+    }
+
+    fn gateway_part(&self) -> SubscriptionRole {
+        if self.config.may_lead() {
+            SubscriptionRole::Candidate
+        } else if self.config.record.as_ref().is_some_and(|record| record.reports) {
+            SubscriptionRole::Observer
+        } else {
+            SubscriptionRole::Follower
+        }
+    }
+
+    /// The identity of the node's log; `record.name` stands for the node's name where it is set.
+    fn log_identity(&self) -> Identity {
+        let NodeConfig { cell, fusion, landmarks, record, .. } = &self.config;
+        let named = record.as_ref().and_then(|record| record.name.clone());
+        let node = named.unwrap_or_else(|| self.name.clone());
+        Identity::new(node, self.run, cell.clone(), fusion.clone(), landmarks.clone())
+    }
+
+    pub(super) fn recorder_arguments(&self) -> Option<RecorderArguments> {
+        Some(RecorderArguments {
+            config: self.config.record.clone()?,
+            identity: self.log_identity(),
+            recording: self.recording.clone(),
+            leadership: self.leadership(),
+            counters: self.counters(),
+        })
+    }
+
+    /// Takes what comes in to the part that deals with it. Reports are recorded by the fuser where there is one: in the
+    /// order in which they are fused.
+    fn subscriber(&self) -> Subscriber {
+        let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
+        let (name, feed, leadership) = (self.name.clone(), Arc::clone(&self.feed), self.leadership());
+        let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
+        let (intake, counters) = (self.intake.clone(), self.counters());
+        Arc::new(move |delivery| {
+            let at = delivery.received_at;
+            feed.note(&delivery.message, at);
+            match &delivery.message {
+                Incoming::Report { kind, report } if !fuses => {
+                    recording.report(*kind, report, at);
+                    true
+                }
+                // Evidence is for those that lead now or next; others that get it only look at it.
+                Incoming::Report { report, .. }
+                    if feed.watches() && report.node != name && leadership.borrow().position == Position::Following =>
+                {
+                    true
+                }
+                Incoming::Report { kind, report } => {
+                    let (kind, report) = (*kind, Arc::clone(report));
+                    let put = intake.put(kind, &report, delivery);
+                    if put.has_replaced {
+                        counters.shed(ShedReason::ReportReplaced, report.node.as_str());
+                    }
+                    !put.is_first || fuser.send(FuserMessage::TakeReports)
+                }
+                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
+                Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
+                Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
+                Incoming::Ledger(share) if !fuses => {
+                    recording.share(share, at);
+                    true
+                }
+                Incoming::Ledger(share) => {
+                    recording.share(share, at);
+                    election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
+                    keeper.send(ReputationKeeperMessage::Merge { delivery })
+                }
+                Incoming::Link { broker, state } => {
+                    recording.link(broker, *state, at);
+                    election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
+                }
+                Incoming::Status { status, .. } => {
+                    recording.status(status, at);
+                    election.send(LeaderElectionMessage::TakeStatus { delivery })
+                }
+            };
+        })
+    }
+
+    pub(super) fn follower_arguments(&self) -> FollowerArguments {
+        FollowerArguments {
+            newest: self.newest.clone(),
+            log: self.config.map_log.clone(),
+            recording: self.recording.clone(),
+            least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
+            term: self.term.subscribe(),
+            leadership: self.leadership(),
+            election: self.slots.election.clone(),
+            fuser: self.slots.fuser.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    pub(super) fn keeper_arguments(&self) -> ReputationKeeperArguments {
+        ReputationKeeperArguments {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+            reputation: self.config.fusion.reputation.clone(),
+            config: self.config.reputations.clone(),
+            book: self.book.clone(),
+            file: self.state_file("reputations"),
+            newest: self.newest.reputations.subscribe(),
+            members: self.members(),
+            leadership: self.leadership(),
+            term: self.term.subscribe(),
+            gateway: self.slots.gateway.clone(),
+            fuser: self.slots.fuser.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    /// A fuser starts with the evidence that the keeper has, and goes on with the objects of the newest map.
+    pub(super) fn fuser_arguments(&self) -> FuserArguments {
+        let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
+        let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
+        let mut aggregator = Aggregator::standby(fusion, landmarks, now);
+        aggregator.adopt(&ledger);
+        self.recording.journal(now, JournalEvent::Start { ledger });
+        FuserArguments {
+            aggregator,
+            term: self.term.subscribe(),
+            recording: self.recording.clone(),
+            intake: self.intake.clone(),
+            newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
+            gateway: self.slots.gateway.clone(),
+            keeper: self.slots.keeper.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
+        let ActorSlots { membership, gateway, fuser, keeper, broker, .. } = self.slots.clone();
+        LeaderElectionArguments {
+            config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+            term_file: self.state_file("term"),
+            round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
+            plane: self.config.data_plane(),
+            status: self.status(),
+            own_broker: self.broker_address(),
+            members: self.members(),
+            parts: Parts { membership, gateway, fuser, keeper, broker },
+            leadership: self.leadership.clone(),
+            term: self.term.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    pub(super) fn dashboard_arguments(&self) -> DashboardArguments {
+        let landmark = |landmark: Landmark| LandmarkFacts {
+            id: landmark.id,
+            x_m: landmark.position.x,
+            y_m: landmark.position.y,
+            facing_rad: landmark.facing_rad,
+        };
+        let node = NodeFacts {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+            role: self.config.role,
+            version: env!("CARGO_PKG_VERSION"),
+            started_at_us: self.started_at,
+            round_period_s: self.config.fusion.round.period_s,
+        };
+        let sources = Sources {
+            node,
+            landmarks: self.config.landmarks().into_iter().map(landmark).collect(),
+            vitals: self.vitals(),
+            members: self.members(),
+            counters: self.counters(),
+            frames: self.frames(),
+            feed: Arc::clone(&self.feed),
+        };
+        DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
+    }
+
+    /// What the node's readiness is judged from.
+    pub(in crate::node) fn vitals(&self) -> Vitals {
+        Vitals {
+            newest: self.newest.clone(),
+            leadership: self.leadership(),
+            plane: self.config.data_plane(),
+            patience: patience(&self.config.fusion),
+            gateway: self.slots.gateway.clone(),
+            broker: self.slots.broker.clone(),
+        }
+    }
+
+    fn state_file(&self, what: &str) -> Option<StateFile> {
+        let directory = self.config.state_dir.as_deref()?;
+        Some(StateFile::new(directory, &self.config.cell, &self.name, what))
+    }
+
+    /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
+    fn status(&self) -> NodeStatus {
+        let newest = self.newest.map.borrow();
+        let taken = newest.as_ref().map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()));
+        let leadership = self.leadership.borrow();
+        let epoch = leadership.epoch.clone().filter(|_| leadership.leader().is_some()).or(taken);
+        NodeStatus {
+            state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
+            epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
+            aggregator: epoch.map(|epoch| epoch.leader),
+            fit: self.config.may_lead().then_some(false),
+            ..NodeStatus::starting(self.name.clone(), self.run, self.config.role, env!("CARGO_PKG_VERSION"))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::time::Timestamp;
+    use ecod::wire::{GlobalMap, Role, SCHEMA_VERSION};
+
+    use ecod::names::NodeName;
+    use tokio::sync::watch;
+
+    use super::*;
+    use crate::messages::newest::ReceivedMap;
+    use crate::node::config::NodeConfig;
+    use crate::transport::mqtt::Security;
+
+    #[test]
+    fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
+        use ecod::aggregator::Algorithms::{Both, Pace};
+        use ecod::tracks::TracksMode::{Auto, Off, On};
+        let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
+        for (algorithms, mode, landmarks, expected) in [
+            (Both, Off, vec![], true),
+            (Pace, Auto, vec![], true),
+            (Pace, On, vec![spot], true),
+            (Pace, Off, vec![], false),
+        ] {
+            let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
+            (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
+            let builder = NodeBuilder::new(config, Security::default(), watch::Sender::new(None));
+            let keeps = builder.parts().contains(&crate::node::slots::ActorKind::ReputationKeeper);
+            assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
+        }
+    }
+
+    #[test]
+    fn a_part_started_anew_still_says_whom_the_node_follows() {
+        let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
+        let builder = NodeBuilder::new(config, Security::default(), watch::Sender::new(None));
+        assert_eq!((builder.status().epoch, builder.status().aggregator), (0, None));
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("edge"),
+            epoch: 7,
+            round: 1,
+            fused_at_us: Timestamp(0),
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+            pose_corrections: Default::default(),
+        };
+        builder.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
+        assert_eq!(
+            (builder.status().epoch, builder.status().aggregator.as_ref().map(NodeName::as_str)),
+            (7, Some("edge"))
+        );
+    }
+}

@@ -1,0 +1,74 @@
+//! The camera of a vehicle as configured: source, optics, detector, projection.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use ecod::aggregator::Algorithms;
+use ecod::landmark::LandmarkIndex;
+
+use crate::actors::detector::DetectorArguments;
+use crate::camera::image_size::ImageSize;
+use crate::camera::perception::{Perception, Vantage};
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::projector::ProjectorMessage;
+use crate::node::config::NodeConfig;
+use crate::observe::recorder::Pictures;
+use crate::telemetry::counters::Counters;
+
+/// A node without a camera was asked for what only a camera gives.
+#[derive(Debug, thiserror::Error)]
+#[error("this node has no camera")]
+pub struct NoCamera;
+
+/// The way from detections to reports, as configured.
+///
+/// # Errors
+/// When there is no camera or its calibration file cannot be used.
+pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
+    let camera = config.camera.as_ref().ok_or(NoCamera)?;
+    let gate = config.fusion.pace.gate();
+    let vantage = Vantage {
+        node: config.name.clone().unwrap_or(ecod::names::NodeName::from_static("node")),
+        pose: config.pose.pose(),
+        mount: camera.mount.into(),
+        lens: camera.optics.lens().context("key `camera.optics.calibration`")?,
+        landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),
+    };
+    Ok(Perception::new(vantage, camera.projection.clone(), camera.view.clone(), gate))
+}
+
+/// The algorithms that the camera's reports are for. Without known locations there is nothing to vote on.
+pub fn algorithms(config: &NodeConfig) -> Algorithms {
+    let votes = config.camera.as_ref().is_some_and(|camera| camera.votes) && !config.landmarks.is_empty();
+    match config.fusion.algorithms {
+        Algorithms::Both if !votes => Algorithms::Pace,
+        algorithms => algorithms,
+    }
+}
+
+/// The way from frames to detections, as configured.
+///
+/// # Errors
+/// When there is no camera or the detector's files cannot be used.
+pub fn detector(
+    config: &NodeConfig,
+    projector: ActorSlot<ProjectorMessage>,
+    pictures: Option<Pictures>,
+    counters: Arc<Counters>,
+) -> anyhow::Result<DetectorArguments> {
+    let camera = config.camera.as_ref().ok_or(NoCamera)?;
+    let source = camera.source.clone();
+    // Somewhat less than the capture waits, so that OpenCV gives up by itself and leaves no thread behind.
+    let patience = Duration::from_secs_f64(0.8 * camera.capture.stall_timeout_s);
+    let lens = camera.optics.lens().context("key `camera.optics.calibration`")?;
+    Ok(DetectorArguments {
+        open: Arc::new(move || source.open(patience)),
+        capture: camera.capture.clone(),
+        detect: camera.detector.build().context("key `camera.detector`")?,
+        optics: ImageSize::from(&lens.intrinsics),
+        projector,
+        pictures,
+        counters,
+    })
+}

@@ -1,0 +1,428 @@
+//! The configuration of a node: defaults, then a TOML file, then `ECOD_…` in the environment, then flags.
+//!
+//! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
+
+mod extraction;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use ecod::aggregator::FusionConfig;
+use ecod::config::ConfigError;
+use ecod::election::ElectionConfig;
+use ecod::landmark::{Landmark, LandmarkConfig};
+use ecod::names::NodeName;
+use ecod::wire::Role;
+use figment::Figment;
+use figment::providers::{Format, Serialized, Toml};
+use serde::{Deserialize, Serialize};
+
+use self::extraction::{environment, extract};
+use crate::actors::reputation_keeper::ReputationKeeperConfig;
+#[cfg(feature = "camera")]
+use crate::camera::config::CameraConfig;
+use crate::camera::vehicle_pose::PoseConfig;
+use crate::observe::dashboard::DashboardConfig;
+use crate::observe::recorder::RecordConfig;
+use crate::transport::broker::BrokerConfig;
+use crate::transport::gossip::MembershipConfig;
+use crate::transport::mqtt::{DataPlane, MqttConfig, Security, SecurityError};
+use crate::transport::pki::TlsConfig;
+
+/// Everything that a node can be told.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NodeConfig {
+    /// Name of the node, unique in its cell. Default `edge` for an edge, the machine's host name for others.
+    pub name: Option<NodeName>,
+    /// Name of the cell; nodes of other cells are not heard. Default `cell`.
+    pub cell: NodeName,
+    /// What the node is meant to do. Default `auto`.
+    pub role: Role,
+    /// Where the embedded broker of a node that may lead listens. Default port 8883 on all interfaces with `[tls]`;
+    /// without, port 1883 on 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says
+    /// otherwise.
+    pub listen: Option<SocketAddr>,
+    /// Directory for what survives a restart: reputations and the highest term of leadership. Default
+    /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
+    /// others.
+    pub state_dir: Option<PathBuf>,
+    /// A file to which every accepted map is appended with its time of receipt, one JSON
+    /// object a line. Default none.
+    pub map_log: Option<PathBuf>,
+    /// Where the vehicle is. Default at the origin, looking east.
+    pub pose: PoseConfig,
+    /// How the nodes of the cell find and watch each other.
+    pub membership: MembershipConfig,
+    /// Who leads the cell.
+    pub election: ElectionConfig,
+    /// MQTT connections.
+    pub mqtt: MqttConfig,
+    /// The node's certificates; default none: brokers are spoken to in plaintext.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls: Option<TlsConfig>,
+    /// Limits of the embedded broker.
+    pub broker: BrokerConfig,
+    /// How reports are fused; used by aggregators.
+    pub fusion: FusionConfig,
+    /// How often reputations are published, saved and replicated; used by aggregators.
+    pub reputations: ReputationKeeperConfig,
+    /// A web page with the cell, metrics and health.
+    pub dashboard: DashboardConfig,
+    /// The camera and what is made of its frames. Default none.
+    #[cfg(feature = "camera")]
+    pub camera: Option<CameraConfig>,
+    /// The log of what the node takes. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub record: Option<RecordConfig>,
+    /// The cell's known locations, the same on every node. Default none.
+    pub landmarks: Vec<LandmarkConfig>,
+}
+
+impl Default for NodeConfig {
+    fn default() -> Self {
+        Self {
+            name: None,
+            cell: NodeName::from_static("cell"),
+            role: Role::Auto,
+            listen: None,
+            state_dir: None,
+            map_log: None,
+            pose: PoseConfig::default(),
+            membership: MembershipConfig::default(),
+            election: ElectionConfig::default(),
+            mqtt: MqttConfig::default(),
+            tls: None,
+            broker: BrokerConfig::default(),
+            fusion: FusionConfig::default(),
+            reputations: ReputationKeeperConfig::default(),
+            dashboard: DashboardConfig::default(),
+            #[cfg(feature = "camera")]
+            camera: None,
+            record: None,
+            landmarks: Vec::new(),
+        }
+    }
+}
+
+/// A configuration that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum LoadError {
+    /// The file is not there or cannot be read.
+    #[error("cannot read configuration {path}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// Keys or values are of the wrong kind or unknown.
+    #[error("{0}")]
+    Malformed(String),
+    /// A value is out of its range.
+    #[error(transparent)]
+    OutOfRange(#[from] ConfigError),
+}
+
+impl NodeConfig {
+    /// Reads the file, if any, lays the environment and `flags` over it, and checks the result.
+    ///
+    /// # Errors
+    /// [`LoadError`] naming the file, or the key, the value and what is allowed.
+    pub fn load(file: Option<&std::path::Path>, flags: &impl Serialize) -> Result<Self, LoadError> {
+        let mut figment = Figment::from(Serialized::defaults(Self::default()));
+        if let Some(path) = file {
+            std::fs::metadata(path).map_err(|source| LoadError::Unreadable { path: path.into(), source })?;
+            figment = figment.merge(Toml::file_exact(path));
+        }
+        let figment = figment.merge(environment()).merge(Serialized::defaults(flags));
+        let mut config = extract(figment)?;
+        if config.name.is_none() {
+            let edge = (config.role == Role::Edge).then_some(NodeName::from_static("edge"));
+            config.name = edge.or_else(host_name);
+        }
+        if config.state_dir.is_none() {
+            config.state_dir = std::env::var_os("STATE_DIRECTORY").map(PathBuf::from);
+        }
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// Reads what a file says about a cell: all keys of a node are known, none is required, and neither the environment
+    /// nor flags play a part. Fusion and locations are checked.
+    ///
+    /// # Errors
+    /// [`LoadError`] naming the file, or the key, the value and what is allowed.
+    pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
+        std::fs::metadata(file).map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
+        let config = extract(Figment::from(Serialized::defaults(Self::default())).merge(Toml::file_exact(file)))?;
+        config.fusion.validate().map_err(|error| error.within("fusion"))?;
+        LandmarkConfig::validate_all(&config.landmarks)?;
+        Ok(config)
+    }
+
+    /// Checks every value and that they fit together.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the key, the value and what is allowed.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if self.name.is_none() {
+            return Err(ConfigError::new(
+                "name",
+                "nothing",
+                "the node's name, unique in its cell (`--name`): the host name cannot serve as one",
+            ));
+        }
+        self.pose.validate().map_err(|error| error.within("pose"))?;
+        self.membership.validate().map_err(|error| error.within("membership"))?;
+        self.election.validate().map_err(|error| error.within("election"))?;
+        let (hello, join) = (self.membership.hello_ms, self.election.join_ms);
+        if hello.saturating_mul(2) > join {
+            let allowed = format!("at most half of `election.join_ms`, {join}: a leader that is there must be found");
+            return Err(ConfigError::new("membership.hello_ms", hello, allowed));
+        }
+        self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
+        if self.mqtt.sign && !self.membership.has_key() {
+            return Err(ConfigError::new(
+                "mqtt.sign",
+                true,
+                "false, or `membership.key_file` set: payloads are signed by it",
+            ));
+        }
+        if let Some(tls) = &self.tls {
+            tls.validate().map_err(|error| error.within("tls"))?;
+        }
+        self.broker.validate().map_err(|error| error.within("broker"))?;
+        self.validate_listen()?;
+        let needed = self.mqtt.max_packet_bytes();
+        if let Some(bytes) = self.broker.max_packet_bytes
+            && (bytes as usize) < needed
+        {
+            let allowed = format!("at least {needed}, so that `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` fit");
+            return Err(ConfigError::new("broker.max_packet_bytes", bytes, allowed));
+        }
+        self.fusion.validate().map_err(|error| error.within("fusion"))?;
+        self.reputations.validate().map_err(|error| error.within("reputations"))?;
+        self.dashboard.validate().map_err(|error| error.within("dashboard"))?;
+        #[cfg(feature = "camera")]
+        if let Some(camera) = &self.camera {
+            camera.validate().map_err(|error| error.within("camera"))?;
+        }
+        if let Some(record) = &self.record {
+            record.validate().map_err(|error| error.within("record"))?;
+        }
+        LandmarkConfig::validate_all(&self.landmarks)
+    }
+
+    /// Others than this machine reach a broker without certificates only if somebody wants that.
+    fn validate_listen(&self) -> Result<(), ConfigError> {
+        let listen = self.broker_listen();
+        let open = self.tls.is_none() && !self.broker.allow_plaintext && !listen.ip().is_loopback();
+        if open && self.may_lead() && self.data_plane().embedded {
+            let allowed =
+                "a loopback address, unless there are certificates in `[tls]` or `broker.allow_plaintext` is true";
+            return Err(ConfigError::new("listen", listen, allowed));
+        }
+        Ok(())
+    }
+
+    /// The configuration as TOML that can be read back; secrets are left out, and a comment says so.
+    ///
+    /// # Errors
+    /// When a value has no form in TOML.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        let mut shown = self.clone();
+        let mut comment = String::new();
+        if shown.mqtt.password.take().is_some() {
+            comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
+        }
+        if shown.dashboard.token.take().is_some() {
+            comment.push_str("# `dashboard.token` is set but not shown: add it, or set ECOD_DASHBOARD__TOKEN\n");
+        }
+        if shown.membership.key.take().is_some() {
+            comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");
+        }
+        #[cfg(feature = "camera")]
+        if shown.camera.as_mut().is_some_and(|camera| camera.source.forget_credentials()) {
+            comment.push_str("# user and password of `camera.source.url` are set but not shown: add them\n");
+        }
+        Ok(comment + &toml::to_string(&shown)?)
+    }
+
+    /// The embedded broker's limits; its packets hold the cell's maps.
+    pub fn broker(&self) -> BrokerConfig {
+        let needed = u32::try_from(self.mqtt.max_packet_bytes()).ok();
+        BrokerConfig { max_packet_bytes: self.broker.max_packet_bytes.or(needed), ..self.broker.clone() }
+    }
+
+    /// Where the embedded broker listens.
+    pub fn broker_listen(&self) -> SocketAddr {
+        let (ip, port) = match &self.tls {
+            Some(_) => ([0, 0, 0, 0], 8883),
+            None if self.broker.allow_plaintext => ([0, 0, 0, 0], 1883),
+            None => ([127, 0, 0, 1], 1883),
+        };
+        self.listen.unwrap_or(SocketAddr::from((ip, port)))
+    }
+
+    /// The protection of links and payloads; the files that the configuration names are read.
+    ///
+    /// # Errors
+    /// [`SecurityError`] naming the file.
+    pub fn security(&self) -> Result<Security, SecurityError> {
+        Security::load(self.tls.as_ref().zip(self.name.as_ref()), &self.mqtt, (&self.membership, &self.cell))
+    }
+
+    /// Whether the node may lead its cell.
+    pub fn may_lead(&self) -> bool {
+        self.role != Role::Cav
+    }
+
+    /// Which brokers carry the cell's data.
+    pub fn data_plane(&self) -> DataPlane {
+        let external = self.mqtt.broker.clone();
+        let embedded = external.is_none() || self.mqtt.fallback_to_embedded;
+        DataPlane { external, embedded }
+    }
+
+    /// The cell's known locations.
+    pub fn landmarks(&self) -> Vec<Landmark> {
+        self.landmarks.iter().map(Landmark::from).collect()
+    }
+}
+
+/// The machine's name without its domain, as far as names of nodes may have its characters.
+fn host_name() -> Option<NodeName> {
+    let system = rustix::system::uname();
+    let host = system.nodename().to_str().ok()?.split('.').next()?;
+    let allowed = |c: char| if c.is_ascii_alphanumeric() || c == '_' { c } else { '-' };
+    NodeName::new(host.chars().map(allowed).collect::<String>()).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[derive(Serialize)]
+    struct Flags {
+        name: &'static str,
+    }
+
+    fn load(toml: &str) -> Result<NodeConfig, LoadError> {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(toml.as_bytes()).unwrap();
+        NodeConfig::load(Some(file.path()), &Flags { name: "from-flag" })
+    }
+
+    #[test]
+    fn flags_override_the_file_and_the_file_the_defaults() {
+        let config = load("name = \"from-file\"\nrole = \"edge\"\ncell = \"lot-9\"").unwrap();
+        assert_eq!(config.name.as_ref().unwrap().as_str(), "from-flag");
+        assert_eq!(config.cell.as_str(), "lot-9");
+        assert_eq!(config.broker_listen().to_string(), "127.0.0.1:1883");
+        let keyed = load("[membership]\nkey = \"a key for the lot\"").unwrap();
+        assert_eq!(keyed.broker_listen().to_string(), "127.0.0.1:1883");
+        let open = load("[broker]\nallow_plaintext = true").unwrap();
+        assert_eq!(open.broker_listen().to_string(), "0.0.0.0:1883");
+        let closed = load("[tls]\nca = \"ca.pem\"\ncertificate = \"edge.pem\"\nkey = \"edge.key\"").unwrap();
+        assert_eq!(closed.broker_listen().to_string(), "0.0.0.0:8883");
+    }
+
+    #[test]
+    fn errors_name_the_key_the_value_and_what_is_allowed() {
+        for (toml, parts) in [
+            ("role = \"edge\"\n[fusion.pace]\ngate_m = -1", ["`fusion.pace.gate_m`", "-1", "0.001 to 1000"]),
+            ("role = \"edge\"\n[fusion.pace]\ngate = 1", ["`fusion.pace.gate`", "unknown field", "`gate_m`"]),
+            ("role = \"edge\"\n[mqtt]\nkeep_alive_s = \"x\"", ["`mqtt.keep_alive_s`", "\"x\"", "u16"]),
+            ("role = \"king\"", ["`role`", "king", "`edge`"]),
+            ("listen = \"0.0.0.0:1883\"", ["`listen`", "0.0.0.0:1883", "allow_plaintext"]),
+            ("[mqtt]\nsign = true", ["`mqtt.sign`", "true", "key_file"]),
+            ("[tls]\nca = \"\"\ncertificate = \"a\"\nkey = \"b\"", ["`tls.ca`", "nothing", "PEM"]),
+            (
+                "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",
+                ["`broker.max_packet_bytes`", "1048576", "8392704"],
+            ),
+            ("[election]\njoin_ms = 700", ["`membership.hello_ms`", "500", "half of `election.join_ms`, 700"]),
+            ("[election]\nbeat_ms = 1", ["`election.beat_ms`", "1", "5 to"]),
+            (
+                "role = \"edge\"\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 1\ny_m = 0",
+                ["`landmarks[1].id`", "\"a\"", "unique"],
+            ),
+            ("role = ", ["TOML", "configuration", ""]),
+            ("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"***\"", ["`mqtt.password`", "not printed", "***"]),
+        ] {
+            let error = load(toml).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[cfg(feature = "camera")]
+    #[test]
+    fn errors_name_the_key_of_a_table_that_has_a_kind() {
+        let source = "[camera.detector]\nkind = \"placard\"\n[camera.source]\n";
+        for (toml, parts) in [
+            ("kind = \"v4l2\"\nwidth = \"wide\"\nheight = 480", ["`camera.source.width`", "\"wide\"", "u32"]),
+            ("kind = \"v4l2\"\nheight = 480\nwidht = 640", ["`camera.source.widht`", "unknown field", "`width`"]),
+            ("kind = \"url\"\nurl = 7", ["`camera.source.url`", "text", "quotes"]),
+            ("kind = \"testbed\"\nscenes = \"a\"\ncav = \"b\"", ["`camera.source`", "missing field", "`scene`"]),
+            ("kind = \"url\"", ["`camera.source`", "missing field", "`url`"]),
+            ("kind = \"eye\"\nwidth = 640", ["`camera.source.kind`", "eye", "`v4l2`"]),
+        ] {
+            let error = load(&format!("{source}{toml}")).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_missing_file_is_named() {
+        let error = NodeConfig::load(Some(std::path::Path::new("/missing.toml")), &Flags { name: "x" }).unwrap_err();
+        assert!(error.to_string().contains("/missing.toml"));
+    }
+
+    #[test]
+    fn a_printed_configuration_can_be_read_back() {
+        let config = load("role = \"edge\"").unwrap();
+        assert_eq!(load(&config.to_toml().unwrap()).unwrap(), config);
+    }
+
+    #[test]
+    fn a_printed_configuration_says_that_the_password_is_missing_and_has_no_other_in_its_place() {
+        let config = load("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"hush\"").unwrap();
+        let printed = config.to_toml().unwrap();
+        assert!(printed.contains("# `mqtt.password` is set but not shown") && !printed.contains("hush"), "{printed}");
+        let read = load(&printed).unwrap();
+        assert_eq!((read.mqtt.user.as_deref(), read.mqtt.password), (Some("u"), None));
+    }
+
+    #[test]
+    fn no_error_shows_a_cell_key() {
+        for key in ["4711471147114711", "\"4711471147114711"] {
+            let error = load(&format!("role = \"edge\"\n[membership]\nkey = {key}")).unwrap_err().to_string();
+            assert!(error.contains("key") && !error.contains("4711"), "{error}");
+        }
+    }
+
+    #[test]
+    fn no_error_shows_a_token_or_the_login_of_a_camera() {
+        for toml in [
+            "[dashboard]\ntoken = 4711",
+            "[dashboard]\ntoken = \"4711",
+            "[camera.source]\nkind = \"url\"\nurl = [\"rtsp://u:4711@camera\"]",
+            "[camera.source]\nkind = \"url\"\nurl = \"rtsp://u:4711@camera",
+        ] {
+            let error = load(toml).unwrap_err().to_string();
+            assert!(!error.contains("4711"), "{error}");
+        }
+    }
+
+    #[test]
+    fn no_error_shows_a_password() {
+        for password in ["4711", "hush4711", "\"hush4711", "[\"hush4711\"]", "{ a = \"hush4711\" }"] {
+            let error = load(&format!("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = {password}")).unwrap_err();
+            let error = format!("{error} {error:?}");
+            assert!(error.contains("password") && !error.contains("4711"), "{error}");
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! What a node tells the service manager that started it, by the protocol of systemd's `sd_notify`.
+//!
+//! `READY=1` once all parts run, `STATUS=` whenever the node's readiness changes, `STOPPING=1` at the end. The watchdog is
+//! fed only while rounds flow: a node that follows a live aggregator whose rounds arrive, or that leads with a working
+//! broker. One that does neither for as long as the watchdog waits is started anew.
+
+use std::io;
+use std::time::Duration;
+
+use sd_notify::NotifyState;
+
+use crate::observe::readiness::Readiness;
+
+/// The service manager of this process.
+#[derive(Debug)]
+pub struct ServiceManager {
+    /// How long it waits for a sign of life; none without a watchdog.
+    watchdog: Option<Duration>,
+    told: Option<String>,
+    failing: bool,
+}
+
+/// How often readiness is looked at; with a watchdog, so many times within what it waits, if that is more often.
+const PERIOD: Duration = Duration::from_secs(1);
+const BEATS: u32 = 4;
+
+impl ServiceManager {
+    /// The manager that the environment names; none where nobody waits to be told.
+    pub fn from_environment() -> Option<Self> {
+        std::env::var_os("NOTIFY_SOCKET")?;
+        Some(Self { watchdog: sd_notify::watchdog_enabled(), told: None, failing: false })
+    }
+
+    /// How often it is told how the node is.
+    pub fn period(&self) -> Duration {
+        self.watchdog.map_or(PERIOD, |watchdog| (watchdog / BEATS).clamp(Duration::from_millis(1), PERIOD))
+    }
+
+    /// All parts run.
+    pub fn started(&mut self) {
+        self.tell(&[NotifyState::Ready]);
+    }
+
+    /// How the node is now; feeds the watchdog if it is ready.
+    pub fn beat(&mut self, readiness: Readiness) {
+        if readiness.ready && self.watchdog.is_some() {
+            self.tell(&[NotifyState::Watchdog]);
+        }
+        if self.told.as_ref() != Some(&readiness.reason) {
+            self.tell(&[NotifyState::Status(&readiness.reason)]);
+            self.told = Some(readiness.reason);
+        }
+    }
+
+    /// The node ends.
+    pub fn stopping(&mut self) {
+        self.tell(&[NotifyState::Stopping]);
+    }
+
+    /// A manager that does not listen is told of once.
+    fn tell(&mut self, news: &[NotifyState<'_>]) {
+        let told: io::Result<()> = sd_notify::notify(news);
+        if let Err(error) = &told
+            && !self.failing
+        {
+            tracing::warn!(%error, "service manager not told");
+        }
+        self.failing = told.is_err();
+    }
+}

@@ -1,0 +1,74 @@
+//! The parts of a node and where each is reached.
+
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::broker::BrokerMessage;
+use crate::messages::dashboard::DashboardMessage;
+#[cfg(feature = "camera")]
+use crate::messages::detector::DetectorMessage;
+use crate::messages::follower::FollowerMessage;
+use crate::messages::fuser::FuserMessage;
+use crate::messages::gateway::GatewayMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::messages::membership::MembershipMessage;
+#[cfg(feature = "camera")]
+use crate::messages::projector::ProjectorMessage;
+use crate::messages::recorder::RecorderMessage;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
+
+/// A part of a node, in the order of starting.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum ActorKind {
+    /// The writer of the log.
+    Recorder,
+    /// The embedded broker.
+    Broker,
+    /// The gossip with the other nodes.
+    Membership,
+    /// The MQTT connections.
+    Gateway,
+    /// The taker of maps.
+    Follower,
+    /// The holder of reputations.
+    ReputationKeeper,
+    /// The maker of maps.
+    Fuser,
+    /// The node's part in the election.
+    LeaderElection,
+    /// The node's page.
+    Dashboard,
+    /// The maker of reports.
+    #[cfg(feature = "camera")]
+    Projector,
+    /// The finder of objects in frames.
+    #[cfg(feature = "camera")]
+    Detector,
+}
+
+/// Where the parts of a node are reached.
+#[derive(Debug, Clone, Default)]
+pub struct ActorSlots {
+    /// The recorder's.
+    pub recorder: ActorSlot<RecorderMessage>,
+    /// The embedded broker's.
+    pub broker: ActorSlot<BrokerMessage>,
+    /// The membership's.
+    pub membership: ActorSlot<MembershipMessage>,
+    /// The gateway's.
+    pub gateway: ActorSlot<GatewayMessage>,
+    /// The follower's.
+    pub follower: ActorSlot<FollowerMessage>,
+    /// The reputation keeper's.
+    pub keeper: ActorSlot<ReputationKeeperMessage>,
+    /// The fuser's.
+    pub fuser: ActorSlot<FuserMessage>,
+    /// The election's.
+    pub election: ActorSlot<LeaderElectionMessage>,
+    /// The dashboard's.
+    pub dashboard: ActorSlot<DashboardMessage>,
+    /// The projector's.
+    #[cfg(feature = "camera")]
+    pub projector: ActorSlot<ProjectorMessage>,
+    /// The detector's.
+    #[cfg(feature = "camera")]
+    pub detector: ActorSlot<DetectorMessage>,
+}

@@ -1,0 +1,206 @@
+//! What the node saw over time: who led, how late the maps came, how far vehicles were trusted.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+use ecod::epoch::Epoch;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::Reputations;
+use serde::Serialize;
+
+use super::picture::json;
+use crate::messages::leadership::{Leadership, Position};
+
+/// A span of time in which one node led, as this node saw it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct Reign {
+    /// The leader.
+    pub leader: NodeName,
+    /// Its term.
+    pub epoch: u64,
+    /// When this node took it for the leader.
+    pub from_us: Timestamp,
+    /// When it no longer did; absent while it does.
+    pub until_us: Option<Timestamp>,
+    /// Milliseconds from the last round accepted before to the first of this leader; absent for the first leader, or
+    /// until then.
+    pub gap_ms: Option<u64>,
+}
+
+/// What one span of [`SAMPLE_PERIOD`] came to.
+#[derive(Debug, Serialize)]
+struct Sample<'a> {
+    /// When the span ended.
+    at_us: Timestamp,
+    /// Rounds accepted in it.
+    rounds: u32,
+    /// Milliseconds from the oldest capture in a map to its receipt, median; absent without such a map.
+    latency_p50_ms: Option<f64>,
+    /// The same, largest.
+    latency_max_ms: Option<f64>,
+    /// Reputation of every vehicle shown.
+    reputations: BTreeMap<&'a NodeName, f64>,
+}
+
+/// Leaders and samples, the oldest first.
+#[derive(Debug, Default)]
+pub(crate) struct History {
+    /// Who led.
+    pub reigns: VecDeque<Reign>,
+    /// When spans ended and, as JSON, how they went: it is written once and not for every browser that asks.
+    samples: VecDeque<(Timestamp, Vec<u8>)>,
+    /// How often the leader changed since the node started.
+    pub failovers: u64,
+    last_round: Option<(Epoch, Timestamp)>,
+    /// The gap before the last epoch's first round, which may be known before its reign is.
+    last_gap: Option<(Epoch, u64)>,
+    latencies_ms: Vec<f64>,
+    rounds: u32,
+}
+
+/// How often a sample is taken.
+pub(crate) const SAMPLE_PERIOD: Duration = Duration::from_secs(2);
+
+/// Most samples kept: ten minutes.
+pub(crate) const MAX_SAMPLES: usize = 300;
+
+/// Most reigns kept.
+pub(crate) const MAX_REIGNS: usize = 32;
+
+/// Most vehicles in a sample.
+pub(crate) const MAX_VEHICLES: usize = 64;
+
+/// Most latencies of one span that are looked at.
+const MAX_LATENCIES: usize = 256;
+
+impl History {
+    /// All of it as JSON, but for samples up to a time, for whoever has those.
+    pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
+        let samples: Vec<_> = self.samples.iter().filter(|(at, _)| *at > time).map(|(_, sample)| &**sample).collect();
+        let (reigns, samples, failovers) = (json(&self.reigns), samples.join(&b','), json(&self.failovers));
+        let parts: [&[u8]; 7] =
+            [b"{\"reigns\":", &reigns, b",\"samples\":[", &samples, b"],\"failovers\":", &failovers, b"}"];
+        parts.concat()
+    }
+
+    /// Notes who leads now.
+    pub(crate) fn note_leadership(&mut self, leadership: &Leadership, now: Timestamp) {
+        let present = leadership.epoch.as_ref().filter(|_| leadership.position != Position::Seeking);
+        if let Some(open) = self.reigns.back_mut().filter(|reign| reign.until_us.is_none()) {
+            if present.is_some_and(|epoch| *epoch == Epoch::new(open.epoch, open.leader.clone())) {
+                return;
+            }
+            open.until_us = Some(now);
+        }
+        let Some(epoch) = present else { return };
+        let changed = self.reigns.back().is_some_and(|last| last.leader != epoch.leader);
+        self.failovers += u64::from(changed);
+        let gap_ms = self.last_gap.as_ref().filter(|(of, _)| of == epoch).map(|(_, gap)| *gap);
+        let (leader, epoch) = (epoch.leader.clone(), epoch.term);
+        push(&mut self.reigns, Reign { leader, epoch, from_us: now, until_us: None, gap_ms }, MAX_REIGNS);
+    }
+
+    /// Notes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
+    pub(crate) fn note_round(&mut self, epoch: &Epoch, captured_at: Option<Timestamp>, received_at: Timestamp) {
+        self.rounds = self.rounds.saturating_add(1);
+        let latency = captured_at.map(|captured_at| received_at.since(captured_at));
+        if self.latencies_ms.len() < MAX_LATENCIES {
+            self.latencies_ms.extend(latency.map(|latency| latency.as_secs_f64() * 1e3));
+        }
+        let before = self.last_round.replace((epoch.clone(), received_at));
+        let Some((last, last_at)) = before.filter(|(last, _)| last != epoch) else { return };
+        let gap_ms = u64::try_from(received_at.since(last_at).as_millis()).unwrap_or(u64::MAX);
+        let of_this = |reign: &&mut Reign| reign.leader == epoch.leader && reign.epoch == epoch.term;
+        if let Some(reign) = self.reigns.iter_mut().rev().find(of_this) {
+            reign.gap_ms.get_or_insert(gap_ms);
+        }
+        self.last_gap = Some((epoch.clone(), gap_ms));
+        tracing::debug!(%last, %epoch, gap_ms, "rounds of another leader");
+    }
+
+    /// Closes a span.
+    pub(crate) fn sample(&mut self, reputations: Option<&Reputations>, now: Timestamp) {
+        let mut latencies = std::mem::take(&mut self.latencies_ms);
+        latencies.sort_by(f64::total_cmp);
+        let reputations = reputations.into_iter().flat_map(|r| &r.reputations).take(MAX_VEHICLES);
+        let sample = Sample {
+            at_us: now,
+            rounds: std::mem::take(&mut self.rounds),
+            latency_p50_ms: latencies.get(latencies.len() / 2).copied(),
+            latency_max_ms: latencies.last().copied(),
+            reputations: reputations.map(|(name, reputation)| (name, reputation.score)).collect(),
+        };
+        push(&mut self.samples, (now, json(&sample)), MAX_SAMPLES);
+    }
+}
+
+fn push<T>(kept: &mut VecDeque<T>, item: T, most: usize) {
+    if kept.len() >= most {
+        kept.pop_front();
+    }
+    kept.push_back(item);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn led_by(leader: &'static str, term: u64) -> Leadership {
+        let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
+        Leadership { position: Position::Following, epoch, standby: None }
+    }
+
+    fn seconds(n: u64) -> Timestamp {
+        Timestamp(n * 1_000_000)
+    }
+
+    #[test]
+    fn a_failover_ends_one_reign_and_begins_another_with_its_gap() {
+        let mut history = History::default();
+        let epoch = |leader, term| Epoch::new(term, NodeName::from_static(leader));
+        history.note_leadership(&led_by("edge", 3), seconds(1));
+        history.note_round(&epoch("edge", 3), None, seconds(9));
+        history.note_leadership(&led_by("edge", 3), seconds(9));
+        let seeking = Leadership { position: Position::Seeking, ..led_by("edge", 3) };
+        history.note_leadership(&seeking, seconds(10));
+        history.note_leadership(&led_by("euclid", 4), seconds(11));
+        history.note_round(&epoch("euclid", 4), None, seconds(12));
+        history.note_round(&epoch("euclid", 4), None, seconds(14));
+        history.note_round(&epoch("gauss", 5), None, seconds(15));
+        history.note_leadership(&led_by("gauss", 5), seconds(16));
+        let reign = |leader, epoch, from, until: Option<u64>, gap_ms| {
+            let leader = NodeName::from_static(leader);
+            Reign { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
+        };
+        let (first, second) = (reign("edge", 3, 1, Some(10), None), reign("euclid", 4, 11, Some(16), Some(3000)));
+        assert_eq!(history.reigns, [first, second, reign("gauss", 5, 16, None, Some(1000))]);
+        assert_eq!(history.failovers, 2);
+    }
+
+    #[test]
+    fn a_leader_that_is_found_again_is_no_failover() {
+        let mut history = History::default();
+        history.note_leadership(&led_by("edge", 3), seconds(1));
+        history.note_leadership(&Leadership::default(), seconds(2));
+        history.note_leadership(&led_by("edge", 4), seconds(3));
+        assert_eq!((history.reigns.len(), history.failovers), (2, 0));
+    }
+
+    #[test]
+    fn a_long_run_is_kept_in_bounds() {
+        let mut history = History::default();
+        for n in 0..1000 {
+            history.note_leadership(&led_by(if n % 2 == 0 { "edge" } else { "euclid" }, n), seconds(n));
+            let epoch = Epoch::new(n, NodeName::from_static("edge"));
+            (0..1000).for_each(|_| history.note_round(&epoch, Some(seconds(n)), seconds(n)));
+            assert!(history.latencies_ms.len() <= MAX_LATENCIES);
+            history.sample(None, seconds(n));
+        }
+        assert_eq!((history.reigns.len(), history.samples.len()), (MAX_REIGNS, MAX_SAMPLES));
+        let told: serde_json::Value = serde_json::from_slice(&history.json_since(seconds(997))).unwrap();
+        let told = told["samples"].as_array().unwrap();
+        assert_eq!(told.len(), 2, "those that a browser has are left out");
+        assert_eq!((&told[1]["at_us"], &told[1]["rounds"]), (&999_000_000.into(), &1000.into()));
+    }
+}

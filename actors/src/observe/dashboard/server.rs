@@ -1,0 +1,177 @@
+//! The listener, on a thread of its own: whatever browsers do, the cell's threads do not notice.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use axum::Router;
+use hyper::Request;
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{oneshot, watch};
+use tokio_io_timeout::TimeoutStream;
+
+use super::access::Access;
+use super::config::{DEFAULT_ADDRESS, DashboardConfig};
+use super::observer::Observer;
+use super::places::{Admitted, Place, Places};
+use super::routes::Site;
+use crate::telemetry::counters::Event;
+
+/// A running server; dropping it stops it.
+#[derive(Debug)]
+pub(crate) struct Server {
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// First and longest wait before an address that was not free is tried again.
+const RETRY_MIN: Duration = Duration::from_millis(500);
+const RETRY_MAX: Duration = Duration::from_secs(10);
+
+/// How long a browser may take for its request.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How long a browser may read nothing of what it asked for.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Most bytes that wait for one browser, beside what its socket holds.
+const MAX_BUFFER_BYTES: usize = 64 * 1024;
+
+impl Server {
+    /// Starts the thread; `bound` gets the address as soon as it is listened on.
+    ///
+    /// # Errors
+    /// When the operating system gives no thread.
+    pub(crate) fn start(
+        config: DashboardConfig,
+        observer: Arc<Observer>,
+        bound: watch::Sender<Option<SocketAddr>>,
+    ) -> io::Result<Self> {
+        let (stop, stopped) = oneshot::channel();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let thread = std::thread::Builder::new().name("dashboard".into()).spawn(move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    () = observer.run() => {}
+                    () = serve(&config, &observer, &bound) => {}
+                    // The sender is dropped too when its owner is.
+                    _ = stopped => {}
+                }
+            });
+            runtime.shutdown_background();
+        })?;
+        Ok(Self { stop: Some(stop), thread: Some(thread) })
+    }
+
+    /// Whether the thread has ended by itself.
+    pub(crate) fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        drop(self.stop.take());
+        if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
+            tracing::warn!("the dashboard's thread panicked");
+        }
+    }
+}
+
+async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch::Sender<Option<SocketAddr>>) {
+    // A run before this one may have been given a port, which browsers now know.
+    let wanted = bound.borrow().or(config.listen);
+    let listener = match wanted {
+        Some(address) => listen(address, observer).await,
+        None => listen_anywhere(observer).await,
+    };
+    let Ok(address) = listener.local_addr() else { return };
+    let node = &observer.sources().node.name;
+    let access = Access::new(config.token.as_ref(), address, node);
+    tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
+    bound.send_replace(Some(address));
+    let router = Site::new(Arc::clone(observer), access, config.max_connections).router();
+    let places = Places::new(config.max_connections);
+    loop {
+        let (stream, from) = match listener.accept().await {
+            Ok(accepted) => accepted,
+            Err(error) => {
+                // Out of file descriptors, most likely: some may be free soon.
+                tracing::debug!(%error, "no connection accepted");
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                continue;
+            }
+        };
+        let admitted = places.admit(from.ip());
+        if admitted.as_ref().is_none_or(|admitted| admitted.displaces) {
+            observer.sources().counters.count(Event::BrowserRefused);
+        }
+        let Some(Admitted { place, displaced, .. }) = admitted else { continue };
+        let router = router.clone();
+        tokio::spawn(async move {
+            tokio::select! {
+                answered = answer(stream, Arc::new(place), router) => if let Err(error) = answered {
+                    tracing::debug!(%error, "connection of a browser ended");
+                },
+                _ = displaced => tracing::debug!(%from, "connection of a browser gave way to another"),
+            }
+        });
+    }
+}
+
+/// Answers one request. What keeps its connection between two requests would take a place for nothing.
+async fn answer(stream: TcpStream, place: Arc<Place>, router: Router) -> hyper::Result<()> {
+    if let Err(error) = stream.set_nodelay(true) {
+        tracing::debug!(%error, "small packets may wait");
+    }
+    let mut stream = TimeoutStream::new(stream);
+    stream.set_write_timeout(Some(WRITE_TIMEOUT));
+    let routed = TowerToHyperService::new(router);
+    let service = service_fn(|mut request: Request<Incoming>| {
+        request.extensions_mut().insert(Arc::clone(&place));
+        routed.call(request)
+    });
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEAD_TIMEOUT)
+        .keep_alive(false)
+        .max_buf_size(MAX_BUFFER_BYTES)
+        .serve_connection(TokioIo::new(Box::pin(stream)), service)
+        .await
+}
+
+/// Listens at the default address or, as other nodes of the machine do it too, on a free port of loopback.
+async fn listen_anywhere(observer: &Observer) -> TcpListener {
+    match TcpListener::bind(DEFAULT_ADDRESS).await {
+        Ok(listener) => listener,
+        Err(error) => {
+            tracing::info!(address = %DEFAULT_ADDRESS, %error, "dashboard takes a free port, key `dashboard.listen` is not set");
+            listen(SocketAddr::new(DEFAULT_ADDRESS.ip(), 0), observer).await
+        }
+    }
+}
+
+/// Listens as soon as the address is free.
+async fn listen(address: SocketAddr, observer: &Observer) -> TcpListener {
+    let mut wait = RETRY_MIN;
+    loop {
+        match TcpListener::bind(address).await {
+            Ok(listener) => return listener,
+            Err(error) => {
+                if wait == RETRY_MIN {
+                    tracing::warn!(%address, %error, "dashboard cannot listen, key `dashboard.listen`; trying again");
+                }
+                observer.sources().counters.count(Event::DashboardNotBound);
+            }
+        }
+        tokio::time::sleep(wait).await;
+        wait = (2 * wait).min(RETRY_MAX);
+    }
+}

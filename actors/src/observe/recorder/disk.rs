@@ -1,0 +1,130 @@
+//! The files of a log: their names, and how much of the disk they use.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use chrono::DateTime;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use rustix::fs::statvfs;
+
+/// How a file of a log ends.
+pub const EXTENSION: &str = "mcap";
+
+/// Most files that one second gives a name to.
+const NAMES_A_SECOND: u32 = 1000;
+
+/// Creates the file of a log that begins `at`, such as `euclid-20261121T100500Z-000.mcap`. By name they are in the
+/// order of time.
+///
+/// # Errors
+/// What the operating system said, and when there is less room than `min_free` bytes.
+pub(crate) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) -> io::Result<(PathBuf, File)> {
+    check_room(dir, min_free)?;
+    let seconds = i64::try_from(at.micros() / 1_000_000).unwrap_or_default();
+    let time = DateTime::from_timestamp(seconds, 0).unwrap_or_default().format("%Y%m%dT%H%M%SZ");
+    for number in 0..NAMES_A_SECOND {
+        let path = dir.join(format!("{node}-{time}-{number:03}.{EXTENSION}"));
+        match File::create_new(&path) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            created => return created.map(|file| (path, file)),
+        }
+    }
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{NAMES_A_SECOND} files began in the same second")))
+}
+
+/// Whether there is room for a log.
+///
+/// # Errors
+/// What the operating system said, and when there is less room than `min_free` bytes.
+pub(crate) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
+    let free = free_bytes(dir)?;
+    if free < min_free {
+        let message = format!("{} MB are free and `record.min_free_mb` is {}", free / 1_000_000, min_free / 1_000_000);
+        return Err(io::Error::new(io::ErrorKind::StorageFull, message));
+    }
+    Ok(())
+}
+
+/// Bytes that programs without privileges may still write where `dir` is.
+///
+/// # Errors
+/// What the operating system said.
+pub fn free_bytes(dir: &Path) -> io::Result<u64> {
+    let facts = statvfs(dir)?;
+    Ok(facts.f_bavail.saturating_mul(facts.f_frsize))
+}
+
+/// The files of a log, the oldest first.
+///
+/// # Errors
+/// What the operating system said about the directory.
+pub fn files(dir: &Path) -> io::Result<Vec<PathBuf>> {
+    let is_log = |path: &PathBuf| path.extension().is_some_and(|extension| extension == EXTENSION);
+    let mut files: Vec<_> = fs::read_dir(dir)?.filter_map(|entry| Some(entry.ok()?.path())).filter(is_log).collect();
+    files.sort();
+    Ok(files)
+}
+
+/// Deletes this node's oldest files until the rest has at most `max_bytes`; says how many are gone.
+///
+/// # Errors
+/// What the operating system said.
+pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<usize> {
+    let mut kept = 0;
+    let mut deleted = 0;
+    for path in files(dir)?.into_iter().rev().filter(|path| is_of(path, node)) {
+        kept += path.metadata()?.len();
+        if kept > max_bytes {
+            fs::remove_file(&path)?;
+            deleted += 1;
+        }
+    }
+    Ok(deleted)
+}
+
+/// A node's name may begin with another's: what follows it is a time and a number, without a further `-` between.
+fn is_of(path: &Path, node: &NodeName) -> bool {
+    let name = path.file_stem().and_then(|stem| stem.to_str());
+    let rest = name.and_then(|name| name.strip_prefix(node.as_str())?.strip_prefix('-'));
+    rest.and_then(|rest| rest.split_once('-')).is_some_and(|(time, number)| {
+        time.len() == "20261121T100500Z".len() && number.bytes().all(|byte| byte.is_ascii_digit())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name(text: &str) -> NodeName {
+        NodeName::new(text).unwrap()
+    }
+
+    #[test]
+    fn the_oldest_files_of_the_node_give_way_and_no_others() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |s: u64| Timestamp(1_732_154_400_000_000 + s * 1_000_000);
+        for (node, second) in [("cav", 0), ("cav", 0), ("cav", 7), ("cav-2", 0), ("cav", 4000)] {
+            let (path, _) = create(dir.path(), &name(node), at(second), 0).unwrap();
+            fs::write(path, [0; 100]).unwrap();
+        }
+        fs::write(dir.path().join("cav-notes.txt"), "mine").unwrap();
+        assert_eq!(prune(dir.path(), &name("cav"), 250).unwrap(), 2);
+        let left: Vec<_> = files(dir.path()).unwrap();
+        let left: Vec<_> = left.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
+        assert_eq!(
+            left,
+            ["cav-2-20241121T020000Z-000.mcap", "cav-20241121T020007Z-000.mcap", "cav-20241121T030640Z-000.mcap"]
+        );
+        assert!(dir.path().join("cav-notes.txt").exists());
+    }
+
+    #[test]
+    fn a_disk_that_is_nearly_full_is_left_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        let error = create(dir.path(), &name("cav"), Timestamp(0), u64::MAX).unwrap_err();
+        assert_eq!(error.kind(), io::ErrorKind::StorageFull);
+        assert!(error.to_string().contains("record.min_free_mb"), "{error}");
+    }
+}

@@ -1,0 +1,154 @@
+//! One file of a log while it is written.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use ecod::time::Timestamp;
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Compression, McapResult, WriteOptions, Writer};
+
+use super::channels::SchemaName;
+use super::identity::Identity;
+use super::scribe::{Message, Sink};
+
+/// A file being written; what was written up to the last [`LogFile::flush`] survives the process.
+pub(crate) struct LogFile {
+    writer: Writer<BufWriter<File>>,
+    path: PathBuf,
+    /// Whether any message is in the file for good.
+    holds: bool,
+    opened: Instant,
+    channels: HashMap<(SchemaName, String), Channel>,
+}
+
+struct Channel {
+    id: u16,
+    sequence: u32,
+}
+
+impl LogFile {
+    /// Begins a file that tells who writes it; where that fails, there is none.
+    pub(crate) fn begin(path: &Path, file: File, identity: &Identity) -> McapResult<Self> {
+        Self::introduce(path.into(), file, identity).inspect_err(|_| remove(path))
+    }
+
+    fn introduce(path: PathBuf, file: File, identity: &Identity) -> McapResult<Self> {
+        let options = WriteOptions::new()
+            .profile("")
+            .library(concat!("ecod-node ", env!("CARGO_PKG_VERSION")))
+            .compression(Some(Compression::Zstd))
+            .compression_level(1)
+            .compression_threads(0);
+        let mut writer = options.create(BufWriter::with_capacity(1 << 16, file))?;
+        writer.write_metadata(&Metadata { name: Identity::RECORD.into(), metadata: identity.to_map() })?;
+        writer.flush()?;
+        Ok(Self { writer, path, holds: false, opened: Instant::now(), channels: HashMap::new() })
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub(crate) fn opened(&self) -> Instant {
+        self.opened
+    }
+
+    /// Closes the chunk and hands all bytes to the operating system; says how large the file is.
+    pub(crate) fn flush(&mut self) -> McapResult<u64> {
+        self.writer.flush()?;
+        self.holds |= !self.channels.is_empty();
+        Ok(std::fs::metadata(&self.path)?.len())
+    }
+
+    /// Ends the file with its index.
+    pub(crate) fn finish(mut self) -> McapResult<()> {
+        self.writer.finish()?;
+        self.writer.into_inner().flush()?;
+        Ok(())
+    }
+
+    /// Leaves the file as it is, such as when the disk takes no more; a file that holds nothing is removed.
+    pub(crate) fn abandon(self) {
+        drop(self.writer.into_inner().into_parts());
+        if !self.holds {
+            remove(&self.path);
+        }
+    }
+}
+
+fn remove(path: &Path) {
+    if let Err(error) = std::fs::remove_file(path) {
+        tracing::debug!(file = %path.display(), %error, "a log that holds nothing cannot be removed");
+    }
+}
+
+impl Sink for LogFile {
+    fn put(&mut self, message: Message<'_>) -> McapResult<()> {
+        let Message { schema, topic, at, made_at, json } = message;
+        let key = (schema, topic.to_owned());
+        if !self.channels.contains_key(&key) {
+            let text = schema.json_schema().to_value().to_string();
+            let schema_id = self.writer.add_schema(schema.as_str(), "jsonschema", text.as_bytes())?;
+            let id = self.writer.add_channel(schema_id, topic, "json", &BTreeMap::new())?;
+            self.channels.insert(key.clone(), Channel { id, sequence: 0 });
+        }
+        let Some(channel) = self.channels.get_mut(&key) else { return Ok(()) };
+        channel.sequence = channel.sequence.wrapping_add(1);
+        let header = MessageHeader {
+            channel_id: channel.id,
+            sequence: channel.sequence,
+            log_time: nanoseconds(at),
+            publish_time: nanoseconds(made_at),
+        };
+        self.writer.write_to_known_channel(&header, json)
+    }
+}
+
+/// Unix nanoseconds; the log's times are exact microseconds.
+fn nanoseconds(at: Timestamp) -> u64 {
+    at.micros().saturating_mul(1000)
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::names::NodeName;
+    use uuid::Uuid;
+
+    use super::*;
+    use ecod::aggregator::FusionConfig;
+
+    #[test]
+    fn a_file_that_holds_nothing_is_not_left_behind() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("cav.mcap");
+        let identity = Identity::new(
+            NodeName::from_static("cav"),
+            Uuid::nil(),
+            NodeName::from_static("lot-1"),
+            FusionConfig::default(),
+            Vec::new(),
+        );
+        let json = br#"{"at_us":0,"event":{"missing":{"entries":1}}}"#;
+        let (at, made_at) = (Timestamp(0), Timestamp(0));
+        let message = Message { schema: SchemaName::JournalEntry, topic: "node/journal", at, made_at, json };
+
+        File::create_new(&path).unwrap();
+        let refusing = File::open(&path).unwrap();
+        assert!(LogFile::begin(&path, refusing, &identity).is_err());
+        assert!(!path.exists(), "the disk took nothing at all");
+
+        let mut file = LogFile::begin(&path, File::create_new(&path).unwrap(), &identity).unwrap();
+        file.put(message).unwrap();
+        file.abandon();
+        assert!(!path.exists(), "the disk took no whole chunk");
+
+        let mut file = LogFile::begin(&path, File::create_new(&path).unwrap(), &identity).unwrap();
+        file.put(message).unwrap();
+        file.flush().unwrap();
+        file.abandon();
+        assert!(path.exists(), "the disk took a message");
+    }
+}

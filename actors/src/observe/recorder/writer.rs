@@ -1,0 +1,348 @@
+//! The thread that writes the log: it alone waits for the disk.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
+
+use ecod::aggregator::Command;
+use ecod::replay::JournalEvent;
+use mcap::{McapError, McapResult};
+
+use super::config::RecordConfig;
+use super::disk;
+use super::identity::Identity;
+#[cfg(feature = "foxglove")]
+use super::live::Live;
+use super::log_file::LogFile;
+use super::recording::{Entry, Item, Recording, Standing};
+use super::scribe::Scribe;
+use crate::telemetry::counters::Event;
+
+/// How often the log is made safe from the end of the process.
+const FLUSH_PERIOD: Duration = Duration::from_secs(1);
+
+/// How long a disk that took nothing is left alone.
+const RETRY_AFTER: Duration = Duration::from_secs(5);
+
+/// Takes entries from the queue to the disk.
+pub(crate) struct LogWriter {
+    config: RecordConfig,
+    identity: Identity,
+    recording: Recording,
+    scribe: Scribe,
+    file: Option<LogFile>,
+    #[cfg(feature = "foxglove")]
+    live: Option<Live>,
+    pending: Pending,
+    flush_due: Instant,
+    retry_at: Option<Instant>,
+    /// A failure is told of once, until something is on the disk again.
+    failing: bool,
+}
+
+/// What was put in the file since it was last flushed, which a failure takes away again.
+#[derive(Debug, Default)]
+struct Pending {
+    entries: u64,
+    /// Of these, or lost before and only told of in them, entries of the journal.
+    of_journal: u64,
+}
+
+impl LogWriter {
+    pub(crate) fn new(config: RecordConfig, identity: Identity, recording: Recording) -> Self {
+        let flush_due = Instant::now() + FLUSH_PERIOD;
+        let scribe = Scribe::new(identity.node.clone(), config.drawable);
+        #[cfg(feature = "foxglove")]
+        let live = config.live_port.map(|port| Live::new(port, identity.node.clone()));
+        Self {
+            config,
+            identity,
+            recording,
+            scribe,
+            file: None,
+            #[cfg(feature = "foxglove")]
+            live,
+            pending: Pending::default(),
+            flush_due,
+            retry_at: None,
+            failing: false,
+        }
+    }
+
+    /// Writes until nobody can send any more.
+    pub(crate) fn run(mut self, queue: &Receiver<Entry>) {
+        loop {
+            match queue.recv_timeout(self.flush_due.saturating_duration_since(Instant::now())) {
+                Ok(entry) => self.take(&entry),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            if Instant::now() >= self.flush_due {
+                self.flush();
+                self.flush_due = Instant::now() + FLUSH_PERIOD;
+            }
+        }
+        self.flush();
+        if let Some(Err(error)) = self.file.take().map(LogFile::finish) {
+            self.failed(&error);
+        }
+    }
+
+    fn take(&mut self, entry: &Entry) {
+        #[cfg(feature = "foxglove")]
+        if let Some(live) = &mut self.live {
+            live.show(entry);
+        }
+        if !entry.item.is_written() {
+            return self.follow(&entry.item);
+        }
+        self.open(entry);
+        self.follow(&entry.item);
+        let of_journal = u64::from(entry.item.is_of_journal());
+        let Some(file) = &mut self.file else { return self.recording.lost(1, of_journal) };
+        let missing = self.recording.take_missing();
+        self.pending.entries += 1;
+        self.pending.of_journal += of_journal + missing;
+        let told = match missing {
+            0 => Ok(()),
+            entries => self.scribe.journal(entry.at, &JournalEvent::Missing { entries }, file),
+        };
+        if let Err(error) = told.and_then(|()| self.scribe.write(entry, file)) {
+            self.failed(&error);
+        }
+    }
+
+    /// Begins the next file if there is none, unless the last attempt has just failed.
+    fn open(&mut self, entry: &Entry) {
+        if self.file.is_some() || self.retry_at.is_some_and(|at| Instant::now() < at) {
+            return;
+        }
+        match self.begin(entry) {
+            Ok(file) => {
+                tracing::info!(file = %file.path().display(), "recording");
+                self.file = Some(file);
+                self.retry_at = None;
+            }
+            Err(error) => self.failed(&error),
+        }
+    }
+
+    fn begin(&mut self, entry: &Entry) -> McapResult<LogFile> {
+        let (dir, node) = (&self.config.dir, &self.identity.node);
+        std::fs::create_dir_all(dir)?;
+        // First, as it may make the room that there must be; what cannot be deleted does not end the log.
+        if let Err(error) = disk::prune(dir, node, self.config.max_old_bytes()) {
+            tracing::warn!(dir = %dir.display(), %error, "old logs cannot be deleted");
+        }
+        let (path, file) = disk::create(dir, node, entry.at, self.config.min_free_bytes())?;
+        let mut file = LogFile::begin(&path, file, &self.identity)?;
+        let Standing { runs, leads, next_round } = self.recording.standing().clone();
+        if runs && !matches!(entry.item, Item::Journal(JournalEvent::Start { .. })) {
+            self.scribe.journal(entry.at, &JournalEvent::Continue { leads, next_round }, &mut file)?;
+        }
+        Ok(file)
+    }
+
+    /// Keeps up with the aggregator, for files that begin in the middle of its run.
+    fn follow(&self, item: &Item) {
+        let mut standing = self.recording.standing();
+        match item {
+            Item::Journal(JournalEvent::Start { .. }) => *standing = Standing { runs: true, ..Standing::default() },
+            Item::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
+                (standing.leads, standing.next_round) = (Some(epoch.clone()), *first_round);
+            }
+            Item::Journal(JournalEvent::Command(Command::StandBy)) => standing.leads = None,
+            Item::Round(round) => standing.next_round = round.saturating_add(1),
+            _ => {}
+        }
+    }
+
+    fn flush(&mut self) {
+        let Some(file) = &mut self.file else { return };
+        let is_full = match file.flush() {
+            Ok(bytes) => bytes >= self.config.max_file_bytes() || file.opened().elapsed() >= self.config.max_file_age(),
+            Err(error) => return self.failed(&error),
+        };
+        self.recording.counters().add(Event::Recorded, std::mem::take(&mut self.pending).entries);
+        self.failing = false;
+        if let Err(error) = disk::check_room(&self.config.dir, self.config.min_free_bytes()) {
+            // All that was taken is in the file: it only has to end.
+            let ended = self.file.take().map_or(Ok(()), LogFile::finish);
+            return self.failed(&ended.err().unwrap_or(error.into()));
+        }
+        if is_full && let Some(Err(error)) = self.file.take().map(LogFile::finish) {
+            self.failed(&error);
+        }
+    }
+
+    /// Counts a failure, and leaves file and disk alone for a while.
+    fn failed(&mut self, error: &McapError) {
+        self.recording.counters().count(Event::RecordFailed);
+        if let Some(file) = self.file.take() {
+            file.abandon();
+        }
+        let Pending { entries, of_journal } = std::mem::take(&mut self.pending);
+        self.recording.lost(entries, of_journal);
+        self.retry_at = Some(Instant::now() + RETRY_AFTER);
+        if !std::mem::replace(&mut self.failing, true) {
+            let directory = self.config.dir.display();
+            let error = match error {
+                McapError::Io(of_disk) => of_disk.to_string(),
+                other => other.to_string(),
+            };
+            tracing::warn!(%directory, error, "not recording, the node goes on; tried again every {RETRY_AFTER:?}");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+    use std::os::fd::AsRawFd;
+    use std::path::Path;
+    use std::sync::Arc;
+    use std::sync::mpsc::sync_channel;
+
+    use ecod::names::NodeName;
+    use ecod::replay::JournalEntry;
+    use ecod::time::Timestamp;
+    use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
+    use uuid::Uuid;
+
+    use super::*;
+    use crate::observe::recorder::{LogEvent, LogMessage, LogReader, SchemaName, files};
+    use crate::telemetry::counters::Counters;
+    use ecod::aggregator::FusionConfig;
+
+    const NODE: NodeName = NodeName::from_static("cav");
+
+    fn writer(config: RecordConfig, counters: &Arc<Counters>) -> LogWriter {
+        let identity =
+            Identity::new(NODE, Uuid::nil(), NodeName::from_static("lot-1"), FusionConfig::default(), Vec::new());
+        LogWriter::new(config, identity, Recording::new(Arc::clone(counters)))
+    }
+
+    fn in_directory(directory: &Path) -> RecordConfig {
+        RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory) }
+    }
+
+    fn second(seconds: u64, item: Item) -> Entry {
+        Entry { at: Timestamp(seconds * 1_000_000), item }
+    }
+
+    fn messages(path: &Path) -> Vec<LogMessage> {
+        let message = |event| if let Ok(LogEvent::Message(message)) = event { Some(message) } else { None };
+        LogReader::open(path).unwrap().filter_map(message).collect()
+    }
+
+    /// When the log says that entries are missing, and how many.
+    fn missing(messages: &[LogMessage]) -> Vec<(Timestamp, u64)> {
+        let journal = messages.iter().filter(|message| message.schema == SchemaName::JournalEntry);
+        let missing = |message: &LogMessage| match serde_json::from_slice(&message.json).unwrap() {
+            JournalEntry { at_us, event: JournalEvent::Missing { entries } } => Some((at_us, entries)),
+            JournalEntry { .. } => None,
+        };
+        journal.filter_map(missing).collect()
+    }
+
+    #[test]
+    fn the_limit_holds_for_nodes_that_never_fill_a_file_and_makes_room_on_a_full_disk() {
+        let directory = tempfile::tempdir().unwrap();
+        for second in 0..40 {
+            let (path, _) = disk::create(directory.path(), &NODE, Timestamp(second * 1_000_000), 0).unwrap();
+            std::fs::write(path, vec![0; 100_000]).unwrap();
+        }
+        let kept = || files(directory.path()).unwrap();
+        let config = |min_free_mb| RecordConfig {
+            max_file_mb: 1,
+            max_total_mb: 3,
+            min_free_mb,
+            ..RecordConfig::new(directory.path())
+        };
+        let counters = Arc::new(Counters::default());
+        let entry = second(100, Item::Counters(counters.snapshot()));
+        let all = kept();
+        writer(config(1_000_000_000), &counters).take(&entry);
+        assert_eq!(counters.events(Event::RecordFailed), 1);
+        assert_eq!(kept(), all[20..], "the oldest are gone, though there is still no room for another");
+        for starts in 1..=3 {
+            let mut writer = writer(config(0), &counters);
+            writer.take(&entry);
+            writer.flush();
+            assert_eq!(counters.events(Event::Recorded), starts);
+            let bytes: u64 = kept().iter().map(|path| path.metadata().unwrap().len()).sum();
+            assert!(bytes <= 3_000_000, "{bytes} bytes after {starts} starts");
+        }
+    }
+
+    #[test]
+    fn a_disk_that_fills_up_while_a_file_is_written_ends_the_file_in_order() {
+        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let mut writer = writer(in_directory(directory.path()), &counters);
+        let entry = |seconds: u64| second(seconds, Item::Counters(counters.snapshot()));
+        writer.take(&entry(1));
+        writer.flush();
+        assert_eq!(counters.events(Event::RecordFailed), 0);
+        writer.config.min_free_mb = 1_000_000_000;
+        writer.take(&entry(2));
+        writer.flush();
+        writer.take(&entry(3));
+        let [recorded, failed, dropped] = [Event::Recorded, Event::RecordFailed, Event::RecordDropped];
+        assert_eq!([recorded, failed, dropped].map(|event| counters.events(event)), [2, 1, 1]);
+        let path = &files(directory.path()).unwrap()[0];
+        let read = LogReader::open(path).unwrap().collect::<Result<Vec<_>, _>>().unwrap();
+        assert!(read.len() >= 2, "what came before is there, and the file is whole: {}", read.len());
+    }
+
+    #[test]
+    fn what_a_disk_did_not_take_is_counted_as_dropped_and_told_of_in_the_next_file() {
+        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let mut writer = writer(in_directory(directory.path()), &counters);
+        let counts = || [Event::Recorded, Event::RecordDropped].map(|event| counters.events(event));
+        let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
+        let memory = File::from(memfd_create("log", flags).unwrap());
+        let path = format!("/proc/self/fd/{}", memory.as_raw_fd());
+        let disk = memory.try_clone().unwrap();
+        writer.file = Some(LogFile::begin(Path::new(&path), memory, &writer.identity).unwrap());
+        let tick = |seconds| second(seconds, Item::Journal(JournalEvent::Command(Command::Tick)));
+        writer.take(&tick(1));
+        assert_eq!(counts(), [0, 0], "it is not on the disk yet");
+        writer.flush();
+        assert_eq!(counts(), [1, 0]);
+
+        fcntl_add_seals(&disk, SealFlags::GROW).unwrap();
+        writer.recording.lost(1, 1);
+        writer.take(&tick(2));
+        writer.take(&second(3, Item::Counters(counters.snapshot())));
+        writer.take(&tick(4));
+        writer.flush();
+        assert_eq!(counts(), [1, 4]);
+
+        writer.retry_at = None;
+        writer.take(&tick(5));
+        writer.flush();
+        assert_eq!(counts(), [2, 4]);
+        let next = messages(&files(directory.path()).unwrap()[0]);
+        assert_eq!(missing(&next), [(Timestamp(5_000_000), 3)]);
+    }
+
+    /// The number of a round is for files that begin later; it is no reason to begin one.
+    #[test]
+    fn files_and_gaps_bear_the_time_of_what_is_written() {
+        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let mut writer = writer(in_directory(directory.path()), &counters);
+        let (sender, queue) = sync_channel(1);
+        writer.recording.connect(Some(sender));
+        writer.recording.lost(3, 3);
+        writer.recording.round(7, Timestamp(99_000_000));
+        let round = queue.recv().unwrap();
+        assert_eq!(round.at, Timestamp(99_000_000));
+        writer.take(&round);
+        assert!(files(directory.path()).unwrap().is_empty());
+        writer.take(&second(100, Item::Journal(JournalEvent::Command(Command::Tick))));
+        writer.flush();
+        let path = &files(directory.path()).unwrap()[0];
+        assert_eq!(path.file_name().unwrap(), "cav-19700101T000140Z-000.mcap");
+        assert_eq!(missing(&messages(path)), [(Timestamp(100_000_000), 3)]);
+        assert_eq!([Event::Recorded, Event::RecordDropped].map(|event| counters.events(event)), [1, 3]);
+    }
+}

@@ -1,0 +1,239 @@
+//! A log as one page: who led, how late and how steadily rounds came, who saw what, who is trusted, what was lost.
+//!
+//! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`].
+
+mod accuracy;
+mod losses;
+mod page;
+mod plot;
+mod series;
+pub(crate) mod tracks;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use ecod::epoch::Epoch;
+use ecod::eval::tracks::{TrackEvaluation, TrackTruth};
+use ecod::eval::{Evaluation, Truth};
+use ecod::landmark::{Landmark, LandmarkIndex};
+use ecod::names::NodeName;
+use ecod::replay::FusedLine;
+use ecod::time::Timestamp;
+use ecod::wire::{GlobalMap, ObjectReport, ReportKind, Reputations, Verdicts};
+
+use crate::observe::recorder::{
+    CounterReading, Identity, LeadershipChange, LogError, LogEvent, LogMessage, LogReader, SchemaName,
+};
+use losses::Losses;
+use series::Samples;
+
+/// What is gathered of a log; by default, nothing yet.
+#[derive(Debug, Default)]
+pub struct Report {
+    identity: Option<Identity>,
+    first: Option<Timestamp>,
+    last: Timestamp,
+    messages: u64,
+    problems: Vec<String>,
+    maps: Rounds,
+    verdicts: Rounds,
+    reigns: Vec<Reign>,
+    changes: Vec<LeadershipChange>,
+    vehicles: BTreeMap<NodeName, Vehicle>,
+    entries: u64,
+    reputations: BTreeMap<NodeName, Samples>,
+    losses: Losses,
+    evaluation: Option<Evaluation>,
+    tracks: Option<TrackEvaluation>,
+}
+
+/// The rounds of one kind as the recording node took them.
+#[derive(Debug, Default)]
+struct Rounds {
+    count: u64,
+    last_at: Option<Timestamp>,
+    /// Seconds since the round before, by time.
+    gaps: Samples,
+    /// Seconds from the oldest capture, or for verdicts none, to the end of the round.
+    fusing: Vec<f64>,
+    /// Seconds from the end of the round to here.
+    travelling: Vec<f64>,
+}
+
+/// A run of rounds by one leader in one term.
+#[derive(Debug, Clone, PartialEq)]
+struct Reign {
+    epoch: Epoch,
+    first_at: Timestamp,
+    last_at: Timestamp,
+    rounds: u64,
+}
+
+/// What one vehicle had to do with it.
+#[derive(Debug, Default)]
+struct Vehicle {
+    reports: u64,
+    objects: u64,
+    first_at: Option<Timestamp>,
+    last_at: Timestamp,
+    /// Entries of maps that rest on its detections.
+    contributed: u64,
+}
+
+impl Report {
+    /// Judges maps and verdicts by what stands at each location.
+    #[must_use]
+    pub fn judged_by(self, truth: Truth) -> Self {
+        Self { evaluation: Some(Evaluation::new(truth)), ..self }
+    }
+
+    /// Judges the objects of maps by where they really were.
+    #[must_use]
+    pub fn judged_by_tracks(self, truth: TrackTruth) -> Self {
+        Self { tracks: Some(TrackEvaluation::new(truth)), ..self }
+    }
+
+    /// Takes in a file; what cannot be used is named on the page and left out.
+    ///
+    /// # Errors
+    /// [`LogError::Unreadable`].
+    pub fn file(&mut self, path: &Path) -> Result<(), LogError> {
+        let mut log = LogReader::open(path)?;
+        for event in log.by_ref() {
+            match event {
+                Ok(LogEvent::Identity(identity)) => self.meet(&identity),
+                Ok(LogEvent::Message(message)) => self.message(&message),
+                Err(error @ LogError::Unreadable { .. }) => return Err(error),
+                Err(error) => self.problems.push(error.to_string()),
+            }
+        }
+        for (schema, messages) in log.unknown() {
+            self.problems.push(format!("{messages} messages of {schema} are not known"));
+        }
+        Ok(())
+    }
+
+    /// Whether anything of a cell was found.
+    pub fn is_empty(&self) -> bool {
+        self.messages == 0
+    }
+
+    /// What was not used.
+    pub fn problems(&self) -> &[String] {
+        &self.problems
+    }
+
+    /// The page: HTML that needs nothing else.
+    pub fn page(&self) -> String {
+        page::write(self)
+    }
+
+    fn meet(&mut self, identity: &Identity) {
+        if let Some(known) = self.identity.replace(identity.clone())
+            && known.node != identity.node
+        {
+            self.problems.push(format!("logs of {} and {} are mixed", known.node, identity.node));
+        }
+        // Each file may have been written under another configuration.
+        if let Some(evaluation) = self.evaluation.take() {
+            let landmarks: Vec<_> = identity.landmarks.iter().map(Landmark::from).collect();
+            let gate = identity.fusion.pace.gate();
+            let evaluation = evaluation.with_landmarks(LandmarkIndex::new(landmarks, gate.radius_m), gate);
+            self.evaluation = Some(evaluation.with_synonyms(identity.fusion.vote.synonyms.clone()));
+        }
+    }
+
+    fn message(&mut self, message: &LogMessage) {
+        self.messages += 1;
+        self.first = Some(self.first.map_or(message.at, |first| first.min(message.at)));
+        self.last = self.last.max(message.at);
+        let taken = match message.schema {
+            SchemaName::ObjectReport => self.with(message, |report, it| report.report(&message.topic, message.at, &it)),
+            SchemaName::GlobalMap => self.with(message, |report, it| report.map(message.at, it)),
+            SchemaName::Verdicts => self.with(message, |report, it| report.verdicts(message.at, it)),
+            SchemaName::Reputations => self.with(message, |report, it| report.reputations(message.at, &it)),
+            SchemaName::Leadership => self.with(message, |report, it| report.changes.push(it)),
+            SchemaName::Counters => self.with(message, Self::counters),
+            _ => true,
+        };
+        if !taken && self.problems.len() < MAX_PROBLEMS {
+            self.problems.push(format!("a message of {} cannot be read", message.schema.as_str()));
+        }
+    }
+
+    /// False when the message is not what its schema says.
+    fn with<T: serde::de::DeserializeOwned>(&mut self, message: &LogMessage, take: impl FnOnce(&mut Self, T)) -> bool {
+        serde_json::from_slice(&message.json).map(|it| take(self, it)).is_ok()
+    }
+
+    fn report(&mut self, topic: &str, at: Timestamp, report: &ObjectReport) {
+        let kind = if topic.starts_with("vote_") { ReportKind::VoteDetections } else { ReportKind::Detections };
+        if let Some(evaluation) = &mut self.evaluation {
+            evaluation.report(kind, report);
+        }
+        let vehicle = self.vehicles.entry(report.node.clone()).or_default();
+        vehicle.reports += 1;
+        vehicle.objects += report.objects.len() as u64;
+        vehicle.first_at = vehicle.first_at.or(Some(at));
+        vehicle.last_at = at;
+    }
+
+    fn map(&mut self, at: Timestamp, map: GlobalMap) {
+        self.maps.note(at, map.oldest_capture_us, map.fused_at_us);
+        self.reign(at, Epoch::new(map.epoch, map.aggregator.clone()));
+        let labelled = map.landmarks.iter().filter(|entry| entry.label.is_some()).map(|entry| &entry.contributors);
+        for contributors in labelled.chain(map.objects.iter().map(|object| &object.contributors)) {
+            self.entries += 1;
+            for node in contributors {
+                self.vehicles.entry(node.clone()).or_default().contributed += 1;
+            }
+        }
+        if let Some(tracks) = &mut self.tracks {
+            tracks.map(&map);
+        }
+        if let Some(evaluation) = &mut self.evaluation {
+            evaluation.fused(&FusedLine::Map(map));
+        }
+    }
+
+    fn verdicts(&mut self, at: Timestamp, verdicts: Verdicts) {
+        self.verdicts.note(at, None, verdicts.fused_at_us);
+        if self.maps.count == 0 {
+            self.reign(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
+        }
+        if let Some(evaluation) = &mut self.evaluation {
+            evaluation.fused(&FusedLine::Verdicts(verdicts));
+        }
+    }
+
+    fn reputations(&mut self, at: Timestamp, reputations: &Reputations) {
+        for (node, reputation) in &reputations.reputations {
+            self.reputations.entry(node.clone()).or_default().push(at, reputation.score);
+        }
+    }
+
+    fn counters(&mut self, reading: CounterReading) {
+        self.losses.note(self.identity.as_ref().map(|identity| identity.run), reading);
+    }
+
+    fn reign(&mut self, at: Timestamp, epoch: Epoch) {
+        match self.reigns.last_mut() {
+            Some(reign) if reign.epoch == epoch => (reign.last_at, reign.rounds) = (at, reign.rounds + 1),
+            _ => self.reigns.push(Reign { epoch, first_at: at, last_at: at, rounds: 1 }),
+        }
+    }
+}
+
+/// Most problems that are named.
+const MAX_PROBLEMS: usize = 20;
+
+impl Rounds {
+    fn note(&mut self, at: Timestamp, oldest_capture: Option<Timestamp>, fused_at: Timestamp) {
+        self.count += 1;
+        if let Some(last) = self.last_at.replace(at) {
+            self.gaps.push(at, at.since(last).as_secs_f64());
+        }
+        self.fusing.extend(oldest_capture.map(|capture| fused_at.since(capture).as_secs_f64()));
+        self.travelling.push(at.since(fused_at).as_secs_f64());
+    }
+}

@@ -1,0 +1,6 @@
+//! The machine below a node: clock, state files, bounded slots, throttles.
+
+pub mod clock;
+pub mod latest_slot;
+pub mod state_file;
+pub(crate) mod throttle;

@@ -1,0 +1,3 @@
+//! Counters of a node.
+
+pub mod counters;

@@ -1,0 +1,371 @@
+//! The embedded broker: rmqtt on a thread of its own, in a node behind a gate.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+use std::{fmt, io};
+
+use ecod::config::{ConfigError, check_range};
+use rmqtt::context::ServerContext;
+use rmqtt::net::{Builder, Listener};
+use rmqtt::server::MqttServer;
+use serde::{Deserialize, Serialize};
+use tokio::net::TcpListener;
+use tokio::runtime;
+use tokio::sync::oneshot;
+
+use super::BrokerHealth;
+use super::gate::{Gate, Guard};
+use super::pulse::{PULSE, Pulse};
+use super::retained::RetainedMessages;
+use super::throttle::ClientThrottle;
+use crate::platform::clock;
+use crate::telemetry::counters::Counters;
+
+/// An MQTT broker that lives inside the process.
+pub trait Mqtt: Send + fmt::Debug {
+    /// Listens on `address`, port 0 for a free one, and returns the bound address; clients may connect at once.
+    ///
+    /// # Errors
+    /// [`BrokerError`] names the address; nothing is left running.
+    fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError>;
+
+    /// Disconnects all clients and frees the port before it returns; nothing happens when not started. Retained
+    /// messages are lost. A broker that hangs is left to itself after a moment, and may keep its port.
+    fn stop(&mut self);
+
+    /// Whether it serves.
+    fn health(&self) -> BrokerHealth;
+
+    /// Stops and starts again at the address it is bound to, empty; `fallback` is for a broker that does not run.
+    ///
+    /// # Errors
+    /// As [`Mqtt::start`]; the broker is then stopped.
+    fn restart(&mut self, fallback: SocketAddr) -> Result<SocketAddr, BrokerError> {
+        let address = match self.health() {
+            BrokerHealth::Serving(address) => address,
+            BrokerHealth::Stopped | BrokerHealth::Dead => fallback,
+        };
+        self.stop();
+        self.start(address)
+    }
+}
+
+/// Why the embedded broker does not run; nothing was left behind.
+#[derive(Debug, thiserror::Error)]
+pub enum BrokerError {
+    /// It is already running.
+    #[error("broker already serves at {0}")]
+    Running(SocketAddr),
+    /// The address cannot be listened on: busy, not this machine's, or not permitted.
+    #[error("broker cannot listen on {address}: {reason}")]
+    Bind {
+        /// The address asked for.
+        address: SocketAddr,
+        /// What the operating system said.
+        reason: String,
+    },
+    /// The operating system gave no thread or event queue.
+    #[error("broker for {address} cannot get a thread: {source}")]
+    Thread {
+        /// The address asked for.
+        address: SocketAddr,
+        /// What the operating system said.
+        source: io::Error,
+    },
+}
+
+/// Limits of the embedded broker.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BrokerConfig {
+    /// Largest MQTT packet in bytes; default what `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` need. A client that
+    /// sends more is cut off. Larger admits the packets of others, smaller bounds the memory that a stranger can take.
+    pub max_packet_bytes: Option<u32>,
+    /// Most clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
+    pub max_clients: usize,
+    /// Most clients at a time of one certificate or, without certificates, of one address other than this machine's; default
+    /// 32. A node has one or two, and one for each observer beside it; a cell behind address translation needs as many for
+    /// each node.
+    pub max_clients_each: usize,
+    /// Most messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
+    /// then gets is old. Each of them may be as large as the largest packet.
+    pub max_waiting: usize,
+    /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
+    pub max_retained: usize,
+    /// Most bytes of all retained messages together; default 67108864. A status has some hundred, reputations some
+    /// hundred for each vehicle. What is beyond is passed on and not kept.
+    pub max_retained_bytes: usize,
+    /// Whether the broker may listen on others than loopback addresses without `[tls]`; default false. Whoever reaches
+    /// it then reads everything and may say anything in anybody's name.
+    pub allow_plaintext: bool,
+    /// Milliseconds within which a client must have shown its certificate and logged in; default 5000. Shorter frees
+    /// its place sooner, longer admits slow boards and lossy networks.
+    pub handshake_timeout_ms: u64,
+    /// Connections that one address may make at once; default 64. A cell behind address translation needs two or more
+    /// for each node.
+    pub connect_burst: u32,
+    /// Connections per second that one address may make after that; default 10.
+    pub connects_per_s: u32,
+    /// Most messages a second of one certificate or, without certificates, of one address, or of one client of this
+    /// machine, and at once after a second of silence; default 1000. What is beyond is passed on to nobody and counted.
+    /// A node sends some tens; more lets a flood take the others' time.
+    pub max_messages_hz: u32,
+}
+
+impl Default for BrokerConfig {
+    fn default() -> Self {
+        Self {
+            max_packet_bytes: None,
+            max_clients: 2048,
+            max_clients_each: 32,
+            max_waiting: 256,
+            max_retained: 8192,
+            max_retained_bytes: 64 * 1024 * 1024,
+            allow_plaintext: false,
+            handshake_timeout_ms: 5000,
+            connect_burst: 64,
+            connects_per_s: 10,
+            max_messages_hz: 1000,
+        }
+    }
+}
+
+impl BrokerConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the key, the value and what is allowed.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if let Some(bytes) = self.max_packet_bytes {
+            check_range("max_packet_bytes", f64::from(bytes), 1024.0, 268_435_455.0)?;
+        }
+        check_range("max_clients", self.max_clients as f64, 1.0, 1e6)?;
+        check_range("max_clients_each", self.max_clients_each as f64, 1.0, 1e6)?;
+        check_range("max_waiting", self.max_waiting as f64, 1.0, 1e6)?;
+        check_range("max_retained", self.max_retained as f64, 1.0, 1e6)?;
+        check_range("max_retained_bytes", self.max_retained_bytes as f64, 1024.0, 1e12)?;
+        check_range("handshake_timeout_ms", self.handshake_timeout_ms as f64, 100.0, 60_000.0)?;
+        check_range("connect_burst", f64::from(self.connect_burst), 1.0, 1e6)?;
+        check_range("connects_per_s", f64::from(self.connects_per_s), 1.0, 1e4)?;
+        check_range("max_messages_hz", f64::from(self.max_messages_hz), 1.0, 1e6)
+    }
+}
+
+/// rmqtt as a library, on one thread, with retained messages in memory.
+#[derive(Default)]
+pub struct EmbeddedBroker {
+    config: BrokerConfig,
+    guard: Option<Guard>,
+    counters: Arc<Counters>,
+    running: Option<Running>,
+}
+
+#[derive(Debug)]
+struct Running {
+    address: SocketAddr,
+    stop: oneshot::Sender<()>,
+    thread: JoinHandle<()>,
+    /// Closed when the thread has ended.
+    ended: mpsc::Receiver<()>,
+    pulse: Mutex<Pulse>,
+}
+
+/// Largest packet of a broker that was not told of a cell's limits: the default maps and their topics.
+const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
+
+/// How long connections may take to end when the broker stops; beyond it their thread is left to end by itself.
+const STOP_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// How long the broker's thread is waited for.
+const END_TIMEOUT: Duration = Duration::from_millis(1500);
+
+impl EmbeddedBroker {
+    /// A broker that is not started and has no gate: whoever reaches it is let in.
+    pub fn new(config: BrokerConfig) -> Self {
+        Self { config, guard: None, counters: Arc::default(), running: None }
+    }
+
+    /// A broker that is not started, behind a gate: clients show certificates, if the guard has any, and strangers are
+    /// limited.
+    pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
+        let counters = Arc::clone(&guard.counters);
+        Self { config, guard: Some(guard), counters, running: None }
+    }
+
+    fn listener(&self, address: SocketAddr) -> Builder {
+        Builder::new()
+            .name("ecod")
+            .laddr(address)
+            // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
+            .reuseaddr(Some(true))
+            .nodelay(true)
+            .max_packet_size(self.config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
+            .max_connections(self.config.max_clients)
+            .max_mqueue_len(self.config.max_waiting)
+            .handshake_timeout(Duration::from_secs(5))
+    }
+}
+
+impl Mqtt for EmbeddedBroker {
+    fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
+        if let Some(running) = &self.running {
+            return Err(BrokerError::Running(running.address));
+        }
+        let thread_error = |source| BrokerError::Thread { address, source };
+        let (stop, stopped) = oneshot::channel();
+        let (ready, started) = mpsc::channel();
+        let (ending, ended) = mpsc::channel();
+        let pulse = Pulse::default();
+        let plan = Plan {
+            address,
+            listener: self.listener(address),
+            config: self.config.clone(),
+            guard: self.guard.clone(),
+            counters: Arc::clone(&self.counters),
+            beats: pulse.beats(),
+        };
+        let thread = thread::Builder::new()
+            .name("mqtt-broker".to_owned())
+            .spawn(move || {
+                serve(plan, &ready, stopped);
+                drop::<mpsc::Sender<()>>(ending);
+            })
+            .map_err(thread_error)?;
+        let outcome = started.recv().unwrap_or_else(|_| Err(thread_error(io::Error::other("it ended at once"))));
+        let bound = match outcome {
+            Ok(bound) => bound,
+            Err(error) => {
+                // Its last act was to send the error; nothing is left to wait for but its end.
+                if thread.join().is_err() {
+                    tracing::error!(%address, "broker's thread panicked");
+                }
+                return Err(error);
+            }
+        };
+        self.running = Some(Running { address: bound, stop, thread, ended, pulse: Mutex::new(pulse) });
+        Ok(bound)
+    }
+
+    fn stop(&mut self) {
+        let Some(Running { address, stop, thread, ended, .. }) = self.running.take() else { return };
+        let told = stop.send(()).is_ok();
+        if ended.recv_timeout(END_TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
+            tracing::error!(%address, "broker hangs and is left to itself");
+        } else if thread.join().is_err() || !told {
+            tracing::warn!(%address, "broker had ended by itself");
+        }
+    }
+
+    fn health(&self) -> BrokerHealth {
+        match &self.running {
+            None => BrokerHealth::Stopped,
+            Some(running) if running.thread.is_finished() || running.hangs() => BrokerHealth::Dead,
+            Some(running) => BrokerHealth::Serving(running.address),
+        }
+    }
+}
+
+impl Running {
+    fn hangs(&self) -> bool {
+        self.pulse.lock().unwrap_or_else(PoisonError::into_inner).is_lost(clock::now())
+    }
+}
+
+impl Drop for EmbeddedBroker {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+impl fmt::Debug for EmbeddedBroker {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("EmbeddedBroker").field("running", &self.running).finish_non_exhaustive()
+    }
+}
+
+/// What the broker's thread is to do.
+struct Plan {
+    address: SocketAddr,
+    listener: Builder,
+    config: BrokerConfig,
+    guard: Option<Guard>,
+    counters: Arc<Counters>,
+    /// Counts on while the thread does not hang.
+    beats: Arc<AtomicU64>,
+}
+
+/// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made
+/// here.
+fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
+    let (address, beats) = (plan.address, Arc::clone(&plan.beats));
+    let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(source) => {
+            // The caller waits for nothing else and cannot be gone.
+            ready.send(Err(BrokerError::Thread { address, source })).unwrap_or_default();
+            return;
+        }
+    };
+    runtime.block_on(async {
+        let (server, gate, bound) = match prepare(plan).await {
+            Ok(prepared) => prepared,
+            Err(error) => {
+                let reason = error.root_cause().to_string();
+                return ready.send(Err(BrokerError::Bind { address, reason })).unwrap_or_default();
+            }
+        };
+        ready.send(Ok(bound)).unwrap_or_default();
+        let admitting = async {
+            match gate {
+                Some(gate) => gate.run().await,
+                None => std::future::pending().await,
+            }
+        };
+        let beating = async {
+            let mut ticks = tokio::time::interval(PULSE);
+            loop {
+                ticks.tick().await;
+                beats.fetch_add(1, Ordering::Relaxed);
+            }
+        };
+        tokio::select! {
+            () = beating => {}
+            ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
+            () = admitting => tracing::error!("gate ended by itself"),
+            _ = stopped => {}
+        }
+    });
+    runtime.shutdown_timeout(STOP_TIMEOUT);
+}
+
+/// Opens the sockets: rmqtt's own is the public one, or behind the gate's.
+async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketAddr)> {
+    let Plan { address, listener, config, guard, counters, .. } = plan;
+    let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+    let listener = match &guard {
+        // Without anonymous clients, the hooks are asked about each.
+        Some(_) => listener.laddr(behind).allow_anonymous(false),
+        None => listener,
+    };
+    let listener = listener.bind().and_then(Listener::tcp)?;
+    let own = listener.local_addr()?;
+    // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
+    let context = ServerContext::new().busy_check_enable(false).build().await;
+    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(&config));
+    let (gate, bound) = match &guard {
+        Some(guard) => {
+            let public = TcpListener::bind(address).await?;
+            let bound = public.local_addr()?;
+            let gate = Gate::new(public, own, guard, &config);
+            gate.permissions(guard).install(&context).await;
+            (Some(gate), bound)
+        }
+        None => (None, own),
+    };
+    let passes = gate.as_ref().map(Gate::passes).unwrap_or_default();
+    ClientThrottle::new(config.max_messages_hz, passes, counters).install(&context).await;
+    Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), gate, bound))
+}

@@ -1,0 +1,259 @@
+//! Who may say what through the embedded broker: hooks of rmqtt that look at the certificate behind a connection.
+//!
+//! | topic | who |
+//! |---|---|
+//! | `detections/N`, `vote_detections/N` | whoever has the certificate of `N` |
+//! | `ledger/N` | the same, if `N` may lead |
+//! | `nodes/N`, `nodes/N--…` | whoever has the certificate of `N`; observers share it |
+//! | `global_detections`, `global_verdicts`, `reputations` | who is elected; while nobody is, who may lead |
+//! | anything else | nobody |
+//!
+//! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a
+//! certificate of the cell may read everything.
+
+use std::fmt;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use ecod::names::NodeName;
+use ecod::wire::{Limits, Topic, Topics};
+use rmqtt::context::ServerContext;
+use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
+use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult};
+
+use super::holder::{Holder, Passes};
+use crate::telemetry::counters::{Counters, Event};
+use crate::transport::mqtt::ENVELOPE_BYTES;
+use crate::transport::pki::Identity;
+
+/// Tells whether a node may speak for all: whether it is the elected one.
+pub type Elected = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
+
+/// What the hooks need to know.
+#[derive(Clone)]
+pub(super) struct Permissions {
+    pub(super) passes: Passes,
+    pub(super) topics: Topics,
+    pub(super) limits: Limits,
+    pub(super) elected: Elected,
+    pub(super) counters: Arc<Counters>,
+}
+
+impl fmt::Debug for Permissions {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Permissions").finish_non_exhaustive()
+    }
+}
+
+impl Permissions {
+    /// Has rmqtt ask before it lets anybody log in or publish.
+    pub(super) async fn install(self, context: &ServerContext) {
+        let register = context.extends.hook_mgr().register();
+        register.add(Type::ClientAuthenticate, Box::new(self.clone())).await;
+        register.add(Type::MessagePublishCheckAcl, Box::new(self)).await;
+        register.start().await;
+    }
+
+    /// Whether the connection may log in under this client id with this last will.
+    fn admits(&self, info: &ConnectInfo) -> bool {
+        // Without a pass it went past the gate: another process of this machine found the port behind it.
+        let Some(holder) = self.passes.holder(info.id().remote_addr) else { return false };
+        let may_say = |will: LastWill<'_>| {
+            let (topic, retain, bytes) = match will {
+                LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
+                LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
+            };
+            self.allows(&holder, topic, retain, bytes)
+        };
+        let is_own = |identity: &Arc<Identity>| holder.is_nameless || may_be_called(identity, info.client_id());
+        holder.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
+    }
+
+    fn permits(&self, address: Option<SocketAddr>, publish: &Publish) -> bool {
+        let allows = |holder: Holder| self.allows(&holder, &publish.topic, publish.retain, publish.payload.len());
+        self.passes.holder(address).is_some_and(allows)
+    }
+
+    /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more
+    /// than the topic's receivers take, nor what is not to be retained.
+    fn allows(&self, holder: &Holder, topic: &str, retain: bool, bytes: usize) -> bool {
+        let topic = self.topics.parse(topic);
+        let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));
+        bytes <= most + ENVELOPE_BYTES
+            && (!retain || topic.as_ref().is_some_and(is_state))
+            && holder
+                .identity
+                .as_ref()
+                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
+    }
+}
+
+#[async_trait]
+impl Handler for Permissions {
+    async fn hook(&self, parameter: &Parameter, _earlier: Option<HookResult>) -> ReturnType {
+        let answer = match parameter {
+            Parameter::ClientAuthenticate(info) => HookResult::AuthResult(if self.admits(info) {
+                AuthResult::Allow(false, None)
+            } else {
+                self.counters.count(Event::ClientDenied);
+                tracing::debug!(client = %info.client_id(), "login in another's name refused");
+                AuthResult::NotAuthorized
+            }),
+            Parameter::MessagePublishCheckAcl(session, publish) => {
+                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, publish) {
+                    PublishAclResult::allow()
+                } else {
+                    self.counters.count(Event::ClientDenied);
+                    tracing::debug!(client = %session.id.client_id, topic = %publish.topic, "message refused");
+                    PublishAclResult::rejected(false, None)
+                })
+            }
+            _ => return (true, None),
+        };
+        (false, Some(answer))
+    }
+}
+
+/// What receivers take of the topic: nobody but the elected has maps to send.
+fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
+    match topic {
+        Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) | Topic::Nodes(_) => limits.payload_bytes,
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
+    }
+}
+
+/// Whether the topic's last message is kept for latecomers.
+fn is_state(topic: &Topic) -> bool {
+    matches!(topic, Topic::Nodes(_) | Topic::Reputations)
+}
+
+fn may_publish(identity: &Identity, topic: &Topic, elected: &Elected) -> bool {
+    match topic {
+        Topic::Detections(node) | Topic::VoteDetections(node) => identity.name() == node,
+        Topic::Ledger(node) => identity.serves() && identity.name() == node,
+        Topic::Nodes(node) => identity.speaks_for(node.as_str()),
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => {
+            identity.serves() && elected(identity.name())
+        }
+    }
+}
+
+/// A second connection of one client id ends the first: nobody may take another's. A node's is its name and its run.
+fn may_be_called(identity: &Identity, client_id: &str) -> bool {
+    let is_run = |text: &str| text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+    client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.speaks_for(name))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use ecod::wire::Role;
+
+    use super::*;
+    use crate::platform::clock;
+    use crate::transport::pki::Authority;
+
+    fn identity(name: &'static str, role: Role) -> Identity {
+        let (directory, name) = (tempfile::tempdir().unwrap(), NodeName::from_static(name));
+        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        authority.issue(&name, role, Duration::from_secs(60), clock::now()).unwrap();
+        let pem = std::fs::read(authority.files_of(&name).0).unwrap();
+        Identity::of(&x509_parser::pem::parse_x509_pem(&pem).unwrap().1.contents).unwrap()
+    }
+
+    fn anyone() -> Holder {
+        Holder::new(None, [10, 0, 0, 1].into(), false)
+    }
+
+    fn with(identity: &Identity) -> Holder {
+        Holder::new(Some(identity.clone()), [10, 0, 0, 1].into(), false)
+    }
+
+    fn permissions() -> Permissions {
+        Permissions {
+            passes: Passes::default(),
+            topics: Topics::new(&NodeName::from_static("lot")),
+            limits: Limits { payload_bytes: 1000, map_bytes: 5000, ..Limits::default() },
+            elected: Arc::new(|name| name.as_str() == "edge"),
+            counters: Arc::default(),
+        }
+    }
+
+    #[test]
+    fn everyone_speaks_for_itself_and_the_elected_for_all() {
+        let permissions = permissions();
+        let allows = |identity: &Identity, topic: &str| {
+            permissions.allows(&with(identity), &format!("ecod/v1/lot/{topic}"), false, 0)
+        };
+        let (edge, euclid) = (identity("edge", Role::Edge), identity("euclid", Role::Auto));
+        for topic in
+            ["detections/euclid", "vote_detections/euclid", "ledger/euclid", "nodes/euclid", "nodes/euclid--top"]
+        {
+            assert!(allows(&euclid, topic) && !allows(&edge, topic), "{topic}");
+        }
+        for topic in ["detections/euclid--2", "vote_detections/euclid--2", "ledger/euclid--2"] {
+            assert!(!allows(&euclid, topic), "one certificate is one vehicle: {topic}");
+        }
+        let vehicle = identity("euclid", Role::Cav);
+        assert!(
+            allows(&vehicle, "vote_detections/euclid") && !allows(&vehicle, "ledger/euclid"),
+            "it never counts votes"
+        );
+        for topic in ["global_detections", "global_verdicts", "reputations"] {
+            assert!(allows(&edge, topic) && !allows(&euclid, topic), "{topic}");
+            assert!(!allows(&identity("edge", Role::Cav), topic), "a vehicle that cannot lead");
+        }
+        assert!(!allows(&euclid, "nodes/euclid-2") && !allows(&euclid, "nodes/euclid/x"));
+        assert!(!permissions.allows(&with(&euclid), "ecod/v1/lot-2/detections/euclid", false, 0));
+        assert!(!permissions.allows(&with(&euclid), "$SYS/x", false, 0));
+    }
+
+    #[test]
+    fn only_statuses_and_reputations_are_retained_whoever_asks() {
+        let permissions = permissions();
+        let edge = with(&identity("edge", Role::Edge));
+        let streams =
+            ["detections/edge", "vote_detections/edge", "ledger/edge", "global_detections", "global_verdicts"];
+        for holder in [edge, anyone()] {
+            let allows = |topic: &str, retain| permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), retain, 0);
+            for topic in streams {
+                assert!(allows(topic, false) && !allows(topic, true), "{topic}");
+            }
+            assert!(allows("nodes/edge", true) && allows("reputations", true));
+            assert!(!permissions.allows(&holder, "elsewhere", true, 0));
+        }
+        assert!(permissions.allows(&anyone(), "elsewhere", false, 0), "without certificates anybody may say anything");
+    }
+
+    #[test]
+    fn a_report_is_not_as_large_as_a_map() {
+        let permissions = permissions();
+        for holder in [with(&identity("edge", Role::Edge)), anyone()] {
+            let allows = |topic: &str, bytes| {
+                permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), false, bytes + ENVELOPE_BYTES)
+            };
+            for topic in ["detections/edge", "vote_detections/edge", "ledger/edge", "nodes/edge"] {
+                assert!(allows(topic, 1000) && !allows(topic, 1001), "{topic}");
+            }
+            for topic in ["global_detections", "global_verdicts", "reputations"] {
+                assert!(allows(topic, 5000) && !allows(topic, 5001), "{topic}");
+            }
+        }
+        assert!(!permissions.allows(&anyone(), "elsewhere", false, 5000));
+    }
+
+    #[test]
+    fn nobody_takes_the_client_id_of_another() {
+        let euclid = identity("euclid", Role::Auto);
+        let run = "0123456789abcdef0123456789abcdef";
+        for good in [format!("euclid-{run}"), format!("euclid--top-7-{run}")] {
+            assert!(may_be_called(&euclid, &good), "{good}");
+        }
+        let others = [format!("edge-{run}"), format!("euclid-2-{run}"), "euclid".into(), "edge".into(), String::new()];
+        for bad in others.into_iter().chain([run.to_owned()]) {
+            assert!(!may_be_called(&euclid, &bad), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,171 @@
+//! Retained messages of the embedded broker, in memory; rmqtt's own default drops them.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use rmqtt::retain::{DefaultRetainStorage, RetainStorage};
+use rmqtt::types::{Retain, TopicFilter, TopicName};
+use tokio::sync::Mutex;
+
+use super::BrokerConfig;
+use crate::transport::pki::OBSERVER_MARK;
+
+/// A bounded number of retained messages and of their bytes.
+pub(super) struct RetainedMessages {
+    storage: DefaultRetainStorage,
+    register: Mutex<Register>,
+}
+
+impl RetainedMessages {
+    pub(super) fn new(config: &BrokerConfig) -> Self {
+        let register = Register {
+            kept: BTreeMap::new(),
+            bytes: 0,
+            max_topics: config.max_retained,
+            max_bytes: config.max_retained_bytes,
+            pruned: None,
+        };
+        Self { storage: DefaultRetainStorage::new(), register: Mutex::new(register) }
+    }
+}
+
+#[async_trait]
+impl RetainStorage for RetainedMessages {
+    fn enable(&self) -> bool {
+        true
+    }
+
+    fn need_sync(&self) -> bool {
+        false
+    }
+
+    // `_listener_expiry` is the listener's bound on queued messages; a retained status holds until it is replaced,
+    // unless its publisher says otherwise (MQTT 5).
+    async fn set(&self, topic: &TopicName, message: Retain, _listener_expiry: Option<Duration>) -> rmqtt::Result<()> {
+        let properties = message.publish.properties.as_ref();
+        let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));
+        let (now, bytes) = (Instant::now(), message.publish.payload.len());
+        let mut register = self.register.lock().await;
+        let has_room = bytes == 0 || register.keep(topic, bytes, expiry.map(|expiry| now + expiry), now);
+        let has_pruned = register.pruned == Some(now);
+        if has_pruned {
+            self.storage.remove_expired_messages().await;
+        }
+        if !has_room {
+            // Not for each: whoever fills the store is not to fill the log.
+            if has_pruned {
+                tracing::warn!(%topic, bytes, "retained messages refused");
+            }
+            return Ok(());
+        }
+        if bytes == 0 {
+            register.forget(topic);
+        }
+        self.storage.set_with_timeout(topic, message, expiry).await
+    }
+
+    async fn get(&self, filter: &TopicFilter) -> rmqtt::Result<Vec<(TopicName, Retain)>> {
+        self.storage.get_message(filter).await
+    }
+
+    async fn count(&self) -> isize {
+        self.storage.count().await
+    }
+
+    async fn max(&self) -> isize {
+        self.storage.max().await
+    }
+}
+
+/// Most observers of one certificate whose statuses are kept.
+const MAX_OBSERVERS: usize = 64;
+
+/// Least time between two looks for messages that have expired.
+const PRUNE: Duration = Duration::from_secs(1);
+
+/// What is kept, by topic: its bytes and until when, if it expires.
+#[derive(Debug)]
+struct Register {
+    kept: BTreeMap<String, (usize, Option<Instant>)>,
+    bytes: usize,
+    max_topics: usize,
+    max_bytes: usize,
+    pruned: Option<Instant>,
+}
+
+impl Register {
+    /// Notes a message in the place of its topic's last, if there is room for it.
+    fn keep(&mut self, topic: &str, bytes: usize, until: Option<Instant>, now: Instant) -> bool {
+        if !self.has_room(topic, bytes) && self.pruned.is_none_or(|pruned| now.duration_since(pruned) >= PRUNE) {
+            self.pruned = Some(now);
+            self.kept.retain(|_, (_, until)| until.is_none_or(|until| until > now));
+            self.bytes = self.kept.values().map(|(bytes, _)| bytes).sum();
+        }
+        let has_room = self.has_room(topic, bytes);
+        if has_room {
+            self.forget(topic);
+            self.kept.insert(topic.to_owned(), (bytes, until));
+            self.bytes += bytes;
+        }
+        has_room
+    }
+
+    fn forget(&mut self, topic: &str) {
+        self.bytes -= self.kept.remove(topic).map_or(0, |(bytes, _)| bytes);
+    }
+
+    fn has_room(&self, topic: &str, bytes: usize) -> bool {
+        let before = self.kept.get(topic).map(|(bytes, _)| bytes);
+        let is_crowded = || self.kept.len() >= self.max_topics || self.observers_beside(topic) >= MAX_OBSERVERS;
+        self.bytes - before.unwrap_or(&0) + bytes <= self.max_bytes && (before.is_some() || !is_crowded())
+    }
+
+    /// How many topics there are of observers that share the certificate of this one.
+    fn observers_beside(&self, topic: &str) -> usize {
+        let name = topic.rfind('/').map_or(0, |slash| slash + 1);
+        let mark = topic.get(name..).and_then(|name| name.find(OBSERVER_MARK));
+        let Some(holder) = mark.and_then(|mark| topic.get(..name + mark + OBSERVER_MARK.len())) else { return 0 };
+        self.kept.range(holder.to_owned()..).take_while(|(topic, _)| topic.starts_with(holder)).count()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn register(max_topics: usize, max_bytes: usize) -> Register {
+        Register { kept: BTreeMap::new(), bytes: 0, max_topics, max_bytes, pruned: None }
+    }
+
+    #[test]
+    fn topics_and_bytes_are_bounded_and_what_is_there_may_change() {
+        let mut register = register(2, 100);
+        let now = Instant::now();
+        assert!(register.keep("a", 60, None, now) && !register.keep("b", 50, None, now), "bytes");
+        assert!(register.keep("a", 100, None, now) && register.keep("a", 50, None, now), "in its own place");
+        assert!(register.keep("b", 50, None, now) && !register.keep("c", 0, None, now), "topics");
+        register.forget("a");
+        assert!(register.keep("c", 50, None, now));
+        assert_eq!(register.bytes, 100);
+    }
+
+    #[test]
+    fn what_has_expired_makes_room() {
+        let mut register = register(1, 100);
+        let (now, second) = (Instant::now(), Duration::from_secs(1));
+        assert!(register.keep("a", 100, Some(now + second), now) && !register.keep("b", 1, None, now));
+        assert!(register.keep("b", 1, None, now + 2 * second));
+    }
+
+    #[test]
+    fn one_certificate_does_not_use_up_the_topics() {
+        let mut register = register(1000, 1000);
+        let now = Instant::now();
+        let kept = (0..200).filter(|n| register.keep(&format!("c--1/nodes/gauss--{n}"), 1, None, now)).count();
+        assert_eq!(kept, MAX_OBSERVERS);
+        for other in ["c--1/nodes/gauss", "c--1/nodes/euclid", "c--1/nodes/euclid--top"] {
+            assert!(register.keep(other, 1, None, now), "{other}");
+        }
+    }
+}

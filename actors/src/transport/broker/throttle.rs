@@ -1,0 +1,53 @@
+//! Nobody takes more than a share of the embedded broker, under however many names.
+
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use async_trait::async_trait;
+use rmqtt::context::ServerContext;
+use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
+use rmqtt::types::PublishAclResult;
+
+use super::holder::{Passes, Source};
+use crate::platform::clock;
+use crate::platform::throttle::Throttles;
+use crate::telemetry::counters::{Counters, ShedReason};
+
+/// Passes on at most so many messages a second of each node, address or client, before anything is done with them.
+pub(super) struct ClientThrottle {
+    sources: Mutex<Throttles<Source>>,
+    passes: Passes,
+    counters: Arc<Counters>,
+}
+
+impl ClientThrottle {
+    pub(super) fn new(per_second: u32, passes: Passes, counters: Arc<Counters>) -> Self {
+        Self { sources: Mutex::new(Throttles::new(per_second)), passes, counters }
+    }
+
+    /// Has rmqtt ask for every message, before anybody is asked for permission.
+    pub(super) async fn install(self, context: &ServerContext) {
+        let register = context.extends.hook_mgr().register();
+        register.add_priority(Type::MessagePublishCheckAcl, 1, Box::new(self)).await;
+        register.start().await;
+    }
+}
+
+#[async_trait]
+impl Handler for ClientThrottle {
+    async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
+        let Parameter::MessagePublishCheckAcl(session, _) = parameter else { return (true, before) };
+        let source = self.passes.source(session.id.remote_addr, &session.id.client_id);
+        if self.sources.lock().unwrap_or_else(PoisonError::into_inner).allow(&source, clock::now()) {
+            return (true, before);
+        }
+        self.counters.shed(ShedReason::BrokerThrottled, source.as_str());
+        (false, Some(HookResult::PublishAclResult(PublishAclResult::rejected(false, None))))
+    }
+}
+
+impl fmt::Debug for ClientThrottle {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ClientThrottle").finish_non_exhaustive()
+    }
+}

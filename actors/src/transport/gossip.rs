@@ -1,0 +1,93 @@
+//! Datagrams between the nodes of a cell: membership, authentication, and messages of the election.
+
+#![deny(clippy::indexing_slicing)]
+
+pub(crate) mod answers;
+pub(crate) mod config;
+pub(crate) mod counters;
+pub(crate) mod frame;
+#[cfg(fuzzing)]
+pub mod fuzzing;
+pub(crate) mod gossip;
+pub(crate) mod key;
+pub(crate) mod machine;
+pub(crate) mod node_id;
+pub(crate) mod replay_window;
+pub(crate) mod seeds;
+pub(crate) mod sessions;
+pub(crate) mod socket;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::Role;
+
+pub use config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
+pub use counters::{FrameCounters, FrameEvent};
+pub(crate) use key::payload_key;
+pub use key::{KeyError, check_key};
+pub(crate) use seeds::look_up;
+pub use socket::BindError;
+pub(crate) use socket::is_of_this_machine;
+
+/// Largest payload of [`MembershipMessage::Send`] in bytes.
+pub const MAX_PAYLOAD_BYTES: usize = 1200;
+
+/// A node of the cell.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Member {
+    /// Its name.
+    pub name: NodeName,
+    /// When it started, in Unix microseconds by its own clock.
+    pub run: u64,
+    /// Where it gossips.
+    pub gossip: SocketAddr,
+    /// Where its broker can be reached, if it has one.
+    pub broker: Option<SocketAddr>,
+    /// The role it was started with.
+    pub role: Role,
+}
+
+/// What the membership found out.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum MembershipEvent {
+    /// A node is there, or a new run of it.
+    Alive {
+        /// The node.
+        member: Member,
+    },
+    /// A node does not answer; it is given up unless it does so soon.
+    Suspected {
+        /// The node.
+        name: NodeName,
+    },
+    /// A node is gone.
+    Down {
+        /// The node.
+        name: NodeName,
+    },
+    /// A living node's addresses changed.
+    Changed {
+        /// The node as it is now.
+        member: Member,
+    },
+    /// A datagram came.
+    Received {
+        /// The authenticated sender.
+        from: NodeName,
+        /// What it sent.
+        payload: Bytes,
+        /// When it came, by this node's clock.
+        received_at: Timestamp,
+    },
+    /// Two running nodes use one name, perhaps that of this node; only the later started one is heard.
+    NameTaken {
+        /// The name.
+        name: NodeName,
+    },
+}
+
+/// Takes events on the membership's own task: it must not wait.
+pub type EventSink = Arc<dyn Fn(MembershipEvent) + Send + Sync>;

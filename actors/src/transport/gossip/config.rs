@@ -1,0 +1,177 @@
+//! The membership's settings.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use ecod::config::{ConfigError, check_range};
+use serde::{Deserialize, Serialize};
+
+use crate::transport::mqtt::Secret;
+
+/// UDP port on which a node gossips unless told otherwise.
+pub const DEFAULT_PORT: u16 = 17_884;
+
+/// Where a node gossips, how it finds others, and how quickly it misses them; `[membership]` in the configuration file.
+///
+/// Key, multicast group and timings must be the same on every node of a cell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MembershipConfig {
+    /// The cell's key: 64 hexadecimal digits (best, such as from `openssl rand -hex 32`), or a passphrase of at least
+    /// 12 characters. Default none: anyone can take part, and the node gossips on loopback only unless `bind` is set.
+    /// Never printed.
+    pub key: Option<Secret>,
+    /// A file that holds the key; white space around it is left out. Default none. Excludes `key`.
+    pub key_file: Option<PathBuf>,
+    /// Address and UDP port to gossip on; port 0 takes any free one. Default port 17884, or a free one if another node
+    /// of this machine has it, on all interfaces with a key and on 127.0.0.1 without. With an IPv6 address all of the
+    /// cell gossips by IPv6, and finds each other by `seeds` only; link-local ones (`fe80::`) do not do.
+    pub bind: Option<SocketAddr>,
+    /// Address at which others reach this node, if address translation hides it. Default none: that of `bind`, or what
+    /// others see.
+    pub advertise: Option<SocketAddr>,
+    /// Nodes as `host:port` that are asked for the cell, besides multicast; resolved anew and asked for ever. Default
+    /// none. Not all need to be there, nor need they be the same on every node.
+    pub seeds: Vec<String>,
+    /// Discovery by multicast.
+    pub multicast: MulticastConfig,
+    /// Time between two probes of one other node, in ms. Default 100. Shorter notices death sooner and costs packets.
+    pub probe_ms: u64,
+    /// Time within which a probed node must answer before others are asked to probe it, in ms. Default 30; must be less
+    /// than half of `probe_ms`. Longer suits slower networks.
+    pub reply_ms: u64,
+    /// How long a suspected node has to show that it lives, in ms. Default 200. Longer gives up fewer living nodes and
+    /// notices death later.
+    pub suspect_ms: u64,
+    /// Time between two spreads of news, in ms. Default 50; nothing is sent when there is none.
+    pub gossip_ms: u64,
+    /// Time between two greetings, in ms: to every seed that is not there, and to the multicast group, to that ten
+    /// times as rarely in company. Default 500, and at most half of the election's `join_ms`, for a seed that returns
+    /// to hear of its cell before it leads on its own. Shorter heals split cells sooner and costs packets.
+    pub hello_ms: u64,
+    /// Most nodes that are known at a time. Default 256.
+    pub max_peers: usize,
+}
+
+/// Discovery by UDP multicast, which needs no configured address.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MulticastConfig {
+    /// Whether to greet and listen to greetings. Default true.
+    pub enabled: bool,
+    /// The group. Default 239.255.36.84, of the range that routers keep local.
+    pub group: Ipv4Addr,
+    /// UDP port of the group. Default 17885. All nodes of a machine share it.
+    pub port: u16,
+    /// Address of the network interface to use. Default that of `bind`, or else what the system chooses.
+    pub interface: Option<Ipv4Addr>,
+}
+
+impl Default for MulticastConfig {
+    fn default() -> Self {
+        Self { enabled: true, group: Ipv4Addr::new(239, 255, 36, 84), port: 17_885, interface: None }
+    }
+}
+
+impl Default for MembershipConfig {
+    fn default() -> Self {
+        Self {
+            key: None,
+            key_file: None,
+            bind: None,
+            advertise: None,
+            seeds: Vec::new(),
+            multicast: MulticastConfig::default(),
+            probe_ms: 100,
+            reply_ms: 30,
+            suspect_ms: 200,
+            gossip_ms: 50,
+            hello_ms: 500,
+            max_peers: 256,
+        }
+    }
+}
+
+impl MembershipConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the first key that cannot be used.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        if self.key.is_some() && self.key_file.is_some() {
+            return Err(ConfigError::new("key_file", "a file", "left out when `key` is set"));
+        }
+        if self.key.as_ref().is_some_and(|key| key.reveal().trim().len() < MIN_KEY_BYTES) {
+            return Err(ConfigError::new("key", "a shorter text", format!("at least {MIN_KEY_BYTES} characters")));
+        }
+        if self.advertise.is_some_and(|address| address.ip().is_unspecified() || address.port() == 0) {
+            return Err(ConfigError::new("advertise", "an open address", "an address and port that others can reach"));
+        }
+        if let Some(seed) = self.seeds.iter().find(|seed| !is_host_and_port(seed)) {
+            return Err(ConfigError::new("seeds", seed, "host:port, such as 192.168.1.10:17884"));
+        }
+        self.multicast.validate().map_err(|error| error.within("multicast"))?;
+        let ms = |key, value: u64, low: f64, high: f64| check_range(key, value as f64, low, high);
+        ms("probe_ms", self.probe_ms, 10.0, 60_000.0)?;
+        ms("reply_ms", self.reply_ms, 1.0, (self.probe_ms.saturating_sub(1) / 2) as f64)?;
+        ms("suspect_ms", self.suspect_ms, 10.0, 600_000.0)?;
+        ms("gossip_ms", self.gossip_ms, 5.0, 60_000.0)?;
+        ms("hello_ms", self.hello_ms, 10.0, 600_000.0)?;
+        check_range("max_peers", self.max_peers as f64, 1.0, 4096.0)
+    }
+
+    /// Whether the node has a key of its own, or one that everybody knows.
+    pub fn has_key(&self) -> bool {
+        self.key.is_some() || self.key_file.is_some()
+    }
+
+    /// Where to gossip when `bind` does not say.
+    pub(crate) fn default_ip(&self) -> IpAddr {
+        IpAddr::V4(if self.has_key() { Ipv4Addr::UNSPECIFIED } else { Ipv4Addr::LOCALHOST })
+    }
+
+    pub(crate) fn hello(&self) -> Duration {
+        Duration::from_millis(self.hello_ms)
+    }
+}
+
+impl MulticastConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        if !self.group.is_multicast() {
+            return Err(ConfigError::new("group", self.group, "an address from 224.0.0.0 to 239.255.255.255"));
+        }
+        check_range("port", f64::from(self.port), 1.0, 65_535.0)
+    }
+}
+
+/// Shortest key.
+pub(crate) const MIN_KEY_BYTES: usize = 12;
+
+fn is_host_and_port(text: &str) -> bool {
+    text.rsplit_once(':').is_some_and(|(host, port)| {
+        let port = port.parse::<u16>().is_ok_and(|port| port != 0);
+        port && !host.is_empty() && !host.contains(|c: char| c.is_whitespace() || c == '/')
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_valid_and_errors_name_the_key() {
+        assert_eq!(MembershipConfig::default().validate(), Ok(()));
+        for (toml, key) in [
+            ("key = \"short\"", "key"),
+            ("key = \"long enough, this\"\nkey_file = \"/etc/ecod/key\"", "key_file"),
+            ("advertise = \"0.0.0.0:1\"", "advertise"),
+            ("seeds = [\"host\"]", "seeds"),
+            ("reply_ms = 50", "reply_ms"),
+            ("[multicast]\ngroup = \"10.0.0.1\"", "multicast.group"),
+        ] {
+            let config: MembershipConfig = toml::from_str(toml).unwrap();
+            assert_eq!(config.validate().unwrap_err().key, key);
+        }
+    }
+}

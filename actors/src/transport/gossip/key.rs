@@ -1,0 +1,220 @@
+//! The cell's key and what is derived from it.
+
+use std::num::NonZeroU32;
+
+use ecod::names::NodeName;
+use ring::{aead, digest, hkdf, hmac, pbkdf2};
+
+use super::config::MembershipConfig;
+
+/// One run of a node's membership, drawn at random.
+pub(crate) type SessionId = [u8; 16];
+
+/// In place of the receiver's session in frames for everybody.
+pub(crate) const EVERYBODY: SessionId = [0; 16];
+
+/// What all nodes of a cell share, and what keys of single frames are derived from.
+pub(crate) struct CellKey {
+    root: hkdf::Prk,
+    tag: [u8; 4],
+}
+
+/// A key that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum KeyError {
+    /// The key file is not there or cannot be read.
+    #[error("cannot read cell key {path}: {source}")]
+    Unreadable {
+        /// The file.
+        path: std::path::PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// The key file holds less than a key.
+    #[error("cell key in {path} must have at least 12 characters")]
+    TooShort {
+        /// The file.
+        path: std::path::PathBuf,
+    },
+}
+
+/// Whether the key that the configuration names can be used.
+///
+/// # Errors
+/// [`KeyError`] when the key file cannot be used.
+pub fn check_key(config: &MembershipConfig, cell: &NodeName) -> Result<(), KeyError> {
+    CellKey::load(config, cell).map(drop)
+}
+
+/// The key that signs payloads, derived from the cell's.
+///
+/// # Errors
+/// [`KeyError`] when the key file cannot be used.
+pub(crate) fn payload_key(config: &MembershipConfig, cell: &NodeName) -> Result<hmac::Key, KeyError> {
+    CellKey::load(config, cell).map(|key| key.payload_key())
+}
+
+impl CellKey {
+    /// Reads the key that the configuration names. Without one, the cell's name is the key, which keeps cells apart and
+    /// nobody out.
+    ///
+    /// # Errors
+    /// [`KeyError`] when the key file cannot be used.
+    pub(crate) fn load(config: &MembershipConfig, cell: &NodeName) -> Result<Self, KeyError> {
+        let Some(path) = &config.key_file else {
+            return Ok(Self::new(config.key.as_ref().map_or("", |key| key.reveal().trim()), cell));
+        };
+        let text =
+            std::fs::read_to_string(path).map_err(|source| KeyError::Unreadable { path: path.clone(), source })?;
+        if text.trim().len() < super::config::MIN_KEY_BYTES {
+            return Err(KeyError::TooShort { path: path.clone() });
+        }
+        Ok(Self::new(text.trim(), cell))
+    }
+
+    /// Takes 64 hexadecimal digits as they are and stretches any other text.
+    pub(crate) fn new(text: &str, cell: &NodeName) -> Self {
+        let mut secret = [0; 32];
+        if !decode_hex(text, &mut secret) && !text.is_empty() {
+            let salt = [b"ecod gossip 1 ", cell.as_str().as_bytes()].concat();
+            pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, STRETCHING, &salt, text.as_bytes(), &mut secret);
+        }
+        let root = hkdf::Salt::new(hkdf::HKDF_SHA256, cell.as_str().as_bytes()).extract(&secret);
+        let hash = digest::digest(&digest::SHA256, cell.as_str().as_bytes());
+        Self { root, tag: hash.as_ref().first_chunk().copied().unwrap_or_default() }
+    }
+
+    /// Signs payloads that go through brokers of others.
+    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
+    pub(crate) fn payload_key(&self) -> hmac::Key {
+        let info: [&[u8]; 1] = [b"ecod payload 1"];
+        let key = self.root.expand(&info, hmac::HMAC_SHA256).map(hmac::Key::from);
+        key.expect("HKDF gives as much as a hash's length")
+    }
+
+    /// Tells frames of other cells; no secret.
+    pub(crate) fn tag(&self) -> [u8; 4] {
+        self.tag
+    }
+
+    /// The key of frames from one session to another. With the sender's frame counter as nonce, no two frames share
+    /// both.
+    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
+    pub(crate) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> Seal {
+        let info: [&[u8]; 3] = [b"ecod frame 1", sender, receiver];
+        let key = self.root.expand(&info, &aead::CHACHA20_POLY1305).map(aead::UnboundKey::from);
+        Seal(aead::LessSafeKey::new(key.expect("HKDF gives as much as a cipher's key")))
+    }
+}
+
+/// Seals and opens the frames of one direction between two sessions.
+pub(crate) struct Seal(aead::LessSafeKey);
+
+impl Seal {
+    /// Encrypts what follows the first `head` bytes of the frame, and authenticates all of it.
+    #[expect(clippy::expect_used, reason = "the cipher seals 256 GiB, a datagram has 64 KiB")]
+    pub(crate) fn close(&self, counter: u64, frame: &mut Vec<u8>, head: usize) {
+        let mut body = frame.split_off(head);
+        let sealed = self.0.seal_in_place_append_tag(nonce(counter), aead::Aad::from(&frame[..]), &mut body);
+        sealed.expect("a frame is shorter than what the cipher can seal");
+        frame.append(&mut body);
+    }
+
+    /// The body of a frame, if nothing of it was changed.
+    pub(crate) fn open(&self, counter: u64, head: &[u8], body: &[u8]) -> Option<Vec<u8>> {
+        let mut body = body.to_vec();
+        let length = self.0.open_in_place(nonce(counter), aead::Aad::from(head), &mut body).ok()?.len();
+        body.truncate(length);
+        Some(body)
+    }
+}
+
+/// Makes proofs of reachability that need not be remembered: whoever returns one has received it.
+pub(crate) struct CookieJar(hmac::Key);
+
+/// Proof that its bearer received what was sent to it lately.
+pub(crate) type Cookie = [u8; 16];
+
+impl CookieJar {
+    pub(crate) fn new(secret: &[u8; 32]) -> Self {
+        Self(hmac::Key::new(hmac::HMAC_SHA256, secret))
+    }
+
+    /// The cookie for a session at an address during one slot of time.
+    pub(crate) fn bake(&self, session: &SessionId, address: std::net::SocketAddr, slot: u64) -> Cookie {
+        let text = format!("{slot} {address}");
+        let tag = hmac::sign(&self.0, &[&session[..], text.as_bytes()].concat());
+        tag.as_ref().first_chunk().copied().unwrap_or_default()
+    }
+}
+
+/// Rounds that stretch a passphrase: about 50 ms on a small board's core for the owner, and for every guess.
+const STRETCHING: NonZeroU32 = NonZeroU32::new(100_000).expect("not zero");
+
+fn nonce(counter: u64) -> aead::Nonce {
+    let [a, b, c, d, e, f, g, h] = counter.to_be_bytes();
+    aead::Nonce::assume_unique_for_key([0, 0, 0, 0, a, b, c, d, e, f, g, h])
+}
+
+/// Whether the text is exactly the hexadecimal form of as many bytes.
+fn decode_hex(text: &str, bytes: &mut [u8]) -> bool {
+    let digits: Option<Vec<u8>> = text.chars().map(|c| c.to_digit(16).map(|digit| digit as u8)).collect();
+    let Some(digits) = digits.filter(|digits| digits.len() == 2 * bytes.len()) else { return false };
+    let (pairs, _) = digits.as_chunks();
+    for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
+        *byte = high << 4 | low;
+    }
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const A: SessionId = [1; 16];
+    const B: SessionId = [2; 16];
+
+    fn open(key: &CellKey, from: &SessionId, to: &SessionId, counter: u64, frame: &[u8]) -> Option<Vec<u8>> {
+        key.seal(from, to).open(counter, &frame[..4], &frame[4..])
+    }
+
+    #[test]
+    fn only_key_cell_sessions_and_counter_of_the_sealing_open_a_frame() {
+        let cell = NodeName::from_static("lot-1");
+        let key = CellKey::new("correct horse battery", &cell);
+        let mut frame = b"headbody".to_vec();
+        key.seal(&A, &B).close(7, &mut frame, 4);
+        assert_eq!(open(&key, &A, &B, 7, &frame).as_deref(), Some(&b"body"[..]));
+        assert_eq!(open(&key, &A, &B, 8, &frame), None);
+        assert_eq!(open(&key, &B, &A, 7, &frame), None);
+        assert_eq!(open(&CellKey::new("correct horse batterz", &cell), &A, &B, 7, &frame), None);
+        let elsewhere = CellKey::new("correct horse battery", &NodeName::from_static("lot-2"));
+        assert_eq!(open(&elsewhere, &A, &B, 7, &frame), None);
+        for at in 0..frame.len() {
+            let mut changed = frame.clone();
+            changed[at] ^= 1;
+            assert_eq!(open(&key, &A, &B, 7, &changed), None, "byte {at}");
+        }
+    }
+
+    #[test]
+    fn sixty_four_digits_are_the_key_itself() {
+        let mut bytes = [0; 32];
+        assert!(decode_hex(&"0aF1".repeat(16), &mut bytes));
+        assert_eq!(bytes[..4], [0x0a, 0xf1, 0x0a, 0xf1]);
+        assert!(!decode_hex(&"0".repeat(63), &mut bytes) && !decode_hex(&"g".repeat(64), &mut bytes));
+    }
+
+    #[test]
+    fn key_files_are_trimmed_and_must_hold_a_key() {
+        let cell = NodeName::from_static("lot-1");
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let config = MembershipConfig { key_file: Some(file.path().into()), ..MembershipConfig::default() };
+        std::fs::write(file.path(), " short\n").unwrap();
+        assert!(CellKey::load(&config, &cell).err().unwrap().to_string().contains("12 characters"));
+        std::fs::write(file.path(), "correct horse battery\n").unwrap();
+        let mut frame = b"headbody".to_vec();
+        CellKey::new("correct horse battery", &cell).seal(&A, &B).close(1, &mut frame, 4);
+        assert!(open(&CellKey::load(&config, &cell).unwrap(), &A, &B, 1, &frame).is_some());
+    }
+}

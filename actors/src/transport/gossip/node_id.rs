@@ -1,0 +1,76 @@
+//! What the gossip says of a node.
+
+use std::net::{IpAddr, SocketAddr};
+
+use ecod::names::NodeName;
+use ecod::wire::Role;
+use serde::{Deserialize, Serialize};
+
+use super::Member;
+use super::socket::is_of_this_machine;
+
+/// A node at one time of its life. Of two with one name, the one with the later `life` is believed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct NodeId {
+    pub(crate) name: NodeName,
+    /// When the node started, in Unix microseconds by its own clock.
+    pub(crate) run: u64,
+    /// Counts up from when the membership started, whenever the node returns from the dead or its addresses change.
+    pub(crate) life: u64,
+    pub(crate) role: Role,
+    /// Where it gossips; unspecified while the node does not know.
+    pub(crate) gossip: SocketAddr,
+    pub(crate) broker: Option<SocketAddr>,
+}
+
+impl NodeId {
+    /// The node as others are told, where it is seen at `address`. A broker on another machine's loopback is none:
+    /// there, this machine would find its own.
+    pub(crate) fn member(&self, address: Option<SocketAddr>) -> Member {
+        let gossip = address.unwrap_or(self.gossip);
+        let reached = |ip: IpAddr| if ip.is_unspecified() { gossip.ip() } else { ip };
+        let is_near = |broker: &SocketAddr| !broker.ip().is_loopback() || is_of_this_machine(gossip.ip());
+        let broker = self.broker.filter(is_near);
+        let broker = broker.map(|broker| SocketAddr::new(reached(broker.ip()), broker.port()));
+        Member { name: self.name.clone(), run: self.run, gossip, broker, role: self.role }
+    }
+}
+
+impl foca::Identity for NodeId {
+    type Addr = NodeName;
+
+    /// The gossip renews its identity itself, and not too often.
+    fn renew(&self) -> Option<Self> {
+        None
+    }
+
+    fn addr(&self) -> NodeName {
+        self.name.clone()
+    }
+
+    fn win_addr_conflict(&self, adversary: &Self) -> bool {
+        self.life > adversary.life
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_broker_on_the_loopback_of_another_machine_is_none() {
+        let id = |gossip: &str| NodeId {
+            name: NodeName::from_static("euclid"),
+            run: 1,
+            life: 1,
+            role: Role::Auto,
+            gossip: gossip.parse().unwrap(),
+            broker: Some("127.0.0.1:1883".parse().unwrap()),
+        };
+        // An address of nobody: reserved for documentation.
+        assert_eq!(id("192.0.2.7:17884").member(None).broker, None);
+        assert_eq!(id("127.0.0.1:17884").member(None).broker, id("127.0.0.1:17884").broker, "this machine's");
+        let open = NodeId { broker: Some("0.0.0.0:1883".parse().unwrap()), ..id("192.0.2.7:17884") };
+        assert_eq!(open.member(None).broker, Some("192.0.2.7:1883".parse().unwrap()));
+    }
+}

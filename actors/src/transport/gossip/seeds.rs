@@ -1,0 +1,77 @@
+//! Keeps the addresses of the seeds.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use tokio::net::lookup_host;
+
+/// Resolves the seeds anew for ever, sooner if one could not be resolved, and tells of them, until `tell` returns false. A seed that cannot
+/// be resolved is logged once, until it can, and keeps the addresses that it had: whoever answers for names may be gone
+/// with the network.
+pub(crate) async fn resolve(seeds: Vec<String>, ipv4: bool, tell: impl Fn(Vec<SocketAddr>) -> bool) {
+    let mut retry = RETRY_MIN;
+    let mut unresolved = BTreeSet::new();
+    let mut known = BTreeMap::new();
+    loop {
+        resolve_once(&seeds, ipv4, &mut known, &mut unresolved).await;
+        let addresses = known.values().flatten().copied().collect();
+        let complete = unresolved.is_empty();
+        if !tell(addresses) {
+            return;
+        }
+        let wait = if complete { REFRESH } else { retry };
+        retry = if complete { RETRY_MIN } else { (retry * 2).min(REFRESH) };
+        tokio::time::sleep(wait).await;
+    }
+}
+
+const RETRY_MIN: Duration = Duration::from_millis(500);
+const REFRESH: Duration = Duration::from_secs(30);
+
+async fn resolve_once(
+    seeds: &[String],
+    ipv4: bool,
+    known: &mut BTreeMap<String, Vec<SocketAddr>>,
+    unresolved: &mut BTreeSet<String>,
+) {
+    for seed in seeds {
+        match look_up(seed, ipv4).await {
+            Ok(found) => {
+                known.insert(seed.clone(), found);
+                if unresolved.remove(seed) {
+                    tracing::info!(%seed, "seed resolved");
+                }
+            }
+            Err(error) if unresolved.insert(seed.clone()) => {
+                tracing::warn!(%error, %seed, "seed cannot be resolved, trying on");
+            }
+            Err(_) => {}
+        }
+    }
+}
+
+/// The addresses of a seed that a socket of its family reaches.
+pub(crate) async fn look_up(seed: &str, ipv4: bool) -> io::Result<Vec<SocketAddr>> {
+    let found: Vec<_> = lookup_host(seed).await?.filter(|address| address.is_ipv4() == ipv4).collect();
+    let family = if ipv4 { "IPv4" } else { "IPv6" };
+    if found.is_empty() { Err(io::Error::other(format!("no {family} address"))) } else { Ok(found) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_seed_of_the_wrong_family_or_without_an_address_is_tried_on() {
+        let seeds = ["127.0.0.1:9", "[::1]:9", "no port"].map(str::to_owned);
+        let mut unresolved = BTreeSet::from(["127.0.0.1:9".to_owned()]);
+        let (usual, before): (SocketAddr, SocketAddr) =
+            ("127.0.0.1:9".parse().unwrap(), "192.0.2.1:9".parse().unwrap());
+        let mut known = BTreeMap::from([("no port".to_owned(), vec![before])]);
+        resolve_once(&seeds, true, &mut known, &mut unresolved).await;
+        assert_eq!(known.into_values().flatten().collect::<Vec<_>>(), [usual, before], "what was known once stays");
+        assert_eq!(unresolved, BTreeSet::from(["[::1]:9", "no port"].map(str::to_owned)));
+    }
+}

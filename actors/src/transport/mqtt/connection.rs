@@ -1,0 +1,308 @@
+//! One MQTT connection, 3.1.1 or 5, to one broker; used once and never reconnected, so that nothing old is sent late.
+
+use std::error::Error;
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
+use rumqttc::v5::mqttbytes::QoS as QoS5;
+use rumqttc::{QoS as QoS4, TlsConfiguration, Transport, v5};
+use rustls::ClientConfig;
+
+use super::address::BrokerAddress;
+use super::config::{MqttConfig, MqttVersion};
+use crate::transport::pki::CredentialsError;
+
+/// How the broker is to treat a message: contract of the topics.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Handling {
+    /// QoS 0, not retained: the next one makes it worthless.
+    Stream,
+    /// QoS 1, retained: latecomers need it.
+    State,
+}
+
+/// The sending half; never waits.
+#[derive(Debug)]
+pub(crate) enum Client {
+    V311(rumqttc::AsyncClient),
+    V5(v5::AsyncClient),
+}
+
+/// The receiving half; must be polled for anything to be sent or received.
+pub(crate) enum Connection {
+    V311(Box<rumqttc::EventLoop>),
+    V5(Box<v5::EventLoop>),
+}
+
+/// What polling a connection yields.
+pub(crate) enum Packet {
+    /// The broker accepted the connection.
+    Accepted,
+    /// A message on a topic, which may be no UTF-8.
+    Message { topic: Bytes, payload: Bytes },
+    /// This side's farewell is on its way.
+    Left,
+    /// The broker answered a subscription and refused some of its filters, by their place in it, with its reason.
+    Denied(Vec<(usize, String)>),
+    /// Something was sent.
+    Sent,
+    /// Something came in that only the protocol is concerned with.
+    Other,
+}
+
+/// Why a connection ended.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ConnectionError {
+    #[error("{0}")]
+    V311(Box<rumqttc::ConnectionError>),
+    #[error("{0}")]
+    V5(Box<v5::ConnectionError>),
+    #[error("nothing within {0:?}")]
+    Silent(Duration),
+    #[error("the broker's certificate is no longer valid: {0}")]
+    Distrusted(rustls::Error),
+    #[error(transparent)]
+    Credentials(#[from] Box<CredentialsError>),
+}
+
+impl ConnectionError {
+    /// Whether nothing listens there: the broker's process is gone.
+    pub(crate) fn is_refused(&self) -> bool {
+        let refused = |error: &io::Error| error.kind() == io::ErrorKind::ConnectionRefused;
+        match self {
+            Self::V311(error) => matches!(&**error, rumqttc::ConnectionError::Io(io) if refused(io)),
+            Self::V5(error) => matches!(&**error, v5::ConnectionError::Io(io) if refused(io)),
+            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
+        }
+    }
+
+    /// Why the broker took the connection and then refused the node, in its own words, or why this node does not trust
+    /// it.
+    pub(crate) fn refusal(&self) -> Option<String> {
+        if let Some(reason) = self.mistrust() {
+            return Some(reason);
+        }
+        match self {
+            Self::V311(error) => match &**error {
+                rumqttc::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
+                _ => None,
+            },
+            Self::V5(error) => match &**error {
+                v5::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
+                _ => None,
+            },
+            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => None,
+        }
+    }
+
+    /// What is wrong with one side's certificate.
+    fn mistrust(&self) -> Option<String> {
+        let mut next: Option<&(dyn Error + 'static)> = match self {
+            Self::V311(error) => Some(&**error),
+            Self::V5(error) => Some(&**error),
+            Self::Distrusted(error) => return Some(error.to_string()),
+            Self::Silent(_) | Self::Credentials(_) => None,
+        };
+        while let Some(error) = next {
+            let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
+            if let Some(rustls::Error::InvalidCertificate(_) | rustls::Error::AlertReceived(_)) =
+                inner.and_then(|inner| inner.downcast_ref())
+            {
+                return inner.map(ToString::to_string);
+            }
+            next = error.source();
+        }
+        None
+    }
+
+    /// Whether a packet beyond [`MqttConfig::max_packet_bytes`] came in.
+    pub(crate) fn is_oversized(&self) -> bool {
+        match self {
+            Self::V311(error) => matches!(
+                **error,
+                rumqttc::ConnectionError::MqttState(rumqttc::StateError::Deserialization(
+                    rumqttc::Error::PayloadSizeLimitExceeded(_)
+                ))
+            ),
+            Self::V5(error) => matches!(
+                **error,
+                v5::ConnectionError::MqttState(
+                    v5::StateError::Deserialization(v5::mqttbytes::Error::PayloadSizeLimitExceeded { .. })
+                        | v5::StateError::IncomingPacketTooLarge { .. }
+                )
+            ),
+            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
+        }
+    }
+}
+
+/// What the broker says about this node when it falls silent.
+#[derive(Debug, Clone)]
+pub(crate) struct LastWill {
+    pub(crate) topic: String,
+    pub(crate) payload: Bytes,
+}
+
+/// The will's payload of a node with this status.
+pub(crate) fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
+    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
+}
+
+/// Prepares a connection; the first poll makes it.
+pub(crate) fn open(
+    address: &BrokerAddress,
+    client_id: &str,
+    will: Option<&LastWill>,
+    config: &MqttConfig,
+    tls: Option<Arc<ClientConfig>>,
+) -> (Client, Connection) {
+    let timeout_s = config.connect_timeout().as_secs().max(1);
+    let mut network = rumqttc::NetworkOptions::new();
+    network.set_tcp_nodelay(true);
+    network.set_connection_timeout(timeout_s);
+    let login = config.user.as_deref().map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
+    let port = address.port();
+    // The client library takes the host for the name in the broker's certificate, where brackets are none.
+    let host = if tls.is_some() { address.host().trim_matches(['[', ']']) } else { address.host() };
+    let transport = tls.map(|tls| Transport::tls_with_config(TlsConfiguration::Rustls(tls)));
+    let max_packet_bytes = config.max_packet_bytes();
+    match config.version {
+        MqttVersion::V311 => {
+            let mut options = rumqttc::MqttOptions::new(client_id, host, port);
+            options.set_keep_alive(config.keep_alive());
+            options.set_max_packet_size(max_packet_bytes, max_packet_bytes);
+            if let Some(transport) = transport {
+                options.set_transport(transport);
+            }
+            if let Some(will) = will {
+                let payload = will.payload.clone();
+                options.set_last_will(rumqttc::LastWill::new(&will.topic, payload, QoS4::AtLeastOnce, true));
+            }
+            if let Some((user, password)) = login {
+                options.set_credentials(user, password);
+            }
+            let (client, mut events) = rumqttc::AsyncClient::new(options, config.send_queue);
+            events.set_network_options(network);
+            (Client::V311(client), Connection::V311(Box::new(events)))
+        }
+        MqttVersion::V5 => {
+            let mut options = v5::MqttOptions::new(client_id, host, port);
+            options.set_keep_alive(config.keep_alive());
+            options.set_connection_timeout(timeout_s);
+            options.set_max_packet_size(u32::try_from(max_packet_bytes).ok());
+            if let Some(transport) = transport {
+                options.set_transport(transport);
+            }
+            if let Some(will) = will {
+                let payload = will.payload.clone();
+                let will = v5::mqttbytes::v5::LastWill::new(&will.topic, payload, QoS5::AtLeastOnce, true, None);
+                options.set_last_will(will);
+            }
+            options.set_network_options(network);
+            if let Some((user, password)) = login {
+                options.set_credentials(user, password);
+            }
+            let (client, events) = v5::AsyncClient::new(options, config.send_queue);
+            (Client::V5(client), Connection::V5(Box::new(events)))
+        }
+    }
+}
+
+impl Client {
+    /// Queues a message; false when there is no room or the connection has ended.
+    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, handling: Handling) -> bool {
+        let retain = handling == Handling::State;
+        match self {
+            Self::V311(client) => {
+                let qos = if retain { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
+                client.try_publish(topic, qos, retain, payload.clone()).is_ok()
+            }
+            Self::V5(client) => {
+                let qos = if retain { QoS5::AtLeastOnce } else { QoS5::AtMostOnce };
+                client.try_publish(topic, qos, retain, payload.clone()).is_ok()
+            }
+        }
+    }
+
+    /// Queues one subscription to all filters, with at most QoS 1; false when there is no room.
+    pub(crate) fn subscribe(&self, filters: &[String]) -> bool {
+        match self {
+            Self::V311(client) => client
+                .try_subscribe_many(
+                    filters.iter().map(|path| rumqttc::SubscribeFilter::new(path.clone(), QoS4::AtLeastOnce)),
+                )
+                .is_ok(),
+            Self::V5(client) => client
+                .try_subscribe_many(
+                    filters.iter().map(|path| v5::mqttbytes::v5::Filter::new(path.clone(), QoS5::AtLeastOnce)),
+                )
+                .is_ok(),
+        }
+    }
+
+    /// Queues the end of subscriptions; false when there is no room for all.
+    pub(crate) fn unsubscribe(&self, filters: &[String]) -> bool {
+        filters.iter().all(|filter| match self {
+            Self::V311(client) => client.try_unsubscribe(filter).is_ok(),
+            Self::V5(client) => client.try_unsubscribe(filter).is_ok(),
+        })
+    }
+
+    /// Queues the farewell, after which the broker does not publish the last will; false when there is no room.
+    pub(crate) fn disconnect(&self) -> bool {
+        match self {
+            Self::V311(client) => client.try_disconnect().is_ok(),
+            Self::V5(client) => client.try_disconnect().is_ok(),
+        }
+    }
+}
+
+impl Connection {
+    /// Sends and receives until there is something to tell; `patience` bounds the silence.
+    pub(crate) async fn next(&mut self, patience: Duration) -> Result<Packet, ConnectionError> {
+        tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Silent(patience)))
+    }
+
+    async fn poll(&mut self) -> Result<Packet, ConnectionError> {
+        Ok(match self {
+            Self::V311(events) => match events.poll().await.map_err(|e| ConnectionError::V311(Box::new(e)))? {
+                rumqttc::Event::Incoming(rumqttc::Packet::ConnAck(_)) => Packet::Accepted,
+                rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) => {
+                    Packet::Message { topic: publish.topic.into(), payload: publish.payload }
+                }
+                rumqttc::Event::Incoming(rumqttc::Packet::SubAck(answer)) => {
+                    denied(answer.return_codes, |code| matches!(code, rumqttc::SubscribeReasonCode::Success(_)))
+                }
+                rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                rumqttc::Event::Outgoing(_) => Packet::Sent,
+                rumqttc::Event::Incoming(_) => Packet::Other,
+            },
+            Self::V5(events) => match events.poll().await.map_err(|e| ConnectionError::V5(Box::new(e)))? {
+                v5::Event::Incoming(v5::Incoming::ConnAck(_)) => Packet::Accepted,
+                v5::Event::Incoming(v5::Incoming::Publish(publish)) => {
+                    Packet::Message { topic: publish.topic, payload: publish.payload }
+                }
+                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => denied(answer.return_codes, |code| {
+                    matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
+                }),
+                v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                v5::Event::Outgoing(_) => Packet::Sent,
+                v5::Event::Incoming(_) => Packet::Other,
+            },
+        })
+    }
+}
+
+/// The filters of a subscription that were refused.
+fn denied<C: std::fmt::Debug>(codes: Vec<C>, granted: impl Fn(&C) -> bool) -> Packet {
+    let refused: Vec<_> = codes
+        .into_iter()
+        .enumerate()
+        .filter(|(_, code)| !granted(code))
+        .map(|(index, code)| (index, format!("{code:?}")))
+        .collect();
+    if refused.is_empty() { Packet::Other } else { Packet::Denied(refused) }
+}

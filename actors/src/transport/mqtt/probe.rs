@@ -1,0 +1,36 @@
+//! Whether a broker takes this node, asked without being one of the cell.
+
+use uuid::Uuid;
+
+use super::config::MqttConfig;
+use super::connection::{Packet, open};
+use super::{BrokerAddress, Security};
+use crate::transport::pki::OBSERVER_MARK;
+
+/// Connects as the configuration says, as an observer beside the node of this name, and leaves again. There is no last
+/// will: whatever becomes of this connection, nothing is said about anybody.
+///
+/// # Errors
+/// Why the broker is not there or refuses, in words.
+pub async fn probe(
+    address: &BrokerAddress,
+    node: &str,
+    config: &MqttConfig,
+    security: &Security,
+) -> Result<(), String> {
+    let client_id = format!("{node}{OBSERVER_MARK}probe-{}", Uuid::now_v7().simple());
+    let tls = security.tls(address).map_err(|error| error.to_string())?;
+    let (client, mut connection) = open(address, &client_id, None, config, tls.map(|tls| tls.client()));
+    let patience = config.connect_timeout();
+    loop {
+        match connection.next(patience).await {
+            Ok(Packet::Accepted) => break,
+            Ok(_) => {}
+            Err(error) => return Err(error.refusal().unwrap_or_else(|| error.to_string())),
+        }
+    }
+    if client.disconnect() {
+        while !matches!(connection.next(patience).await, Ok(Packet::Left) | Err(_)) {}
+    }
+    Ok(())
+}

@@ -1,0 +1,354 @@
+//! The cell's certificate authority: a directory on one machine, which need not be one of the cell.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::Role;
+use rcgen::{
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose, IsCa,
+    Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, RevocationReason, RevokedCertParams, SerialNumber,
+};
+use ring::rand::{SecureRandom, SystemRandom};
+use serde::{Deserialize, Serialize};
+
+use super::{BROKER_NAME, OBSERVER_MARK};
+
+/// Days for which a node's certificate is valid unless told otherwise.
+pub const DEFAULT_DAYS: u32 = 365;
+
+/// Days for which a CA is valid.
+const CA_DAYS: u32 = 3650;
+
+/// How far a certificate's beginning lies back: clocks of the cell may be behind.
+const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
+
+/// The CA of one cell and all that it has issued.
+#[derive(Debug)]
+pub struct Authority {
+    directory: PathBuf,
+    register: Register,
+}
+
+/// Every certificate that was issued, in `issued.json`; the revocation list is made from it.
+#[derive(Debug, Serialize, Deserialize)]
+struct Register {
+    cell: NodeName,
+    revision: u64,
+    issued: Vec<Issued>,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Issued {
+    node: NodeName,
+    serial: String,
+    expires_at_us: Timestamp,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    revoked_at_us: Option<Timestamp>,
+}
+
+/// Why the authority did not do what it was asked to; what was there before is still there.
+#[derive(Debug, thiserror::Error)]
+pub enum AuthorityError {
+    /// A file could not be read or written.
+    #[error("cannot use {path}")]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system said.
+        source: io::Error,
+    },
+    /// There is no CA.
+    #[error("{0} has no CA: make one with `ecod-node pki init`")]
+    Missing(PathBuf),
+    /// The directory has a CA already, whose certificates would all be worth nothing.
+    #[error("{0} has a CA already; a new one needs an empty directory")]
+    Exists(PathBuf),
+    /// The register is not what this program writes.
+    #[error("{path} cannot be understood: {reason}")]
+    Register {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// Names with the mark belong to observers, and file names have to end somewhere.
+    #[error("{0} cannot have a certificate: names of nodes have no `{OBSERVER_MARK}`")]
+    Name(NodeName),
+    /// No valid certificate was issued for the node.
+    #[error("{0} has no certificate that could be revoked")]
+    Unknown(NodeName),
+    /// A key or certificate could not be made.
+    #[error("no certificate could be made: {0}")]
+    Crypto(String),
+}
+
+impl From<rcgen::Error> for AuthorityError {
+    fn from(error: rcgen::Error) -> Self {
+        Self::Crypto(error.to_string())
+    }
+}
+
+impl Authority {
+    /// Makes a CA for a cell in a directory, which is made too, with an empty revocation list.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when there is a CA or the directory cannot be written.
+    pub fn init(directory: &Path, cell: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
+        let file = |path: &Path, source| AuthorityError::File { path: path.into(), source };
+        fs::create_dir_all(directory.join(NODES)).map_err(|source| file(directory, source))?;
+        if directory.join(CA_KEY).exists() {
+            return Err(AuthorityError::Exists(directory.into()));
+        }
+        let key = KeyPair::generate()?;
+        let mut parameters = CertificateParams::default();
+        parameters.distinguished_name.push(DnType::CommonName, format!("ECOD cell {cell}"));
+        parameters.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        parameters.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        set_validity(&mut parameters, now, days(CA_DAYS));
+        parameters.serial_number = Some(draw_serial()?);
+        let certificate = parameters.self_signed(&key)?;
+        let secret = key.serialize_pem();
+        write(&directory.join(CA), &certificate.pem())?;
+        let register = Register { cell: cell.clone(), revision: 0, issued: Vec::new() };
+        let mut authority = Self { directory: directory.into(), register };
+        authority.save(&Issuer::from_ca_cert_pem(&certificate.pem(), key)?, now)?;
+        // Last: with the key there is a CA, and what is left of an attempt without it gives way to the next.
+        write_secret(&directory.join(CA_KEY), &secret)?;
+        Ok(authority)
+    }
+
+    /// Opens the CA of a directory.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when there is none.
+    pub fn open(directory: &Path) -> Result<Self, AuthorityError> {
+        let path = directory.join(REGISTER);
+        if !path.exists() {
+            return Err(AuthorityError::Missing(directory.into()));
+        }
+        let text = read(&path)?;
+        let register = serde_json::from_str(&text)
+            .map_err(|error| AuthorityError::Register { path, reason: error.to_string() })?;
+        Ok(Self { directory: directory.into(), register })
+    }
+
+    /// Makes a key and a certificate for a node, `nodes/<node>.key` and `nodes/<node>.pem`, in place of earlier ones,
+    /// which stay valid until they expire or are revoked.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
+    pub fn issue(
+        &mut self,
+        node: &NodeName,
+        role: Role,
+        valid: Duration,
+        now: Timestamp,
+    ) -> Result<(), AuthorityError> {
+        if node.as_str().contains(OBSERVER_MARK) {
+            return Err(AuthorityError::Name(node.clone()));
+        }
+        let mut parameters = CertificateParams::default();
+        parameters.distinguished_name.push(DnType::CommonName, node.as_str());
+        parameters.use_authority_key_identifier_extension = true;
+        parameters.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
+        if role != Role::Cav {
+            parameters.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
+            let name = BROKER_NAME.try_into()?;
+            parameters.subject_alt_names.push(rcgen::SanType::DnsName(name));
+        }
+        set_validity(&mut parameters, now, valid);
+        let serial = draw_serial()?;
+        parameters.serial_number = Some(serial.clone());
+        let key = KeyPair::generate()?;
+        let issuer = self.issuer()?;
+        let certificate = parameters.signed_by(&key, &issuer)?;
+        let serial = hex(serial.as_ref());
+        let issued = Issued { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
+        // Known before it exists, so that nothing can be valid that cannot be revoked.
+        self.register.issued.push(issued);
+        self.save(&issuer, now)?;
+        let nodes = self.directory.join(NODES);
+        write_secret(&nodes.join(format!("{node}.key")), &key.serialize_pem())?;
+        write(&nodes.join(format!("{node}.pem")), &certificate.pem())
+    }
+
+    /// Revokes all certificates of a node and writes the list anew; tells how many they were.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when there are none or the list cannot be written.
+    pub fn revoke(&mut self, node: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
+        let mut revoked = 0;
+        for issued in &mut self.register.issued {
+            if issued.node == *node && issued.revoked_at_us.is_none() && issued.expires_at_us > now {
+                issued.revoked_at_us = Some(now);
+                revoked += 1;
+            }
+        }
+        if revoked == 0 {
+            return Err(AuthorityError::Unknown(node.clone()));
+        }
+        self.save(&self.issuer()?, now)?;
+        Ok(revoked)
+    }
+
+    /// The CA's certificate.
+    pub fn ca(&self) -> PathBuf {
+        self.directory.join(CA)
+    }
+
+    /// The revocation list.
+    pub fn revocation_list(&self) -> PathBuf {
+        self.directory.join(LIST)
+    }
+
+    /// A node's certificate and its key, issued or not.
+    pub fn files_of(&self, node: &NodeName) -> (PathBuf, PathBuf) {
+        let nodes = self.directory.join(NODES);
+        (nodes.join(format!("{node}.pem")), nodes.join(format!("{node}.key")))
+    }
+
+    fn issuer(&self) -> Result<Issuer<'static, KeyPair>, AuthorityError> {
+        let key = KeyPair::from_pem(&read(&self.directory.join(CA_KEY))?)?;
+        Ok(Issuer::from_ca_cert_pem(&read(&self.ca())?, key)?)
+    }
+
+    /// Writes the revocation list and then the register.
+    fn save(&mut self, issuer: &Issuer<'_, KeyPair>, now: Timestamp) -> Result<(), AuthorityError> {
+        self.register.revision += 1;
+        let revoked = |issued: &Issued| {
+            let serial = SerialNumber::from_slice(&unhex(&issued.serial));
+            let revocation_time = time(issued.revoked_at_us?).into();
+            let reason_code = Some(RevocationReason::PrivilegeWithdrawn);
+            Some(RevokedCertParams { serial_number: serial, revocation_time, reason_code, invalidity_date: None })
+        };
+        let list = CertificateRevocationListParams {
+            this_update: time(now).into(),
+            next_update: time(now + days(CA_DAYS)).into(),
+            crl_number: SerialNumber::from(self.register.revision),
+            issuing_distribution_point: None,
+            revoked_certs: self.register.issued.iter().filter_map(revoked).collect(),
+            key_identifier_method: KeyIdMethod::Sha256,
+        };
+        write(&self.revocation_list(), &list.signed_by(issuer)?.pem()?)?;
+        let text = serde_json::to_string_pretty(&self.register)
+            .map_err(|error| AuthorityError::Register { path: REGISTER.into(), reason: error.to_string() })?;
+        write(&self.directory.join(REGISTER), &(text + "\n"))
+    }
+}
+
+const CA: &str = "ca.pem";
+const CA_KEY: &str = "ca.key";
+const LIST: &str = "revoked.pem";
+const REGISTER: &str = "issued.json";
+const NODES: &str = "nodes";
+
+fn days(count: u32) -> Duration {
+    Duration::from_secs(u64::from(count) * 86_400)
+}
+
+fn time(timestamp: Timestamp) -> SystemTime {
+    SystemTime::UNIX_EPOCH + Duration::from_micros(timestamp.micros())
+}
+
+fn set_validity(parameters: &mut CertificateParams, now: Timestamp, valid: Duration) {
+    parameters.not_before = (time(now) - CLOCK_ALLOWANCE).into();
+    parameters.not_after = time(now + valid).into();
+}
+
+/// 127 random bits: positive, and never the same twice.
+fn draw_serial() -> Result<SerialNumber, AuthorityError> {
+    let mut bytes = [0; 16];
+    let drawn = SystemRandom::new().fill(&mut bytes);
+    drawn.map_err(|_| AuthorityError::Crypto("the system gives no random numbers".into()))?;
+    bytes[0] = bytes[0] & 0x7f | 0x40;
+    Ok(SerialNumber::from_slice(&bytes))
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn unhex(text: &str) -> Vec<u8> {
+    let pairs = text.as_bytes().chunks(2);
+    pairs.filter_map(|pair| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok()).collect()
+}
+
+fn read(path: &Path) -> Result<String, AuthorityError> {
+    fs::read_to_string(path).map_err(|source| AuthorityError::File { path: path.into(), source })
+}
+
+fn write(path: &Path, text: &str) -> Result<(), AuthorityError> {
+    replace(path, text, 0o644)
+}
+
+fn write_secret(path: &Path, text: &str) -> Result<(), AuthorityError> {
+    replace(path, text, 0o600)
+}
+
+/// Writes the file whole or leaves the one before.
+fn replace(path: &Path, text: &str, mode: u32) -> Result<(), AuthorityError> {
+    let beside = path.with_extension("new");
+    let written = || -> io::Result<()> {
+        let mut file: File = OpenOptions::new().write(true).create(true).truncate(true).mode(mode).open(&beside)?;
+        file.write_all(text.as_bytes())?;
+        file.sync_all()?;
+        fs::rename(&beside, path)
+    };
+    written().map_err(|source| AuthorityError::File { path: path.into(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+    use crate::platform::clock;
+
+    #[test]
+    fn a_ca_is_made_once_and_its_keys_are_for_its_owner_only() {
+        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
+        for key in ["ca.key", "nodes/edge.key"] {
+            let mode = fs::metadata(directory.path().join(key)).unwrap().permissions().mode();
+            assert_eq!(mode & 0o777, 0o600, "{key}");
+        }
+        let again = Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
+        assert!(matches!(again, AuthorityError::Exists(_)));
+    }
+
+    #[test]
+    fn a_ca_that_was_left_half_made_can_be_made_again() {
+        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let obstacle = directory.path().join("issued.new");
+        fs::create_dir(&obstacle).unwrap();
+        Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
+        fs::remove_dir(&obstacle).unwrap();
+        Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        let mut authority = Authority::open(directory.path()).unwrap();
+        authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
+    }
+
+    #[test]
+    fn only_what_was_issued_can_be_revoked_and_once() {
+        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let (edge, euclid) = (NodeName::from_static("edge"), NodeName::from_static("euclid"));
+        Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        let mut authority = Authority::open(directory.path()).unwrap();
+        for _ in 0..2 {
+            authority.issue(&edge, Role::Edge, days(1), clock::now()).unwrap();
+        }
+        assert!(matches!(authority.revoke(&euclid, clock::now()), Err(AuthorityError::Unknown(_))));
+        assert_eq!(authority.revoke(&edge, clock::now()).unwrap(), 2);
+        let mut reopened = Authority::open(directory.path()).unwrap();
+        assert!(matches!(reopened.revoke(&edge, clock::now()), Err(AuthorityError::Unknown(_))));
+        let observer = NodeName::from_static("edge--top");
+        assert!(matches!(reopened.issue(&observer, Role::Cav, days(1), clock::now()), Err(AuthorityError::Name(_))));
+    }
+}

@@ -1,0 +1,186 @@
+//! Trust in a broker for as long as a connection to it lasts, not only in the handshake.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use rustls::client::WebPkiServerVerifier;
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
+
+use super::{Credentials, Current};
+
+/// How one connection to a broker is made, and whether its certificate is still good.
+#[derive(Debug)]
+pub struct BrokerTrust {
+    client: Arc<ClientConfig>,
+    shown: Arc<Shown>,
+    verifier: Arc<WebPkiServerVerifier>,
+    /// Of a broker of the cell: where lists change.
+    changing: Option<(Arc<Credentials>, Arc<Current>)>,
+    checked: Instant,
+}
+
+/// Time between two looks at whether certificates have changed.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// Time between two checks of a certificate, for one that has expired.
+const RECHECK: Duration = Duration::from_secs(30);
+
+impl BrokerTrust {
+    /// Trusts whom `verifier` trusts under `name`, or under the name by which it is connected to.
+    pub(super) fn new(
+        client: &ClientConfig,
+        verifier: Arc<WebPkiServerVerifier>,
+        name: Option<ServerName<'static>>,
+    ) -> Self {
+        let shown = Arc::new(Shown::new(Arc::clone(&verifier), name));
+        let mut client = client.clone();
+        client.dangerous().set_certificate_verifier(Arc::clone(&shown) as Arc<dyn ServerCertVerifier>);
+        Self { client: Arc::new(client), shown, verifier, changing: None, checked: Instant::now() }
+    }
+
+    /// Trusts brokers of the cell, as the node's files say at the time.
+    pub fn of_cell(credentials: &Arc<Credentials>) -> Self {
+        let current = credentials.current();
+        let trust = Self::new(&current.client, Arc::clone(&current.brokers), Some(current.broker_name.clone()));
+        Self { changing: Some((Arc::clone(credentials), current)), ..trust }
+    }
+
+    /// How to connect, once.
+    pub fn client(&self) -> Arc<ClientConfig> {
+        Arc::clone(&self.client)
+    }
+
+    /// Waits until the broker's certificate is not valid any more, and says why.
+    pub async fn lost(mut self) -> rustls::Error {
+        loop {
+            tokio::time::sleep(LOOK).await;
+            if let Err(error) = self.look(Instant::now()) {
+                return error;
+            }
+        }
+    }
+
+    fn look(&mut self, now: Instant) -> Result<(), rustls::Error> {
+        let mut has_changed = false;
+        if let Some((credentials, known)) = &mut self.changing {
+            let current = credentials.current();
+            has_changed = !Arc::ptr_eq(&current, known);
+            self.verifier = Arc::clone(&current.brokers);
+            *known = current;
+        }
+        if !has_changed && now.duration_since(self.checked) < RECHECK {
+            return Ok(());
+        }
+        self.checked = now;
+        self.shown.check(&self.verifier)
+    }
+}
+
+/// Verifies a broker's certificate and remembers it.
+#[derive(Debug)]
+pub(super) struct Shown {
+    verifier: Arc<WebPkiServerVerifier>,
+    /// The name that the certificate must bear; without one that by which the broker is connected to.
+    name: Option<ServerName<'static>>,
+    chain: Mutex<Option<(Vec<CertificateDer<'static>>, ServerName<'static>)>>,
+}
+
+impl Shown {
+    pub(super) fn new(verifier: Arc<WebPkiServerVerifier>, name: Option<ServerName<'static>>) -> Self {
+        Self { verifier, name, chain: Mutex::default() }
+    }
+
+    /// Verifies again what was shown, if anything was.
+    fn check(&self, verifier: &WebPkiServerVerifier) -> Result<(), rustls::Error> {
+        let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some((chain, name)) = &*chain else { return Ok(()) };
+        let Some((own, intermediates)) = chain.split_first() else { return Ok(()) };
+        verifier.verify_server_cert(own, intermediates, name, &[], UnixTime::now()).map(drop)
+    }
+}
+
+impl ServerCertVerifier for Shown {
+    fn verify_server_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        name: &ServerName<'_>,
+        ocsp_response: &[u8],
+        now: UnixTime,
+    ) -> Result<ServerCertVerified, rustls::Error> {
+        let name = self.name.as_ref().unwrap_or(name);
+        let verified = self.verifier.verify_server_cert(end_entity, intermediates, name, ocsp_response, now)?;
+        let chain = [end_entity].into_iter().chain(intermediates).map(|shown| shown.clone().into_owned()).collect();
+        *self.chain.lock().unwrap_or_else(PoisonError::into_inner) = Some((chain, name.to_owned()));
+        Ok(verified)
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        cert: &CertificateDer<'_>,
+        dss: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        self.verifier.verify_tls12_signature(message, cert, dss)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        cert: &CertificateDer<'_>,
+        dss: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        self.verifier.verify_tls13_signature(message, cert, dss)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.verifier.supported_verify_schemes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::names::NodeName;
+    use ecod::wire::Role;
+    use rustls::pki_types::pem::PemObject;
+
+    use super::*;
+    use crate::platform::clock;
+    use crate::transport::pki::{Authority, BROKER_NAME, TlsConfig};
+
+    #[test]
+    fn a_broker_is_trusted_until_its_certificate_is_revoked_or_has_expired() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        let [euclid, edge, brief] = ["euclid", "edge", "brief"].map(NodeName::from_static);
+        let day = Duration::from_secs(86_400);
+        for (name, valid) in [(&euclid, day), (&edge, day), (&brief, Duration::from_secs(2))] {
+            authority.issue(name, Role::Auto, valid, clock::now()).unwrap();
+        }
+        let ((certificate, key), list) = (authority.files_of(&euclid), authority.revocation_list());
+        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list) };
+        let credentials = Arc::new(Credentials::load(&files, &euclid).unwrap());
+        let connected = |broker: &NodeName| {
+            let trust = BrokerTrust::of_cell(&credentials);
+            let shown = CertificateDer::from_pem_file(authority.files_of(broker).0).unwrap();
+            let name = ServerName::try_from(BROKER_NAME).unwrap();
+            trust.shown.verify_server_cert(&shown, &[], &name, &[], UnixTime::now()).unwrap();
+            trust
+        };
+        let (mut brief_trust, mut edge_trust) = (connected(&brief), connected(&edge));
+        assert_eq!(brief_trust.look(Instant::now() + RECHECK), Ok(()));
+        std::thread::sleep(Duration::from_millis(3100));
+        assert_eq!(brief_trust.look(Instant::now()), Ok(()), "looked at from time to time only");
+        let expired = brief_trust.look(Instant::now() + 2 * RECHECK);
+        assert!(matches!(expired, Err(rustls::Error::InvalidCertificate(_))), "{expired:?}");
+
+        assert_eq!(edge_trust.look(Instant::now() + RECHECK), Ok(()));
+        authority.revoke(&edge, clock::now()).unwrap();
+        std::thread::sleep(LOOK);
+        let revoked = edge_trust.look(Instant::now());
+        let why = rustls::Error::InvalidCertificate(rustls::CertificateError::Revoked);
+        assert_eq!(revoked, Err(why), "at once when the list has changed");
+    }
+}

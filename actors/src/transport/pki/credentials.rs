@@ -1,0 +1,274 @@
+//! What one node holds: its certificate, and how it checks those of others.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use ecod::names::NodeName;
+use rustls::client::{Resumption, WebPkiServerVerifier};
+use rustls::crypto::{CryptoProvider, ring as provider};
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer, ServerName};
+use rustls::server::danger::ClientCertVerifier;
+use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
+use rustls::version::TLS13;
+use rustls::{ClientConfig, RootCertStore, ServerConfig};
+
+use super::broker_trust::Shown;
+use super::{BROKER_NAME, BrokerTrust, Identity, TlsConfig};
+
+/// The certificates of a node, read again when their files change.
+#[derive(Debug)]
+pub struct Credentials {
+    files: TlsConfig,
+    node: NodeName,
+    kept: Mutex<Kept>,
+}
+
+#[derive(Debug)]
+struct Kept {
+    looked_at: Instant,
+    stamps: Vec<Option<(SystemTime, u64)>>,
+    current: Arc<Current>,
+}
+
+/// What the files held when they were read last.
+#[derive(Debug)]
+pub struct Current {
+    /// The node's own certificate.
+    pub identity: Identity,
+    /// How the node serves: TLS 1.3, clients show a certificate of the cell, sessions are not resumed, as a resumed one
+    /// would not be checked against the revocation list.
+    pub server: Arc<ServerConfig>,
+    /// How the node connects to brokers of the cell.
+    pub client: Arc<ClientConfig>,
+    /// Checks certificates of clients.
+    pub clients: Arc<dyn ClientCertVerifier>,
+    /// Checks certificates of brokers of the cell, which bear `broker_name` at whatever address they are.
+    pub(super) brokers: Arc<WebPkiServerVerifier>,
+    pub(super) broker_name: ServerName<'static>,
+    certificates: Vec<CertificateDer<'static>>,
+    key: PrivateKeyDer<'static>,
+}
+
+/// Files that are no credentials of this node.
+#[derive(Debug, thiserror::Error)]
+pub enum CredentialsError {
+    /// A file is not there, cannot be read, or is not PEM of the kind that it should be.
+    #[error("key `{key}`: {path}: {reason}")]
+    File {
+        /// The configuration key that names the file.
+        key: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The certificate is another node's.
+    #[error("key `tls.certificate`: {path} is for {found}, this node is {node}")]
+    AnothersName {
+        /// The file.
+        path: PathBuf,
+        /// Whom it is for.
+        found: NodeName,
+        /// This node.
+        node: NodeName,
+    },
+    /// Key, certificate, CA and list do not belong together.
+    #[error("table `tls`: {0}")]
+    Unusable(String),
+}
+
+/// Least time between two looks at the files.
+const LOOK: Duration = Duration::from_secs(1);
+
+impl Credentials {
+    /// Reads a node's files.
+    ///
+    /// # Errors
+    /// [`CredentialsError`] naming the file.
+    pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
+        let (stamps, current) = (stamps(files), Arc::new(read(files, node)?));
+        let kept = Mutex::new(Kept { looked_at: Instant::now(), stamps, current });
+        Ok(Self { files: files.clone(), node: node.clone(), kept })
+    }
+
+    /// What the files hold now; what they held before if they have become unusable, which is logged.
+    pub fn current(&self) -> Arc<Current> {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if kept.looked_at.elapsed() >= LOOK {
+            kept.looked_at = Instant::now();
+            let stamps = stamps(&self.files);
+            if stamps != kept.stamps {
+                kept.stamps = stamps;
+                match read(&self.files, &self.node) {
+                    Ok(current) => {
+                        tracing::info!("certificates read again");
+                        kept.current = Arc::new(current);
+                    }
+                    Err(error) => tracing::warn!(%error, "changed certificates not used"),
+                }
+            }
+        }
+        Arc::clone(&kept.current)
+    }
+}
+
+/// How a node connects to a broker that is none of the cell's, and goes on trusting it: its certificate must be signed
+/// by one of those in `ca` and bear the name under which it is configured. The node shows its own certificate, if it
+/// has one.
+///
+/// # Errors
+/// [`CredentialsError`] naming the file.
+pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, CredentialsError> {
+    let roots = Arc::new(roots("mqtt.ca", ca)?);
+    let verifier = server_verifier(Arc::clone(&roots), Vec::new())?;
+    let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
+    let builder = builder.map_err(unusable)?.with_root_certificates(roots);
+    let client = match own {
+        Some(own) => builder.with_client_auth_cert(own.certificates.clone(), own.key.clone_key()).map_err(unusable)?,
+        None => builder.with_no_client_auth(),
+    };
+    Ok(BrokerTrust::new(&client, verifier, None))
+}
+
+fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError> {
+    let roots = Arc::new(roots("tls.ca", &files.ca)?);
+    let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
+    let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
+    let key = key.map_err(|error| file_error("tls.key", &files.key, &error))?;
+    let lists = files.revocation_list.as_deref().map(lists).transpose()?.unwrap_or_default();
+    let own =
+        certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
+    let identity = Identity::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
+    if !identity.speaks_for(node.as_str()) {
+        let (path, found) = (files.certificate.clone(), identity.name().clone());
+        return Err(CredentialsError::AnothersName { path, found, node: node.clone() });
+    }
+    let clients = client_verifier(&roots, &lists)?;
+    let mut server = ServerConfig::builder_with_provider(crypto())
+        .with_protocol_versions(&[&TLS13])
+        .map_err(unusable)?
+        .with_client_cert_verifier(Arc::clone(&clients))
+        .with_single_cert(certificates.clone(), key.clone_key())
+        .map_err(unusable)?;
+    server.session_storage = Arc::new(NoServerSessionStorage {});
+    server.send_tls13_tickets = 0;
+    let brokers = server_verifier(roots, lists)?;
+    let broker_name = ServerName::try_from(BROKER_NAME);
+    let broker_name = broker_name.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
+    let mut client = ClientConfig::builder_with_provider(crypto())
+        .with_protocol_versions(&[&TLS13])
+        .map_err(unusable)?
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(Shown::new(Arc::clone(&brokers), Some(broker_name.clone()))))
+        .with_client_auth_cert(certificates.clone(), key.clone_key())
+        .map_err(unusable)?;
+    client.resumption = Resumption::disabled();
+    let (server, client) = (Arc::new(server), Arc::new(client));
+    Ok(Current { identity, server, client, clients, brokers, broker_name, certificates, key })
+}
+
+fn client_verifier(
+    roots: &Arc<RootCertStore>,
+    lists: &[CertificateRevocationListDer<'static>],
+) -> Result<Arc<dyn ClientCertVerifier>, CredentialsError> {
+    let mut builder = WebPkiClientVerifier::builder_with_provider(Arc::clone(roots), crypto());
+    if !lists.is_empty() {
+        builder = builder.with_crls(lists.iter().cloned()).only_check_end_entity_revocation();
+    }
+    builder.build().map_err(|error| CredentialsError::Unusable(error.to_string()))
+}
+
+fn server_verifier(
+    roots: Arc<RootCertStore>,
+    lists: Vec<CertificateRevocationListDer<'static>>,
+) -> Result<Arc<WebPkiServerVerifier>, CredentialsError> {
+    let mut builder = WebPkiServerVerifier::builder_with_provider(roots, crypto());
+    if !lists.is_empty() {
+        builder = builder.with_crls(lists).only_check_end_entity_revocation();
+    }
+    builder.build().map_err(|error| CredentialsError::Unusable(error.to_string()))
+}
+
+fn crypto() -> Arc<CryptoProvider> {
+    Arc::new(provider::default_provider())
+}
+
+fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsError> {
+    let mut roots = RootCertStore::empty();
+    for certificate in pem::<CertificateDer<'static>>(key, path)? {
+        roots.add(certificate).map_err(|error| file_error(key, path, &error))?;
+    }
+    if roots.is_empty() {
+        return Err(file_error(key, path, "no certificate"));
+    }
+    Ok(roots)
+}
+
+/// A file without a list in it, such as one half copied, is not a list of nobody.
+fn lists(path: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
+    let key = "tls.revocation_list";
+    let lists = pem(key, path)?;
+    if lists.is_empty() { Err(file_error(key, path, "no revocation list")) } else { Ok(lists) }
+}
+
+fn pem<T: PemObject>(key: &'static str, path: &Path) -> Result<Vec<T>, CredentialsError> {
+    let items: Result<Vec<T>, _> = T::pem_slice_iter(&bytes(key, path)?).collect();
+    items.map_err(|error| file_error(key, path, &error))
+}
+
+fn bytes(key: &'static str, path: &Path) -> Result<Vec<u8>, CredentialsError> {
+    fs::read(path).map_err(|error| file_error(key, path, &error))
+}
+
+fn file_error(key: &'static str, path: &Path, reason: &(impl ToString + ?Sized)) -> CredentialsError {
+    CredentialsError::File { key, path: path.into(), reason: reason.to_string() }
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "takes what map_err gives")]
+fn unusable(error: rustls::Error) -> CredentialsError {
+    CredentialsError::Unusable(error.to_string())
+}
+
+/// Time of change and length of each file: enough to tell that it was replaced.
+fn stamps(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
+    let stamp = |path: &PathBuf| {
+        let facts = fs::metadata(path).ok()?;
+        Some((facts.modified().ok()?, facts.len()))
+    };
+    let paths = [&files.ca, &files.certificate, &files.key];
+    paths.into_iter().chain(&files.revocation_list).map(stamp).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::wire::Role;
+
+    use super::*;
+    use crate::platform::clock;
+    use crate::transport::pki::Authority;
+
+    #[test]
+    fn a_revocation_list_without_a_list_is_refused_and_the_one_before_stays_in_use() {
+        let (directory, edge) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
+        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        authority.issue(&edge, Role::Edge, Duration::from_secs(60), clock::now()).unwrap();
+        let ((certificate, key), list) = (authority.files_of(&edge), directory.path().join("copied.pem"));
+        fs::copy(authority.revocation_list(), &list).unwrap();
+        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list.clone()) };
+        let credentials = Credentials::load(&files, &edge).unwrap();
+        let before = credentials.current();
+        for text in ["", "# revoked\n", "-----BEGIN X509 CRL-----\nMIIB"] {
+            fs::write(&list, text).unwrap();
+            let error = Credentials::load(&files, &edge).unwrap_err().to_string();
+            assert!(error.starts_with("key `tls.revocation_list`: ") && error.contains("copied.pem"), "{error}");
+        }
+        std::thread::sleep(LOOK);
+        assert!(Arc::ptr_eq(&credentials.current(), &before), "still checked against the list before");
+        fs::copy(authority.revocation_list(), &list).unwrap();
+        std::thread::sleep(LOOK);
+        assert!(!Arc::ptr_eq(&credentials.current(), &before), "and against the next");
+    }
+}
