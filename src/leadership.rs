@@ -5,6 +5,7 @@ pub mod echo;
 pub mod election;
 pub mod health;
 pub mod links;
+pub mod node;
 pub mod readiness;
 pub mod round_filter;
 pub mod timers;

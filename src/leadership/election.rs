@@ -3,7 +3,7 @@
 //! # Call order
 //!
 //! [`Election::new`] with the persisted term, then, for as long as the node runs: [`Election::handle`] with whatever
-//! happened, [`Election::tick`] at [`Election::next_deadline`]. Both return [`Effect`]s to be carried out in order.
+//! happened, [`Election::tick`] at [`Election::next_deadline`]. Both return [`ElectionEffect`]s to be carried out in order.
 //! A caller that was held up handles all messages that wait before it ticks. Equal inputs give equal effects.
 //!
 //! # Kinds of methods
@@ -38,7 +38,7 @@
 //! and 251 ms. A silent leader has to be replaced within 400 ms, a period of 100 ms included, and 251 ms leaves no room
 //! for a lost packet. Moreover the beat carries what a successor needs, its round and its successors, and proves that
 //! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as its
-//! cost per node does not grow with the cell; what it finds enters as [`Input::PeerAlive`] and [`Input::PeerDown`]. To
+//! cost per node does not grow with the cell; what it finds enters as [`ElectionInput::PeerAlive`] and [`ElectionInput::PeerDown`]. To
 //! keep a leader's packets few, only its standby gets every beat, its other successors and better nodes that are not fit
 //! every eighth, and everyone else one each `idle_beat_ms`.
 
@@ -62,7 +62,7 @@ use crate::wire::SCHEMA_VERSION;
 
 pub use awake_clock::AwakeClock;
 pub use config::ElectionConfig;
-pub use interface::{Effect, Health, Input};
+pub use interface::{ElectionEffect, ElectionInput, Health};
 pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM};
 
 use leading::Leading;
@@ -90,7 +90,7 @@ pub struct Election {
     peers: Peers,
     questions: Questions,
     state: State,
-    effects: Vec<Effect>,
+    effects: Vec<ElectionEffect>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -113,7 +113,7 @@ struct Terms {
 
 impl Election {
     /// A node that starts; it listens for `join_ms` before it leads. `persisted_term` is the last
-    /// [`Effect::PersistTerm`] of earlier runs, 0 without any.
+    /// [`ElectionEffect::PersistTerm`] of earlier runs, 0 without any.
     pub fn new(config: ElectionConfig, id: NodeName, persisted_term: u64, now: Timestamp) -> Self {
         let clock = AwakeClock::new(now, std::time::Duration::from_millis(config.stall_ms));
         let persisted = persisted_term.min(MAX_TERM);
@@ -138,25 +138,25 @@ impl Election {
     }
 
     /// Takes in what happened.
-    pub fn handle(&mut self, input: Input, now: Timestamp) -> Vec<Effect> {
+    pub fn handle(&mut self, input: ElectionInput, now: Timestamp) -> Vec<ElectionEffect> {
         let now = self.advance(now);
         match input {
-            Input::Receive { message } => self.receive(message, now),
-            Input::PeerAlive { peer } => self.peer_alive(&peer, now),
-            Input::PeerSuspected { peer } => self.peer_suspected(&peer, now),
-            Input::PeerDown { peer } => self.peer_down(&peer, now),
-            Input::PeerGone { peer } => self.peer_gone(&peer, now),
-            Input::Health { health } => self.set_health(health, now),
-            Input::Round { epoch, round } => self.note_round(&epoch, round, now),
-            Input::Prepared => self.prepared(now),
-            Input::Leave => self.leave(now),
+            ElectionInput::Receive { message } => self.receive(message, now),
+            ElectionInput::PeerAlive { peer } => self.peer_alive(&peer, now),
+            ElectionInput::PeerSuspected { peer } => self.peer_suspected(&peer, now),
+            ElectionInput::PeerDown { peer } => self.peer_down(&peer, now),
+            ElectionInput::PeerGone { peer } => self.peer_gone(&peer, now),
+            ElectionInput::Health { health } => self.set_health(health, now),
+            ElectionInput::Round { epoch, round } => self.note_round(&epoch, round, now),
+            ElectionInput::Prepared => self.prepared(now),
+            ElectionInput::Leave => self.leave(now),
         }
         self.run_timers(now);
         self.finish()
     }
 
     /// Does what time demands; harmless when nothing is due.
-    pub fn tick(&mut self, now: Timestamp) -> Vec<Effect> {
+    pub fn tick(&mut self, now: Timestamp) -> Vec<ElectionEffect> {
         let now = self.advance(now);
         self.run_timers(now);
         self.finish()
@@ -230,7 +230,7 @@ impl Election {
         }
     }
 
-    fn finish(&mut self) -> Vec<Effect> {
+    fn finish(&mut self) -> Vec<ElectionEffect> {
         // The next term is on disk before it is needed: taking the lead need not wait for the disk.
         self.persist(self.terms.seen + 1);
         std::mem::take(&mut self.effects)
@@ -239,7 +239,7 @@ impl Election {
     fn persist(&mut self, term: u64) {
         if term > self.terms.persisted {
             self.terms.persisted = term;
-            self.effects.push(Effect::PersistTerm { term });
+            self.effects.push(ElectionEffect::PersistTerm { term });
         }
     }
 
@@ -344,7 +344,7 @@ impl Election {
             hears_you,
             body,
         };
-        self.effects.push(Effect::Send { to: to.clone(), message });
+        self.effects.push(ElectionEffect::Send { to: to.clone(), message });
     }
 
     fn send_all(&mut self, body: &Body, now: Timestamp) {

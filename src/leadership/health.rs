@@ -17,7 +17,7 @@ use crate::time::Timestamp;
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct HealthMonitor {
     links: BTreeMap<BrokerAddress, LinkState>,
-    answer: PartsAnswer,
+    sample: HealthSample,
     /// Time that passed while this node was awake.
     clock: AwakeClock,
     look_at: Timestamp,
@@ -28,7 +28,7 @@ pub struct HealthMonitor {
 
 /// The answer of the parts to a look at them.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
-pub struct PartsAnswer {
+pub struct HealthSample {
     /// Whether clients can connect to the node's own broker.
     pub broker_serves: bool,
     /// State of the gateway's links; none when it does not answer.
@@ -42,7 +42,7 @@ impl HealthMonitor {
     pub fn new(now: Timestamp) -> Self {
         Self {
             links: BTreeMap::new(),
-            answer: PartsAnswer::default(),
+            sample: HealthSample::default(),
             clock: AwakeClock::new(now, LOOK_TOLERANCE),
             look_at: now,
             rounds_closed: 0,
@@ -58,6 +58,8 @@ impl HealthMonitor {
 
     /// Whether to look at the parts now; the next look is then due [`HEALTH_PERIOD`] later.
     pub fn is_due(&mut self, now: Timestamp) -> bool {
+        // A clock that was set back does not put the look off.
+        self.look_at = self.look_at.min(now + HEALTH_PERIOD);
         let is_due = now >= self.look_at;
         if is_due {
             self.look_at = now + HEALTH_PERIOD;
@@ -87,8 +89,8 @@ impl HealthMonitor {
     }
 
     /// Notes the answers. They make up for a link that came up before there was anyone to be told.
-    pub fn note_answer(&mut self, answer: PartsAnswer) {
-        for (broker, state) in answer.links.iter().flatten() {
+    pub fn note_sample(&mut self, sample: HealthSample) {
+        for (broker, state) in sample.links.iter().flatten() {
             match state {
                 LinkState::Up | LinkState::Stalled => {
                     self.links.insert(broker.clone(), *state);
@@ -99,7 +101,7 @@ impl HealthMonitor {
                 }
             }
         }
-        self.answer = answer;
+        self.sample = sample;
     }
 
     /// Notes a look: the number of rounds closed so far, and the processor load in percent.
@@ -117,13 +119,13 @@ impl HealthMonitor {
     /// of them. A stalled link is none, but in a leader with `no_other` to lead, which would only make way for nobody.
     pub fn health(&self, plane: &DataPlane, brokers: &Brokers, no_other: bool, round_period: Duration) -> Health {
         let external = self.is_up(plane.external.as_ref(), no_other);
-        let embedded = plane.embedded && self.answer.broker_serves;
+        let embedded = plane.embedded && self.sample.broker_serves;
         let timeout = round_timeout(round_period);
         let closes_rounds = self.round_closed_at.is_some_and(|at| self.clock.now().since(at) < timeout);
         Health {
             broker: external || embedded,
-            fuser: self.answer.fuser_runs && closes_rounds,
-            gateway: self.answer.links.is_some()
+            fuser: self.sample.fuser_runs && closes_rounds,
+            gateway: self.sample.links.is_some()
                 && (external || (embedded && self.is_up(brokers.own.as_ref(), no_other))),
             load_percent: self.load_percent,
         }
@@ -157,7 +159,7 @@ mod tests {
     /// A monitor of parts that answered, and have closed a round.
     fn monitor(now: Timestamp) -> HealthMonitor {
         let mut monitor = HealthMonitor::new(now);
-        monitor.note_answer(PartsAnswer { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true });
+        monitor.note_sample(HealthSample { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true });
         monitor.note_look(1, 0, now);
         monitor
     }
@@ -214,10 +216,10 @@ mod tests {
         let plane = DataPlane { external: None, embedded: true };
         let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
         let links = |state| Some(BTreeMap::from([(address(1), state)]));
-        let answer = |state| PartsAnswer { broker_serves: true, links: links(state), fuser_runs: true };
-        monitor.note_answer(answer(LinkState::Up));
+        let answer = |state| HealthSample { broker_serves: true, links: links(state), fuser_runs: true };
+        monitor.note_sample(answer(LinkState::Up));
         assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
-        monitor.note_answer(answer(LinkState::Down));
+        monitor.note_sample(answer(LinkState::Down));
         assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
         assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
     }

@@ -44,7 +44,7 @@ pub struct Brokers {
 }
 
 /// The links that a gateway is to keep.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct WantedLinks {
     /// All brokers to be linked to.
     pub brokers: Vec<BrokerAddress>,
@@ -70,6 +70,10 @@ impl Links {
 
     /// Notes the brokers of the moment; returns the links to keep if they are others than before.
     pub fn update(&mut self, brokers: Brokers, now: Timestamp) -> Option<WantedLinks> {
+        let is_expired = self.lingering.iter().any(|(_, until)| *until <= now);
+        if brokers == self.present && !is_expired && !self.wanted.is_empty() {
+            return None;
+        }
         if brokers != self.present {
             let left = [self.present.leader.take(), self.present.standby.take()].into_iter().flatten();
             self.lingering.extend(left.map(|broker| (broker, now + LINK_LINGER)));

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::epoch::Epoch;
-use crate::leadership::election::interface::Effect;
+use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::liveness::Following;
 use crate::leadership::election::message::{Body, ElectionMessage};
 use crate::leadership::election::{Beat, Election, State};
@@ -89,8 +89,8 @@ impl Election {
             let succeeded = leading.after.as_ref() >= Some(&beat.epoch);
             if beat.hears_us && followers == 0 && beat.followers > 0 && !succeeded {
                 self.close(own.clone());
-                self.effects.push(Effect::StopPublishing { epoch: own });
-                self.effects.push(Effect::SendState { to: beat.epoch.leader.clone() });
+                self.effects.push(ElectionEffect::StopPublishing { epoch: own });
+                self.effects.push(ElectionEffect::SendSnapshot { to: beat.epoch.leader.clone() });
                 self.seek(vec![beat.epoch.leader.clone()], now + self.config.response_timeout(), now);
                 self.send_status(&beat.epoch.leader, now);
             } else {
@@ -112,8 +112,8 @@ impl Election {
 
     fn stop_leading(&mut self, next: &NodeName) {
         if let State::Leading(leading) = &self.state {
-            self.effects.push(Effect::StopPublishing { epoch: leading.epoch.clone() });
-            self.effects.push(Effect::SendState { to: next.clone() });
+            self.effects.push(ElectionEffect::StopPublishing { epoch: leading.epoch.clone() });
+            self.effects.push(ElectionEffect::SendSnapshot { to: next.clone() });
         }
     }
 
@@ -121,7 +121,6 @@ impl Election {
         self.epoch = Some(beat.epoch.clone());
         self.round = self.round.max(beat.round);
         let leader = beat.epoch.leader.clone();
-        self.effects.push(Effect::Follow { epoch: beat.epoch.clone(), standby: beat.successors.first().cloned() });
         let beat_interval = Duration::from_millis(beat.every_ms);
         self.state =
             State::Following(Following::new(beat.epoch, beat.successors, beat_interval, now, Timestamp::default()));
@@ -132,7 +131,6 @@ impl Election {
     pub(super) fn adopt(&mut self, epoch: Epoch, heard_at: Timestamp, now: Timestamp) {
         let leader = epoch.leader.clone();
         self.epoch = Some(epoch.clone());
-        self.effects.push(Effect::Follow { epoch: epoch.clone(), standby: None });
         let unheard = Timestamp::default();
         self.state = State::Following(Following::new(epoch, Vec::new(), self.config.beat(), unheard, heard_at));
         self.peers.add(&leader);
@@ -147,10 +145,6 @@ impl Election {
         following.forget_round_interval(now);
         if beat.hears_us {
             following.bidirectional_at = now;
-        }
-        if following.successors.first() != beat.successors.first() {
-            let standby = beat.successors.first().cloned();
-            self.effects.push(Effect::Follow { epoch: beat.epoch.clone(), standby });
         }
         following.successors = beat.successors;
         self.send_status(&beat.epoch.leader, now);

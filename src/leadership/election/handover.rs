@@ -5,7 +5,7 @@
 //! those packets be lost for a period, the old leader publishes that round too, and yields again after it.
 
 use crate::epoch::Epoch;
-use crate::leadership::election::interface::Effect;
+use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::message::{Body, MAX_TERM};
 use crate::leadership::election::{Election, State};
 use crate::names::NodeName;
@@ -31,7 +31,7 @@ impl Election {
         leading.handover =
             Some(Handover { to: to.clone(), retry_at: now, started_at: now, ready_at: None, yielded: false });
         self.name_successors(now);
-        self.effects.push(Effect::SendState { to });
+        self.effects.push(ElectionEffect::SendSnapshot { to });
         self.drive_handover(now);
     }
 
@@ -55,6 +55,7 @@ impl Election {
         handover.retry_at = now + self.config.handover_retry(handover.yielded);
         let last_round = self.round;
         if handover.yielded {
+            self.effects.push(ElectionEffect::HoldRound);
             self.send(&to, Body::Yield { last_round }, now);
         } else if handover.ready_at.is_none() {
             self.send(&to, Body::Offer, now);
@@ -96,7 +97,7 @@ impl Election {
         following.offered_at = Some(now);
         if !fresh {
             following.prepared = false;
-            self.effects.push(Effect::Prepare { leader: from.clone() });
+            self.effects.push(ElectionEffect::Prepare { leader: from.clone() });
         } else if following.prepared {
             self.send(from, Body::Ready, now);
         }

@@ -7,7 +7,7 @@ use crate::round::FirstRound;
 
 /// What happened around the node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Input {
+pub enum ElectionInput {
     /// An authenticated message arrived.
     Receive {
         /// The message.
@@ -45,7 +45,7 @@ pub enum Input {
         /// The round's number.
         round: u64,
     },
-    /// What [`Effect::Prepare`] asked for is done.
+    /// What [`ElectionEffect::Prepare`] asked for is done.
     Prepared,
     /// The node is about to stop: a leader resigns, a follower tells its leader that it is no candidate any more.
     Leave,
@@ -73,9 +73,8 @@ impl Health {
 
 /// What the actor must do, in the order given.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Effect {
-    /// Write the term to disk; it must be there before an [`Effect::Lead`] in it, and all that follows that, is carried
-    /// out. It mostly comes long before.
+pub enum ElectionEffect {
+    /// Hand a term to the disk. An [`ElectionEffect::Lead`] in it waits for the disk's answer.
     PersistTerm {
         /// To be given to [`crate::leadership::election::Election::new`] after a restart.
         term: u64,
@@ -96,34 +95,20 @@ pub enum Effect {
         /// When it is due.
         first: FirstRound,
     },
+    /// Let the present round last its whole length: the next one is the other's unless it stays away for a whole period.
+    HoldRound,
     /// Publish nothing more in this epoch.
     StopPublishing {
         /// The leadership that ended.
         epoch: Epoch,
     },
-    /// Take maps from this epoch's leader, and send reports to it and to the standby.
-    Follow {
-        /// The leadership followed.
-        epoch: Epoch,
-        /// Who leads next; keep a connection to its broker. This node, it may be.
-        standby: Option<NodeName>,
-    },
-    /// There is no leader that is known; keep the connections and wait.
-    Seek,
-    /// Tell everyone who leads next; reports go there too.
-    AnnounceStandby {
-        /// The leadership it stands by for.
-        epoch: Epoch,
-        /// The standby, if anyone can.
-        standby: Option<NodeName>,
-    },
-    /// Get ready to lead: serve the broker, take the leader's state, warm the fuser; then tell [`Input::Prepared`].
+    /// Get ready to lead: serve the broker, take the leader's state, warm the fuser; then tell [`ElectionInput::Prepared`].
     Prepare {
         /// The leader that hands over.
         leader: NodeName,
     },
-    /// Send reputations and tracks to a node: the next leader, or the one that remains when two sides heal.
-    SendState {
+    /// Share all evidence about vehicles with a node: the next leader, or the one that remains when two sides heal.
+    SendSnapshot {
         /// The addressee.
         to: NodeName,
     },

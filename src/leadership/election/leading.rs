@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use crate::epoch::Epoch;
 use crate::leadership::election::handover::Handover;
-use crate::leadership::election::interface::Effect;
 use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
 use crate::leadership::election::{Election, State};
 use crate::names::NodeName;
@@ -121,10 +120,6 @@ impl Election {
         }
         if next == leading.successors {
             return;
-        }
-        if next.first() != leading.successors.first() {
-            let standby = next.first().cloned();
-            self.effects.push(Effect::AnnounceStandby { epoch: leading.epoch.clone(), standby });
         }
         leading.successors = next;
         self.beat_all(now);

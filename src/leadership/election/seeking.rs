@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use crate::epoch::Epoch;
-use crate::leadership::election::interface::Effect;
+use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::leading::Leading;
 use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
 use crate::leadership::election::{Election, State};
@@ -87,7 +87,6 @@ impl Election {
         // Whoever is first in turn is heard before everyone has to ask.
         let ask_at = now + self.config.answer_time();
         self.state = State::Seeking(Seeking { known_until, asked_at, ..Seeking::new(since, order, ask_at) });
-        self.effects.push(Effect::Seek);
     }
 
     pub(super) fn ask_all(&mut self, now: Timestamp) {
@@ -153,7 +152,6 @@ impl Election {
         self.terms.seen = term;
         let epoch = Epoch::new(term, self.id.clone());
         self.epoch = Some(epoch.clone());
-        let known = self.standby().cloned();
         let successors = self.peers.successors(MAX_SUCCESSORS, now);
         let first = match &self.state {
             State::Seeking(seeking) if seeking.order.first() == Some(&self.id) => FirstRound::Overdue,
@@ -161,10 +159,7 @@ impl Election {
             State::Following(_) => FirstRound::OnTime,
             State::Leading(_) => FirstRound::InStep,
         };
-        self.effects.push(Effect::Lead { epoch: epoch.clone(), first_round: self.round + 1, first });
-        if known.as_ref() != successors.first() {
-            self.effects.push(Effect::AnnounceStandby { epoch: epoch.clone(), standby: successors.first().cloned() });
-        }
+        self.effects.push(ElectionEffect::Lead { epoch: epoch.clone(), first_round: self.round + 1, first });
         self.state = State::Leading(Leading::new(epoch, after, successors, now));
         self.beat_all(now);
     }
@@ -175,7 +170,7 @@ impl Election {
         let epoch = leading.epoch.clone();
         let order = std::mem::take(&mut leading.successors);
         self.close(epoch.clone());
-        self.effects.push(Effect::StopPublishing { epoch: epoch.clone() });
+        self.effects.push(ElectionEffect::StopPublishing { epoch: epoch.clone() });
         self.seek(order, now + self.config.response_timeout(), now);
         self.send_all(&Body::Resign { epoch, last_round: self.round }, now);
     }
