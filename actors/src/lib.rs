@@ -3,7 +3,6 @@
 #![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
-pub mod bench;
 pub mod broker;
 #[cfg(feature = "camera")]
 pub mod calibrate;
@@ -16,8 +15,6 @@ pub mod config;
 pub mod corner_pose;
 pub mod counters;
 pub mod dashboard;
-#[cfg(feature = "camera")]
-pub mod demo;
 #[cfg(feature = "camera")]
 pub mod detect;
 #[cfg(feature = "camera")]
@@ -40,7 +37,6 @@ pub mod lens;
 pub mod lines;
 pub mod membership;
 pub mod node;
-pub mod node_process;
 #[cfg(feature = "camera")]
 pub mod perception;
 pub mod pki;
@@ -53,8 +49,6 @@ pub mod reputation_keeper;
 pub mod seat;
 pub mod service;
 pub mod state_file;
-#[cfg(feature = "camera")]
-pub mod testbed;
 mod throttles;
 pub mod top;
 pub mod vehicle_pose;

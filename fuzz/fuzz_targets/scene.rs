@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use ecod::testbed::{Recording, Testbed};
+use ecod_lab::testbed::{Recording, Testbed};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|text: &str| {
