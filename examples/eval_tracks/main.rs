@@ -5,7 +5,7 @@
 //!
 //! Parameters are chosen on the seeds `tuning` and figures reported on the seeds `report`; `--count` takes the first
 //! of them. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
-//! `ecod-node eval`.
+//! `ecod-lab eval`.
 
 mod baselines;
 mod plot;
