@@ -7,8 +7,8 @@
 //!      ── kills the edge half-way and starts it again a second later
 //! ```
 
-mod observer;
-mod reign;
+mod judged_term;
+mod report_collector;
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -28,13 +28,13 @@ use ecod_actors::follower::ReceivedMap;
 use ecod_actors::frame_source::SourceConfig;
 use ecod_actors::membership::MembershipConfig;
 
-pub use self::observer::ObservedReport;
-pub use self::reign::Reign;
+pub use self::judged_term::JudgedTerm;
+pub use self::report_collector::ObservedReport;
 
-use self::observer::Observer;
-use self::reign::reigns;
+use self::judged_term::judged_terms;
+use self::report_collector::ReportCollector;
 use crate::node_process::NodeProcess;
-use crate::testbed::score::{SceneResult, Score};
+use crate::testbed::score::{SceneResult, SpotScore};
 use crate::testbed::{Cav, Scene, Testbed};
 use crate::testbed::{frames, setup};
 
@@ -73,7 +73,7 @@ pub struct DemoResult {
     /// From when on the maps are judged.
     pub from: Timestamp,
     /// Who led when.
-    pub reigns: Vec<Reign>,
+    pub terms: Vec<JudgedTerm>,
 }
 
 /// How far a running demo is.
@@ -104,7 +104,7 @@ const EDGE_GONE: Duration = Duration::from_secs(1);
 
 /// Where a node listens: its broker, and for other nodes.
 #[derive(Debug, Clone, Copy)]
-struct Place {
+struct NodeAddresses {
     broker: SocketAddr,
     gossip: SocketAddr,
 }
@@ -127,19 +127,19 @@ impl Demo<'_> {
         let frames = self.directory.join("frames");
         let render = |cav: &Cav| frames::render(self.testbed, self.scene, cav, 1, &frames.join(cav.name.as_str()));
         let sources = self.scene.cavs.iter().map(render).collect::<anyhow::Result<Vec<_>>>()?;
-        let places = free_places(self.scene.cavs.len() + 1)?;
-        let mut nodes = vec![self.start_node(setup::edge(self.testbed, self.scene), &places, 0)?];
+        let addresses = free_addresses(self.scene.cavs.len() + 1)?;
+        let mut nodes = vec![self.start_node(setup::edge(self.testbed, self.scene), &addresses, 0)?];
         for (index, (cav, source)) in self.scene.cavs.iter().zip(sources).enumerate() {
-            nodes.push(self.start_cav(cav, source, &places, index + 1)?);
+            nodes.push(self.start_cav(cav, source, &addresses, index + 1)?);
         }
-        let brokers = places.iter().map(|place| place.broker.into()).collect();
-        let observer = Observer::start(brokers, setup::unused_name(self.scene, "observer")).await?;
-        let outcome = self.watch(&mut nodes, &observer, progress).await;
+        let brokers = addresses.iter().map(|node| node.broker.into()).collect();
+        let collector = ReportCollector::start(brokers, setup::unused_name(self.scene, "observer")).await?;
+        let outcome = self.watch(&mut nodes, &collector, progress).await;
         for node in nodes.iter_mut().rev() {
             node.stop().await;
         }
         fs::remove_dir_all(&frames).with_context(|| format!("cannot remove {}", frames.display()))?;
-        let reports = observer.stop().await;
+        let reports = collector.stop().await;
         let (from, until) = outcome?;
         self.evaluate(reports, from, until)
     }
@@ -149,14 +149,14 @@ impl Demo<'_> {
     async fn watch(
         &self,
         nodes: &mut [NodeProcess],
-        observer: &Observer,
+        collector: &ReportCollector,
         progress: impl Fn(Progress) -> anyhow::Result<()>,
     ) -> anyhow::Result<(Timestamp, Timestamp)> {
         let started = clock::now();
         let edge = setup::edge(self.testbed, self.scene).name;
-        while observer.reporters() < self.scene.cavs.len() || observer.leader() != edge {
+        while collector.reporters() < self.scene.cavs.len() || collector.leader() != edge {
             if clock::now().since(started) > START_TIMEOUT {
-                let (reporters, leader) = (observer.reporters(), observer.leader());
+                let (reporters, leader) = (collector.reporters(), collector.leader());
                 let leader = leader.map_or_else(|| "nobody".to_owned(), |leader| leader.to_string());
                 let vehicles = self.scene.cavs.len();
                 bail!("after {START_TIMEOUT:?} {reporters} of {vehicles} vehicles report and {leader} leads");
@@ -181,7 +181,7 @@ impl Demo<'_> {
                 tell(News::EdgeStarted)?;
             } else if now >= next_progress {
                 next_progress = now + Duration::from_secs(1);
-                tell(News::Reports(observer.reports()))?;
+                tell(News::Reports(collector.reports()))?;
             }
         }
         Ok((from, clock::now()))
@@ -202,7 +202,7 @@ impl Demo<'_> {
             logs.push(log);
         }
         let received: usize = logs.iter().map(Vec::len).sum();
-        let mut fused = Score::default();
+        let mut fused = SpotScore::default();
         maps.values().for_each(|map| fused.judge(self.testbed, self.scene, map));
         ages.sort();
         Ok(DemoResult {
@@ -213,17 +213,17 @@ impl Demo<'_> {
             last_map: maps.into_values().next_back(),
             reports,
             from,
-            reigns: reigns(self.testbed, self.scene, logs.iter().map(Vec::as_slice)),
+            terms: judged_terms(self.testbed, self.scene, logs.iter().map(Vec::as_slice)),
         })
     }
 
     /// What every vehicle would have known alone.
-    fn alone(&self, reports: &[ObservedReport], from: Timestamp) -> BTreeMap<NodeName, Score> {
+    fn alone(&self, reports: &[ObservedReport], from: Timestamp) -> BTreeMap<NodeName, SpotScore> {
         let alone = |cav: &Cav| {
             let landmarks = self.scene.landmarks(&self.testbed.placard);
             let start = reports.first().map_or(from, |observed| observed.received_at);
             let mut aggregator = Aggregator::new(cav.name.clone(), 1, setup::fusion(self.testbed), landmarks, start);
-            let mut score = Score::default();
+            let mut score = SpotScore::default();
             for observed in reports.iter().filter(|observed| observed.report.node == cav.name) {
                 let fused = aggregator.report(ReportKind::Detections, &observed.report, observed.received_at);
                 if let Ok(Some(Fused { map: Some(map), .. })) = fused
@@ -238,13 +238,13 @@ impl Demo<'_> {
     }
 
     /// Starts a node that finds the others by seeds.
-    fn start_node(&self, config: NodeConfig, places: &[Place], index: usize) -> anyhow::Result<NodeProcess> {
+    fn start_node(&self, config: NodeConfig, addresses: &[NodeAddresses], index: usize) -> anyhow::Result<NodeProcess> {
         let membership = MembershipConfig {
-            bind: Some(places[index].gossip),
-            seeds: places.iter().map(|place| place.gossip.to_string()).collect(),
+            bind: Some(addresses[index].gossip),
+            seeds: addresses.iter().map(|node| node.gossip.to_string()).collect(),
             ..config.membership
         };
-        let listen = Some(places[index].broker);
+        let listen = Some(addresses[index].broker);
         let state_dir = Some(self.directory.join("state"));
         NodeProcess::start(self.program, &NodeConfig { listen, state_dir, membership, ..config }, self.directory)
     }
@@ -253,7 +253,7 @@ impl Demo<'_> {
         &self,
         cav: &Cav,
         source: SourceConfig,
-        places: &[Place],
+        addresses: &[NodeAddresses],
         index: usize,
     ) -> anyhow::Result<NodeProcess> {
         let mut config = setup::cav(self.testbed, self.scene, cav, source);
@@ -266,7 +266,7 @@ impl Demo<'_> {
             fs::remove_file(&log).with_context(|| format!("cannot remove {}", log.display()))?;
         }
         config.map_log = Some(log);
-        self.start_node(config, places, index)
+        self.start_node(config, addresses, index)
     }
 
     fn map_log(&self, cav: &Cav) -> PathBuf {
@@ -275,14 +275,14 @@ impl Demo<'_> {
 }
 
 /// Addresses on which nothing listens now, no two the same.
-fn free_places(count: usize) -> anyhow::Result<Vec<Place>> {
+fn free_addresses(count: usize) -> anyhow::Result<Vec<NodeAddresses>> {
     let sockets: std::io::Result<Vec<_>> = (0..count)
         .map(|_| Ok((TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?, UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?)))
         .collect();
-    let place = |(broker, gossip): &(TcpListener, UdpSocket)| {
-        Ok(Place { broker: broker.local_addr()?, gossip: gossip.local_addr()? })
+    let node = |(broker, gossip): &(TcpListener, UdpSocket)| {
+        Ok(NodeAddresses { broker: broker.local_addr()?, gossip: gossip.local_addr()? })
     };
-    sockets.and_then(|sockets| sockets.iter().map(place).collect()).context("no free port on loopback")
+    sockets.and_then(|sockets| sockets.iter().map(node).collect()).context("no free port on loopback")
 }
 
 fn check(nodes: &mut [NodeProcess]) -> anyhow::Result<()> {

@@ -61,7 +61,7 @@ pub struct Scores {
     /// Every vehicle alone; with reports only.
     pub vehicles: BTreeMap<NodeName, VehicleScores>,
     /// How often which truth was called what, by item; correct ones too.
-    pub confusion: Vec<Confusion>,
+    pub confusion: Vec<ConfusionCell>,
 }
 
 /// Entries of all lines.
@@ -77,7 +77,7 @@ pub struct RoundScores {
 
 /// One cell of a confusion matrix.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Confusion {
+pub struct ConfusionCell {
     /// The first accepted label; null where nothing stands.
     pub truth: Option<Label>,
     /// What was said; null for no label.
@@ -219,7 +219,7 @@ impl Tally {
             }
             *confusion.entry((span.name().cloned(), said.cloned())).or_default() += 1;
         }
-        let entry = |((truth, said), count)| Confusion { truth, said, count };
+        let entry = |((truth, said), count)| ConfusionCell { truth, said, count };
         Some(Scores {
             lines: self.lines,
             items,

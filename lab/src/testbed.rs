@@ -26,7 +26,7 @@ use ecod::names::{Label, LandmarkId, NodeName};
 use nalgebra::Point2;
 
 pub use file::TestbedError;
-pub use recording::{KnownObject, Recording};
+pub use recording::{IntersectionRecording, KnownObject};
 pub use sight::{Hit, Sighting};
 
 /// Scenes that share one kind of camera and one kind of placard.

@@ -14,9 +14,9 @@
 mod config;
 mod dice;
 mod drive;
-mod observer;
 mod roads;
 mod sight;
+mod simulated_sensor;
 #[cfg(test)]
 mod tests;
 mod walk;
@@ -33,10 +33,10 @@ use serde::Serialize;
 pub use config::{SaidConfig, SensorConfig, TrafficConfig};
 
 use dice::Dice;
-use drive::Vehicle;
-use observer::{Observer, Surroundings};
+use drive::MovingVehicle;
 use roads::{Building, Roads};
 use sight::Body;
+use simulated_sensor::{SimulatedSensor, Surroundings};
 use walk::Walker;
 
 /// When the recording begins.
@@ -61,7 +61,7 @@ pub struct TrafficRecording {
     /// In the order of arrival.
     pub reports: Vec<ArrivedReport>,
     /// In the order of time.
-    pub truth: Truth,
+    pub truth: TrafficTruth,
 }
 
 /// A report and when it arrived, as a line of a recording for [`ecod::replay`].
@@ -77,7 +77,7 @@ pub struct ArrivedReport {
 
 /// What is true, as a file for [`crate::eval::tracks::TrackTruth`].
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Truth {
+pub struct TrafficTruth {
     /// In the order of time.
     pub frames: Vec<TruthFrame>,
 }
@@ -129,7 +129,7 @@ pub fn generate(config: &TrafficConfig, uniform: &mut dyn FnMut() -> f64) -> Tra
 struct Town {
     roads: Roads,
     buildings: Vec<Building>,
-    vehicles: Vec<Vehicle>,
+    vehicles: Vec<MovingVehicle>,
     walkers: Vec<Walker>,
     parked: Vec<Body>,
     lures: Vec<Point2<f64>>,
@@ -171,7 +171,7 @@ impl Town {
     fn bodies(&self) -> Vec<Body> {
         let vehicles = self.vehicles.iter().map(|vehicle| {
             let (center, heading_rad) = self.roads.place(vehicle.path, vehicle.along_m);
-            let Vehicle { speed_mps, length_m, width_m, .. } = *vehicle;
+            let MovingVehicle { speed_mps, length_m, width_m, .. } = *vehicle;
             Body { speed_mps, length_m, width_m, ..body("car", center, heading_rad) }
         });
         let walkers = self.walkers.iter().map(|walker| {
@@ -195,12 +195,12 @@ struct Watch<'a> {
     /// By body, when an observer could see it last.
     seen_at: Vec<Option<u64>>,
     arrived: Vec<(Timestamp, ArrivedReport)>,
-    truth: Truth,
+    truth: TrafficTruth,
 }
 
 struct Watcher {
     name: NodeName,
-    observer: Observer,
+    sensor: SimulatedSensor,
     /// Step of the next capture by the clockwork, and by the shutter.
     due: u64,
     shutter: u64,
@@ -217,7 +217,7 @@ impl<'a> Watch<'a> {
             let clock_s = if config.synchronous { 0.0 } else { CLOCK_S * dice.normal() };
             Watcher {
                 name: observer_name(number),
-                observer: Observer::new(bodies, dice),
+                sensor: SimulatedSensor::new(bodies, dice),
                 due,
                 shutter: due,
                 clock_us: (clock_s * 1e6) as i64,
@@ -225,7 +225,7 @@ impl<'a> Watch<'a> {
             }
         };
         let observers = (0..config.observers).map(&mut watcher).collect();
-        Self { config, observers, seen_at: vec![None; bodies], arrived: Vec::new(), truth: Truth::default() }
+        Self { config, observers, seen_at: vec![None; bodies], arrived: Vec::new(), truth: TrafficTruth::default() }
     }
 
     fn step(&mut self, step: u64, town: &Town, dice: &mut Dice<'_>) {
@@ -249,7 +249,7 @@ impl<'a> Watch<'a> {
         let config = self.config;
         let pose = Pose { position: bodies[number].center, heading_rad: bodies[number].heading_rad };
         let sights = sight::sights(number, bodies, &town.buildings, config.sensor.range_m);
-        for sight in sights.iter().filter(|sight| Observer::sees(config, &pose, sight)) {
+        for sight in sights.iter().filter(|sight| SimulatedSensor::sees(config, &pose, sight)) {
             self.seen_at[sight.body] = Some(step);
         }
         let is_open = |lure: &&Point2<f64>| !town.buildings.iter().any(|building| building.hides(&pose.position, lure));
@@ -258,7 +258,7 @@ impl<'a> Watch<'a> {
         let watcher = &mut self.observers[number];
         watcher.seq += 1;
         let mut report = ObjectReport::new(watcher.name.clone(), watcher.seq, time_of(step).shifted(watcher.clock_us));
-        watcher.observer.observe(config, &around, &mut report, dice);
+        watcher.sensor.observe(config, &around, &mut report, dice);
         watcher.due += (STEPS_PER_S / config.sensor.rate_hz).round() as u64;
         watcher.shutter = if config.synchronous { watcher.due } else { watcher.due - 1 + dice.below(3) as u64 };
         let mut takes_s = LEAST_LATENCY_S + dice.exponential(config.sensor.latency_s);

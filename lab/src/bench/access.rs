@@ -9,7 +9,7 @@ use rumqttc::{
 
 /// A broker, and what it and the cell behind it ask of clients: TLS, a user's name and password, signed payloads.
 #[derive(Debug, Clone)]
-pub struct Access {
+pub struct BrokerAccess {
     /// Where it is.
     pub broker: BrokerAddress,
     login: Option<(String, String)>,
@@ -31,7 +31,7 @@ pub enum AccessError {
     Security(#[from] ecod_actors::gateway::SecurityError),
 }
 
-impl Access {
+impl BrokerAccess {
     /// To a broker that asks for nothing.
     pub fn open(broker: BrokerAddress) -> Self {
         Self { broker, login: None, security: Security::default() }
@@ -120,10 +120,10 @@ mod tests {
             }),
             ..NodeConfig::default()
         };
-        let error = Access::of(address("10.0.0.2:8883"), &config).unwrap_err().to_string();
+        let error = BrokerAccess::of(address("10.0.0.2:8883"), &config).unwrap_err().to_string();
         assert!(error.contains("10.0.0.2:8883") && error.contains("one vehicle only"), "{error}");
         config.mqtt.broker = Some(address("10.0.0.9:8883"));
-        assert!(matches!(Access::of(address("10.0.0.2:8883"), &config), Err(AccessError::Closed(_))));
+        assert!(matches!(BrokerAccess::of(address("10.0.0.2:8883"), &config), Err(AccessError::Closed(_))));
     }
 
     #[test]
@@ -132,10 +132,10 @@ mod tests {
             membership: MembershipConfig { key: Some(Secret::new("correct horse battery")), ..Default::default() },
             ..NodeConfig::default()
         };
-        let open = Access::of(address("10.0.0.2:1883"), &config).unwrap();
+        let open = BrokerAccess::of(address("10.0.0.2:1883"), &config).unwrap();
         assert_eq!(open.unseal(&open.seal("a/b", b"{}".to_vec())), b"{}");
         config.mqtt.sign = true;
-        let signing = Access::of(address("10.0.0.2:1883"), &config).unwrap();
+        let signing = BrokerAccess::of(address("10.0.0.2:1883"), &config).unwrap();
         let sealed = signing.seal("a/b", b"{}".to_vec());
         assert_eq!(sealed.len(), ecod_actors::gateway::ENVELOPE_BYTES + 2);
         assert_eq!(signing.unseal(&sealed), b"{}");

@@ -12,7 +12,7 @@ use ecod_actors::config::NodeConfig;
 use ecod_actors::recorder::RecordConfig;
 use tokio::net::TcpStream;
 
-use super::access::Access;
+use super::access::BrokerAccess;
 use super::load::landmarks;
 use super::measurement::Target;
 use crate::node_process::{NodeProcess, free_address};
@@ -57,7 +57,7 @@ impl OwnAggregator {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
         let target = Target {
-            access: Access::open(broker.into()),
+            access: BrokerAccess::open(broker.into()),
             cell: config.cell,
             landmarks: config.landmarks,
             encoding: config.mqtt.encoding,

@@ -8,7 +8,7 @@ use anyhow::Context;
 use rumqttc::{Event, Packet, QoS};
 use tokio::sync::oneshot;
 
-use super::access::Access;
+use super::access::BrokerAccess;
 use super::vehicle::AnswerBytes;
 
 /// Where vehicles send; below it their names.
@@ -28,7 +28,7 @@ impl Echo {
     /// Starts it; it is subscribed when this returns. A tick is complete with `packets`, and its answers have as many bytes as
     /// `answer_bytes` says when they are sent; without verdicts there is one.
     pub(super) async fn start(
-        access: Access,
+        access: BrokerAccess,
         packets: usize,
         answer_bytes: Arc<AnswerBytes>,
         votes: bool,

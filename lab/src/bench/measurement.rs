@@ -10,20 +10,20 @@ use ecod::names::NodeName;
 use ecod::wire::{Encoding, ReportKind, Topics};
 use tokio::sync::{oneshot, watch};
 
-use super::access::Access;
+use super::access::BrokerAccess;
 use super::driver::{Sender, Sent, drive};
 use super::echo::{Echo, OUT};
 use super::latency::Answers;
 use super::load::{self, Load};
 use super::schedule::Schedule;
 use super::usage::{Usage, UsageMeter};
-use super::vehicle::{AnswerBytes, Came, Common, Vehicle};
+use super::vehicle::{AnswerBytes, BenchVehicle, Came, Common};
 
 /// The cell that is measured.
 #[derive(Debug, Clone)]
 pub struct Target {
     /// Where its data goes.
-    pub access: Access,
+    pub access: BrokerAccess,
     /// Its name.
     pub cell: NodeName,
     /// Its known locations.
@@ -94,7 +94,7 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<Measurement>
     for index in 0..load.vehicles {
         let report = load::report(index, &target.landmarks);
         let id = format!("ecod-bench-{}", report.node);
-        let connected = Vehicle::connect(&id, load.ticks() as usize, &common).await;
+        let connected = BenchVehicle::connect(&id, load.ticks() as usize, &common).await;
         let vehicle =
             connected.with_context(|| format!("vehicle {index} of {}", load.vehicles)).with_context(at_broker)?;
         let topic = |kind: ReportKind| common.topics.path(&kind.topic(report.node.clone()));
@@ -136,7 +136,7 @@ async fn on_a_thread(schedule: Schedule, load: Load, target: Target, senders: Ve
 }
 
 /// Waits for the last answers, and turns arrivals into times.
-async fn gather(vehicles: &[Vehicle], schedule: Schedule, load: Load) -> (Answers, Answers) {
+async fn gather(vehicles: &[BenchVehicle], schedule: Schedule, load: Load) -> (Answers, Answers) {
     let begun = Instant::now();
     while begun.elapsed() < LAST_ANSWERS && !vehicles.iter().all(|vehicle| is_done(vehicle, load)) {
         tokio::time::sleep(Duration::from_millis(10)).await;
@@ -163,7 +163,7 @@ async fn gather(vehicles: &[Vehicle], schedule: Schedule, load: Load) -> (Answer
     (cell, bare)
 }
 
-fn is_done(vehicle: &Vehicle, load: Load) -> bool {
+fn is_done(vehicle: &BenchVehicle, load: Load) -> bool {
     let arrivals = vehicle.arrivals.lock().unwrap_or_else(PoisonError::into_inner);
     let came = |arrivals: &[Option<Instant>]| arrivals.last().is_some_and(Option::is_some);
     let all_came = |ways: &Came| came(&ways.map) && (!load.votes || came(&ways.verdict));

@@ -9,7 +9,7 @@ use rumqttc::{Event, EventLoop, Packet, Publish, QoS};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 
-use super::access::Access;
+use super::access::BrokerAccess;
 
 /// What is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,7 +63,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// [`TwoHopError`] when the broker cannot be reached or loses messages.
 pub async fn raw(broker: &BrokerAddress, load: Load) -> Result<Histogram<u64>, TwoHopError> {
     let error = |source| TwoHopError::Connection { broker: broker.clone(), source: Box::new(source) };
-    let access = Access::open(broker.clone());
+    let access = BrokerAccess::open(broker.clone());
     let (echoer, echo_events) = access.subscribed("ecod-bench-echo", &[OUT]).await.map_err(error)?;
     let (sender, events) = access.subscribed("ecod-bench", &[BACK]).await.map_err(error)?;
     let (arrivals, mut arrived) = mpsc::unbounded_channel();

@@ -10,14 +10,14 @@ use rumqttc::{AsyncClient, Event, EventLoop, Packet, Publish};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-use super::access::Access;
+use super::access::BrokerAccess;
 use super::echo::{BACK, tick_of};
 use super::schedule::Schedule;
 
 /// What the vehicles of a run have in common.
 #[derive(Debug)]
 pub(super) struct Common {
-    pub(super) access: Access,
+    pub(super) access: BrokerAccess,
     pub(super) topics: Topics,
     /// Set when all are connected.
     pub(super) schedule: OnceLock<Schedule>,
@@ -65,13 +65,13 @@ pub(super) struct Arrivals {
 
 /// A connected vehicle; its connection is cut when it is dropped.
 #[derive(Debug)]
-pub(super) struct Vehicle {
+pub(super) struct BenchVehicle {
     pub(super) client: AsyncClient,
     pub(super) arrivals: Arc<Mutex<Arrivals>>,
     task: AbortHandle,
 }
 
-impl Vehicle {
+impl BenchVehicle {
     pub(super) async fn connect(
         id: &str,
         ticks: usize,
@@ -86,7 +86,7 @@ impl Vehicle {
     }
 }
 
-impl Drop for Vehicle {
+impl Drop for BenchVehicle {
     fn drop(&mut self) {
         self.task.abort();
     }

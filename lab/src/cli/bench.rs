@@ -17,7 +17,7 @@ use serde_json::{Map, Value, json};
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::columns::columns;
-use crate::bench::access::Access;
+use crate::bench::access::BrokerAccess;
 use crate::bench::aggregator::OwnAggregator;
 use crate::bench::latency::{Answers, Latencies, Quantiles};
 use crate::bench::load::Load;
@@ -179,7 +179,7 @@ impl BenchArguments {
                 "the configuration has `fusion.algorithms` vote: without maps it shows nowhere which reports a round rests on"
             );
         }
-        let access = Access::of(broker, &config)?;
+        let access = BrokerAccess::of(broker, &config)?;
         // By packets, not every round has verdicts.
         let votes = config.fusion.algorithms.vote() && config.fusion.vote.mode == VoteMode::Weighted;
         let cell = self.cell.clone().unwrap_or(config.cell);

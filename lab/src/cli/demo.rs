@@ -13,7 +13,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::testbed::{Results, check_writable, read, select};
 use super::write_json;
-use crate::demo::{Demo, DemoResult, News, Reign};
+use crate::demo::{Demo, DemoResult, JudgedTerm, News};
 use crate::node_process::{free_address, node_program};
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::table::table;
@@ -95,15 +95,15 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
 
 /// Who led when, how right its maps were, and what the change cost the vehicles.
 fn leaders(outcome: &DemoResult) -> String {
-    let line = |reign: &Reign| {
+    let line = |term: &JudgedTerm| {
         let since = |time: Timestamp| time.since(outcome.from).as_secs_f64();
-        let (leader, from, until) = (&reign.epoch.leader, since(reign.from), since(reign.until));
-        let gap = reign.gap.map_or_else(String::new, |gap| {
+        let (leader, from, until) = (&term.epoch.leader, since(term.from), since(term.until));
+        let gap = term.gap.map_or_else(String::new, |gap| {
             format!(", {} ms after the last map of the one before (worst vehicle)", gap.as_millis())
         });
-        format!("        {leader} led from {from:.1} to {until:.1} s, {:.1} % right{gap}\n", reign.score.accuracy_pct())
+        format!("        {leader} led from {from:.1} to {until:.1} s, {:.1} % right{gap}\n", term.score.accuracy_pct())
     };
-    outcome.reigns.iter().map(line).collect()
+    outcome.terms.iter().map(line).collect()
 }
 
 /// Runs a scene; SIGINT and SIGTERM end it and, with it, its processes.

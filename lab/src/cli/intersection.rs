@@ -11,8 +11,8 @@ use super::columns::columns;
 use super::testbed::{Results, TestbedArguments, check_writable};
 use super::write_json;
 use crate::report::tracks::percent;
-use crate::testbed::Recording;
-use crate::testbed::intersection::generate::Confusion;
+use crate::testbed::IntersectionRecording;
+use crate::testbed::intersection::generate::ConfusionModel;
 use crate::testbed::intersection::{self, IntersectionResult};
 
 const RECORDING: &str = "recording";
@@ -20,7 +20,8 @@ const GENERATED: &str = "generated";
 
 pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failure> {
     let path = arguments.scenes.display();
-    let recording = Recording::from_json(text).with_context(|| format!("scenes {path}")).map_err(Failure::usage)?;
+    let recording =
+        IntersectionRecording::from_json(text).with_context(|| format!("scenes {path}")).map_err(Failure::usage)?;
     if recording.objects.is_empty() || recording.frame_count() == 0 {
         return Err(Failure::usage(anyhow::anyhow!("scenes {path}: nothing was recorded")));
     }
@@ -60,8 +61,11 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
     }
 }
 
-fn generated(arguments: &TestbedArguments, recording: &Recording) -> anyhow::Result<Option<IntersectionResult>> {
-    let confusion = Confusion::of(recording);
+fn generated(
+    arguments: &TestbedArguments,
+    recording: &IntersectionRecording,
+) -> anyhow::Result<Option<IntersectionResult>> {
+    let confusion = ConfusionModel::of(recording);
     let mut scenes = Vec::new();
     for number in 0..arguments.generated {
         let scene = confusion.scene(arguments.seed.wrapping_add(number), arguments.frames.into());

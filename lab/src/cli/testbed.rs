@@ -14,7 +14,7 @@ use super::{intersection, write_json};
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 use crate::testbed::trial::Trial;
-use crate::testbed::{Recording, Scene, Testbed};
+use crate::testbed::{IntersectionRecording, Scene, Testbed};
 
 /// Flags of `testbed`.
 #[derive(Debug, Args)]
@@ -69,7 +69,7 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     if let Some(out) = &arguments.out {
         lines::check_apart(out, &[&arguments.scenes]).map_err(Failure::usage)?;
     }
-    if serde_json::from_str(&text).is_ok_and(|file| Recording::is_recording(&file)) {
+    if serde_json::from_str(&text).is_ok_and(|file| IntersectionRecording::is_recording(&file)) {
         return intersection::run(arguments, &text);
     }
     if arguments.reports.is_some() {

@@ -8,12 +8,12 @@ use ecod::time::Timestamp;
 use ecod::wire::GlobalMap;
 use ecod_actors::follower::ReceivedMap;
 
-use crate::testbed::score::Score;
+use crate::testbed::score::SpotScore;
 use crate::testbed::{Scene, Testbed};
 
 /// A leadership as the vehicles saw it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Reign {
+pub struct JudgedTerm {
     /// Who led, in which term.
     pub epoch: Epoch,
     /// When the first vehicle took the first map.
@@ -24,37 +24,40 @@ pub struct Reign {
     /// was no other.
     pub gap: Option<Duration>,
     /// How right the maps were.
-    pub score: Score,
+    pub score: SpotScore,
 }
 
 /// All leaderships in the order of their terms, from what each vehicle took in its order.
-pub(super) fn reigns<'a>(
+pub(super) fn judged_terms<'a>(
     testbed: &Testbed,
     scene: &Scene,
     vehicles: impl IntoIterator<Item = &'a [ReceivedMap]>,
-) -> Vec<Reign> {
-    let mut reigns: BTreeMap<Epoch, (Reign, BTreeMap<u64, &GlobalMap>)> = BTreeMap::new();
+) -> Vec<JudgedTerm> {
+    let mut terms: BTreeMap<Epoch, (JudgedTerm, BTreeMap<u64, &GlobalMap>)> = BTreeMap::new();
     for maps in vehicles {
         let mut before: Option<(Epoch, Timestamp)> = None;
         for ReceivedMap { received_at, map } in maps {
             let epoch = Epoch::new(map.epoch, map.aggregator.clone());
             let waited = before.filter(|(last, _)| *last != epoch).map(|(_, at)| received_at.since(at));
-            let (reign, rounds) = reigns.entry(epoch.clone()).or_insert_with(|| {
+            let (term, rounds) = terms.entry(epoch.clone()).or_insert_with(|| {
                 let (from, until) = (*received_at, *received_at);
-                (Reign { epoch: epoch.clone(), from, until, gap: None, score: Score::default() }, BTreeMap::new())
+                (
+                    JudgedTerm { epoch: epoch.clone(), from, until, gap: None, score: SpotScore::default() },
+                    BTreeMap::new(),
+                )
             });
-            reign.from = reign.from.min(*received_at);
-            reign.until = reign.until.max(*received_at);
-            reign.gap = reign.gap.max(waited);
+            term.from = term.from.min(*received_at);
+            term.until = term.until.max(*received_at);
+            term.gap = term.gap.max(waited);
             rounds.insert(map.round, map);
             before = Some((epoch, *received_at));
         }
     }
-    let judged = |(mut reign, rounds): (Reign, BTreeMap<u64, &GlobalMap>)| {
-        rounds.values().for_each(|map| reign.score.judge(testbed, scene, map));
-        reign
+    let judged = |(mut term, rounds): (JudgedTerm, BTreeMap<u64, &GlobalMap>)| {
+        rounds.values().for_each(|map| term.score.judge(testbed, scene, map));
+        term
     };
-    reigns.into_values().map(judged).collect()
+    terms.into_values().map(judged).collect()
 }
 
 #[cfg(test)]
@@ -84,20 +87,20 @@ mod tests {
     }
 
     #[test]
-    fn the_gap_of_a_reign_is_that_of_the_vehicle_that_waited_longest() {
+    fn the_gap_of_a_term_is_that_of_the_vehicle_that_waited_longest() {
         let testbed = Testbed::from_json(SCENES).unwrap();
         let quick = [taken("edge", 1, 1, 0), taken("edge", 1, 2, 100), taken("euclid", 2, 3, 210)];
         let slow = [taken("edge", 1, 1, 5), taken("euclid", 2, 4, 320), taken("edge", 3, 5, 400)];
-        let reigns = reigns(&testbed, &testbed.scenes[0], [&quick[..], &slow[..]]);
-        let told = |reign: &Reign| {
-            let (from, until) = (reign.from.micros() / 1000, reign.until.micros() / 1000);
-            (reign.epoch.to_string(), from, until, reign.gap.map(|gap| gap.as_millis()))
+        let terms = judged_terms(&testbed, &testbed.scenes[0], [&quick[..], &slow[..]]);
+        let told = |term: &JudgedTerm| {
+            let (from, until) = (term.from.micros() / 1000, term.until.micros() / 1000);
+            (term.epoch.to_string(), from, until, term.gap.map(|gap| gap.as_millis()))
         };
         let expected = [
             ("edge@1".to_owned(), 0, 100, None),
             ("euclid@2".to_owned(), 210, 320, Some(315)),
             ("edge@3".to_owned(), 400, 400, Some(80)),
         ];
-        assert_eq!(reigns.iter().map(told).collect::<Vec<_>>(), expected);
+        assert_eq!(terms.iter().map(told).collect::<Vec<_>>(), expected);
     }
 }

@@ -23,7 +23,7 @@ pub struct ObservedReport {
 }
 
 /// A gateway that keeps every report.
-pub(super) struct Observer {
+pub(super) struct ReportCollector {
     gateway: ActorRef<GatewayMessage>,
     ended: JoinHandle<()>,
     seen: Arc<Mutex<Seen>>,
@@ -36,7 +36,7 @@ struct Seen {
     leader: Option<NodeName>,
 }
 
-impl Observer {
+impl ReportCollector {
     pub(super) async fn start(brokers: Vec<BrokerAddress>, name: NodeName) -> anyhow::Result<Self> {
         let seen: Arc<Mutex<Seen>> = Arc::default();
         let kept = Arc::clone(&seen);
@@ -75,7 +75,7 @@ impl Observer {
     pub(super) async fn stop(self) -> Vec<ObservedReport> {
         self.gateway.stop(None);
         if self.ended.await.is_err() {
-            tracing::warn!("the observer did not end well");
+            tracing::warn!("the collector of reports did not end well");
         }
         std::mem::take(&mut lock(&self.seen).reports)
     }

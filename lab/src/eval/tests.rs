@@ -64,7 +64,7 @@ fn figures_are_those_worked_out_by_hand() {
     let v3 = &vote.vehicles[&NodeName::from_static("v3")];
     assert_eq!((v3.votes, v3.accuracy_pct), (1, Some(25.0)), "wrong on a, silent and right on d");
     let cell = |truth: Option<&str>, said: Option<&str>| {
-        let find = |c: &&Confusion| c.truth.as_deref() == truth && c.said.as_deref() == said;
+        let find = |c: &&ConfusionCell| c.truth.as_deref() == truth && c.said.as_deref() == said;
         vote.confusion.iter().find(find).map_or(0, |c| c.count)
     };
     assert_eq!((cell(Some("cup"), Some("cup")), cell(Some("cup"), Some("mouse"))), (1, 1));

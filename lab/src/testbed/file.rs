@@ -44,7 +44,7 @@ pub enum TestbedError {
 
 pub(super) fn read(text: &str) -> Result<Testbed, TestbedError> {
     let value: Value = serde_json::from_str(text).map_err(TestbedError::NotJson)?;
-    let file = Place("scene file".into());
+    let file = KeyPath("scene file".into());
     let head: FileFields = file.parse(value)?;
     head.units.check(&file)?;
     if head.scenes.is_empty() {
@@ -55,7 +55,7 @@ pub(super) fn read(text: &str) -> Result<Testbed, TestbedError> {
     let mut scenes: Vec<Scene> = Vec::with_capacity(head.scenes.len());
     for (index, value) in head.scenes.into_iter().enumerate() {
         let name = value.get("name").and_then(Value::as_str);
-        let place = Place(name.map_or_else(|| format!("scene {index}"), |name| format!("scene {name}")));
+        let place = KeyPath(name.map_or_else(|| format!("scene {index}"), |name| format!("scene {name}")));
         let scene = place.parse::<SceneFields>(value)?.check(&place)?;
         if scenes.iter().any(|other| other.name == scene.name) {
             return Err(place.error("name", "is used by an earlier scene"));
@@ -66,9 +66,9 @@ pub(super) fn read(text: &str) -> Result<Testbed, TestbedError> {
 }
 
 /// The part of the file that an error is about.
-pub(super) struct Place(pub(super) String);
+pub(super) struct KeyPath(pub(super) String);
 
-impl Place {
+impl KeyPath {
     pub(super) fn error(&self, key: impl Into<String>, reason: impl Display) -> TestbedError {
         TestbedError::Value { place: self.0.clone(), key: key.into(), reason: reason.to_string() }
     }
@@ -124,7 +124,7 @@ pub(super) struct UnitFields {
 }
 
 impl UnitFields {
-    pub(super) fn check(&self, place: &Place) -> Result<(), TestbedError> {
+    pub(super) fn check(&self, place: &KeyPath) -> Result<(), TestbedError> {
         let expect = |key: &str, found: &Option<String>, unit: &str| match found {
             Some(found) if !found.starts_with(unit) => {
                 Err(place.error(key, format_args!("is {found:?}, must be {unit:?}")))
@@ -157,7 +157,7 @@ fn default_submission_interval_s() -> f64 {
 }
 
 impl CameraFields {
-    pub(super) fn check(&self, place: &Place) -> Result<Camera, TestbedError> {
+    pub(super) fn check(&self, place: &KeyPath) -> Result<Camera, TestbedError> {
         place.number("camera.image_width", self.image_width.into(), 0.0, 8192.0)?;
         place.number("camera.image_height", self.image_height.into(), 0.0, 8192.0)?;
         let horizontal = place.number("camera.horizontal_fov_deg", self.horizontal_fov_deg, 0.0, 170.0)?;
@@ -190,7 +190,7 @@ struct PlacardFields {
 }
 
 impl PlacardFields {
-    fn check(self, place: &Place) -> Result<Placard, TestbedError> {
+    fn check(self, place: &KeyPath) -> Result<Placard, TestbedError> {
         let width = place.number("placard.card_width", self.card_width, 0.0, 1e4)?;
         let height = place.number("placard.card_height", self.card_height, 0.0, 1e4)?;
         let quiet = place.number("placard.qr_with_quiet_zone", self.qr_with_quiet_zone, 0.0, width.min(height))?;
@@ -215,7 +215,7 @@ struct SceneFields {
 }
 
 impl SceneFields {
-    fn check(self, place: &Place) -> Result<Scene, TestbedError> {
+    fn check(self, place: &KeyPath) -> Result<Scene, TestbedError> {
         let spots = check_spots(self.spots, place)?;
         let mut cavs: Vec<Cav> = Vec::with_capacity(self.cavs.len());
         for (index, fields) in self.cavs.into_iter().enumerate() {
@@ -247,7 +247,7 @@ enum SpotId {
     Name(String),
 }
 
-fn check_spots(fields: Vec<SpotFields>, place: &Place) -> Result<Vec<Spot>, TestbedError> {
+fn check_spots(fields: Vec<SpotFields>, place: &KeyPath) -> Result<Vec<Spot>, TestbedError> {
     let mut ids = HashSet::new();
     let mut spots = Vec::with_capacity(fields.len());
     let mut undirected = Vec::new();
@@ -289,7 +289,7 @@ pub(super) struct CavFields {
 }
 
 impl CavFields {
-    pub(super) fn check(self, index: usize, place: &Place) -> Result<Cav, TestbedError> {
+    pub(super) fn check(self, index: usize, place: &KeyPath) -> Result<Cav, TestbedError> {
         let key = |name: &str| format!("cavs[{index}].{name}");
         let name = NodeName::new(&self.id).map_err(|error| place.error(key("id"), format_args!("is a {error}")))?;
         let position = place.point(&key("position"), self.position)?;

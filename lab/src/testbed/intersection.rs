@@ -29,7 +29,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use crate::eval::{Evaluation, Scores, Truth};
-use crate::testbed::{Cav, Recording};
+use crate::testbed::{Cav, IntersectionRecording};
 
 /// When virtual time begins.
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
@@ -102,7 +102,7 @@ pub struct FrameLabel {
 ///
 /// # Errors
 /// When a report cannot be written or read back.
-pub fn run(name: &str, recording: &Recording) -> anyhow::Result<IntersectionResult> {
+pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<IntersectionResult> {
     let reports = reports(recording);
     let (fused, scores) = vote(recording, &reports, VoteMode::Weighted)?;
     let (_, paper) = vote(recording, &reports, VoteMode::Paper)?;
@@ -144,7 +144,7 @@ impl IntersectionResult {
 }
 
 /// What the vehicles would have published, in order of arrival.
-pub fn reports(recording: &Recording) -> Vec<ObjectReport> {
+pub fn reports(recording: &IntersectionRecording) -> Vec<ObjectReport> {
     let landmarks = Arc::new(LandmarkIndex::new(recording.landmarks(), GATE.radius_m));
     let mut vehicles: Vec<Perception> =
         recording.cavs.iter().map(|cav| perception(recording, cav, landmarks.clone())).collect();
@@ -188,7 +188,11 @@ pub fn line(report: &ObjectReport) -> serde_json::Result<String> {
 }
 
 /// The verdicts of a mode and how right they are, each frame by itself.
-fn vote(recording: &Recording, reports: &[ObjectReport], mode: VoteMode) -> anyhow::Result<(Vec<FusedLine>, Scores)> {
+fn vote(
+    recording: &IntersectionRecording,
+    reports: &[ObjectReport],
+    mode: VoteMode,
+) -> anyhow::Result<(Vec<FusedLine>, Scores)> {
     let landmarks = recording.landmarks();
     let config = ReplayConfig { fusion: fusion(mode), landmarks: landmarks.clone(), ..ReplayConfig::default() };
     let mut replay = Replay::new(config);
@@ -210,7 +214,7 @@ fn vote(recording: &Recording, reports: &[ObjectReport], mode: VoteMode) -> anyh
 }
 
 /// Every frame counts by itself.
-fn truth(recording: &Recording) -> anyhow::Result<Truth> {
+fn truth(recording: &IntersectionRecording) -> anyhow::Result<Truth> {
     let spans = |accepted: &[Label]| -> Vec<_> {
         (0..recording.frame_count()).map(|f| json!({"from_us": captured_at(f), "label": accepted})).collect()
     };
@@ -220,7 +224,7 @@ fn truth(recording: &Recording) -> anyhow::Result<Truth> {
 }
 
 /// The last verdict on every object in every frame.
-fn labels(recording: &Recording, fused: &[FusedLine]) -> Vec<FrameLabel> {
+fn labels(recording: &IntersectionRecording, fused: &[FusedLine]) -> Vec<FrameLabel> {
     let verdicts = |line: &FusedLine| if let FusedLine::Verdicts(v) = line { Some(v.clone()) } else { None };
     let rounds: Vec<_> = fused.iter().filter_map(verdicts).collect();
     let mut labels = Vec::new();
@@ -254,7 +258,7 @@ fn fusion(mode: VoteMode) -> FusionConfig {
     }
 }
 
-fn perception(recording: &Recording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -> Perception {
+fn perception(recording: &IntersectionRecording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -> Perception {
     let vantage = Vantage {
         node: cav.name.clone(),
         pose: cav.pose,

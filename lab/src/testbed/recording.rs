@@ -14,7 +14,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::Cav;
-use super::file::{CameraFields, CavFields, Place, TestbedError, UnitFields};
+use super::file::{CameraFields, CavFields, KeyPath, TestbedError, UnitFields};
 
 /// The order of a box's edges in a file.
 const BOX_ORDER: &str = "y_min, x_min, y_max, x_max";
@@ -23,7 +23,7 @@ const MAX_BOXES: usize = 1_000_000;
 
 /// Known objects and the detections of the vehicles that watch them.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Recording {
+pub struct IntersectionRecording {
     /// The camera of every vehicle.
     pub intrinsics: Intrinsics,
     /// What stands where.
@@ -45,7 +45,7 @@ pub struct KnownObject {
     pub accepted: Vec<Label>,
 }
 
-impl Recording {
+impl IntersectionRecording {
     /// Whether a JSON file is a recording rather than a list of scenes.
     pub fn is_recording(file: &Value) -> bool {
         file.get("frames").is_some() && file.get("objects").is_some()
@@ -56,7 +56,7 @@ impl Recording {
     /// # Errors
     /// [`TestbedError`] when the text is not JSON, or names the key and what is wrong with its value.
     pub fn from_json(text: &str) -> Result<Self, TestbedError> {
-        let place = Place("recording".into());
+        let place = KeyPath("recording".into());
         let value: Value = serde_json::from_str(text).map_err(TestbedError::NotJson)?;
         place.parse::<RecordingFields>(value)?.check(&place)
     }
@@ -118,7 +118,7 @@ struct DetectionFields {
 }
 
 impl RecordingFields {
-    fn check(mut self, place: &Place) -> Result<Recording, TestbedError> {
+    fn check(mut self, place: &KeyPath) -> Result<IntersectionRecording, TestbedError> {
         self.units.check(place)?;
         if let Some(order) = self.bounding_box_order.filter(|order| !order.starts_with(BOX_ORDER)) {
             return Err(place.error("bounding_box_order", format_args!("is {order:?}, must be {BOX_ORDER:?}")));
@@ -152,13 +152,13 @@ impl RecordingFields {
         }
         match self.frames.keys().next() {
             Some(stranger) => Err(place.error(format!("frames.{stranger}"), "is of no vehicle in `cavs`")),
-            None => Ok(Recording { intrinsics, objects, cavs, frames }),
+            None => Ok(IntersectionRecording { intrinsics, objects, cavs, frames }),
         }
     }
 }
 
 impl ObjectFields {
-    fn check(self, index: usize, place: &Place) -> Result<KnownObject, TestbedError> {
+    fn check(self, index: usize, place: &KeyPath) -> Result<KnownObject, TestbedError> {
         let key = |name: &str| format!("objects[{index}].{name}");
         if self.accepted_labels.is_empty() {
             return Err(place.error(key("accepted_labels"), "is empty"));
@@ -176,7 +176,7 @@ fn detections(
     recorded: Vec<Vec<DetectionFields>>,
     cav: &Cav,
     camera: &Intrinsics,
-    place: &Place,
+    place: &KeyPath,
 ) -> Result<Vec<Vec<Detection>>, TestbedError> {
     let mut frames = Vec::with_capacity(recorded.len());
     for (number, boxes) in recorded.into_iter().enumerate() {
@@ -191,7 +191,7 @@ fn detections(
 }
 
 impl DetectionFields {
-    fn check(self, key: &str, camera: &Intrinsics, place: &Place) -> Result<Detection, TestbedError> {
+    fn check(self, key: &str, camera: &Intrinsics, place: &KeyPath) -> Result<Detection, TestbedError> {
         let [y_min, x_min, y_max, x_max] = self.bounding_box;
         let (width, height) = (f64::from(camera.width), f64::from(camera.height));
         let bounding_box =
@@ -217,7 +217,7 @@ mod tests {
 
     #[test]
     fn the_recording_is_read_in_metres_and_pixels() {
-        let recording = Recording::from_json(TEXT).unwrap();
+        let recording = IntersectionRecording::from_json(TEXT).unwrap();
         assert_eq!((recording.objects.len(), recording.cavs.len(), recording.frame_count()), (3, 4, 3));
         let landmarks = recording.landmarks();
         assert!((landmarks[0].position - Point2::new(0.5334, 0.889)).norm() < 1e-12);
@@ -247,7 +247,7 @@ mod tests {
             ),
         ] {
             assert!(TEXT.contains(from), "{from}");
-            let error = Recording::from_json(&TEXT.replacen(from, to, 1)).unwrap_err().to_string();
+            let error = IntersectionRecording::from_json(&TEXT.replacen(from, to, 1)).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
         }
     }

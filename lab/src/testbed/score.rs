@@ -10,14 +10,14 @@ use crate::testbed::{Scene, Spot, Testbed};
 
 /// Right and judged spots, of all and of the occupied ones.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Score {
+pub struct SpotScore {
     right: u64,
     judged: u64,
     right_occupied: u64,
     judged_occupied: u64,
 }
 
-impl Score {
+impl SpotScore {
     /// Judges every spot of a map; not knowing is wrong.
     pub fn judge(&mut self, testbed: &Testbed, scene: &Scene, map: &GlobalMap) {
         for spot in &scene.spots {
@@ -89,8 +89,8 @@ impl SceneResult {
         testbed: &Testbed,
         scene: &Scene,
         verdicts: u64,
-        fused: &Score,
-        single: &BTreeMap<NodeName, Score>,
+        fused: &SpotScore,
+        single: &BTreeMap<NodeName, SpotScore>,
     ) -> Self {
         let empty = scene.spots.iter().filter(|spot| spot.truth.is_none()).count() as u64;
         let unseen = |spot: &&Spot| !scene.cavs.iter().any(|cav| testbed.sighting(scene, cav, spot).is_some());

@@ -16,7 +16,7 @@ use ecod_actors::detect::placard::{PlacardConfig, PlacardDetector};
 use ecod_actors::frame::Frame;
 
 use super::camera::TestbedCamera;
-use super::score::{SceneResult, Score};
+use super::score::{SceneResult, SpotScore};
 use super::setup;
 use crate::testbed::{Cav, Scene, Testbed};
 
@@ -44,9 +44,9 @@ impl Trial<'_> {
     pub fn run(&self, progress: impl Fn() + Sync) -> anyhow::Result<SceneResult> {
         let reports = self.reports(&progress)?;
         let mut fused = self.aggregator();
-        let mut alone: BTreeMap<NodeName, (Aggregator, Score)> =
-            self.scene.cavs.iter().map(|cav| (cav.name.clone(), (self.aggregator(), Score::default()))).collect();
-        let mut score = Score::default();
+        let mut alone: BTreeMap<NodeName, (Aggregator, SpotScore)> =
+            self.scene.cavs.iter().map(|cav| (cav.name.clone(), (self.aggregator(), SpotScore::default()))).collect();
+        let mut score = SpotScore::default();
         for verdict in 0..self.verdicts {
             let steps = verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();
             let of_verdict = |cav: &[ObjectReport]| cav[steps.start as usize..steps.end as usize].to_vec();

@@ -21,7 +21,7 @@ const ROOM_M: f64 = 8.0;
 const ROUTE: usize = 64;
 
 #[derive(Debug, Clone)]
-pub(super) struct Vehicle {
+pub(super) struct MovingVehicle {
     pub(super) path: Path,
     pub(super) along_m: f64,
     pub(super) speed_mps: f64,
@@ -33,12 +33,12 @@ pub(super) struct Vehicle {
 }
 
 /// Vehicles at random places on random routes; in a convoy, the first `convoy` are one behind the other.
-pub(super) fn vehicles(roads: &Roads, count: usize, convoy: usize, dice: &mut Dice<'_>) -> Vec<Vehicle> {
+pub(super) fn vehicles(roads: &Roads, count: usize, convoy: usize, dice: &mut Dice<'_>) -> Vec<MovingVehicle> {
     let lanes = roads.lanes();
-    let mut vehicles: Vec<Vehicle> = Vec::with_capacity(count);
+    let mut vehicles: Vec<MovingVehicle> = Vec::with_capacity(count);
     while vehicles.len() < count {
         let is_van = dice.chance(0.15);
-        let mut vehicle = Vehicle {
+        let mut vehicle = MovingVehicle {
             path: lanes[dice.below(lanes.len())],
             along_m: dice.between(0.0, roads.length_m(lanes[0])),
             speed_mps: 0.0,
@@ -55,8 +55,9 @@ pub(super) fn vehicles(roads: &Roads, count: usize, convoy: usize, dice: &mut Di
         } else if convoy > 1 && vehicles.is_empty() {
             vehicle.along_m = roads.length_m(vehicle.path) - 1.0;
         }
-        let is_free =
-            |other: &Vehicle| other.path != vehicle.path || (other.along_m - vehicle.along_m).abs() > ROOM_M - 0.5;
+        let is_free = |other: &MovingVehicle| {
+            other.path != vehicle.path || (other.along_m - vehicle.along_m).abs() > ROOM_M - 0.5
+        };
         // Places may run out at last; then vehicles stand closer, and the model parts them.
         if vehicles.len() < convoy || vehicles.iter().all(is_free) || dice.chance(0.001) {
             vehicles.push(vehicle);
@@ -66,7 +67,7 @@ pub(super) fn vehicles(roads: &Roads, count: usize, convoy: usize, dice: &mut Di
 }
 
 /// Moves all vehicles on by `step_s`, one after the other.
-pub(super) fn drive(roads: &Roads, vehicles: &mut [Vehicle], at_s: f64, step_s: f64) {
+pub(super) fn drive(roads: &Roads, vehicles: &mut [MovingVehicle], at_s: f64, step_s: f64) {
     for number in 0..vehicles.len() {
         let ahead = ahead(roads, vehicles, number, at_s);
         let vehicle = &mut vehicles[number];
@@ -91,12 +92,12 @@ struct Ahead {
     limit_mps: f64,
 }
 
-fn ahead(roads: &Roads, vehicles: &[Vehicle], number: usize, at_s: f64) -> Ahead {
+fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) -> Ahead {
     let me = &vehicles[number];
     let remaining_m = roads.length_m(me.path) - me.along_m;
     let next = me.next(roads);
     let mut ahead = Ahead { gap_m: f64::INFINITY, speed_mps: 0.0, limit_mps: f64::INFINITY };
-    let mut mind = |distance_m: f64, other: &Vehicle| {
+    let mut mind = |distance_m: f64, other: &MovingVehicle| {
         let gap_m = distance_m - (me.length_m + other.length_m) / 2.0;
         if gap_m < ahead.gap_m {
             (ahead.gap_m, ahead.speed_mps) = (gap_m, other.speed_mps);
@@ -135,7 +136,7 @@ fn ahead(roads: &Roads, vehicles: &[Vehicle], number: usize, at_s: f64) -> Ahead
 }
 
 /// Whether nobody is on the crossing who would be in the way, and there is room behind it.
-fn is_free(vehicles: &[Vehicle], number: usize, crossing: Crossing, heading: Direction, to: Direction) -> bool {
+fn is_free(vehicles: &[MovingVehicle], number: usize, crossing: Crossing, heading: Direction, to: Direction) -> bool {
     let is_left = |from: Direction, to: Direction| (from + 1) % 4 == to % 4;
     vehicles.iter().enumerate().filter(|(place, _)| *place != number).all(|(_, other)| match other.path {
         Path::Turn { at, from, to: other_to } if at == crossing => {
@@ -149,7 +150,7 @@ fn is_free(vehicles: &[Vehicle], number: usize, crossing: Crossing, heading: Dir
     })
 }
 
-impl Vehicle {
+impl MovingVehicle {
     /// What it drives on after this.
     #[expect(clippy::expect_used, reason = "the grid of roads has no dead ends")]
     fn next(&self, roads: &Roads) -> Path {

@@ -30,7 +30,7 @@ const LURE_CHANCE: f64 = 0.35;
 const CONFUSED: f64 = 0.05;
 
 #[derive(Debug, Clone)]
-pub(super) struct Observer {
+pub(super) struct SimulatedSensor {
     offset: [Drift; 2],
     turn: Drift,
     /// By body.
@@ -87,7 +87,7 @@ fn share_of(log_odds: f64) -> f64 {
     1.0 / (1.0 + (-log_odds).exp())
 }
 
-impl Observer {
+impl SimulatedSensor {
     pub(super) fn new(bodies: usize, dice: &mut Dice<'_>) -> Self {
         let mut drift = || Drift::new(dice);
         Self {

@@ -80,16 +80,16 @@ impl TrackTruth {
     /// objects with a time or with objects.
     pub fn is_in(text: &str) -> bool {
         #[derive(Deserialize)]
-        struct Probe {
-            frames: Vec<FrameProbe>,
+        struct TruthKeys {
+            frames: Vec<FrameKeys>,
         }
         #[derive(Deserialize)]
-        struct FrameProbe {
+        struct FrameKeys {
             t_us: Option<IgnoredAny>,
             objects: Option<IgnoredAny>,
         }
-        let is_frame = |frame: &FrameProbe| frame.t_us.is_some() || frame.objects.is_some();
-        serde_json::from_str::<Probe>(trimmed(text))
+        let is_frame = |frame: &FrameKeys| frame.t_us.is_some() || frame.objects.is_some();
+        serde_json::from_str::<TruthKeys>(trimmed(text))
             .is_ok_and(|probe| probe.frames.is_empty() || probe.frames.iter().any(is_frame))
     }
 

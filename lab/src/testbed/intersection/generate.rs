@@ -16,7 +16,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::reports;
-use crate::testbed::{KnownObject, Recording};
+use crate::testbed::{IntersectionRecording, KnownObject};
 
 /// How far objects and vehicles are moved, in metres along each axis.
 const MOVED_M: RangeInclusive<f64> = -0.025..=0.025;
@@ -25,8 +25,8 @@ const TURNED_RAD: RangeInclusive<f64> = -0.03..=0.03;
 
 /// What a recording teaches about its detectors.
 #[derive(Debug, Clone)]
-pub struct Confusion<'a> {
-    recording: &'a Recording,
+pub struct ConfusionModel<'a> {
+    recording: &'a IntersectionRecording,
     /// By object, every vehicle's view of it.
     views: Vec<Vec<View>>,
     /// By vehicle and frame, what was found at no object.
@@ -46,9 +46,9 @@ struct Glimpse {
     bearing_error_rad: f64,
 }
 
-impl<'a> Confusion<'a> {
+impl<'a> ConfusionModel<'a> {
     /// Takes a recording apart by the locations that its detections are taken for.
-    pub fn of(recording: &'a Recording) -> Self {
+    pub fn of(recording: &'a IntersectionRecording) -> Self {
         let cavs = recording.cavs.len();
         let mut views = vec![vec![View::default(); cavs]; recording.objects.len()];
         let mut clutter: Vec<Vec<Vec<Detection>>> = vec![Vec::new(); cavs];
@@ -76,7 +76,7 @@ impl<'a> Confusion<'a> {
     }
 
     /// A scene of `frames` frames; equal seeds give equal scenes.
-    pub fn scene(&self, seed: u64, frames: usize) -> Recording {
+    pub fn scene(&self, seed: u64, frames: usize) -> IntersectionRecording {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut scene = self.recording.clone();
         let mut places: Vec<Point2<f64>> = scene.objects.iter().map(|object| object.position).collect();
@@ -92,7 +92,13 @@ impl<'a> Confusion<'a> {
         scene
     }
 
-    fn watch(&self, scene: &Recording, cav: usize, frames: usize, rng: &mut ChaCha8Rng) -> Vec<Vec<Detection>> {
+    fn watch(
+        &self,
+        scene: &IntersectionRecording,
+        cav: usize,
+        frames: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Vec<Vec<Detection>> {
         let (camera, pose) = (&scene.intrinsics, &scene.cavs[cav].pose);
         let mut chosen = Vec::new();
         for (object, views) in scene.objects.iter().zip(&self.views) {
@@ -119,8 +125,8 @@ fn sight(camera: &Intrinsics, pose: &Pose, object: &KnownObject) -> Option<(f64,
 }
 
 /// The object that a vehicle takes a detection for.
-fn object_of(recording: &Recording, cav: usize, detection: &Detection) -> Option<usize> {
-    let alone = Recording {
+fn object_of(recording: &IntersectionRecording, cav: usize, detection: &Detection) -> Option<usize> {
+    let alone = IntersectionRecording {
         cavs: vec![recording.cavs[cav].clone()],
         frames: vec![vec![vec![detection.clone()]]],
         ..recording.clone()
@@ -129,7 +135,7 @@ fn object_of(recording: &Recording, cav: usize, detection: &Detection) -> Option
     recording.objects.iter().position(|object| object.id == id)
 }
 
-fn glimpse(recording: &Recording, cav: usize, object: usize, detection: &Detection) -> Option<Glimpse> {
+fn glimpse(recording: &IntersectionRecording, cav: usize, object: usize, detection: &Detection) -> Option<Glimpse> {
     let (range_m, bearing_rad) = recording.cavs[cav].pose.range_bearing(&recording.objects[object].position);
     let forward_m = range_m * bearing_rad.cos();
     let found_rad = recording.intrinsics.bearing(detection.bounding_box.center().x);
