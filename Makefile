@@ -24,18 +24,18 @@ setup: ## install the system packages that are missing
 	fi
 
 demo: setup ## run a whole cell as separate processes on this machine and print what it saw
-	cargo build --release --locked --bin ecod-node
-	target/release/ecod-node demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
+	cargo build --release --locked --bin ecod-node --bin ecod-lab
+	$(BUILD)/release/ecod-lab demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
-	cargo build --release --locked --bin ecod-node
-	for setup in 1 2; do target/release/ecod-node testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
+	cargo build --release --locked --bin ecod-lab
+	for setup in 1 2; do $(BUILD)/release/ecod-lab testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
 	    --at-least 99.5 --occupied-at-least 99 --out target/testbed-setup$$setup.json || exit; done
-	target/release/ecod-node testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
+	$(BUILD)/release/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
 eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/algorithms.md
-	cargo build --release --locked --bin ecod-node
+	cargo build --release --locked --bin ecod-node --bin ecod-lab
 	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
 
@@ -47,6 +47,7 @@ eval-tracks-check: PACKAGES += python3-venv
 eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics from PyPI
 	packaging/check-eval-tracks
 
+# All programs are built before the first test: those of ecod-lab need ecod-node beside it.
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
 test: PACKAGES += mosquitto mosquitto-clients
 test: setup ## all tests

@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use ecod_actors::broker::read_login;
+use ecod_actors::transport::broker::read_login;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|sent: &[u8]| {

@@ -7,13 +7,13 @@
 use std::sync::LazyLock;
 
 use ecod::detection::detections_in;
-use ecod::eval::Truth;
-use ecod::eval::tracks::TrackTruth;
 use ecod::time::Timestamp;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::gateway::{Secret, Security};
-use ecod_actors::reputation_keeper::read_saved;
-use ecod_actors::vehicle_pose::read_pose;
+use ecod_actors::actors::reputation_keeper::read_saved;
+use ecod_actors::camera::vehicle_pose::read_pose;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::transport::mqtt::{Secret, Security};
+use ecod_lab::eval::Truth;
+use ecod_lab::eval::tracks::TrackTruth;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|input: &[u8]| {
@@ -40,5 +40,5 @@ static SIGNING: LazyLock<Security> = LazyLock::new(|| {
     let mut config = NodeConfig::default();
     config.mqtt.sign = true;
     config.membership.key = Some(Secret::new("01".repeat(32)));
-    Security::of(&config).expect("the key is a key")
+    config.security().expect("the key is a key")
 });

@@ -10,7 +10,7 @@ use tracing_subscriber::{EnvFilter, Layer, Registry};
 
 /// The form of the log.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
-pub(super) enum LogFormat {
+pub enum LogFormat {
     /// To the journal if it is connected; else text on a terminal and for tools, and JSON for nodes
     #[default]
     Auto,
@@ -27,7 +27,7 @@ const JOURNAL_PREFIX: &str = "ECOD";
 
 /// Starts the log. `runs_on` tells programs that work until they are told to stop, whose logs machines read, from tools.
 /// `RUST_LOG` goes before `level`.
-pub(super) fn start(format: LogFormat, runs_on: bool, level: &str) {
+pub fn start(format: LogFormat, runs_on: bool, level: &str) {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let (layer, problem) = match resolved(format, runs_on) {
         LogFormat::Journal => match journal() {

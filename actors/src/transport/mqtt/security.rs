@@ -59,7 +59,10 @@ impl Security {
     }
 
     /// How to speak TLS to a broker, for one connection; none where it is spoken to in plaintext.
-    pub(crate) fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
+    ///
+    /// # Errors
+    /// When the credentials can no longer be used.
+    pub fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self.external.as_ref().filter(|external| external.address == *broker) {
             Some(External { ca: Some(ca), .. }) => {
                 let current = self.credentials.as_ref().map(|credentials| credentials.current());
@@ -71,7 +74,7 @@ impl Security {
     }
 
     /// The payload as it travels on a topic: signed where the cell signs.
-    pub(crate) fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
+    pub fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
         match &self.signing {
             Some(key) => key.seal(topic, &payload),
             None => payload,
@@ -88,7 +91,7 @@ impl Security {
     }
 
     /// Bytes before a payload that travels.
-    pub(crate) fn envelope_bytes(&self) -> usize {
+    pub fn envelope_bytes(&self) -> usize {
         if self.signing.is_some() { ENVELOPE_BYTES } else { 0 }
     }
 }
