@@ -4,6 +4,7 @@ pub mod address;
 pub mod echo;
 pub mod election;
 pub mod health;
+pub mod ledger_resync;
 pub mod links;
 pub mod node;
 pub mod readiness;

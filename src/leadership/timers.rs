@@ -18,6 +18,7 @@
 //! | [`EPOCH_MEMORY`] | 3 s | above [`MAX_ROUND_AGE`] and [`SUCCESSOR_CREDIT`] | a forged epoch ends, a queued round does not return |
 //! | [`MAX_ROUND_AGE`] | 1 s | above [`MAX_ROUND_WAIT`] | the rest is the way itself |
 //! | [`MAX_ROUND_WAIT`] | 900 ms | above [`SUCCESSOR_CREDIT`] | a failover alone makes no round stale |
+//! | [`MAX_ADOPTED_MAP_AGE`] | 1 s | [`MAX_ROUND_AGE`] | a new leader goes on from maps that others may still accept |
 //! | [`LIVE_STREAM_TIME`] | 150 ms | above a round | at least two rounds prove a live stream |
 //! | [`FAREWELL_TIME`] | 1 s | not below [`MAX_ROUND_AGE`] | what receivers may accept a broker passes on |
 //! | [`LINK_LINGER`] | 2 s | above [`FAREWELL_TIME`] | the last round finds a link |
@@ -25,7 +26,7 @@
 //! | [`LOOK_TOLERANCE`] | 500 ms | above [`HEALTH_PERIOD`] | a late look on a busy machine is still time |
 //! | [`ANSWER_STEP`] times [`ANSWER_STEPS`] | 1 s | below [`PART_TIMEOUT`] | a hung part shows before its rounds do |
 //! | [`PART_TIMEOUT`] | 2 s and three rounds | above [`ECHO_TIMEOUT`] | a stalled broker is found by its missing echo |
-//! | [`READINESS_TIMEOUT`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part as long as two looks |
+//! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part as long as two looks |
 //! | [`ECHO_TIMEOUT`] | 800 ms | above [`MIN_UNANSWERED`] rounds | both conditions hold at about the same time |
 //! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::round::CONNECT_TIME`] | a planned handover waits for everybody |
 //! | [`LEDGER_TIMEOUT`] | 1 s | above [`VEHICLE_CONNECT_TIME`], below `handover` | a lost ledger delays a handover and does not end it |
@@ -46,6 +47,9 @@ pub const MAX_ROUND_AGE: Duration = Duration::from_secs(1);
 
 /// Maximum time that a round spent in queues. The shortest way itself is not known, only the time beyond it.
 pub const MAX_ROUND_WAIT: Duration = Duration::from_millis(900);
+
+/// Maximum age of the map whose objects a new leader goes on with.
+pub const MAX_ADOPTED_MAP_AGE: Duration = Duration::from_secs(1);
 
 /// Time for which rounds arrive no faster than they were made before their delay counts as that of a live stream.
 pub const LIVE_STREAM_TIME: Duration = Duration::from_millis(150);
@@ -81,8 +85,8 @@ pub const ANSWER_STEPS: usize = 10;
 /// Time without a round after which a fuser counts as broken; three round periods are added.
 pub const PART_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Time for which readiness waits for a part's answer.
-pub const READINESS_TIMEOUT: Duration = Duration::from_millis(500);
+/// Steps for which readiness waits for a part's answer.
+pub const READINESS_STEPS: usize = 5;
 
 /// Time without an echo after which a broker counts as stalled. Six busy loops on two processors delay a broker by some
 /// tens of milliseconds.
@@ -112,7 +116,7 @@ pub const DEPARTED_TIME: Duration = Duration::from_secs(5);
 /// Time for a restarted membership to find its members again.
 pub const REDISCOVERY_TIME: Duration = Duration::from_secs(2);
 
-/// Time for which a node that is about to lead waits for its term to be on disk.
+/// Time for which a node waits for its disk: for its term before it leads, for reputations before it publishes them.
 pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Least time between two transfers of all evidence to new leaders: leaders may seem to come and go fast.
@@ -234,7 +238,7 @@ mod tests {
             (HEALTH_PERIOD, LOOK_TOLERANCE, "a late look is still time"),
             (ANSWER_STEP * ANSWER_STEPS as u32, PART_TIMEOUT, "a hung part shows before its rounds do"),
             (ECHO_TIMEOUT, PART_TIMEOUT, "a missing echo shows first"),
-            (HEALTH_PERIOD, READINESS_TIMEOUT, "a page waits for two looks"),
+            (HEALTH_PERIOD, ANSWER_STEP * READINESS_STEPS as u32, "a page waits for two looks"),
             (MIN_UNANSWERED * round, ECHO_TIMEOUT, "both conditions hold at once"),
             (CONNECT_TIME, VEHICLE_CONNECT_TIME, "a planned handover waits for everybody"),
             (VEHICLE_CONNECT_TIME, LEDGER_TIMEOUT, "evidence has more time than links"),
@@ -250,6 +254,7 @@ mod tests {
             assert!(smaller < larger, "{why}: {smaller:?} is not below {larger:?}");
         }
         assert_eq!(SUCCESSOR_CREDIT, 2 * ELECTED_SILENCE);
+        assert_eq!(MAX_ADOPTED_MAP_AGE, MAX_ROUND_AGE);
         assert!(config.stable() > config.response_timeout(), "a candidate's trial outlasts a restart");
     }
 }
