@@ -72,7 +72,7 @@ pub struct Aggregator {
 
 impl Aggregator {
     /// An aggregator without evidence that does not lead; `config` is taken as valid.
-    pub fn standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
+    pub fn new_standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
         let is_tracking = config.tracks_objects(!landmarks.is_empty());
         let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
         let by_packets = vote.mode == VoteMode::Paper;
@@ -98,7 +98,7 @@ impl Aggregator {
 
     /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
     pub fn new(name: NodeName, epoch: u64, config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let mut aggregator = Self::standby(config, landmarks, now);
+        let mut aggregator = Self::new_standby(config, landmarks, now);
         aggregator.lead(Epoch::new(epoch, name), 1, FirstRound::OnTime, now);
         aggregator
     }
@@ -123,7 +123,7 @@ impl Aggregator {
     }
 
     /// Goes on as a standby.
-    pub fn stand_by(&mut self) {
+    pub fn step_down(&mut self) {
         self.leads = None;
     }
 

@@ -82,7 +82,7 @@ impl Vehicle {
             filter: RoundFilter::new(0),
             resync: LedgerResync::new(name.clone(), SHARES_PER_SNAPSHOT),
             tick_at: now + SHARE_PERIOD,
-            aggregator: Aggregator::standby(fusion, landmarks, now),
+            aggregator: Aggregator::new_standby(fusion, landmarks, now),
             ledger: ReputationLedger::default(),
             members: BTreeMap::new(),
             rounds_closed: 0,
@@ -219,7 +219,7 @@ impl Vehicle {
             Effect::StopPublishing { epoch } => {
                 self.news.push(format!("{epoch} stops"));
                 self.resync.step_down();
-                self.aggregator.stand_by();
+                self.aggregator.step_down();
             }
             Effect::SendSnapshot { .. } => self.share(self.resync.snapshot(&self.ledger)),
             Effect::Look => {

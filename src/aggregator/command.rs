@@ -32,8 +32,9 @@ pub enum Command {
     },
     /// [`Aggregator::hold`].
     Hold,
-    /// [`Aggregator::stand_by`].
-    StandBy,
+    /// [`Aggregator::step_down`].
+    #[serde(rename = "stand_by")]
+    StepDown,
     /// [`Aggregator::adopt`].
     Adopt {
         /// All evidence that is known.
@@ -61,7 +62,7 @@ impl Aggregator {
             Command::Tick => return self.tick(now),
             Command::Lead { epoch, first_round, first } => self.lead(epoch.clone(), *first_round, *first, now),
             Command::Hold => self.hold(),
-            Command::StandBy => self.stand_by(),
+            Command::StepDown => self.step_down(),
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::Resume { reputations } => self.resume(reputations),

@@ -96,7 +96,7 @@ impl Rerun {
         let at = entry.at_us;
         match &entry.event {
             JournalEvent::Start { ledger } => {
-                let mut aggregator = self.standby(at);
+                let mut aggregator = self.new_standby(at);
                 aggregator.adopt(ledger);
                 self.aggregator = Some(aggregator);
                 Vec::new()
@@ -139,8 +139,8 @@ impl Rerun {
         &self.summary
     }
 
-    fn standby(&self, at: Timestamp) -> Aggregator {
-        Aggregator::standby(self.fusion.clone(), self.landmarks.clone(), at)
+    fn new_standby(&self, at: Timestamp) -> Aggregator {
+        Aggregator::new_standby(self.fusion.clone(), self.landmarks.clone(), at)
     }
 
     /// The present run; one whose beginning is not in the journal began as a standby.
@@ -148,7 +148,7 @@ impl Rerun {
         if self.aggregator.is_none() {
             self.summary.continued = true;
         }
-        let fresh = self.aggregator.take().unwrap_or_else(|| self.standby(at));
+        let fresh = self.aggregator.take().unwrap_or_else(|| self.new_standby(at));
         self.aggregator.insert(fresh)
     }
 
