@@ -1,4 +1,4 @@
-//! Whose rounds a node accepts: the only place that decides it.
+//! Acceptance of rounds: the only place that decides whose rounds a node accepts.
 //!
 //! # Filters
 //!

@@ -35,7 +35,7 @@ impl AwakeClock {
         self.inside
     }
 
-    /// When `due` inside will be outside.
+    /// The time outside when it will be `due` inside.
     pub fn outside(&self, due: Timestamp) -> Timestamp {
         self.outside + due.since(self.inside)
     }

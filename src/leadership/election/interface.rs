@@ -45,7 +45,7 @@ pub enum ElectionInput {
         /// The round's number.
         round: u64,
     },
-    /// What [`ElectionEffect::Prepare`] asked for is done.
+    /// The preparation that [`ElectionEffect::Prepare`] asked for is complete.
     Prepared,
     /// The node is about to stop: a leader resigns, a follower tells its leader that it is no candidate any more.
     Leave,
@@ -92,7 +92,7 @@ pub enum ElectionEffect {
         epoch: Epoch,
         /// The number of the next round.
         first_round: u64,
-        /// When it is due.
+        /// Time at which it is due.
         first: FirstRound,
     },
     /// Let the present round last its whole length: the next one is the other's unless it stays away for a whole period.

@@ -17,11 +17,11 @@ pub(super) struct Leading {
     pub(super) since: Timestamp,
     /// The epoch that this one succeeded.
     pub(super) after: Option<Epoch>,
-    /// Who leads next, the standby first.
+    /// The next leaders, the standby first.
     pub(super) successors: Vec<NodeName>,
     /// The handover under way.
     pub(super) handover: Option<Handover>,
-    /// When to lead on in a higher epoch, as this one is refused by some.
+    /// Time at which to lead on in a higher epoch, as some refuse this one.
     renew_at: Option<Timestamp>,
     beat_at: Timestamp,
     beats: u64,

@@ -19,7 +19,7 @@ pub const MAX_MESSAGE_BYTES: usize = 1200;
 
 /// One message; may be lost, repeated, delayed and re-ordered on its way.
 ///
-/// Who sent it must be proven by the transport: the election believes [`Self::from`].
+/// The transport must prove the sender: the election believes [`Self::from`].
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct ElectionMessage {
     /// Major version of the message, [`wire::SCHEMA_VERSION`].
@@ -48,7 +48,7 @@ pub struct ElectionMessage {
     /// Whether the sender lately heard the addressee: links may work one way only.
     #[n(6)]
     pub hears_you: bool,
-    /// What it says.
+    /// Its content.
     #[n(7)]
     pub body: Body,
 }
@@ -130,7 +130,7 @@ pub enum Body {
     /// "I lead": the leader's sign of life.
     #[n(3)]
     Beat {
-        /// When the addressee gets the next one, in ms.
+        /// Time until the addressee gets the next one, in ms.
         #[n(0)]
         every_ms: u64,
         /// The round published last.
@@ -143,7 +143,7 @@ pub enum Body {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[n(3)]
         after: Option<Epoch>,
-        /// Who leads next, the standby first; at most [`MAX_SUCCESSORS`].
+        /// The next leaders, the standby first; at most [`MAX_SUCCESSORS`].
         #[n(4)]
         successors: Vec<NodeName>,
     },

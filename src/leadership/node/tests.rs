@@ -1,4 +1,4 @@
-//! What the actors are told to do, and when.
+//! Effects of a node's leadership, and their order.
 
 use super::*;
 use crate::leadership::election::{Body, Candidacy, ElectionConfig, ElectionMessage};
