@@ -155,3 +155,14 @@ fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
         .spawn()
         .with_context(|| format!("cannot start {}", program.display()))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_without_a_node_beside_it_says_how_to_get_one() {
+        let error = node_beside(Path::new("/no/such/ecod-lab")).unwrap_err().to_string();
+        assert!(error.contains("/no/such/ecod-node") && error.contains("--bin ecod-node`"), "{error}");
+    }
+}
