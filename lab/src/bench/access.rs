@@ -1,4 +1,4 @@
-//! How the simulated clients get into a broker.
+//! Access of the simulated clients to a broker.
 
 use ecod_actors::config::NodeConfig;
 use ecod_actors::gateway::{BrokerAddress, Security};
