@@ -1,4 +1,4 @@
-//! What an idle cell's membership costs: packets and processor time of each node, all in this one process.
+//! Costs of an idle cell's membership: packets and processor time of each node, all in this one process.
 //!
 //! The goals are 60 packets/s and 1.5 % of a core. `NODES` (32) nodes gossip on loopback without multicast for
 //! `SECONDS` (10), after they have all met.

@@ -1,4 +1,4 @@
-//! How the simulated clients get into a broker.
+//! Access of the simulated clients to a broker.
 
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::transport::mqtt::{BrokerAddress, Security};

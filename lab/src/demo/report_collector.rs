@@ -56,7 +56,7 @@ impl ReportCollector {
         Ok(Self { gateway, ended, seen })
     }
 
-    /// How many vehicles have reported.
+    /// Number of vehicles that have reported.
     pub(super) fn reporters(&self) -> usize {
         lock(&self.seen).reports.iter().map(|observed| observed.report.node.clone()).collect::<BTreeSet<_>>().len()
     }
@@ -66,7 +66,7 @@ impl ReportCollector {
         lock(&self.seen).leader.clone()
     }
 
-    /// How many reports have come.
+    /// Number of reports received.
     pub(super) fn reports(&self) -> usize {
         lock(&self.seen).reports.len()
     }

@@ -1,4 +1,4 @@
-//! What the vehicles said, without fusion: the baselines.
+//! Baselines: the vehicles' votes without fusion.
 
 use std::collections::BTreeMap;
 

@@ -58,19 +58,19 @@ const SIZES: [(&str, f64, f64); 16] = [
 const ANY_HEIGHT_M: f64 = 0.11;
 /// Which location an object of known size is taken for.
 const GATE: Gate = Gate { radius_m: 0.5, sigmas: 3.0, floor_m: 0.02 };
-/// How far in radians an object of unknown size may be beside a location that it is taken for.
+/// Greatest angle in radians between an object of unknown size and the location that it is taken for.
 const MAX_BESIDE_RAD: f64 = 0.15;
 /// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.
 const MAX_HEIGHT_FACTOR: f64 = 5.0;
 
-/// What came of a recording.
+/// Result of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct IntersectionResult {
     /// The scene's name.
     pub name: String,
-    /// How many scenes it is the mean of: 1 for a recording.
+    /// Number of scenes that it is the mean of: 1 for a recording.
     pub scenes: u64,
-    /// How many verdicts were judged: one for every object and frame.
+    /// Number of verdicts that were judged: one for every object and frame.
     pub verdicts: u64,
     /// Right verdicts in percent, default mode.
     pub vote_accuracy_pct: f64,
@@ -94,7 +94,7 @@ pub struct FrameLabel {
     pub landmark: LandmarkId,
     /// The verdict; null for none.
     pub label: Option<Label>,
-    /// Whether it is among the accepted labels.
+    /// True if it is among the accepted labels.
     pub right: bool,
 }
 
@@ -143,7 +143,7 @@ impl IntersectionResult {
     }
 }
 
-/// What the vehicles would have published, in order of arrival.
+/// Reports that the vehicles would have published, in order of arrival.
 pub fn reports(recording: &IntersectionRecording) -> Vec<ObjectReport> {
     let landmarks = Arc::new(LandmarkIndex::new(recording.landmarks(), GATE.radius_m));
     let mut vehicles: Vec<Perception> =

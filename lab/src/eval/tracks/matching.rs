@@ -13,11 +13,11 @@ use super::{Frame, SaidObject, TrueObject};
 pub(super) struct Pair {
     pub(super) truth: usize,
     pub(super) said: usize,
-    /// What the pair is worth, or how far it is apart.
+    /// Similarity of the pair, or its distance.
     pub(super) value: f64,
 }
 
-/// Whether one may be taken for the other, and the distance in metres if so.
+/// Distance in metres if one may be taken for the other.
 pub(super) fn distance_m(truth: &TrueObject, said: &SaidObject, limit_m: f64) -> Option<f64> {
     let distance_m = (truth.position - said.position).norm();
     (distance_m <= limit_m && truth.label == said.label).then_some(distance_m)
