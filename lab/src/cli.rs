@@ -4,7 +4,6 @@ mod bench;
 mod columns;
 mod demo;
 mod eval;
-mod intersection;
 mod report;
 mod testbed;
 

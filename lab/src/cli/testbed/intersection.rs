@@ -7,9 +7,9 @@ use ecod::names::Label;
 use ecod_actors::cli::{Failure, print};
 use tracing::subscriber::NoSubscriber;
 
-use super::columns::columns;
-use super::testbed::{Results, TestbedArguments, check_writable};
-use super::write_json;
+use super::{Results, TestbedArguments, check_writable};
+use crate::cli::columns::columns;
+use crate::cli::write_json;
 use crate::report::tracks::percent;
 use crate::testbed::IntersectionRecording;
 use crate::testbed::intersection::generate::ConfusionModel;
