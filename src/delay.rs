@@ -8,7 +8,7 @@ use crate::time::Timestamp;
 ///
 /// The least delay of a one-way stream is the clock offset plus the shortest transit, so later arrivals stand out by
 /// their queueing alone (Moon, Skelly, Towsley, "Estimation and removal of clock skew", INFOCOM 1999).
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct MinimumDelay {
     span_start: Timestamp,
     current_us: i64,

@@ -12,10 +12,10 @@ pub mod camera;
 pub mod config;
 pub mod delay;
 pub mod detection;
-pub mod election;
 pub mod epoch;
 pub mod geometry;
 pub mod landmark;
+pub mod leadership;
 pub mod motion;
 pub mod names;
 pub mod pace;
@@ -29,3 +29,5 @@ pub mod view;
 pub mod vote;
 pub mod window;
 pub mod wire;
+
+pub use leadership::election;

@@ -332,7 +332,7 @@ pub struct LedgerMark {
 }
 
 /// A node's own word about itself; the broker publishes the last will when the node goes silent.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct NodeStatus {
     /// Major version of the payload, [`SCHEMA_VERSION`].
     #[n(0)]

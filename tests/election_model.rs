@@ -7,8 +7,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::epoch::{Epoch, EpochGate};
+use ecod::leadership::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::Role;

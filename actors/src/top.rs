@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::Leadership;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{Reputations, Role, Verdicts};
@@ -13,7 +14,6 @@ use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
-use crate::messages::leadership::Leadership;
 use crate::messages::newest::{Received, ReceivedMap};
 use crate::node::NodeHandle;
 use crate::node::config::NodeConfig;
@@ -240,12 +240,12 @@ fn span(time: Duration) -> String {
 mod tests {
     use std::sync::Arc;
 
+    use ecod::leadership::Position;
     use ecod::wire::{GlobalMap, LandmarkState, SCHEMA_VERSION};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
     use super::*;
-    use crate::messages::leadership::Position;
     use crate::telemetry::counters::{Counters, ShedReason};
 
     fn name(text: &str) -> NodeName {

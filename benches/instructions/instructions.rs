@@ -5,8 +5,8 @@
 use std::hint::black_box;
 
 use ecod::detection::Detection;
-use ecod::election::{Effect, Election, Input};
 use ecod::geometry::Pose;
+use ecod::leadership::election::{Effect, Election, Input};
 use ecod::names::NodeName;
 use ecod::pace::Pace;
 use ecod::projection::Projection;

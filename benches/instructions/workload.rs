@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use ecod::camera::Intrinsics;
 use ecod::detection::{BoundingBox, Detection};
-use ecod::election::{Body, Election, ElectionConfig, ElectionMessage, Health, Input, Standing};
 use ecod::epoch::Epoch;
 use ecod::geometry::Pose;
 use ecod::landmark::{Landmark, LandmarkIndex};
+use ecod::leadership::election::{Body, Candidacy, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::names::NodeName;
 use ecod::pace::{Pace, PaceConfig};
 use ecod::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
@@ -102,7 +102,7 @@ fn beat(seq: u64) -> Input {
         from: edge.clone(),
         run: NOON.micros(),
         seq,
-        standing: Standing { role: Role::Edge, priority: 100, load: 1, fit: true },
+        candidacy: Candidacy { role: Role::Edge, priority: 100, load: 1, fit: true },
         term: 1,
         epoch: Some(Epoch::new(1, edge)),
         hears_you: true,

@@ -16,8 +16,8 @@ use std::time::Duration;
 
 use anyhow::ensure;
 use ecod::aggregator::FusionConfig;
-use ecod::election::Input;
 use ecod::landmark::{Landmark, LandmarkConfig};
+use ecod::leadership::election::Input;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{ObjectReport, PerceivedObject};

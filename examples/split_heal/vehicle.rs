@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
-use ecod::election::{Body, Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::epoch::{Epoch, EpochGate};
 use ecod::landmark::Landmark;
+use ecod::leadership::election::{Body, Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
 use ecod::names::NodeName;
 use ecod::reputation::ReputationLedger;
 use ecod::time::Timestamp;

@@ -10,7 +10,7 @@ mod world;
 use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use ecod::election::ElectionConfig;
+use ecod::leadership::election::ElectionConfig;
 use ecod::wire::Role;
 use node::Fault;
 use random::Random;
@@ -197,13 +197,13 @@ fn a_standby_that_is_gone_is_not_named() {
                 world.run_for(9 * SECOND);
                 let leader = world.leaders()[0];
                 let standby = |world: &World, of: usize| {
-                    let named = world.nodes[of].election.as_ref()?.standby()?.clone();
+                    let named = world.nodes[of].standby()?.clone();
                     world.nodes.iter().position(|node| node.name == named)
                 };
                 let Some(gone) = standby(world, leader) else { return Ok(()) };
                 world.plan(0, fault(gone));
                 world.run_for(MS);
-                while is_unseen && world.nodes[leader].known.contains(&gone) {
+                while is_unseen && world.nodes[leader].known.contains_key(&gone) {
                     world.run_for(10 * MS);
                 }
                 world.run_for(patience);
@@ -257,7 +257,7 @@ fn failover_gap(seed: u64, seen: bool, victims: usize) -> Option<u64> {
         let (leader, changes, from) = (world.leaders()[0], world.led.len(), world.now);
         world.plan(0, Fault::Kill { node: leader, seen });
         if victims > 1 {
-            let standby = world.nodes[leader].election.as_ref().and_then(|election| election.standby().cloned());
+            let standby = world.nodes[leader].standby().cloned();
             let standby = world.nodes.iter().position(|node| Some(&node.name) == standby.as_ref());
             world.plan(0, Fault::Kill { node: standby.ok_or("no standby")?, seen });
         }

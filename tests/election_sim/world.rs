@@ -1,22 +1,31 @@
 //! A cell in simulated time: nodes, links that lose, delay, repeat and cut, and a data plane that carries rounds.
+//!
+//! Each node runs the machines that a real one does, and carries out their effects as the actors do.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
-use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
-use ecod::epoch::{Epoch, EpochGate};
+use ecod::epoch::Epoch;
+use ecod::leadership::Position;
+use ecod::leadership::election::{ElectionConfig, ElectionMessage};
+use ecod::leadership::links::{LinkState, WantedLinks};
+use ecod::leadership::node::{Effect, Input, Member};
 use ecod::names::NodeName;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::wire::{Encoding, Role};
+use ecod::wire::{Encoding, GlobalMap, Role, SCHEMA_VERSION};
 
-use crate::node::{Accepted, Event, Fault, News, Node};
+use crate::node::{Accepted, Event, Fault, Map, Node, address_of, broker_of};
 use crate::random::Random;
 
 /// Microseconds in a millisecond.
 pub(crate) const MS: u64 = 1000;
-/// All parts work.
-pub(crate) const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 10 };
+
+/// Start of the simulation, in Unix microseconds.
+const START: u64 = 1_732_154_400_000_000;
+
+/// Processor load of every node, in percent.
+const LOAD: u8 = 10;
 
 /// The cell and everything under way in it.
 pub(crate) struct World {
@@ -41,7 +50,7 @@ impl World {
     pub(crate) fn new(seed: u64, configs: Vec<ElectionConfig>) -> Self {
         let nodes = configs.into_iter().enumerate().map(|(index, config)| Node::new(index, config)).collect();
         let mut world = Self {
-            now: 1_732_154_400_000_000,
+            now: START,
             nodes,
             random: Random::new(seed),
             led: Vec::new(),
@@ -76,7 +85,7 @@ impl World {
     }
 
     pub(crate) fn alive(&self) -> impl Iterator<Item = (usize, &Node)> {
-        self.nodes.iter().enumerate().filter(|(_, node)| node.election.is_some())
+        self.nodes.iter().enumerate().filter(|(_, node)| node.machine.is_some())
     }
 
     pub(crate) fn leaders(&self) -> Vec<usize> {
@@ -109,12 +118,14 @@ impl World {
             Event::Packet { to, life, .. }
             | Event::Map { to, life, .. }
             | Event::Tell { to, life, .. }
-            | Event::Prepared { to, life }
+            | Event::Connect { to, life, .. }
+            | Event::Refused { to, life, .. }
+            | Event::Answered { to, life }
             | Event::Broker { to, life, .. }
             | Event::Timer { to, life, .. }
             | Event::Publish { to, life, .. } => {
                 let node = &mut self.nodes[to];
-                if node.life != life || node.election.is_none() {
+                if node.life != life || node.machine.is_none() {
                     return;
                 }
                 if node.paused_until > self.now {
@@ -128,38 +139,44 @@ impl World {
 
     fn reach(&mut self, to: usize, event: Event) {
         match event {
-            Event::Packet { bytes, .. } => {
+            Event::Packet { from, bytes, .. } => {
                 let message = ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
-                self.handle(to, Input::Receive { message });
+                let from = self.nodes[from].name.clone();
+                self.handle(to, Input::Receive { from, message });
             }
-            Event::Map { epoch, round, .. } => self.accept(to, &epoch, round),
-            Event::Tell { about, news, .. } => {
-                let peer = self.nodes[about].name.clone();
-                self.handle(
-                    to,
-                    match news {
-                        News::Alive => Input::PeerAlive { peer },
-                        News::Down => Input::PeerDown { peer },
-                        News::Gone => Input::PeerGone { peer },
-                    },
-                );
+            Event::Map { map, .. } => self.accept(to, &map),
+            Event::Tell { about, about_life, is_there: true, .. } => {
+                self.nodes[to].members.insert(about, about_life);
+                self.handle(to, Input::MemberAlive { member: self.member(about, about_life) });
             }
-            Event::Prepared { .. } => self.handle(to, Input::Prepared),
+            Event::Tell { about, .. } => {
+                self.nodes[to].members.remove(&about);
+                self.handle(to, Input::MemberDown { name: self.nodes[about].name.clone() });
+            }
+            Event::Connect { broker, .. } => self.connect(to, broker),
+            Event::Refused { broker, .. } => {
+                if self.nodes[to].links.contains_key(&broker) {
+                    self.set_link(to, broker, LinkState::Down);
+                    self.set_link(to, broker, LinkState::Refused);
+                    self.plan_connect(to, broker, 80 * MS);
+                }
+            }
+            Event::Answered { .. } => self.handle(to, Input::PartsAnswered { sample: self.nodes[to].sample() }),
             Event::Broker { works, .. } => {
-                self.handle(to, Input::Health { health: Health { broker: works, ..FIT } });
+                self.nodes[to].broker_works = works;
+                if !works && self.nodes[to].links.contains_key(&to) {
+                    self.set_link(to, to, LinkState::Down);
+                }
+                self.plan_connect(to, to, 0);
             }
-            Event::Timer { armed, .. } if armed == self.nodes[to].armed => {
-                let now = self.clock_of(to);
-                let effects = self.nodes[to].election.as_mut().map(|election| election.tick(now));
-                self.carry_out(to, effects.unwrap_or_default());
-            }
+            Event::Timer { armed, .. } if armed == self.nodes[to].armed => self.handle(to, Input::Wake),
             Event::Publish { term, .. } => self.publish(to, term),
             Event::Timer { .. } | Event::Resume { .. } | Event::Gossip | Event::Fault(_) => {}
         }
     }
 
     fn strike(&mut self, fault: &Fault) {
-        self.history.push(format!("{:>10} µs {fault:?}", self.now - 1_732_154_400_000_000));
+        self.history.push(format!("{:>10} µs {fault:?}", self.now - START));
         match *fault {
             Fault::Start(index) => self.start(index),
             Fault::Kill { node, seen } => self.kill(node, seen),
@@ -185,59 +202,88 @@ impl World {
     }
 
     fn start(&mut self, index: usize) {
-        if self.nodes[index].election.is_some() {
+        if self.nodes[index].machine.is_some() {
             return;
         }
-        let now = self.clock_of(index);
-        let node = &mut self.nodes[index];
-        node.life += 1;
-        node.known.clear();
-        node.paused_until = 0;
-        let election = Election::new(node.config.clone(), node.name.clone(), node.persisted, now);
-        node.gate = EpochGate::new(election.floor());
-        node.election = Some(election);
-        let life = node.life;
-        self.arm(index);
-        // A node is met by others before it has found its own parts fit.
-        let after = self.random.between(5 * MS, 300 * MS);
-        self.push(after, Event::Broker { to: index, life, works: true });
+        self.nodes[index].start(self.now);
+        self.handle(index, Input::OwnBroker { address: Some(broker_of(index)) });
+        for to in 0..self.nodes.len() {
+            if to != index && self.nodes[to].links.contains_key(&index) {
+                self.plan_connect(to, index, 0);
+            }
+        }
     }
 
     fn kill(&mut self, index: usize, seen: bool) {
         let node = &mut self.nodes[index];
-        node.election = None;
+        node.machine = None;
         node.publishing = None;
         node.waiting.clear();
         if seen {
             for to in 0..self.nodes.len() {
-                if self.linked(to, index) {
+                if self.linked(to, index) && self.nodes[to].links.get(&index) == Some(&LinkState::Up) {
                     let (life, after) = (self.nodes[to].life, self.random.between(MS, 6 * MS));
-                    self.push(after, Event::Tell { to, life, about: index, news: News::Gone });
+                    self.push(after, Event::Refused { to, life, broker: index });
                 }
             }
         }
+    }
+
+    /// Makes the links what the machine wants.
+    fn set_links(&mut self, index: usize, wanted: &WantedLinks) {
+        let is_wanted = |broker: &usize| wanted.brokers.contains(&address_of(*broker));
+        self.nodes[index].links.retain(|broker, _| is_wanted(broker));
+        for broker in (0..self.nodes.len()).filter(is_wanted) {
+            if !self.nodes[index].links.contains_key(&broker) {
+                self.nodes[index].links.insert(broker, LinkState::Down);
+                self.plan_connect(index, broker, 0);
+            }
+        }
+    }
+
+    fn plan_connect(&mut self, to: usize, broker: usize, pause: u64) {
+        let (life, after) = (self.nodes[to].life, pause + self.random.between(MS, 20 * MS));
+        self.push(after, Event::Connect { to, life, broker });
+    }
+
+    /// Tries to connect, and goes on trying.
+    fn connect(&mut self, to: usize, broker: usize) {
+        let Some(state) = self.nodes[to].links.get(&broker) else { return };
+        let there = &self.nodes[broker];
+        let serves = there.machine.is_some() && there.broker_works && there.paused_until <= self.now;
+        if serves && self.linked(to, broker) {
+            self.set_link(to, broker, LinkState::Up);
+        } else if *state != LinkState::Up {
+            self.plan_connect(to, broker, 80 * MS);
+        }
+    }
+
+    fn set_link(&mut self, to: usize, broker: usize, state: LinkState) {
+        self.nodes[to].links.insert(broker, state);
+        self.handle(to, Input::LinkChanged { broker: address_of(broker), state });
     }
 
     /// What a membership would find out, a while later and node by node.
     fn gossip(&mut self) {
         for to in 0..self.nodes.len() {
             for about in 0..self.nodes.len() {
-                let there = self.nodes[about].election.is_some()
+                let is_there = self.nodes[about].machine.is_some()
                     && self.nodes[about].paused_until < self.now + 300 * MS
                     && self.linked(to, about);
-                let known = self.nodes[to].known.contains(&about);
-                if to == about || there == known || self.nodes[to].election.is_none() || self.random.chance(50) {
+                let about_life = self.nodes[about].life;
+                let known = self.nodes[to].known.get(&about);
+                let is_news = if is_there { known != Some(&about_life) } else { known.is_some() };
+                if to == about || !is_news || self.nodes[to].machine.is_none() || self.random.chance(50) {
                     continue;
                 }
                 let (life, after) = (self.nodes[to].life, self.random.between(20 * MS, 300 * MS));
                 let node = &mut self.nodes[to];
-                let news = if there { News::Alive } else { News::Down };
-                if there {
-                    node.known.insert(about)
+                if is_there {
+                    node.known.insert(about, about_life);
                 } else {
-                    node.known.remove(&about)
-                };
-                self.push(after, Event::Tell { to, life, about, news });
+                    node.known.remove(&about);
+                }
+                self.push(after, Event::Tell { to, life, about, about_life, is_there });
             }
         }
         self.push(100 * MS, Event::Gossip);
@@ -257,48 +303,68 @@ impl World {
         Timestamp(self.now).shifted(self.nodes[index].clock)
     }
 
-    fn handle(&mut self, to: usize, input: Input) {
-        let now = self.clock_of(to);
-        if let Some(election) = &mut self.nodes[to].election {
-            let effects = election.handle(input, now);
-            self.carry_out(to, effects);
-        }
+    fn member(&self, about: usize, run: u64) -> Member {
+        let name = self.nodes[about].name.clone();
+        Member { name, run, broker: Some(address_of(about)), is_on_this_machine: false }
     }
 
-    fn carry_out(&mut self, index: usize, effects: impl IntoIterator<Item = Effect>) {
-        let life = self.nodes[index].life;
-        for effect in effects {
-            match effect {
-                Effect::PersistTerm { term } => self.nodes[index].persisted = term,
-                Effect::Send { to, message } => self.send(index, &to, &message),
-                Effect::Lead { epoch, first_round, first } => {
-                    assert!(epoch.term <= self.nodes[index].persisted, "led in a term that is not on disk");
-                    let owner = self.owners.insert(epoch.clone(), (index, life));
-                    assert_eq!(owner, None, "two leaderships share {epoch}");
-                    self.led.push((self.now, epoch.clone()));
-                    self.history.push(format!("{:>10} µs {epoch} leads", self.now - 1_732_154_400_000_000));
-                    self.begin_to_publish(index, epoch, first_round, first);
-                }
-                Effect::StopPublishing { .. } => self.nodes[index].publishing = None,
-                Effect::Follow { epoch, .. } => {
-                    assert!(self.nodes[index].publishing.is_none(), "follows {epoch} and still publishes");
-                }
-                Effect::Prepare { .. } => {
-                    let after = self.random.between(5 * MS, 120 * MS);
-                    self.push(after, Event::Prepared { to: index, life });
-                }
-                Effect::Seek | Effect::AnnounceStandby { .. } | Effect::SendState { .. } => {}
+    /// Hands in what happened and carries out what comes of it, as the actors do.
+    fn handle(&mut self, index: usize, input: Input) {
+        let mut inputs = VecDeque::from([input]);
+        while let Some(input) = inputs.pop_front() {
+            let now = self.clock_of(index);
+            let Some(machine) = &mut self.nodes[index].machine else { return };
+            for effect in machine.handle(input, now) {
+                inputs.extend(self.carry_out(index, effect));
             }
         }
         self.arm(index);
+    }
+
+    /// Does what the machine wants; returns what it is to be told at once.
+    fn carry_out(&mut self, index: usize, effect: Effect) -> Option<Input> {
+        let life = self.nodes[index].life;
+        match effect {
+            Effect::PersistTerm { term } => self.nodes[index].persisted = term,
+            Effect::Send { to, message } => self.send(index, &to, &message),
+            Effect::TellLeadership { leadership } => {
+                let follows = matches!(leadership.position, Position::Following | Position::StandingBy);
+                assert!(!follows || self.nodes[index].publishing.is_none(), "follows and still publishes");
+                self.nodes[index].leadership = leadership;
+            }
+            Effect::Lead { epoch, first_round, first } => {
+                assert!(epoch.term <= self.nodes[index].persisted, "led in a term that is not on disk");
+                assert!(self.nodes[index].leadership.is_leading(), "leads before it is told");
+                let owner = self.owners.insert(epoch.clone(), (index, life));
+                assert_eq!(owner, None, "two leaderships share {epoch}");
+                self.led.push((self.now, epoch.clone()));
+                self.history.push(format!("{:>10} µs {epoch} leads", self.now - START));
+                self.begin_to_publish(index, epoch, first_round, first);
+            }
+            Effect::HoldRound => self.nodes[index].rounds.hold(),
+            Effect::StopPublishing { .. } => self.nodes[index].publishing = None,
+            Effect::SetLinks { links } => self.set_links(index, &links),
+            Effect::Look => {
+                let node = &self.nodes[index];
+                let members = node.members.iter().map(|(about, run)| self.member(*about, *run)).collect();
+                let rounds_closed = node.rounds_closed(self.now);
+                return Some(Input::Looked { rounds_closed, load_percent: LOAD, members });
+            }
+            Effect::AskParts => {
+                let after = self.random.between(MS, 20 * MS);
+                self.push(after, Event::Answered { to: index, life });
+            }
+            Effect::PublishStatus { .. } | Effect::SendSnapshot { .. } | Effect::Log { .. } => {}
+        }
+        None
     }
 
     fn arm(&mut self, index: usize) {
         let now = self.clock_of(index);
         let late = self.random.between(0, self.lateness);
         let node = &mut self.nodes[index];
-        let Some(election) = &node.election else { return };
-        let after = election.next_deadline().since(now).as_micros() as u64 + late;
+        let Some(machine) = &node.machine else { return };
+        let after = machine.next_deadline().since(now).as_micros() as u64 + late;
         node.armed += 1;
         let event = Event::Timer { to: index, life: node.life, armed: node.armed };
         self.push(after, event);
@@ -315,7 +381,7 @@ impl World {
         let copies = if self.random.chance(self.loss_percent / 4) { 2 } else { 1 };
         for _ in 0..copies {
             let (life, after) = (self.nodes[to].life, self.random.between(200, 3 * MS));
-            self.push(after, Event::Packet { to, life, bytes: bytes.clone() });
+            self.push(after, Event::Packet { from, to, life, bytes: bytes.clone() });
         }
     }
 
@@ -339,7 +405,7 @@ impl World {
         if epoch.term != term {
             return;
         }
-        let (epoch, round) = (epoch.clone(), *next);
+        let map = Map { epoch: epoch.clone(), round: *next, fused_at: Timestamp(self.now).shifted(node.steady_clock) };
         *next += 1;
         node.rounds.tick(Timestamp(self.now));
         self.plan_round(index, term);
@@ -347,31 +413,34 @@ impl World {
             if to != index && self.linked(index, to) {
                 let retry = if self.random.chance(self.loss_percent) { 30 * MS } else { 0 };
                 let (life, after) = (self.nodes[to].life, retry + self.random.between(300, 3 * MS));
-                self.push(after, Event::Map { to, life, epoch: epoch.clone(), round });
+                self.push(after, Event::Map { to, life, map: map.clone() });
             }
         }
-        self.accept(index, &epoch, round);
+        self.accept(index, &map);
     }
 
-    fn accept(&mut self, to: usize, epoch: &Epoch, round: u64) {
-        let now = self.now;
+    fn accept(&mut self, to: usize, map: &Map) {
         let node = &mut self.nodes[to];
-        let is_elected = node.election.as_ref().and_then(Election::epoch) == Some(epoch);
-        if node.gate.admit(epoch, round).is_err() {
-            node.stale_refused += 1;
-            // As the gate of a real node: the elected is not refused for ever.
-            let since = is_elected.then(|| *node.elected_refused_since.get_or_insert(now));
-            if since.is_none_or(|since| now - since < 500 * MS) {
-                return;
-            }
-            node.gate = EpochGate::default();
-            node.gate.admit(epoch, round).expect("the first");
-        }
-        node.accepted.push(Accepted { at: now, round });
-        // As in a real node: rounds of others prove nothing.
-        if is_elected {
-            node.elected_refused_since = None;
-            self.handle(to, Input::Round { epoch: epoch.clone(), round });
+        let received_at = Timestamp(self.now).shifted(node.steady_clock);
+        let Map { epoch, round, fused_at } = map.clone();
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader,
+            epoch: epoch.term,
+            round,
+            fused_at_us: fused_at,
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+            pose_corrections: Default::default(),
+        };
+        let Ok(accepted) = node.filter.accept_map(&map, received_at, &node.leadership) else {
+            node.refused += 1;
+            return;
+        };
+        node.accepted.push(Accepted { at: self.now, round });
+        if accepted.is_sign_of_life {
+            self.handle(to, Input::RoundAccepted { epoch: accepted.epoch, round });
         }
     }
 }

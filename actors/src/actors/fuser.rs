@@ -15,17 +15,16 @@ mod intake;
 mod tests;
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use ecod::aggregator::{Aggregator, Command, Fused};
 use ecod::epoch::Epoch;
+use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::replay::JournalEvent;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
 use ecod::tracks::TracksLosses;
 use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
-use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 pub use intake::{Intake, Put};
@@ -42,8 +41,6 @@ use crate::transport::mqtt::{Delivery, Incoming};
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
-    /// The highest term that the election knows.
-    pub term: watch::Receiver<u64>,
     /// Where vehicles' reports wait.
     pub intake: Intake,
     /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
@@ -58,9 +55,6 @@ pub struct FuserArguments {
     pub counters: Arc<Counters>,
 }
 
-/// How old a map may be whose objects a new leader goes on with.
-const FRESH_MAP: Duration = Duration::from_secs(1);
-
 /// Drives an [`Aggregator`] with the clock and the gateway.
 #[derive(Debug, Default)]
 pub struct Fuser;
@@ -68,7 +62,6 @@ pub struct Fuser;
 /// The aggregator and its alarm.
 pub struct FuserState {
     aggregator: Aggregator,
-    term: watch::Receiver<u64>,
     intake: Intake,
     recording: Recording,
     gateway: ActorSlot<GatewayMessage>,
@@ -120,7 +113,7 @@ impl Actor for Fuser {
             }
             FuserMessage::StopPublishing => {
                 state.command(Command::StandBy);
-                state.keeper.send(ReputationKeeperMessage::StandBy);
+                state.keeper.send(ReputationKeeperMessage::StepDown);
             }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
@@ -133,10 +126,9 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
-        let FuserArguments { aggregator, term, intake, newest, recording, gateway, keeper, counters } = arguments;
+        let FuserArguments { aggregator, intake, newest, recording, gateway, keeper, counters } = arguments;
         Self {
             aggregator,
-            term,
             intake,
             recording,
             gateway,
@@ -168,10 +160,9 @@ impl FuserState {
         }
     }
 
-    /// Keeps the map that was admitted last. While nobody is known to lead, the gate admits any epoch: one that the
-    /// election does not know is nobody's to go on from.
+    /// Keeps the map that was accepted last, to go on from it when this node leads.
     fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
-        if self.aggregator.leads().is_none() && map.epoch <= *self.term.borrow() {
+        if self.aggregator.leads().is_none() {
             self.last_map = Some((map, received_at));
         }
     }
@@ -180,7 +171,7 @@ impl FuserState {
         self.keeper
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
         if let Some((map, received_at)) = self.last_map.take()
-            && clock::now().since(received_at) < FRESH_MAP
+            && clock::now().since(received_at) < MAX_ADOPTED_MAP_AGE
         {
             self.command(Command::AdoptMap { map, received_at });
         }

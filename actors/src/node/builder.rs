@@ -1,12 +1,14 @@
 //! How the parts of a node are made, connected, started and stopped.
 
 mod arguments;
-mod elected;
 
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use ecod::leadership::Leadership;
+use ecod::leadership::node::Input;
+use ecod::leadership::round_filter::PublisherFilter;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::vote::VoteMode;
@@ -32,7 +34,6 @@ use crate::actors::reputation_keeper::{ReputationKeeper, SharedBook};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
-use crate::messages::leadership::Leadership;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
@@ -42,7 +43,7 @@ use crate::observe::recorder::Pictures;
 use crate::observe::recorder::Recording;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
-use crate::transport::broker::{BrokerError, EmbeddedBroker, Guard};
+use crate::transport::broker::{BrokerError, Elected, EmbeddedBroker, Guard};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
@@ -64,8 +65,6 @@ pub(super) struct NodeBuilder {
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
-    /// The highest term that the election knows.
-    term: watch::Sender<u64>,
     feed: Arc<Feed>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
@@ -99,7 +98,6 @@ impl NodeBuilder {
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
-            term: watch::Sender::default(),
             feed: Arc::default(),
             dashboard_address: watch::Sender::new(None),
             failed,
@@ -180,7 +178,7 @@ impl NodeBuilder {
             ActorKind::Gateway => {
                 let started = Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
                 let id = slot(&self.slots.gateway, started)?;
-                self.slots.election.send(LeaderElectionMessage::NoteGatewayRestart);
+                self.slots.election.send(LeaderElectionMessage::Note { input: Input::GatewayRestarted });
                 Ok(id)
             }
             ActorKind::Follower => {
@@ -195,7 +193,7 @@ impl NodeBuilder {
             ActorKind::Fuser => {
                 let started = Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
                 let id = slot(&self.slots.fuser, started)?;
-                self.slots.election.send(LeaderElectionMessage::NoteFuserRestart);
+                self.slots.election.send(LeaderElectionMessage::Note { input: Input::FuserRestarted });
                 Ok(id)
             }
             ActorKind::LeaderElection => {
@@ -289,7 +287,7 @@ impl NodeBuilder {
             (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
             (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
         }
-        let (topics, elected) = (Topics::new(&self.config.cell), elected::rule(self.leadership()));
+        let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
         let (limits, counters) = (self.config.mqtt.limits(), self.counters());
         EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
     }
@@ -322,6 +320,15 @@ fn slot<M: Message>(
     let id = actor.get_id();
     slot.set(actor);
     Ok(id)
+}
+
+/// The rule of the node's own broker: who may publish for all.
+fn publish_rule(leadership: watch::Receiver<Leadership>) -> Elected {
+    let filter = Mutex::<PublisherFilter>::default();
+    Arc::new(move |name| {
+        let mut filter = filter.lock().unwrap_or_else(PoisonError::into_inner);
+        filter.may_publish(name, &leadership.borrow(), clock::now())
+    })
 }
 
 /// Why an actor did not start, without the framework's own words around it.

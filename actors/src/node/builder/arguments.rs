@@ -4,9 +4,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
-use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
 use ecod::landmark::Landmark;
+use ecod::leadership::Position;
+use ecod::leadership::election::ElectionConfig;
+use ecod::leadership::node::{Input, NodeSettings};
 use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
@@ -22,10 +24,10 @@ use crate::actors::reputation_keeper::ReputationKeeperArguments;
 use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
-use crate::messages::leadership::Position;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::ActorSlots;
 use crate::node::config::NodeConfig;
+use crate::node::slots::ActorKind;
 use crate::observe::dashboard::{LandmarkFacts, NodeFacts, Sources};
 use crate::observe::readiness::{Vitals, patience};
 use crate::observe::recorder::Identity;
@@ -135,12 +137,14 @@ impl NodeBuilder {
                 }
                 Incoming::Ledger(share) => {
                     recording.share(share, at);
-                    election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
+                    let input = Input::EvidenceReceived { from: share.node.clone() };
+                    election.send(LeaderElectionMessage::Note { input });
                     keeper.send(ReputationKeeperMessage::Merge { delivery })
                 }
                 Incoming::Link { broker, state } => {
                     recording.link(broker, *state, at);
-                    election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
+                    let input = Input::LinkChanged { broker: broker.clone(), state: *state };
+                    election.send(LeaderElectionMessage::Note { input })
                 }
                 Incoming::Status { status, .. } => {
                     recording.status(status, at);
@@ -155,8 +159,7 @@ impl NodeBuilder {
             newest: self.newest.clone(),
             log: self.config.map_log.clone(),
             recording: self.recording.clone(),
-            least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
-            term: self.term.subscribe(),
+            saved_term: saved_term(self.state_file("term").as_ref()),
             leadership: self.leadership(),
             election: self.slots.election.clone(),
             fuser: self.slots.fuser.clone(),
@@ -175,7 +178,6 @@ impl NodeBuilder {
             newest: self.newest.reputations.subscribe(),
             members: self.members(),
             leadership: self.leadership(),
-            term: self.term.subscribe(),
             gateway: self.slots.gateway.clone(),
             fuser: self.slots.fuser.clone(),
             counters: self.counters(),
@@ -191,7 +193,6 @@ impl NodeBuilder {
         self.recording.journal(now, JournalEvent::Start { ledger });
         FuserArguments {
             aggregator,
-            term: self.term.subscribe(),
             recording: self.recording.clone(),
             intake: self.intake.clone(),
             newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
@@ -204,16 +205,18 @@ impl NodeBuilder {
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
         let ActorSlots { membership, gateway, fuser, keeper, broker, .. } = self.slots.clone();
         LeaderElectionArguments {
-            config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+            settings: NodeSettings {
+                election: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+                plane: self.config.data_plane(),
+                round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
+                keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
+                status: self.status(),
+            },
             term_file: self.state_file("term"),
-            round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
-            plane: self.config.data_plane(),
-            status: self.status(),
             own_broker: self.broker_address(),
             members: self.members(),
             parts: Parts { membership, gateway, fuser, keeper, broker },
             leadership: self.leadership.clone(),
-            term: self.term.clone(),
             counters: self.counters(),
         }
     }

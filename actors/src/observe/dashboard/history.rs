@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::Reputations;
 use serde::Serialize;
 
 use super::picture::json;
-use crate::messages::leadership::{Leadership, Position};
 
 /// A span of time in which one node led, as this node saw it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]

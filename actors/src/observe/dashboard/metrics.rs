@@ -5,6 +5,7 @@
 
 use std::fmt;
 
+use ecod::leadership::Position;
 use ecod::wire::ReportKind;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
@@ -16,7 +17,6 @@ use super::feed::kind_label;
 use super::history::MAX_VEHICLES;
 use super::observer::{Observer, age_s};
 use super::process;
-use crate::messages::leadership::Position;
 use crate::telemetry::counters::{Event, OTHERS, Shed, ShedReason};
 use crate::transport::mqtt::LinkState;
 

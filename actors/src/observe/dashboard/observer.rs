@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::epoch::Epoch;
+use ecod::leadership::Position;
+use ecod::leadership::readiness::Readiness;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use tokio::sync::watch;
@@ -17,8 +19,7 @@ use super::paced::{Made, Paced};
 use super::picture::{API_VERSION, LeadershipFacts, Picture, Stamped, json, nodes};
 use super::sources::Sources;
 use crate::messages::gateway::GatewayMessage;
-use crate::messages::leadership::Position;
-use crate::observe::readiness::{Probe, Readiness};
+use crate::observe::readiness::Probe;
 use crate::platform::clock;
 use crate::transport::mqtt::LinkState;
 

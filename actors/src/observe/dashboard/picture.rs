@@ -3,6 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use ecod::leadership::readiness::Readiness;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::{LandmarkId, NodeName};
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
@@ -10,9 +12,7 @@ use serde::Serialize;
 
 use super::feed::{MAX_SHOWN, Sighting, Told};
 use super::sources::Sources;
-use crate::messages::leadership::{Leadership, Position};
 use crate::messages::newest::Received;
-use crate::observe::readiness::Readiness;
 use crate::telemetry::counters::CounterSnapshot;
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::{BrokerAddress, LinkState};

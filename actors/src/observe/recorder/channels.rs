@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::replay::JournalEntry;
 use ecod::time::Timestamp;
@@ -15,7 +16,6 @@ use serde::{Deserialize, Serialize};
 
 use super::foxglove;
 use super::viewers::schema_of;
-use crate::messages::leadership::{Leadership, Position};
 
 /// A channel's schema by its name in the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

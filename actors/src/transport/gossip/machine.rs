@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::election::Clock;
+use ecod::leadership::election::AwakeClock;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use rand::{RngExt, SeedableRng};
@@ -55,7 +55,7 @@ pub(crate) struct Setup {
 pub(crate) struct Machine {
     sessions: Sessions,
     gossip: Gossip,
-    clock: Clock,
+    clock: AwakeClock,
     hello: Duration,
     hello_at: Timestamp,
     hellos: u64,
@@ -80,7 +80,7 @@ struct Waiting {
 impl Machine {
     pub(crate) fn new(setup: Setup, config: &MembershipConfig, now: Timestamp) -> Self {
         let Setup { own, key, session, secret, seed, counters } = setup;
-        let clock = Clock::new(now, STALL);
+        let clock = AwakeClock::new(now, STALL);
         Self {
             learns_address: own.gossip.ip().is_unspecified(),
             sessions: Sessions::new(key, session, &secret, config.max_peers, Arc::clone(&counters), now),

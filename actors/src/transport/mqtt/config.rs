@@ -8,7 +8,7 @@ use ecod::config::{ConfigError, check_range};
 use ecod::wire::{Encoding, Limits};
 use serde::{Deserialize, Serialize};
 
-use super::address::BrokerAddress;
+use ecod::leadership::BrokerAddress;
 
 /// Protocol, credentials and limits of the MQTT connections.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -12,11 +12,12 @@ use ecod::wire::{
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
 
-use super::address::BrokerAddress;
 use super::security::SigningKey;
 use crate::platform::clock;
 use crate::platform::throttle::Throttles;
 use crate::telemetry::counters::{Counters, Event, ShedReason};
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::links::LinkState;
 
 /// A checked message of the cell, or news about a link.
 ///
@@ -53,19 +54,6 @@ pub enum Incoming {
         /// How it is now.
         state: LinkState,
     },
-}
-
-/// How a link is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LinkState {
-    /// Connected, subscribed, status published.
-    Up,
-    /// Connected, but nothing comes back of what is sent: the broker hangs, or its answers are lost.
-    Stalled,
-    /// Not connected; attempts go on.
-    Down,
-    /// Not connected and nothing listens there: the broker's process is gone. Attempts go on.
-    Refused,
 }
 
 /// A message on its way to a receiver. Dropping it makes room for another: keep it until it has been dealt with.

@@ -11,12 +11,15 @@ use rustls::ClientConfig;
 use tokio::task::{AbortHandle, JoinHandle};
 use uuid::Uuid;
 
-use super::address::BrokerAddress;
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet};
-use super::inbox::{Inbox, LinkState, Outcome};
+use super::hearing::Hearing;
+use super::inbox::{Inbox, Outcome};
 use super::security::Security;
-use super::silence::{Hearing, Silence};
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::echo::EchoMonitor;
+use ecod::leadership::links::LinkState;
+
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 
@@ -69,7 +72,7 @@ pub(crate) struct Link {
     pub(crate) state: LinkState,
     pub(crate) client: Option<Client>,
     hearing: Arc<Hearing>,
-    silence: Silence,
+    echo: EchoMonitor,
     task: Option<JoinHandle<()>>,
     abort: AbortHandle,
 }
@@ -81,14 +84,14 @@ impl Link {
         let task = Task { id, broker: at, setup, report, hearing, told: None, told_oversized: false };
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
-        let (abort, silence) = (task.abort_handle(), Silence::default());
-        Self { broker, state: LinkState::Down, client: None, hearing, silence, abort, task: Some(task) }
+        let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
+        Self { broker, state: LinkState::Down, client: None, hearing, echo, abort, task: Some(task) }
     }
 
     /// Notes a message that the broker should pass back to this node, whether or not there was room for it; true when
     /// the broker seems stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
-        let is_stalled = self.silence.note_sent(self.hearing.packets(), now);
+        let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
         if is_stalled {
             self.hearing.miss();
         }

@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use ecod::leadership::BrokerAddress;
 use ecod::names::NodeName;
 use ring::hmac;
 
-use super::address::BrokerAddress;
 use super::config::MqttConfig;
 use crate::transport::gossip::{KeyError, MembershipConfig, payload_key};
 use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker};
