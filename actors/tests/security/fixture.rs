@@ -9,11 +9,15 @@ use ecod::wire::{Limits, Role, Topics};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::{Counters, Event};
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
-use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
+use ecod_actors::transport::pki::{Authority, BROKER_NAME, Credentials, TlsConfig};
 use rumqttc::{AsyncClient, EventLoop, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
 use rustls::ClientConfig;
+use rustls::pki_types::ServerName;
 use tempfile::TempDir;
+use tokio::net::{TcpSocket, TcpStream};
 use tokio::time::{Instant, sleep, timeout};
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
 use uuid::Uuid;
 
 pub(crate) const DAY: Duration = Duration::from_secs(86_400);
@@ -62,6 +66,25 @@ impl Pki {
 /// The client's side of certificates.
 pub(crate) fn client_config(name: &str, files: &TlsConfig) -> Arc<ClientConfig> {
     Arc::clone(&Credentials::load(files, &node(name)).unwrap().current().client)
+}
+
+/// Another host than the honest ones, as far as a broker can see.
+const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
+
+pub(crate) async fn knock(broker: SocketAddr) -> TcpStream {
+    knock_from(ELSEWHERE, broker).await
+}
+
+pub(crate) async fn knock_from(address: Ipv4Addr, broker: SocketAddr) -> TcpStream {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.bind((address, 0).into()).unwrap();
+    socket.connect(broker).await.unwrap()
+}
+
+pub(crate) async fn secure(cell: &mut Cell, stream: TcpStream) -> TlsStream<TcpStream> {
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let name = ServerName::try_from(BROKER_NAME).unwrap();
+    TlsConnector::from(client_config("gauss", &files)).connect(name, stream).await.unwrap()
 }
 
 /// An edge's broker, which `edge` is elected to use, and two honest clients.

@@ -9,36 +9,14 @@ use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::broker::BrokerConfig;
-use ecod_actors::transport::pki::BROKER_NAME;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rustls::pki_types::ServerName;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpSocket, TcpStream};
 use tokio::time::timeout;
-use tokio_rustls::TlsConnector;
-use tokio_rustls::client::TlsStream;
 
-use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, node};
-
-/// Another host than the honest ones, as far as a broker can see.
-const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
-
-async fn knock(broker: SocketAddr) -> TcpStream {
-    knock_from(ELSEWHERE, broker).await
-}
-
-async fn knock_from(address: Ipv4Addr, broker: SocketAddr) -> TcpStream {
-    let socket = TcpSocket::new_v4().unwrap();
-    socket.bind((address, 0).into()).unwrap();
-    socket.connect(broker).await.unwrap()
-}
-
-async fn secure(cell: &mut Cell, stream: TcpStream) -> TlsStream<TcpStream> {
-    let files = cell.pki.issue("gauss", Role::Auto, DAY);
-    let name = ServerName::try_from(BROKER_NAME).unwrap();
-    TlsConnector::from(client_config("gauss", &files)).connect(name, stream).await.unwrap()
-}
+use crate::fixture::{
+    Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, knock, knock_from, node, secure,
+};
 
 /// Waits until the other side has closed, whatever came before.
 async fn closed(stream: &mut (impl AsyncReadExt + Unpin)) {

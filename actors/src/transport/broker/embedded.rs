@@ -176,6 +176,20 @@ struct Running {
 /// Largest packet of a broker that was not told of a cell's limits: the default maps and their topics.
 const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
 
+/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
+const MAX_TOPIC_LEVELS: usize = 32;
+
+/// Maximum length of a topic or filter in bytes.
+const MAX_TOPIC_BYTES: usize = 512;
+
+/// Maximum subscriptions of one client.
+const MAX_SUBSCRIPTIONS: usize = 256;
+
+/// Whether rmqtt can hold a topic or filter.
+pub(super) fn is_topic_bounded(topic: &str) -> bool {
+    topic.len() <= MAX_TOPIC_BYTES && topic.split('/').count() <= MAX_TOPIC_LEVELS
+}
+
 /// How long connections may take to end when the broker stops; beyond it their thread is left to end by itself.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -205,6 +219,8 @@ impl EmbeddedBroker {
             .max_packet_size(self.config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
             .max_connections(self.config.max_clients)
             .max_mqueue_len(self.config.max_waiting)
+            .max_topic_levels(MAX_TOPIC_LEVELS)
+            .max_subscriptions(MAX_SUBSCRIPTIONS)
             .handshake_timeout(Duration::from_secs(5))
     }
 }

@@ -9,7 +9,7 @@
 //! | anything else | nobody |
 //!
 //! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a
-//! certificate of the cell may read everything.
+//! certificate of the cell may read everything. Topics and filters are bounded in length and in levels.
 
 use std::fmt;
 use std::net::SocketAddr;
@@ -18,10 +18,12 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use ecod::names::NodeName;
 use ecod::wire::{Limits, Topic, Topics};
+use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
-use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult};
+use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, SubscribeAclResult, TopicFilter};
 
+use super::embedded::is_topic_bounded;
 use super::holder::{Holder, Passes};
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::ENVELOPE_BYTES;
@@ -51,7 +53,9 @@ impl Permissions {
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
         register.add(Type::ClientAuthenticate, Box::new(self.clone())).await;
-        register.add(Type::MessagePublishCheckAcl, Box::new(self)).await;
+        register.add(Type::MessagePublishCheckAcl, Box::new(self.clone())).await;
+        register.add(Type::ClientSubscribeCheckAcl, Box::new(self.clone())).await;
+        register.add(Type::ClientUnsubscribe, Box::new(self)).await;
         register.start().await;
     }
 
@@ -78,6 +82,9 @@ impl Permissions {
     /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more
     /// than the topic's receivers take, nor what is not to be retained.
     fn allows(&self, holder: &Holder, topic: &str, retain: bool, bytes: usize) -> bool {
+        if !is_topic_bounded(topic) {
+            return false;
+        }
         let topic = self.topics.parse(topic);
         let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));
         bytes <= most + ENVELOPE_BYTES
@@ -108,6 +115,15 @@ impl Handler for Permissions {
                     tracing::debug!(client = %session.id.client_id, topic = %publish.topic, "message refused");
                     PublishAclResult::rejected(false, None)
                 })
+            }
+            Parameter::ClientSubscribeCheckAcl(_, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
+                self.counters.count(Event::ClientDenied);
+                HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
+            }
+            // An answer to an unsubscription cannot refuse it. The filter cannot be subscribed: nothing is ended.
+            Parameter::ClientUnsubscribe(_, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
+                self.counters.count(Event::ClientDenied);
+                HookResult::TopicFilter(Some(TopicFilter::default()))
             }
             _ => return (true, None),
         };

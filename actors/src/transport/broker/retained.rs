@@ -9,6 +9,7 @@ use rmqtt::types::{Retain, TopicFilter, TopicName};
 use tokio::sync::Mutex;
 
 use super::BrokerConfig;
+use super::embedded::is_topic_bounded;
 use crate::transport::pki::OBSERVER_MARK;
 
 /// A bounded number of retained messages and of their bytes.
@@ -47,7 +48,8 @@ impl RetainStorage for RetainedMessages {
         let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));
         let (now, bytes) = (Instant::now(), message.publish.payload.len());
         let mut register = self.register.lock().await;
-        let has_room = bytes == 0 || register.keep(topic, bytes, expiry.map(|expiry| now + expiry), now);
+        let has_room = is_topic_bounded(topic)
+            && (bytes == 0 || register.keep(topic, bytes, expiry.map(|expiry| now + expiry), now));
         let has_pruned = register.pruned == Some(now);
         if has_pruned {
             self.storage.remove_expired_messages().await;
