@@ -42,7 +42,7 @@ use crate::observe::recorder::Pictures;
 use crate::observe::recorder::Recording;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
-use crate::transport::broker::{BrokerError, EmbeddedBroker, Guard};
+use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
@@ -291,7 +291,7 @@ impl NodeBuilder {
         }
         let (topics, elected) = (Topics::new(&self.config.cell), elected::rule(self.leadership()));
         let (limits, counters) = (self.config.mqtt.limits(), self.counters());
-        EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
+        EmbeddedBroker::protected(config, AccessPolicy { credentials, topics, limits, elected, counters })
     }
 
     /// The membership comes back at the address it had, as the broker does.

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use ecod::wire::Encoding;
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::telemetry::counters::Event;
-use ecod_actors::transport::broker::Mqtt;
+use ecod_actors::transport::broker::MqttBroker;
 use ecod_actors::transport::mqtt::{
     BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, Secret, SubscriptionRole,
 };

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use ecod_actors::bench::two_hop::{Load, TwoHopError, raw};
-use ecod_actors::transport::broker::Mqtt;
+use ecod_actors::transport::broker::MqttBroker;
 
 use crate::cell::embedded;
 

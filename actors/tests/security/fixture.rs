@@ -8,7 +8,7 @@ use ecod::names::NodeName;
 use ecod::wire::{Limits, Role, Topics};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::{Counters, Event};
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::transport::broker::{AccessPolicy, BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::pki::{Authority, BROKER_NAME, Credentials, TlsConfig};
 use rumqttc::{AsyncClient, EventLoop, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
 use rustls::ClientConfig;
@@ -109,7 +109,7 @@ impl Cell {
         let edge = pki.issue("edge", Role::Edge, DAY);
         let euclid = pki.issue("euclid", Role::Cav, DAY);
         let counters = Arc::<Counters>::default();
-        let guard = Guard {
+        let guard = AccessPolicy {
             credentials: Some(Arc::new(Credentials::load(&edge, &node("edge")).unwrap())),
             topics: Topics::new(&node("lot")),
             limits: Limits { payload_bytes: MAX_REPORT, ..Limits::default() },
@@ -124,7 +124,7 @@ impl Cell {
             ..BrokerConfig::default()
         };
         adjust(&mut config);
-        let mut broker = EmbeddedBroker::guarded(config, guard);
+        let mut broker = EmbeddedBroker::protected(config, guard);
         let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
         let mut edge = Client::new(address, "edge", &client_config("edge", &edge));
         edge.log_in().await.unwrap();

@@ -212,10 +212,10 @@ async fn limits_hold_on_loopback_as_they_come() {
 async fn limits_hold_without_certificates_too() {
     use ecod::wire::Topics;
     use ecod_actors::telemetry::counters::Counters;
-    use ecod_actors::transport::broker::{EmbeddedBroker, Guard, Mqtt};
+    use ecod_actors::transport::broker::{AccessPolicy, EmbeddedBroker, MqttBroker};
 
     let counters = Arc::<Counters>::default();
-    let guard = Guard {
+    let guard = AccessPolicy {
         credentials: None,
         topics: Topics::new(&node("lot")),
         limits: Default::default(),
@@ -223,7 +223,7 @@ async fn limits_hold_without_certificates_too() {
         counters: Arc::clone(&counters),
     };
     let config = BrokerConfig { handshake_timeout_ms: 300, ..BrokerConfig::default() };
-    let mut broker = EmbeddedBroker::guarded(config, guard);
+    let mut broker = EmbeddedBroker::protected(config, guard);
     let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
     let mut silent = knock(address).await;
     closed(&mut silent).await;

@@ -3,7 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 
 use ecod_actors::telemetry::counters::Event;
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;

@@ -7,7 +7,7 @@ use ecod::names::NodeName;
 use tokio::sync::watch;
 
 use crate::messages::leadership::Leadership;
-use crate::transport::broker::Elected;
+use crate::transport::broker::LeaderCheck;
 
 /// How long after it was last heard a leader that is not elected any more may still speak: its last round is under way
 /// when its successor is known already.
@@ -15,7 +15,7 @@ const FAREWELL: Duration = Duration::from_secs(1);
 
 /// Whoever this node knows to lead, as the other nodes told it over authenticated datagrams; while it knows of nobody,
 /// anyone, and receivers decide.
-pub(super) fn rule(leadership: watch::Receiver<Leadership>) -> Elected {
+pub(super) fn rule(leadership: watch::Receiver<Leadership>) -> LeaderCheck {
     let voices = Mutex::<Voices>::default();
     Arc::new(move |name| {
         let leadership = leadership.borrow();
