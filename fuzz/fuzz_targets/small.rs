@@ -10,10 +10,11 @@ use ecod::detection::detections_in;
 use ecod::eval::Truth;
 use ecod::eval::tracks::TrackTruth;
 use ecod::time::Timestamp;
-use ecod_actors::node::config::NodeConfig;
-use ecod_actors::transport::mqtt::{Secret, Security};
 use ecod_actors::actors::reputation_keeper::read_saved;
 use ecod_actors::camera::vehicle_pose::read_pose;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::platform::secret::Secret;
+use ecod_actors::transport::mqtt::Security;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|input: &[u8]| {

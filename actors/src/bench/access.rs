@@ -102,8 +102,8 @@ const MAX_PACKET_BYTES: usize = 1 << 20;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::platform::secret::Secret;
     use crate::transport::gossip::MembershipConfig;
-    use crate::transport::mqtt::Secret;
 
     fn address(text: &str) -> BrokerAddress {
         text.parse().unwrap()

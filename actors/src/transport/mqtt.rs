@@ -11,7 +11,7 @@ pub(crate) mod security;
 pub(crate) mod silence;
 pub(crate) mod subscription_role;
 pub use address::{BrokerAddress, InvalidAddress};
-pub use config::{HiddenSecret, MqttConfig, MqttVersion, Secret};
+pub use config::{MqttConfig, MqttVersion};
 pub use data_plane::DataPlane;
 pub use inbox::{Delivery, Incoming, LinkState, Subscriber};
 pub use link::LinkEvent;

@@ -138,7 +138,7 @@ mod tests {
 
     fn key(text: &str, cell: &'static str) -> SigningKey {
         let membership =
-            MembershipConfig { key: Some(crate::transport::mqtt::Secret::new(text)), ..MembershipConfig::default() };
+            MembershipConfig { key: Some(crate::platform::secret::Secret::new(text)), ..MembershipConfig::default() };
         SigningKey(payload_key(&membership, &NodeName::from_static(cell)).unwrap())
     }
 
