@@ -16,10 +16,10 @@ use ecod::wire::Role;
 use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
 use ecod_actors::platform::clock;
+use ecod_actors::platform::secret::Secret;
 use ecod_actors::transport::gossip::{
     FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
-use ecod_actors::transport::mqtt::Secret;
 use ractor::{Actor, call_t};
 use tokio::sync::watch;
 

@@ -43,7 +43,7 @@ use crate::observe::recorder::Pictures;
 use crate::observe::recorder::Recording;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
-use crate::transport::broker::{BrokerError, Elected, EmbeddedBroker, Guard};
+use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
@@ -289,7 +289,7 @@ impl NodeBuilder {
         }
         let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
         let (limits, counters) = (self.config.mqtt.limits(), self.counters());
-        EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
+        EmbeddedBroker::protected(config, AccessPolicy { credentials, topics, limits, elected, counters })
     }
 
     /// The membership comes back at the address it had, as the broker does.
@@ -323,7 +323,7 @@ fn slot<M: Message>(
 }
 
 /// The rule of the node's own broker: who may publish for all.
-fn publish_rule(leadership: watch::Receiver<Leadership>) -> Elected {
+fn publish_rule(leadership: watch::Receiver<Leadership>) -> LeaderCheck {
     let filter = Mutex::<PublisherFilter>::default();
     Arc::new(move |name| {
         let mut filter = filter.lock().unwrap_or_else(PoisonError::into_inner);

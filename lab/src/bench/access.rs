@@ -100,8 +100,8 @@ const MAX_PACKET_BYTES: usize = 1 << 20;
 
 #[cfg(test)]
 mod tests {
+    use ecod_actors::platform::secret::Secret;
     use ecod_actors::transport::gossip::MembershipConfig;
-    use ecod_actors::transport::mqtt::Secret;
 
     use super::*;
 

@@ -43,7 +43,7 @@ impl ReportCollector {
         let status = NodeStatus::starting(name, Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static("testbed"),
-            part: SubscriptionRole::Candidate,
+            role: SubscriptionRole::Candidate,
             status,
             mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },
             security: Security::default(),

@@ -61,7 +61,7 @@ impl NodeBuilder {
     pub(super) fn gateway_arguments(&self) -> GatewayArguments {
         GatewayArguments {
             cell: self.config.cell.clone(),
-            part: self.gateway_part(),
+            role: self.gateway_part(),
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
             security: self.security.clone(),

@@ -7,7 +7,7 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, Uri};
 use ecod::names::NodeName;
 use ring::{digest, hmac};
 
-use crate::transport::mqtt::Secret;
+use crate::platform::secret::Secret;
 
 /// Judges requests.
 #[derive(Debug)]

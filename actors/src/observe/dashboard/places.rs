@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::oneshot;
 
-use crate::platform::throttle::source;
+use crate::platform::throttle::host_network;
 
 /// Limits connections. While a request that may be answered is being answered its connection is kept; the others give
 /// way when there is no room, first the oldest of the address that has most of them.
@@ -66,7 +66,7 @@ impl Places {
         let number = taken.next;
         taken.next += 1;
         let (leave, displaced) = oneshot::channel();
-        taken.connections.insert(number, Connection { source: source(from), kept: false, _leave: leave });
+        taken.connections.insert(number, Connection { source: host_network(from), kept: false, _leave: leave });
         Some(Admitted { place: Place { taken: Arc::clone(&self.taken), number }, displaced, displaces })
     }
 }

@@ -23,7 +23,7 @@ use super::paced::Paced;
 use super::picture::json;
 use super::places::Place;
 use crate::platform::clock;
-use crate::platform::throttle::Throttle;
+use crate::platform::throttle::TokenBucket;
 use crate::telemetry::counters::Event;
 
 /// What requests are answered with.
@@ -31,9 +31,9 @@ use crate::telemetry::counters::Event;
 pub(crate) struct Site {
     observer: Arc<Observer>,
     access: Arc<Access>,
-    answers: Arc<Mutex<Throttle>>,
+    answers: Arc<Mutex<TokenBucket>>,
     /// Apart, so that whoever may not look takes nothing from those who may.
-    refusals: Arc<Mutex<Throttle>>,
+    refusals: Arc<Mutex<TokenBucket>>,
     metrics: Arc<Paced<Result<Bytes, fmt::Error>>>,
     landmarks: Bytes,
     max_viewers: usize,
@@ -51,7 +51,7 @@ const JSON: &str = "application/json";
 impl Site {
     /// Half of the connections at most are for live pictures.
     pub(crate) fn new(observer: Arc<Observer>, access: Access, max_connections: usize) -> Self {
-        let throttle = || Arc::new(Mutex::new(Throttle::new(BURST, STEADY, clock::now())));
+        let throttle = || Arc::new(Mutex::new(TokenBucket::new(BURST, STEADY, clock::now())));
         Self {
             access: Arc::new(access),
             answers: throttle(),

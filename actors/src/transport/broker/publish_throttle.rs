@@ -8,21 +8,21 @@ use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::types::PublishAclResult;
 
-use super::holder::{Passes, Source};
+use super::principal::{PrincipalRegistry, QuotaKey};
 use crate::platform::clock;
-use crate::platform::throttle::Throttles;
+use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, ShedReason};
 
 /// Passes on at most so many messages a second of each node, address or client, before anything is done with them.
-pub(super) struct ClientThrottle {
-    sources: Mutex<Throttles<Source>>,
-    passes: Passes,
+pub(super) struct PublishThrottle {
+    sources: Mutex<KeyedThrottle<QuotaKey>>,
+    principals: PrincipalRegistry,
     counters: Arc<Counters>,
 }
 
-impl ClientThrottle {
-    pub(super) fn new(per_second: u32, passes: Passes, counters: Arc<Counters>) -> Self {
-        Self { sources: Mutex::new(Throttles::new(per_second)), passes, counters }
+impl PublishThrottle {
+    pub(super) fn new(per_second: u32, principals: PrincipalRegistry, counters: Arc<Counters>) -> Self {
+        Self { sources: Mutex::new(KeyedThrottle::new(per_second)), principals, counters }
     }
 
     /// Has rmqtt ask for every message, before anybody is asked for permission.
@@ -34,10 +34,10 @@ impl ClientThrottle {
 }
 
 #[async_trait]
-impl Handler for ClientThrottle {
+impl Handler for PublishThrottle {
     async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
         let Parameter::MessagePublishCheckAcl(session, _) = parameter else { return (true, before) };
-        let source = self.passes.source(session.id.remote_addr, &session.id.client_id);
+        let source = self.principals.quota_key(session.id.remote_addr, &session.id.client_id);
         if self.sources.lock().unwrap_or_else(PoisonError::into_inner).allow(&source, clock::now()) {
             return (true, before);
         }
@@ -46,8 +46,8 @@ impl Handler for ClientThrottle {
     }
 }
 
-impl fmt::Debug for ClientThrottle {
+impl fmt::Debug for PublishThrottle {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("ClientThrottle").finish_non_exhaustive()
+        f.debug_struct("PublishThrottle").finish_non_exhaustive()
     }
 }

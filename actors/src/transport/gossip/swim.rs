@@ -15,11 +15,11 @@ use super::MAX_PAYLOAD_BYTES;
 use super::config::MembershipConfig;
 use super::counters::FrameEvent;
 use super::node_id::NodeId;
-use super::sessions::Known;
+use super::sessions::KnownMember;
 
 /// What the gossip wants done or known.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Rumour {
+pub(crate) enum SwimOutput {
     /// Send words to a node.
     Send { to: NodeId, body: Vec<u8> },
     /// A node is there, or a new run of it.
@@ -33,27 +33,27 @@ pub(crate) enum Rumour {
 }
 
 /// This node's part in the gossip.
-pub(crate) struct Gossip {
+pub(crate) struct Swim {
     foca: Foca<NodeId, PostcardCodec, ChaCha8Rng, NoCustomBroadcast>,
     runtime: AccumulatingRuntime<NodeId>,
-    timers: BinaryHeap<Reverse<Due>>,
+    timers: BinaryHeap<Reverse<ScheduledTimer>>,
     scheduled: u64,
     alive: BTreeMap<NodeName, NodeId>,
     /// When the node last returned from the dead, and when it will.
-    renewed: Option<Timestamp>,
+    renewed_at: Option<Timestamp>,
     renew_at: Option<Timestamp>,
     left: bool,
-    rumours: VecDeque<Rumour>,
+    outputs: VecDeque<SwimOutput>,
 }
 
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Due {
+struct ScheduledTimer {
     at: Timestamp,
     timer: Timer<NodeId>,
     order: u64,
 }
 
-impl Gossip {
+impl Swim {
     pub(crate) fn new(own: NodeId, config: &MembershipConfig, seed: u64) -> Self {
         Self {
             foca: Foca::new(own, settings(config), ChaCha8Rng::seed_from_u64(seed), PostcardCodec),
@@ -61,16 +61,16 @@ impl Gossip {
             timers: BinaryHeap::new(),
             scheduled: 0,
             alive: BTreeMap::new(),
-            renewed: None,
+            renewed_at: None,
             renew_at: None,
             left: false,
-            rumours: VecDeque::new(),
+            outputs: VecDeque::new(),
         }
     }
 
     /// The next thing to be done or known.
-    pub(crate) fn poll(&mut self) -> Option<Rumour> {
-        self.rumours.pop_front()
+    pub(crate) fn poll(&mut self) -> Option<SwimOutput> {
+        self.outputs.pop_front()
     }
 
     /// Who this node is.
@@ -84,9 +84,9 @@ impl Gossip {
     }
 
     /// What is known of a name that is not this node's.
-    pub(crate) fn known(&self, name: &NodeName) -> Option<Known> {
+    pub(crate) fn known(&self, name: &NodeName) -> Option<KnownMember> {
         let member = self.foca.iter_membership_state().find(|member| member.id().name == *name)?;
-        Some(Known { life: member.id().life, alive: member.state() != State::Down })
+        Some(KnownMember { life: member.id().life, alive: member.state() != State::Down })
     }
 
     /// When [`Self::tick`] is next needed.
@@ -131,7 +131,7 @@ impl Gossip {
     }
 
     /// Begins a life after that of whoever had this node's name.
-    pub(crate) fn outlive(&mut self, life: u64, now: Timestamp) {
+    pub(crate) fn start_life_after(&mut self, life: u64, now: Timestamp) {
         if life >= self.own().life {
             self.change(now, |own| own.life = life);
         }
@@ -161,22 +161,22 @@ impl Gossip {
 
     fn renew(&mut self, now: Timestamp) {
         self.renew_at = None;
-        self.renewed = Some(now);
+        self.renewed_at = Some(now);
         self.change(now, |_| ());
     }
 
     fn collect(&mut self, now: Timestamp) {
         while let Some((to, body)) = self.runtime.to_send() {
-            self.rumours.push_back(Rumour::Send { to, body: body.into() });
+            self.outputs.push_back(SwimOutput::Send { to, body: body.into() });
         }
         while let Some((after, timer)) = self.runtime.to_schedule() {
             if let Timer::ChangeSuspectToDown { member_id, .. } = &timer
                 && self.alive.contains_key(&member_id.name)
             {
-                self.rumours.push_back(Rumour::Suspected(member_id.name.clone()));
+                self.outputs.push_back(SwimOutput::Suspected(member_id.name.clone()));
             }
             self.scheduled += 1;
-            self.timers.push(Reverse(Due { at: now + after, timer, order: self.scheduled }));
+            self.timers.push(Reverse(ScheduledTimer { at: now + after, timer, order: self.scheduled }));
         }
         while let Some(notification) = self.runtime.to_notify() {
             self.take(notification, now);
@@ -187,23 +187,23 @@ impl Gossip {
         match notification {
             OwnedNotification::MemberUp(id) => {
                 self.alive.insert(id.name.clone(), id.clone());
-                self.rumours.push_back(Rumour::Alive(id));
+                self.outputs.push_back(SwimOutput::Alive(id));
             }
             OwnedNotification::MemberDown(id) => {
                 if self.alive.remove(&id.name).is_some() {
-                    self.rumours.push_back(Rumour::Down(id.name));
+                    self.outputs.push_back(SwimOutput::Down(id.name));
                 }
             }
             OwnedNotification::Rename(_, id) => {
                 if let Some(before) = self.alive.get_mut(&id.name) {
                     let before = std::mem::replace(before, id.clone());
                     let same = (before.run, before.role) == (id.run, id.role);
-                    self.rumours.push_back(if same { Rumour::Changed(id) } else { Rumour::Alive(id) });
+                    self.outputs.push_back(if same { SwimOutput::Changed(id) } else { SwimOutput::Alive(id) });
                 }
             }
             OwnedNotification::Defunct if !self.left => {
                 // Others thought this node dead, such as while it was stopped.
-                let earliest = self.renewed.map_or(now, |renewed| renewed + RENEW_INTERVAL);
+                let earliest = self.renewed_at.map_or(now, |renewed_at| renewed_at + MIN_RENEW_INTERVAL);
                 if earliest <= now { self.renew(now) } else { self.renew_at = Some(earliest) }
             }
             OwnedNotification::Active
@@ -215,7 +215,7 @@ impl Gossip {
 }
 
 /// Least time between two returns from the dead.
-const RENEW_INTERVAL: Duration = Duration::from_secs(1);
+const MIN_RENEW_INTERVAL: Duration = Duration::from_secs(1);
 
 fn settings(config: &MembershipConfig) -> foca::Config {
     let ms = Duration::from_millis;

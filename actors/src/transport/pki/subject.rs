@@ -12,9 +12,9 @@ use super::{BROKER_NAME, OBSERVER_MARK};
 
 /// The holder of a certificate; that the certificate is genuine is for others to check.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Identity {
+pub struct CertificateSubject {
     name: NodeName,
-    serves: bool,
+    may_serve: bool,
     expires: Timestamp,
 }
 
@@ -29,7 +29,7 @@ pub enum InvalidCertificate {
     NoName,
 }
 
-impl Identity {
+impl CertificateSubject {
     /// Reads a certificate in DER.
     ///
     /// # Errors
@@ -40,11 +40,11 @@ impl Identity {
         let (Some(name), None) = (names.next(), names.next()) else { return Err(InvalidCertificate::NoName) };
         let name = name.as_str().ok().and_then(|name| NodeName::new(name).ok()).ok_or(InvalidCertificate::NoName)?;
         let alternatives = parsed.subject_alternative_name().ok().flatten();
-        let serves = alternatives.is_some_and(|names| {
+        let may_serve = alternatives.is_some_and(|names| {
             names.value.general_names.iter().any(|name| matches!(name, GeneralName::DNSName(BROKER_NAME)))
         });
         let expires = u64::try_from(parsed.validity().not_after.timestamp()).unwrap_or(0);
-        Ok(Self { name, serves, expires: Timestamp(0) + Duration::from_secs(expires) })
+        Ok(Self { name, may_serve, expires: Timestamp(0) + Duration::from_secs(expires) })
     }
 
     /// The node's name.
@@ -53,8 +53,8 @@ impl Identity {
     }
 
     /// Whether the node may have a broker, and so lead.
-    pub fn serves(&self) -> bool {
-        self.serves
+    pub fn may_serve(&self) -> bool {
+        self.may_serve
     }
 
     /// Until when the certificate is valid.
@@ -64,7 +64,7 @@ impl Identity {
 
     /// Whether the holder may have a client of this name: its own, or that of an observer which shares its certificate.
     /// An observer has a status and nothing else to say: one certificate is one vehicle.
-    pub fn speaks_for(&self, name: &str) -> bool {
+    pub fn may_act_as(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
     }
 }

@@ -2,14 +2,14 @@
 
 use tokio::io::{AsyncRead, AsyncReadExt};
 
-use super::gate::TurnedAway;
+use super::frontend::ClientRejection;
 
 /// A CONNECT packet as it came.
 #[derive(Debug)]
-pub(super) struct Login {
+pub(super) struct ConnectPacket {
     pub(super) packet: Vec<u8>,
     /// Whether the client leaves it to the broker to draw its id.
-    pub(super) is_nameless: bool,
+    pub(super) has_generated_id: bool,
 }
 
 /// Largest CONNECT packet: client id, last will, user name and password.
@@ -21,9 +21,9 @@ const CONNECT: u8 = 0x10;
 const MQTT_5: u8 = 5;
 
 /// Reads the first packet, which must be CONNECT; rmqtt itself would wait for its first bytes for good.
-pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Login, TurnedAway> {
+pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<ConnectPacket, ClientRejection> {
     if stream.read_u8().await? != CONNECT {
-        return Err(TurnedAway::Malformed);
+        return Err(ClientRejection::Malformed);
     }
     let mut packet = vec![CONNECT];
     let mut length = 0;
@@ -36,18 +36,18 @@ pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Login,
         }
     }
     if packet.last().is_some_and(|byte| byte & 0x80 != 0) || length > MAX_BYTES {
-        return Err(TurnedAway::Malformed);
+        return Err(ClientRejection::Malformed);
     }
     let mut body = vec![0; length];
     stream.read_exact(&mut body).await?;
-    let is_nameless = client_id(&body).is_some_and(<[u8]>::is_empty);
+    let has_generated_id = client_id(&body).is_some_and(<[u8]>::is_empty);
     packet.append(&mut body);
-    Ok(Login { packet, is_nameless })
+    Ok(ConnectPacket { packet, has_generated_id })
 }
 
 /// The length of the first packet in what a client sent, if all of it is there; only built for the fuzz targets.
 #[cfg(fuzzing)]
-pub fn read_login(sent: &[u8]) -> Option<usize> {
+pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     use futures_util::FutureExt;
 
     let login = read(&mut &*sent).now_or_never().expect("bytes that are there are not waited for").ok()?;
@@ -93,12 +93,12 @@ mod tests {
             [&b"\0\x04MQTT\x05\x02\0\x3c\x05\x11\0\0\x0e\x10\0"[..], &[id.len() as u8], id.as_bytes()].concat()
         };
         let drawn = "0123456789abcdef0123456789abcdef";
-        for (body, is_nameless) in
+        for (body, has_generated_id) in
             [(v4(""), true), (v5(""), true), (v4("euclid"), false), (v5("euclid"), false), (v4(drawn), false)]
         {
             let packet = [&[CONNECT, body.len() as u8], &body[..]].concat();
             let login = read(&mut &packet[..]).await.unwrap();
-            assert_eq!((login.packet, login.is_nameless), (packet, is_nameless));
+            assert_eq!((login.packet, login.has_generated_id), (packet, has_generated_id));
         }
         for body in [&b""[..], b"\0\x04MQ", b"\0\x04MQTT\x05\x02\0\x3c\xff\xff\xff\xff", b"\0\x04MQTT\x04\x02\0\x3c\0"]
         {
