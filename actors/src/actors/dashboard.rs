@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! Follower ──────── watch of maps, verdicts, reputations ──┐
-//! LeaderElection ── watch of the leadership ───────────────┼─> Observer ── pictures, latest only ──> browsers
-//! Gateway ───────── Feed: latest reports, statuses ────────┘      │ a thread of its own
+//! LeaderElection ── watch of the leadership ───────────────┼─> NodeMonitor ── pictures, latest only ──> browsers
+//! Gateway ───────── LiveState: latest reports, statuses ────────┘      │ a thread of its own
 //! Gateway, Broker <── how are you, every half second ─────────────┘
 //! ```
 //!
@@ -19,9 +19,9 @@ use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
 use crate::messages::dashboard::DashboardMessage;
-use crate::observe::dashboard::observer::Observer;
+use crate::observe::dashboard::node_monitor::NodeMonitor;
 use crate::observe::dashboard::server::Server;
-use crate::observe::dashboard::{DashboardConfig, Sources};
+use crate::observe::dashboard::{DashboardConfig, NodeSources};
 
 /// What a dashboard needs at its start.
 #[derive(Debug)]
@@ -29,7 +29,7 @@ pub struct DashboardArguments {
     /// Address, limits and token.
     pub config: DashboardConfig,
     /// What it shows.
-    pub sources: Sources,
+    pub sources: NodeSources,
     /// Gets the address that is listened on. A run before this one may have bound it; it is then taken again.
     pub bound: watch::Sender<Option<SocketAddr>>,
 }
@@ -59,8 +59,8 @@ impl Actor for Dashboard {
     ) -> Result<Self::State, ActorProcessingErr> {
         let DashboardArguments { config, sources, bound } = arguments;
         config.validate()?;
-        let observer = Arc::new(Observer::new(sources, config.max_rate_hz));
-        let server = Server::start(config, observer, bound)?;
+        let monitor = Arc::new(NodeMonitor::new(sources, config.max_rate_hz));
+        let server = Server::start(config, monitor, bound)?;
         myself.send_interval(CHECK_PERIOD, || DashboardMessage::CheckServer);
         Ok(DashboardState { server })
     }

@@ -28,7 +28,7 @@ use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::leadership::Leadership;
-use crate::observe::recorder::Recording;
+use crate::observe::recorder::LogSender;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::Incoming;
 use age::Age;
@@ -42,7 +42,7 @@ pub struct FollowerArguments {
     /// object a line.
     pub log: Option<PathBuf>,
     /// Where everything accepted is recorded.
-    pub recording: Recording,
+    pub recording: LogSender,
     /// The lowest term taken at first: the highest that an earlier run of the node knew.
     pub least_term: u64,
     /// The highest term that the election knows.
@@ -70,7 +70,7 @@ pub struct FollowerState {
     map_age: Age,
     verdicts_age: Age,
     log: Option<BufWriter<File>>,
-    recording: Recording,
+    recording: LogSender,
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
     fuser: ActorSlot<FuserMessage>,
@@ -211,7 +211,7 @@ mod tests {
         let arguments = FollowerArguments {
             newest: Newest::default(),
             log: None,
-            recording: Recording::default(),
+            recording: LogSender::default(),
             least_term: 0,
             term: watch::channel(7).1,
             leadership: watch::channel(leadership).1,

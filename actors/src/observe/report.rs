@@ -22,7 +22,7 @@ use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, ReportKind, Reputations, Verdicts};
 
 use crate::observe::recorder::{
-    CounterReading, Identity, LeadershipChange, LogError, LogEvent, LogMessage, LogReader, SchemaName,
+    CounterReading, LeadershipChange, LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName,
 };
 use losses::Losses;
 use series::Samples;
@@ -30,7 +30,7 @@ use series::Samples;
 /// What is gathered of a log; by default, nothing yet.
 #[derive(Debug, Default)]
 pub struct Report {
-    identity: Option<Identity>,
+    identity: Option<LogIdentity>,
     first: Option<Timestamp>,
     last: Timestamp,
     messages: u64,
@@ -128,7 +128,7 @@ impl Report {
         page::write(self)
     }
 
-    fn meet(&mut self, identity: &Identity) {
+    fn meet(&mut self, identity: &LogIdentity) {
         if let Some(known) = self.identity.replace(identity.clone())
             && known.node != identity.node
         {

@@ -29,7 +29,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use crate::camera::lens::Lens;
-use crate::camera::perception::{Perception, Vantage};
+use crate::camera::perception::{Perception, VehicleCamera};
 
 /// When virtual time begins.
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
@@ -255,7 +255,7 @@ fn fusion(mode: VoteMode) -> FusionConfig {
 }
 
 fn perception(recording: &Recording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -> Perception {
-    let vantage = Vantage {
+    let vehicle_camera = VehicleCamera {
         node: cav.name.clone(),
         pose: cav.pose,
         mount: Mount::default(),
@@ -272,5 +272,5 @@ fn perception(recording: &Recording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -
         position_sigma_m: 0.02,
         ..ProjectionConfig::default()
     };
-    Perception::new(vantage, projection, ViewConfig::default(), GATE)
+    Perception::new(vehicle_camera, projection, ViewConfig::default(), GATE)
 }

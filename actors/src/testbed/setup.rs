@@ -21,7 +21,7 @@ use crate::camera::detect::placard::PlacardConfig;
 use crate::camera::frame_source::SourceConfig;
 use crate::camera::frame_source::capture::CaptureConfig;
 use crate::camera::lens::Lens;
-use crate::camera::perception::{Perception, Vantage};
+use crate::camera::perception::{Perception, VehicleCamera};
 use crate::camera::vehicle_pose::PoseConfig;
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::DashboardConfig;
@@ -85,14 +85,14 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
 /// A vehicle's way from detections to reports.
 pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
     let gate = fusion(testbed).pace.gate();
-    let vantage = Vantage {
+    let vehicle_camera = VehicleCamera {
         node: cav.name.clone(),
         pose: cav.pose,
         mount: Mount::default(),
         lens: Lens::ideal(testbed.camera.intrinsics),
         landmarks: Arc::new(LandmarkIndex::new(scene.landmarks(&testbed.placard), gate.radius_m)),
     };
-    Perception::new(vantage, projection(&testbed.placard), view(&testbed.placard), gate)
+    Perception::new(vehicle_camera, projection(&testbed.placard), view(&testbed.placard), gate)
 }
 
 /// How reports are fused: a round for every frame, which counts until some more have come.

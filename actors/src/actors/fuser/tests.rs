@@ -44,7 +44,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         let arguments = FollowerArguments {
             newest: Newest::default(),
             log: None,
-            recording: Recording::default(),
+            recording: LogSender::default(),
             least_term: 0,
             term: watch::channel(7).1,
             leadership: watch::channel(leadership.clone()).1,
@@ -65,7 +65,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             term: watch::channel(7).1,
             intake: Intake::default(),
             newest: None,
-            recording: Recording::default(),
+            recording: LogSender::default(),
             gateway: ActorSlot::default(),
             keeper: ActorSlot::default(),
             counters: Arc::default(),

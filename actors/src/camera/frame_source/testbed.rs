@@ -6,7 +6,7 @@ use std::path::Path;
 use ecod::names::NodeName;
 use ecod::testbed::Testbed;
 
-use super::{FrameError, FrameSource, Pace};
+use super::{FrameError, FramePacer, FrameSource};
 use crate::camera::frame::Frame;
 use crate::platform::clock;
 use crate::testbed::TestbedCamera;
@@ -15,7 +15,7 @@ use crate::testbed::TestbedCamera;
 pub(super) struct TestbedVehicle {
     camera: TestbedCamera,
     origin: String,
-    pace: Pace,
+    pace: FramePacer,
     next: u64,
 }
 
@@ -29,7 +29,7 @@ impl TestbedVehicle {
         let found = scene.cavs.iter().find(|candidate| candidate.name == *cav);
         let cav = found.ok_or_else(|| failed("there is no such vehicle".into()))?;
         let camera = TestbedCamera::new(&testbed, scene, cav, seed).map_err(|error| failed(error.to_string()))?;
-        let pace = Pace::new(1.0 / testbed.camera.capture_interval.as_secs_f64());
+        let pace = FramePacer::new(1.0 / testbed.camera.capture_interval.as_secs_f64());
         Ok(Self { camera, origin, pace, next: 0 })
     }
 }

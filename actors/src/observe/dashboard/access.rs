@@ -11,7 +11,7 @@ use crate::transport::mqtt::Secret;
 
 /// Judges requests.
 #[derive(Debug)]
-pub(crate) struct Access {
+pub(crate) struct AccessPolicy {
     loopback: bool,
     token: Option<Token>,
 }
@@ -26,7 +26,7 @@ struct Token {
 
 /// How a request stands.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum AccessDecision {
     /// It may see everything.
     Allowed,
     /// It brought the token in its address: it gets a cookie, and the token leaves the address.
@@ -55,8 +55,8 @@ pub(crate) const HEADERS: [(HeaderName, HeaderValue); 5] = [
     (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
 ];
 
-impl Access {
-    /// Access to the page of a node that listens on `address`.
+impl AccessPolicy {
+    /// AccessPolicy to the page of a node that listens on `address`.
     pub(crate) fn new(token: Option<&Secret>, address: SocketAddr, node: &NodeName) -> Self {
         let token = token.map(|token| {
             let key = hmac::Key::new(hmac::HMAC_SHA256, token.reveal().as_bytes());
@@ -68,17 +68,17 @@ impl Access {
     }
 
     /// Whether the request may be answered.
-    pub(crate) fn judge(&self, uri: &Uri, headers: &HeaderMap) -> Verdict {
+    pub(crate) fn judge(&self, uri: &Uri, headers: &HeaderMap) -> AccessDecision {
         if self.loopback && !headers.get(HOST).is_some_and(is_this_machine) {
-            return Verdict::ForeignHost;
+            return AccessDecision::ForeignHost;
         }
-        let Some(token) = &self.token else { return Verdict::Allowed };
+        let Some(token) = &self.token else { return AccessDecision::Allowed };
         if token.is_in_headers(headers) {
-            return Verdict::Allowed;
+            return AccessDecision::Allowed;
         }
         match token_in(uri) {
-            Some(given) if token.is(given.as_bytes()) => Verdict::SignIn,
-            _ => Verdict::Unauthorized,
+            Some(given) if token.is(given.as_bytes()) => AccessDecision::SignIn,
+            _ => AccessDecision::Unauthorized,
         }
     }
 
@@ -136,12 +136,12 @@ fn is_this_machine(host: &HeaderValue) -> bool {
 mod tests {
     use super::*;
 
-    fn access(listen: &str, token: Option<&str>) -> Access {
+    fn access(listen: &str, token: Option<&str>) -> AccessPolicy {
         let token = token.map(Secret::new);
-        Access::new(token.as_ref(), listen.parse().unwrap(), &NodeName::from_static("edge"))
+        AccessPolicy::new(token.as_ref(), listen.parse().unwrap(), &NodeName::from_static("edge"))
     }
 
-    fn judge(access: &Access, uri: &str, headers: &[(HeaderName, &str)]) -> Verdict {
+    fn judge(access: &AccessPolicy, uri: &str, headers: &[(HeaderName, &str)]) -> AccessDecision {
         let headers = headers.iter().map(|(name, value)| (name.clone(), HeaderValue::from_str(value).unwrap()));
         access.judge(&uri.parse().unwrap(), &headers.collect())
     }
@@ -150,31 +150,31 @@ mod tests {
     fn on_loopback_only_names_of_this_machine_are_answered() {
         let access = access("127.0.0.1:8080", None);
         for host in ["localhost:8080", "LOCALHOST", "127.0.0.1:9", "127.1.2.3", "[::1]:8080", "[::1]"] {
-            assert_eq!(judge(&access, "/", &[(HOST, host)]), Verdict::Allowed, "{host}");
+            assert_eq!(judge(&access, "/", &[(HOST, host)]), AccessDecision::Allowed, "{host}");
         }
         for host in ["evil.example:8080", "127.0.0.1.evil.example", "localhost.evil.example", "10.0.0.2", "", "::1:"] {
-            assert_eq!(judge(&access, "/", &[(HOST, host)]), Verdict::ForeignHost, "{host}");
+            assert_eq!(judge(&access, "/", &[(HOST, host)]), AccessDecision::ForeignHost, "{host}");
         }
-        assert_eq!(judge(&access, "/", &[]), Verdict::ForeignHost);
+        assert_eq!(judge(&access, "/", &[]), AccessDecision::ForeignHost);
     }
 
     #[test]
     fn a_token_comes_by_header_cookie_or_once_by_address() {
         let access = access("0.0.0.0:8080", Some("correct-horse"));
         let with = |uri: &str, header: Option<(HeaderName, &str)>| judge(&access, uri, header.as_slice());
-        assert_eq!(with("/", None), Verdict::Unauthorized);
-        assert_eq!(with("/?token=correct-horse", None), Verdict::SignIn);
-        assert_eq!(with("/?a=b&token=correct-horse", None), Verdict::SignIn);
-        assert_eq!(with("/?token=correct-hors", None), Verdict::Unauthorized);
-        assert_eq!(with("/", Some((AUTHORIZATION, "Bearer correct-horse"))), Verdict::Allowed);
+        assert_eq!(with("/", None), AccessDecision::Unauthorized);
+        assert_eq!(with("/?token=correct-horse", None), AccessDecision::SignIn);
+        assert_eq!(with("/?a=b&token=correct-horse", None), AccessDecision::SignIn);
+        assert_eq!(with("/?token=correct-hors", None), AccessDecision::Unauthorized);
+        assert_eq!(with("/", Some((AUTHORIZATION, "Bearer correct-horse"))), AccessDecision::Allowed);
         for wrong in ["Bearer wrong", "Bearer ", "correct-horse", "Basic correct-horse"] {
-            assert_eq!(with("/", Some((AUTHORIZATION, wrong))), Verdict::Unauthorized, "{wrong}");
+            assert_eq!(with("/", Some((AUTHORIZATION, wrong))), AccessDecision::Unauthorized, "{wrong}");
         }
         let cookie = access.cookie().unwrap();
         let cookie = cookie.to_str().unwrap();
         assert!(cookie.contains("HttpOnly") && !cookie.contains("correct-horse"), "{cookie}");
         let pair = cookie.split(';').next().unwrap();
-        assert_eq!(with("/", Some((COOKIE, &format!("a=b; {pair}")))), Verdict::Allowed);
-        assert_eq!(with("/", Some((COOKIE, &pair[..pair.len() - 1]))), Verdict::Unauthorized);
+        assert_eq!(with("/", Some((COOKIE, &format!("a=b; {pair}")))), AccessDecision::Allowed);
+        assert_eq!(with("/", Some((COOKIE, &pair[..pair.len() - 1]))), AccessDecision::Unauthorized);
     }
 }

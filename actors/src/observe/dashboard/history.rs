@@ -9,12 +9,12 @@ use ecod::time::Timestamp;
 use ecod::wire::Reputations;
 use serde::Serialize;
 
-use super::picture::json;
+use super::snapshot::json;
 use crate::messages::leadership::{Leadership, Position};
 
 /// A span of time in which one node led, as this node saw it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(crate) struct Reign {
+pub(crate) struct LeaderTerm {
     /// The leader.
     pub leader: NodeName,
     /// Its term.
@@ -47,7 +47,7 @@ struct Sample<'a> {
 #[derive(Debug, Default)]
 pub(crate) struct History {
     /// Who led.
-    pub reigns: VecDeque<Reign>,
+    pub reigns: VecDeque<LeaderTerm>,
     /// When spans ended and, as JSON, how they went: it is written once and not for every browser that asks.
     samples: VecDeque<(Timestamp, Vec<u8>)>,
     /// How often the leader changed since the node started.
@@ -66,7 +66,7 @@ pub(crate) const SAMPLE_PERIOD: Duration = Duration::from_secs(2);
 pub(crate) const MAX_SAMPLES: usize = 300;
 
 /// Most reigns kept.
-pub(crate) const MAX_REIGNS: usize = 32;
+pub(crate) const MAX_TERMS: usize = 32;
 
 /// Most vehicles in a sample.
 pub(crate) const MAX_VEHICLES: usize = 64;
@@ -98,7 +98,7 @@ impl History {
         self.failovers += u64::from(changed);
         let gap_ms = self.last_gap.as_ref().filter(|(of, _)| of == epoch).map(|(_, gap)| *gap);
         let (leader, epoch) = (epoch.leader.clone(), epoch.term);
-        push(&mut self.reigns, Reign { leader, epoch, from_us: now, until_us: None, gap_ms }, MAX_REIGNS);
+        push(&mut self.reigns, LeaderTerm { leader, epoch, from_us: now, until_us: None, gap_ms }, MAX_TERMS);
     }
 
     /// Notes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
@@ -111,7 +111,7 @@ impl History {
         let before = self.last_round.replace((epoch.clone(), received_at));
         let Some((last, last_at)) = before.filter(|(last, _)| last != epoch) else { return };
         let gap_ms = u64::try_from(received_at.since(last_at).as_millis()).unwrap_or(u64::MAX);
-        let of_this = |reign: &&mut Reign| reign.leader == epoch.leader && reign.epoch == epoch.term;
+        let of_this = |reign: &&mut LeaderTerm| reign.leader == epoch.leader && reign.epoch == epoch.term;
         if let Some(reign) = self.reigns.iter_mut().rev().find(of_this) {
             reign.gap_ms.get_or_insert(gap_ms);
         }
@@ -171,7 +171,7 @@ mod tests {
         history.note_leadership(&led_by("gauss", 5), seconds(16));
         let reign = |leader, epoch, from, until: Option<u64>, gap_ms| {
             let leader = NodeName::from_static(leader);
-            Reign { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
+            LeaderTerm { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
         };
         let (first, second) = (reign("edge", 3, 1, Some(10), None), reign("euclid", 4, 11, Some(16), Some(3000)));
         assert_eq!(history.reigns, [first, second, reign("gauss", 5, 16, None, Some(1000))]);
@@ -197,7 +197,7 @@ mod tests {
             assert!(history.latencies_ms.len() <= MAX_LATENCIES);
             history.sample(None, seconds(n));
         }
-        assert_eq!((history.reigns.len(), history.samples.len()), (MAX_REIGNS, MAX_SAMPLES));
+        assert_eq!((history.reigns.len(), history.samples.len()), (MAX_TERMS, MAX_SAMPLES));
         let told: serde_json::Value = serde_json::from_slice(&history.json_since(seconds(997))).unwrap();
         let told = told["samples"].as_array().unwrap();
         assert_eq!(told.len(), 2, "those that a browser has are left out");

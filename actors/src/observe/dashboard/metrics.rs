@@ -12,10 +12,10 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::{Registry, Unit};
 
-use super::feed::kind_label;
 use super::history::MAX_VEHICLES;
-use super::observer::{Observer, age_s};
-use super::process;
+use super::live_state::kind_label;
+use super::node_monitor::{NodeMonitor, age_s};
+use super::process_metrics;
 use crate::messages::leadership::Position;
 use crate::telemetry::counters::{Event, OTHERS, Shed, ShedReason};
 use crate::transport::mqtt::LinkState;
@@ -30,15 +30,15 @@ type Float = Gauge<f64, std::sync::atomic::AtomicU64>;
 ///
 /// # Errors
 /// Never with text; the encoder writes to what may refuse.
-pub(crate) fn metrics(observer: &Observer) -> Result<String, fmt::Error> {
+pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod");
-    node(&mut registry, observer);
-    election(&mut registry, observer);
-    rounds(&mut registry, observer);
-    traffic(&mut registry, observer);
-    reputations(&mut registry, observer);
+    node(&mut registry, monitor);
+    election(&mut registry, monitor);
+    rounds(&mut registry, monitor);
+    traffic(&mut registry, monitor);
+    reputations(&mut registry, monitor);
     let mut own = Registry::default();
-    process::register(&mut own, observer.sources().node.started_at_us);
+    process_metrics::register(&mut own, monitor.sources().node.started_at_us);
     let mut text = String::new();
     encode(&mut text, &registry)?;
     // One text has one end.
@@ -47,18 +47,18 @@ pub(crate) fn metrics(observer: &Observer) -> Result<String, fmt::Error> {
     Ok(text)
 }
 
-fn node(registry: &mut Registry, observer: &Observer) {
-    let facts = &observer.sources().node;
+fn node(registry: &mut Registry, monitor: &NodeMonitor) {
+    let facts = &monitor.sources().node;
     let role = format!("{:?}", facts.role).to_lowercase();
     let labels = [("node", facts.name.to_string()), ("cell", facts.cell.to_string()), ("role", role)];
     let info = family(registry, "node_info", "Name, cell, role and version of the node; always 1.");
     set(&info, [labels.as_slice(), &[("version", facts.version.to_owned())]].concat(), 1);
     let ready = "Whether the node follows a live aggregator, or leads with a working broker.";
-    gauge(registry, "ready", ready, i64::from(observer.readiness().ready));
+    gauge(registry, "ready", ready, i64::from(monitor.readiness().ready));
     gauge(registry, "members", "Nodes of the cell that answer, this one included.", {
-        count(observer.sources().members.borrow().len() + 1)
+        count(monitor.sources().members.borrow().len() + 1)
     });
-    let (probe, viewers) = (observer.probe(), observer.viewers());
+    let (probe, viewers) = (monitor.probe(), monitor.viewers());
     let serves = "Whether the node's embedded broker serves; 0 too on a node without one.";
     gauge(registry, "broker_up", serves, i64::from(probe.broker_serves));
     let up = |state: LinkState| state == LinkState::Up;
@@ -70,8 +70,8 @@ fn node(registry: &mut Registry, observer: &Observer) {
     gauge(registry, "dashboard_viewers", "Browsers that get live pictures.", count(viewers));
 }
 
-fn election(registry: &mut Registry, observer: &Observer) {
-    let leadership = observer.sources().vitals.leadership.borrow().clone();
+fn election(registry: &mut Registry, monitor: &NodeMonitor) {
+    let leadership = monitor.sources().vitals.leadership.borrow().clone();
     let states = family(registry, "election_state", "What the node has to do with the lead; 1 for the present state.");
     for (label, position) in [
         ("seeking", Position::Seeking),
@@ -84,12 +84,12 @@ fn election(registry: &mut Registry, observer: &Observer) {
     let term = leadership.epoch.as_ref().map_or(0, |epoch| i64::try_from(epoch.term).unwrap_or(i64::MAX));
     gauge(registry, "election_epoch", "Highest term of leadership known.", term);
     let failovers = Counter::<u64>::default();
-    failovers.inc_by(observer.failovers());
+    failovers.inc_by(monitor.failovers());
     registry.register("election_failovers", "Changes of the leader seen since the node started", failovers);
 }
 
-fn rounds(registry: &mut Registry, observer: &Observer) {
-    let (sources, latencies) = (observer.sources(), observer.latencies());
+fn rounds(registry: &mut Registry, monitor: &NodeMonitor) {
+    let (sources, latencies) = (monitor.sources(), monitor.latencies());
     for (name, help, histogram) in [
         ("map_capture_to_fused", "From the oldest capture in a map to its fusion", &latencies.capture_to_fused),
         ("map_fused_to_received", "From a map's fusion to its receipt", &latencies.fused_to_received),
@@ -120,8 +120,8 @@ fn rounds(registry: &mut Registry, observer: &Observer) {
     }
 }
 
-fn traffic(registry: &mut Registry, observer: &Observer) {
-    let sources = observer.sources();
+fn traffic(registry: &mut Registry, monitor: &NodeMonitor) {
+    let sources = monitor.sources();
     let snapshot = sources.counters.snapshot();
     let accepted = counters(registry, "rounds_accepted", "Maps, verdicts and reputations newer than all before");
     for (kind, event) in [
@@ -133,7 +133,7 @@ fn traffic(registry: &mut Registry, observer: &Observer) {
     }
     let reports = counters(registry, "reports_received", "Vehicles' reports, also those that were not used");
     for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
-        add(&reports, [("kind", kind_label(kind).to_owned())], sources.feed.reports(kind));
+        add(&reports, [("kind", kind_label(kind).to_owned())], sources.live_state.reports(kind));
     }
     let rejected = counters(registry, "payloads_rejected", "Payloads that were not used, by reason");
     for (reason, number) in snapshot.rejects {
@@ -157,8 +157,8 @@ fn traffic(registry: &mut Registry, observer: &Observer) {
     }
 }
 
-fn reputations(registry: &mut Registry, observer: &Observer) {
-    let Some(newest) = observer.sources().vitals.newest.reputations.borrow().clone() else { return };
+fn reputations(registry: &mut Registry, monitor: &NodeMonitor) {
+    let Some(newest) = monitor.sources().vitals.newest.reputations.borrow().clone() else { return };
     let vehicles = &newest.message.reputations;
     gauge(registry, "reputation_vehicles", "Vehicles that have a reputation.", count(vehicles.len()));
     let scores = Family::<Labels, Float>::default();

@@ -15,26 +15,26 @@ use axum::{Json, Router};
 use ecod::time::Timestamp;
 use futures_util::stream;
 
-use super::access::{Access, HEADERS, Verdict};
+use super::access::{AccessDecision, AccessPolicy, HEADERS};
 use super::assets::Asset;
+use super::connection_limit::ConnectionSlot;
 use super::metrics;
-use super::observer::Observer;
-use super::paced::Paced;
-use super::picture::json;
-use super::places::Place;
+use super::node_monitor::NodeMonitor;
+use super::response_cache::ResponseCache;
+use super::snapshot::json;
 use crate::platform::clock;
 use crate::platform::throttle::Throttle;
 use crate::telemetry::counters::Event;
 
 /// What requests are answered with.
 #[derive(Debug, Clone)]
-pub(crate) struct Site {
-    observer: Arc<Observer>,
-    access: Arc<Access>,
+pub(crate) struct HttpApi {
+    monitor: Arc<NodeMonitor>,
+    access: Arc<AccessPolicy>,
     answers: Arc<Mutex<Throttle>>,
     /// Apart, so that whoever may not look takes nothing from those who may.
     refusals: Arc<Mutex<Throttle>>,
-    metrics: Arc<Paced<Result<Bytes, fmt::Error>>>,
+    metrics: Arc<ResponseCache<Result<Bytes, fmt::Error>>>,
     landmarks: Bytes,
     max_viewers: usize,
 }
@@ -48,18 +48,18 @@ const METRICS_PAUSE: Duration = Duration::from_millis(100);
 
 const JSON: &str = "application/json";
 
-impl Site {
+impl HttpApi {
     /// Half of the connections at most are for live pictures.
-    pub(crate) fn new(observer: Arc<Observer>, access: Access, max_connections: usize) -> Self {
+    pub(crate) fn new(monitor: Arc<NodeMonitor>, access: AccessPolicy, max_connections: usize) -> Self {
         let throttle = || Arc::new(Mutex::new(Throttle::new(BURST, STEADY, clock::now())));
         Self {
             access: Arc::new(access),
             answers: throttle(),
             refusals: throttle(),
-            metrics: Arc::new(Paced::new(METRICS_PAUSE)),
-            landmarks: json(&observer.sources().landmarks).into(),
+            metrics: Arc::new(ResponseCache::new(METRICS_PAUSE)),
+            landmarks: json(&monitor.sources().landmarks).into(),
             max_viewers: max_connections / 2,
-            observer,
+            monitor,
         }
     }
 
@@ -82,25 +82,25 @@ impl Site {
     }
 
     fn count(&self, event: Event) {
-        self.observer.sources().counters.count(event);
+        self.monitor.sources().counters.count(event);
     }
 }
 
 /// Lets through what may pass, and as much of it as may.
-async fn guard(State(site): State<Site>, request: Request, next: Next) -> Response {
+async fn guard(State(site): State<HttpApi>, request: Request, next: Next) -> Response {
     let verdict = site.access.judge(request.uri(), request.headers());
-    let is_allowed = matches!(verdict, Verdict::Allowed | Verdict::SignIn);
+    let is_allowed = matches!(verdict, AccessDecision::Allowed | AccessDecision::SignIn);
     let throttle = if is_allowed { &site.answers } else { &site.refusals };
     if !throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(clock::now()) {
         site.count(Event::BrowserThrottled);
         return (StatusCode::TOO_MANY_REQUESTS, [(header::RETRY_AFTER, "1")], "too many requests\n").into_response();
     }
-    if is_allowed && let Some(place) = request.extensions().get::<Arc<Place>>() {
-        place.keep();
+    if is_allowed && let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
+        slot.keep();
     }
     match verdict {
-        Verdict::Allowed => next.run(request).await,
-        Verdict::SignIn => {
+        AccessDecision::Allowed => next.run(request).await,
+        AccessDecision::SignIn => {
             let location = HeaderValue::from_str(request.uri().path()).unwrap_or(HeaderValue::from_static("/"));
             let mut answer = (StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response();
             if let Some(cookie) = site.access.cookie() {
@@ -108,13 +108,13 @@ async fn guard(State(site): State<Site>, request: Request, next: Next) -> Respon
             }
             answer
         }
-        Verdict::Unauthorized => {
+        AccessDecision::Unauthorized => {
             site.count(Event::BrowserRefused);
             let ask = [(header::WWW_AUTHENTICATE, "Bearer")];
             (StatusCode::UNAUTHORIZED, ask, "open this page with ?token=… or send Authorization: Bearer …\n")
                 .into_response()
         }
-        Verdict::ForeignHost => {
+        AccessDecision::ForeignHost => {
             site.count(Event::BrowserRefused);
             (StatusCode::MISDIRECTED_REQUEST, "this page is served on loopback only\n").into_response()
         }
@@ -128,14 +128,14 @@ async fn with_headers(mut answer: Response) -> Response {
     answer
 }
 
-async fn show_readiness(State(site): State<Site>) -> Response {
-    let readiness = site.observer.readiness();
+async fn show_readiness(State(site): State<HttpApi>) -> Response {
+    let readiness = site.monitor.readiness();
     let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     (status, Json(readiness)).into_response()
 }
 
-async fn show_metrics(State(site): State<Site>) -> Response {
-    match site.metrics.get(|| metrics::metrics(&site.observer).map(Bytes::from)).value {
+async fn show_metrics(State(site): State<HttpApi>) -> Response {
+    match site.metrics.get(|| metrics::metrics(&site.monitor).map(Bytes::from)).value {
         Ok(text) => ([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response(),
         Err(error) => {
             tracing::warn!(%error, "metrics not written");
@@ -144,31 +144,31 @@ async fn show_metrics(State(site): State<Site>) -> Response {
     }
 }
 
-async fn show_picture(State(site): State<Site>) -> Response {
-    ([(header::CONTENT_TYPE, JSON)], site.observer.json()).into_response()
+async fn show_picture(State(site): State<HttpApi>) -> Response {
+    ([(header::CONTENT_TYPE, JSON)], site.monitor.json()).into_response()
 }
 
 /// All of the history, or with `?since=` only later samples.
-async fn show_history(State(site): State<Site>, uri: Uri) -> Response {
+async fn show_history(State(site): State<HttpApi>, uri: Uri) -> Response {
     let since = uri.query().and_then(|query| query.strip_prefix("since=")).and_then(|time| time.parse().ok());
-    let history = site.observer.history_since(Timestamp(since.unwrap_or(0)));
+    let history = site.monitor.history_since(Timestamp(since.unwrap_or(0)));
     ([(header::CONTENT_TYPE, JSON)], history).into_response()
 }
 
-async fn show_landmarks(State(site): State<Site>) -> Response {
+async fn show_landmarks(State(site): State<HttpApi>) -> Response {
     ([(header::CONTENT_TYPE, JSON)], site.landmarks).into_response()
 }
 
 /// Pictures as they are made. Each browser has the latest and what fits into its socket; what it is too slow for, it
 /// never gets.
-async fn show_events(State(site): State<Site>) -> Response {
-    if site.observer.viewers() >= site.max_viewers {
+async fn show_events(State(site): State<HttpApi>) -> Response {
+    if site.monitor.viewers() >= site.max_viewers {
         site.count(Event::BrowserRefused);
         return (StatusCode::SERVICE_UNAVAILABLE, "too many browsers\n").into_response();
     }
-    let mut pictures = site.observer.pictures();
+    let mut pictures = site.monitor.pictures();
     pictures.mark_unchanged();
-    let first = Some(site.observer.event());
+    let first = Some(site.monitor.event());
     let events = stream::unfold((pictures, first), |(mut pictures, mut first)| async move {
         let event = match first.take() {
             Some(event) => event,

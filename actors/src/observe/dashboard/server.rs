@@ -17,11 +17,11 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{oneshot, watch};
 use tokio_io_timeout::TimeoutStream;
 
-use super::access::Access;
+use super::access::AccessPolicy;
 use super::config::{DEFAULT_ADDRESS, DashboardConfig};
-use super::observer::Observer;
-use super::places::{Admitted, Place, Places};
-use super::routes::Site;
+use super::connection_limit::{Admitted, ConnectionLimit, ConnectionSlot};
+use super::node_monitor::NodeMonitor;
+use super::routes::HttpApi;
 use crate::telemetry::counters::Event;
 
 /// A running server; dropping it stops it.
@@ -51,7 +51,7 @@ impl Server {
     /// When the operating system gives no thread.
     pub(crate) fn start(
         config: DashboardConfig,
-        observer: Arc<Observer>,
+        monitor: Arc<NodeMonitor>,
         bound: watch::Sender<Option<SocketAddr>>,
     ) -> io::Result<Self> {
         let (stop, stopped) = oneshot::channel();
@@ -59,8 +59,8 @@ impl Server {
         let thread = std::thread::Builder::new().name("dashboard".into()).spawn(move || {
             runtime.block_on(async {
                 tokio::select! {
-                    () = observer.run() => {}
-                    () = serve(&config, &observer, &bound) => {}
+                    () = monitor.run() => {}
+                    () = serve(&config, &monitor, &bound) => {}
                     // The sender is dropped too when its owner is.
                     _ = stopped => {}
                 }
@@ -85,20 +85,20 @@ impl Drop for Server {
     }
 }
 
-async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch::Sender<Option<SocketAddr>>) {
+async fn serve(config: &DashboardConfig, monitor: &Arc<NodeMonitor>, bound: &watch::Sender<Option<SocketAddr>>) {
     // A run before this one may have been given a port, which browsers now know.
     let wanted = bound.borrow().or(config.listen);
     let listener = match wanted {
-        Some(address) => listen(address, observer).await,
-        None => listen_anywhere(observer).await,
+        Some(address) => listen(address, monitor).await,
+        None => listen_anywhere(monitor).await,
     };
     let Ok(address) = listener.local_addr() else { return };
-    let node = &observer.sources().node.name;
-    let access = Access::new(config.token.as_ref(), address, node);
+    let node = &monitor.sources().node.name;
+    let access = AccessPolicy::new(config.token.as_ref(), address, node);
     tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
     bound.send_replace(Some(address));
-    let router = Site::new(Arc::clone(observer), access, config.max_connections).router();
-    let places = Places::new(config.max_connections);
+    let router = HttpApi::new(Arc::clone(monitor), access, config.max_connections).router();
+    let connection_limit = ConnectionLimit::new(config.max_connections);
     loop {
         let (stream, from) = match listener.accept().await {
             Ok(accepted) => accepted,
@@ -109,15 +109,15 @@ async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch
                 continue;
             }
         };
-        let admitted = places.admit(from.ip());
+        let admitted = connection_limit.admit(from.ip());
         if admitted.as_ref().is_none_or(|admitted| admitted.displaces) {
-            observer.sources().counters.count(Event::BrowserRefused);
+            monitor.sources().counters.count(Event::BrowserRefused);
         }
-        let Some(Admitted { place, displaced, .. }) = admitted else { continue };
+        let Some(Admitted { slot, displaced, .. }) = admitted else { continue };
         let router = router.clone();
         tokio::spawn(async move {
             tokio::select! {
-                answered = answer(stream, Arc::new(place), router) => if let Err(error) = answered {
+                answered = answer(stream, Arc::new(slot), router) => if let Err(error) = answered {
                     tracing::debug!(%error, "connection of a browser ended");
                 },
                 _ = displaced => tracing::debug!(%from, "connection of a browser gave way to another"),
@@ -126,8 +126,8 @@ async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch
     }
 }
 
-/// Answers one request. What keeps its connection between two requests would take a place for nothing.
-async fn answer(stream: TcpStream, place: Arc<Place>, router: Router) -> hyper::Result<()> {
+/// Answers one request. What keeps its connection between two requests would take a slot for nothing.
+async fn answer(stream: TcpStream, slot: Arc<ConnectionSlot>, router: Router) -> hyper::Result<()> {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "small packets may wait");
     }
@@ -135,7 +135,7 @@ async fn answer(stream: TcpStream, place: Arc<Place>, router: Router) -> hyper::
     stream.set_write_timeout(Some(WRITE_TIMEOUT));
     let routed = TowerToHyperService::new(router);
     let service = service_fn(|mut request: Request<Incoming>| {
-        request.extensions_mut().insert(Arc::clone(&place));
+        request.extensions_mut().insert(Arc::clone(&slot));
         routed.call(request)
     });
     http1::Builder::new()
@@ -148,18 +148,18 @@ async fn answer(stream: TcpStream, place: Arc<Place>, router: Router) -> hyper::
 }
 
 /// Listens at the default address or, as other nodes of the machine do it too, on a free port of loopback.
-async fn listen_anywhere(observer: &Observer) -> TcpListener {
+async fn listen_anywhere(monitor: &NodeMonitor) -> TcpListener {
     match TcpListener::bind(DEFAULT_ADDRESS).await {
         Ok(listener) => listener,
         Err(error) => {
             tracing::info!(address = %DEFAULT_ADDRESS, %error, "dashboard takes a free port, key `dashboard.listen` is not set");
-            listen(SocketAddr::new(DEFAULT_ADDRESS.ip(), 0), observer).await
+            listen(SocketAddr::new(DEFAULT_ADDRESS.ip(), 0), monitor).await
         }
     }
 }
 
 /// Listens as soon as the address is free.
-async fn listen(address: SocketAddr, observer: &Observer) -> TcpListener {
+async fn listen(address: SocketAddr, monitor: &NodeMonitor) -> TcpListener {
     let mut wait = RETRY_MIN;
     loop {
         match TcpListener::bind(address).await {
@@ -168,7 +168,7 @@ async fn listen(address: SocketAddr, observer: &Observer) -> TcpListener {
                 if wait == RETRY_MIN {
                     tracing::warn!(%address, %error, "dashboard cannot listen, key `dashboard.listen`; trying again");
                 }
-                observer.sources().counters.count(Event::DashboardNotBound);
+                monitor.sources().counters.count(Event::DashboardNotBound);
             }
         }
         tokio::time::sleep(wait).await;

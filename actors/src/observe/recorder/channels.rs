@@ -14,7 +14,7 @@ use schemars::{JsonSchema, Schema};
 use serde::{Deserialize, Serialize};
 
 use super::foxglove;
-use super::viewers::schema_of;
+use super::viewer_schema::schema_of;
 use crate::messages::leadership::{Leadership, Position};
 
 /// A channel's schema by its name in the log.

@@ -11,13 +11,13 @@ use crate::platform::throttle::source;
 /// Limits connections. While a request that may be answered is being answered its connection is kept; the others give
 /// way when there is no room, first the oldest of the address that has most of them.
 #[derive(Debug, Clone)]
-pub(crate) struct Places {
+pub(crate) struct ConnectionLimit {
     most: usize,
-    taken: Arc<Mutex<Taken>>,
+    taken: Arc<Mutex<OpenConnections>>,
 }
 
 #[derive(Debug, Default)]
-struct Taken {
+struct OpenConnections {
     /// In the order in which they came.
     connections: BTreeMap<Number, Connection>,
     next: Number,
@@ -33,29 +33,29 @@ struct Connection {
     _leave: oneshot::Sender<()>,
 }
 
-/// A connection's place; free when dropped.
+/// A connection's slot; free when dropped.
 #[derive(Debug)]
-pub(crate) struct Place {
-    taken: Arc<Mutex<Taken>>,
+pub(crate) struct ConnectionSlot {
+    taken: Arc<Mutex<OpenConnections>>,
     number: Number,
 }
 
 /// What became of a new connection.
 #[derive(Debug)]
 pub(crate) struct Admitted {
-    pub(crate) place: Place,
+    pub(crate) slot: ConnectionSlot,
     /// Ends when the connection has to give way.
     pub(crate) displaced: oneshot::Receiver<()>,
     /// Whether another had to give way.
     pub(crate) displaces: bool,
 }
 
-impl Places {
+impl ConnectionLimit {
     pub(crate) fn new(most: usize) -> Self {
         Self { most, taken: Arc::default() }
     }
 
-    /// A place for a connection from an address; none while all are kept.
+    /// A slot for a connection from an address; none while all are kept.
     pub(crate) fn admit(&self, from: IpAddr) -> Option<Admitted> {
         let mut taken = lock(&self.taken);
         let displaces = taken.connections.len() >= self.most;
@@ -67,11 +67,11 @@ impl Places {
         taken.next += 1;
         let (leave, displaced) = oneshot::channel();
         taken.connections.insert(number, Connection { source: source(from), kept: false, _leave: leave });
-        Some(Admitted { place: Place { taken: Arc::clone(&self.taken), number }, displaced, displaces })
+        Some(Admitted { slot: ConnectionSlot { taken: Arc::clone(&self.taken), number }, displaced, displaces })
     }
 }
 
-impl Taken {
+impl OpenConnections {
     fn next_to_leave(&self) -> Option<Number> {
         let waiting = || self.connections.iter().filter(|(_, connection)| !connection.kept);
         let mut held = HashMap::<IpAddr, usize>::new();
@@ -83,7 +83,7 @@ impl Taken {
     }
 }
 
-impl Place {
+impl ConnectionSlot {
     /// Its connection no longer gives way.
     pub(crate) fn keep(&self) {
         if let Some(connection) = lock(&self.taken).connections.get_mut(&self.number) {
@@ -92,13 +92,13 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for ConnectionSlot {
     fn drop(&mut self) {
         lock(&self.taken).connections.remove(&self.number);
     }
 }
 
-fn lock(taken: &Mutex<Taken>) -> MutexGuard<'_, Taken> {
+fn lock(taken: &Mutex<OpenConnections>) -> MutexGuard<'_, OpenConnections> {
     taken.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -106,8 +106,8 @@ fn lock(taken: &Mutex<Taken>) -> MutexGuard<'_, Taken> {
 mod tests {
     use super::*;
 
-    fn admit(places: &Places, from: &str) -> Option<Admitted> {
-        places.admit(from.parse().unwrap())
+    fn admit(connection_limit: &ConnectionLimit, from: &str) -> Option<Admitted> {
+        connection_limit.admit(from.parse().unwrap())
     }
 
     fn is_displaced(admitted: &mut Admitted) -> bool {
@@ -116,11 +116,11 @@ mod tests {
 
     #[test]
     fn an_address_that_takes_all_places_makes_room_for_another() {
-        let places = Places::new(4);
+        let connection_limit = ConnectionLimit::new(4);
         let [mut first, mut second, mut third, mut other] =
-            ["10.0.0.9", "10.0.0.9", "10.0.0.9", "10.0.0.2"].map(|from| admit(&places, from).unwrap());
+            ["10.0.0.9", "10.0.0.9", "10.0.0.9", "10.0.0.2"].map(|from| admit(&connection_limit, from).unwrap());
         assert!(!other.displaces);
-        let mut flood: Vec<_> = (0..100).map(|_| admit(&places, "10.0.0.9").unwrap()).collect();
+        let mut flood: Vec<_> = (0..100).map(|_| admit(&connection_limit, "10.0.0.9").unwrap()).collect();
         assert!(flood.iter().all(|admitted| admitted.displaces));
         assert!([&mut first, &mut second, &mut third].into_iter().all(is_displaced));
         assert!(!is_displaced(&mut other), "it is not the one that has most");
@@ -129,24 +129,24 @@ mod tests {
 
     #[test]
     fn an_ipv6_network_counts_as_one_address_and_of_equals_the_oldest_leaves() {
-        let places = Places::new(3);
+        let connection_limit = ConnectionLimit::new(3);
         let [mut a, mut b, mut c] =
-            ["2001:db8::1", "2001:db8:0:1::1", "2001:db8:0:1::2"].map(|from| admit(&places, from).unwrap());
-        let _d = admit(&places, "2001:db8:0:2::1").unwrap();
+            ["2001:db8::1", "2001:db8:0:1::1", "2001:db8:0:1::2"].map(|from| admit(&connection_limit, from).unwrap());
+        let _d = admit(&connection_limit, "2001:db8:0:2::1").unwrap();
         assert_eq!([&mut a, &mut b, &mut c].map(is_displaced), [false, true, false]);
-        let _e = admit(&places, "2001:db8:0:3::1").unwrap();
+        let _e = admit(&connection_limit, "2001:db8:0:3::1").unwrap();
         assert_eq!([&mut a, &mut c].map(is_displaced), [true, false]);
     }
 
     #[test]
     fn whoever_is_answered_stays_and_leaves_its_place() {
-        let places = Places::new(2);
-        let mut kept = ["10.0.0.2", "10.0.0.2"].map(|from| admit(&places, from).unwrap());
-        kept.iter().for_each(|admitted| admitted.place.keep());
-        assert!(admit(&places, "10.0.0.3").is_none());
+        let connection_limit = ConnectionLimit::new(2);
+        let mut kept = ["10.0.0.2", "10.0.0.2"].map(|from| admit(&connection_limit, from).unwrap());
+        kept.iter().for_each(|admitted| admitted.slot.keep());
+        assert!(admit(&connection_limit, "10.0.0.3").is_none());
         assert_eq!(kept.each_mut().map(is_displaced), [false, false]);
         let [gone, _kept] = kept;
         drop(gone);
-        assert!(!admit(&places, "10.0.0.3").unwrap().displaces);
+        assert!(!admit(&connection_limit, "10.0.0.3").unwrap().displaces);
     }
 }

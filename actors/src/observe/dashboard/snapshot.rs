@@ -1,4 +1,4 @@
-//! The picture of a cell that browsers get: everything the page shows, as one JSON object.
+//! The snapshot of a cell that browsers get: everything the page shows, as one JSON object.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -8,8 +8,8 @@ use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
 use serde::Serialize;
 
-use super::feed::{MAX_SHOWN, Sighting, Told};
-use super::sources::Sources;
+use super::live_state::{LatestReport, MAX_SHOWN, ReportedStatus};
+use super::node_sources::NodeSources;
 use crate::messages::leadership::{Leadership, Position};
 use crate::messages::newest::Received;
 use crate::observe::readiness::Readiness;
@@ -20,13 +20,13 @@ use crate::transport::mqtt::{BrokerAddress, LinkState};
 /// How the link to each broker is.
 pub(crate) type Links = BTreeMap<BrokerAddress, LinkState>;
 
-/// Version of [`Picture`] and of the other answers of the API.
+/// Version of [`Snapshot`] and of the other answers of the API.
 pub(crate) const API_VERSION: u32 = 1;
 
 /// What the node knows of its cell at one moment. Times are Unix microseconds by the node's clock unless they come from
 /// a message.
 #[derive(Debug, Clone, Serialize)]
-pub(crate) struct Picture {
+pub(crate) struct Snapshot {
     /// [`API_VERSION`].
     pub schema: u32,
     /// When it was made.
@@ -44,7 +44,7 @@ pub(crate) struct Picture {
     /// The newest reputations accepted.
     pub reputations: Option<Stamped<Reputations>>,
     /// The latest report of each vehicle.
-    pub vehicles: Vec<Sighting>,
+    pub vehicles: Vec<LatestReport>,
     /// This node and the others.
     pub nodes: Vec<NodeEntry>,
     /// State of the link to each broker: `up`, `stalled`, `down` or `refused`.
@@ -156,7 +156,7 @@ pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
 
 /// This node, those that answer, and those that only brokers tell of; `met` are names of nodes that have answered at
 /// some time, `links` how the links are, if the gateway tells.
-pub(crate) fn nodes(sources: &Sources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
+pub(crate) fn nodes(sources: &NodeSources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
     let own = &sources.node;
     let leading = sources.vitals.leadership.borrow().is_leading();
     let me = NodeEntry {
@@ -167,7 +167,7 @@ pub(crate) fn nodes(sources: &Sources, met: &BTreeSet<NodeName>, links: Option<&
         fit: None,
         version: Some(own.version.to_owned()),
     };
-    let mut nodes = others(&sources.members.borrow(), sources.feed.statuses(), met, links);
+    let mut nodes = others(&sources.members.borrow(), sources.live_state.statuses(), met, links);
     nodes.retain(|node| node.name != own.name);
     nodes.push(me);
     nodes.sort_by(|a, b| a.name.cmp(&b.name));
@@ -177,7 +177,7 @@ pub(crate) fn nodes(sources: &Sources, met: &BTreeSet<NodeName>, links: Option<&
 /// A node that has answered is there while it does; of one that never has, a broker's word counts while it is heard.
 fn others(
     members: &[Member],
-    mut statuses: BTreeMap<NodeName, Told>,
+    mut statuses: BTreeMap<NodeName, ReportedStatus>,
     met: &BTreeSet<NodeName>,
     links: Option<&Links>,
 ) -> Vec<NodeEntry> {
@@ -198,7 +198,7 @@ fn others(
     let is_heard = |broker: &BrokerAddress| {
         links.is_none_or(|links| matches!(links.get(broker), Some(LinkState::Up | LinkState::Stalled)))
     };
-    for Told { status, via, .. } in statuses.values() {
+    for ReportedStatus { status, via, .. } in statuses.values() {
         let name = &status.node;
         let is_told = status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_heard);
         let alive = is_told || further.iter().any(|member| member.name == *name);
@@ -212,7 +212,7 @@ mod tests {
     use uuid::Uuid;
 
     use super::*;
-    use crate::observe::dashboard::Feed;
+    use crate::observe::dashboard::LiveState;
     use crate::transport::mqtt::Incoming;
 
     #[test]
@@ -227,10 +227,10 @@ mod tests {
             broker: None,
             role: Role::Auto,
         };
-        let feed = Feed::default();
+        let live_state = LiveState::default();
         let say = |node, via: &BrokerAddress| {
             let status = NodeStatus::starting(name(node), Uuid::nil(), Role::Cav, "0.1.0");
-            feed.note(&Incoming::Status { status: Arc::new(status), via: via.clone() }, Timestamp(1));
+            live_state.note(&Incoming::Status { status: Arc::new(status), via: via.clone() }, Timestamp(1));
         };
         for node in ["edge", "euclid", "plain"] {
             say(node, &edge);
@@ -239,14 +239,14 @@ mod tests {
         say("both", &euclid);
         let alive = |members: &[Member], links: &Links| {
             let met = [name("edge"), name("euclid")].into();
-            let nodes = others(members, feed.statuses(), &met, Some(links));
+            let nodes = others(members, live_state.statuses(), &met, Some(links));
             nodes.into_iter().filter(|node| node.alive).map(|node| node.name.to_string()).collect::<Vec<_>>()
         };
         let up = [(edge.clone(), LinkState::Up), (euclid.clone(), LinkState::Up)].into();
         assert_eq!(alive(std::slice::from_ref(&member), &up), ["euclid", "both", "plain"], "the edge does not answer");
         let left = [(euclid.clone(), LinkState::Up)].into();
         assert_eq!(alive(std::slice::from_ref(&member), &left), ["euclid", "both"], "the link was given up");
-        feed.note(&Incoming::Link { broker: edge, state: LinkState::Refused }, Timestamp(2));
+        live_state.note(&Incoming::Link { broker: edge, state: LinkState::Refused }, Timestamp(2));
         assert_eq!(
             alive(&[member], &up),
             ["euclid", "both"],

@@ -4,15 +4,15 @@ use std::sync::Arc;
 
 use tokio::sync::watch;
 
-use super::feed::Feed;
-use super::picture::{LandmarkFacts, NodeFacts};
+use super::live_state::LiveState;
+use super::snapshot::{LandmarkFacts, NodeFacts};
 use crate::observe::readiness::Vitals;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::{FrameCounters, Member};
 
 /// What the node tells its dashboard.
 #[derive(Debug, Clone)]
-pub struct Sources {
+pub struct NodeSources {
     /// The node.
     pub node: NodeFacts,
     /// The cell's known locations.
@@ -26,5 +26,5 @@ pub struct Sources {
     /// The counters of its gossip.
     pub frames: Arc<FrameCounters>,
     /// Reports and statuses.
-    pub feed: Arc<Feed>,
+    pub live_state: Arc<LiveState>,
 }

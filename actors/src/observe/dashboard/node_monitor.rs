@@ -12,10 +12,10 @@ use tokio::sync::watch;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
 
 use super::history::{History, SAMPLE_PERIOD};
-use super::latency::Latencies;
-use super::paced::{Made, Paced};
-use super::picture::{API_VERSION, LeadershipFacts, Picture, Stamped, json, nodes};
-use super::sources::Sources;
+use super::map_latency::MapLatency;
+use super::node_sources::NodeSources;
+use super::response_cache::{CachedResponse, ResponseCache};
+use super::snapshot::{API_VERSION, LeadershipFacts, Snapshot, Stamped, json, nodes};
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leadership::Position;
 use crate::observe::readiness::{Probe, Readiness};
@@ -24,17 +24,17 @@ use crate::transport::mqtt::LinkState;
 
 /// What requests are answered from.
 #[derive(Debug)]
-pub(crate) struct Observer {
-    sources: Sources,
-    latencies: Latencies,
+pub(crate) struct NodeMonitor {
+    sources: NodeSources,
+    latencies: MapLatency,
     pictures: watch::Sender<Bytes>,
-    seen: Mutex<Seen>,
-    /// The latest picture as a server-sent event.
-    event: Paced<Bytes>,
+    seen: Mutex<Observed>,
+    /// The latest snapshot as a server-sent event.
+    event: ResponseCache<Bytes>,
 }
 
 #[derive(Debug, Default)]
-struct Seen {
+struct Observed {
     history: History,
     probe: Probe,
     /// Nodes that answer, and those that did and of which brokers tell.
@@ -44,34 +44,34 @@ struct Seen {
 /// How often the parts are asked how they are.
 const PROBE_PERIOD: Duration = Duration::from_millis(500);
 
-/// How often browsers get a picture although nothing came in: they take a longer silence for a lost connection.
+/// How often browsers get a snapshot although nothing came in: they take a longer silence for a lost connection.
 const HEARTBEAT: Duration = Duration::from_secs(1);
 
-/// Around the JSON of a picture in its event.
+/// Around the JSON of a snapshot in its event.
 const EVENT_HEAD: &[u8] = b"event: picture\ndata: ";
 const EVENT_END: &[u8] = b"\n\n";
 
 /// A vehicle whose last report is older is no longer shown.
 const FORGET_AFTER: Duration = Duration::from_secs(30);
 
-impl Observer {
-    pub(crate) fn new(sources: Sources, max_rate_hz: f64) -> Self {
+impl NodeMonitor {
+    pub(crate) fn new(sources: NodeSources, max_rate_hz: f64) -> Self {
         Self {
             sources,
-            latencies: Latencies::default(),
+            latencies: MapLatency::default(),
             pictures: watch::Sender::new(Bytes::new()),
             seen: Mutex::default(),
-            event: Paced::new(Duration::from_secs_f64(1.0 / max_rate_hz)),
+            event: ResponseCache::new(Duration::from_secs_f64(1.0 / max_rate_hz)),
         }
     }
 
     /// What the node tells.
-    pub(crate) fn sources(&self) -> &Sources {
+    pub(crate) fn sources(&self) -> &NodeSources {
         &self.sources
     }
 
     /// How late maps came.
-    pub(crate) fn latencies(&self) -> &Latencies {
+    pub(crate) fn latencies(&self) -> &MapLatency {
         &self.latencies
     }
 
@@ -106,7 +106,7 @@ impl Observer {
     }
 
     /// What the node knows now.
-    pub(crate) fn picture(&self) -> Picture {
+    pub(crate) fn snapshot(&self) -> Snapshot {
         let (sources, now) = (&self.sources, clock::now());
         let readiness = self.readiness();
         let seen = self.seen();
@@ -114,7 +114,7 @@ impl Observer {
         let since = history.reigns.back().filter(|reign| reign.until_us.is_none()).map(|reign| reign.from_us);
         let links = seen.probe.links.iter().flatten().map(|(broker, state)| (broker.to_string(), link_label(*state)));
         let newest_map = sources.vitals.newest.map.borrow().clone();
-        Picture {
+        Snapshot {
             schema: API_VERSION,
             now_us: now,
             node: sources.node.clone(),
@@ -123,26 +123,26 @@ impl Observer {
             map: newest_map.map(|newest| Stamped { received_at_us: newest.received_at, message: newest.map }),
             verdicts: sources.vitals.newest.verdicts.borrow().clone().map(Stamped::from),
             reputations: sources.vitals.newest.reputations.borrow().clone().map(Stamped::from),
-            vehicles: sources.feed.sightings_since(now - FORGET_AFTER),
+            vehicles: sources.live_state.sightings_since(now - FORGET_AFTER),
             nodes: nodes(sources, &seen.met, seen.probe.links.as_ref()),
             links: links.collect(),
             counters: sources.counters.snapshot(),
         }
     }
 
-    /// The latest picture as a server-sent event, made anew when the last one is old enough.
+    /// The latest snapshot as a server-sent event, made anew when the last one is old enough.
     pub(crate) fn event(&self) -> Bytes {
         self.made().value
     }
 
-    /// The latest picture as JSON.
+    /// The latest snapshot as JSON.
     pub(crate) fn json(&self) -> Bytes {
         let event = self.event();
         event.slice(EVENT_HEAD.len()..event.len() - EVENT_END.len())
     }
 
-    fn made(&self) -> Made<Bytes> {
-        self.event.get(|| [EVENT_HEAD, &json(&self.picture()), EVENT_END].concat().into())
+    fn made(&self) -> CachedResponse<Bytes> {
+        self.event.get(|| [EVENT_HEAD, &json(&self.snapshot()), EVENT_END].concat().into())
     }
 
     /// Looks on; ends never.
@@ -206,7 +206,7 @@ impl Observer {
     }
 
     fn note_members(&self) {
-        let told = self.sources.feed.statuses();
+        let told = self.sources.live_state.statuses();
         let mut seen = self.seen();
         seen.met.retain(|name| told.contains_key(name));
         seen.met.extend(self.sources.members.borrow().iter().map(|member| member.name.clone()));
@@ -237,13 +237,13 @@ impl Observer {
     /// A node that only follows takes the vehicles' reports while anyone looks.
     fn watch_reports(&self) {
         let wanted = self.viewers() > 0 && self.sources.vitals.leadership.borrow().position == Position::Following;
-        if wanted || self.sources.feed.watches() {
-            self.sources.feed.set_watches(wanted);
+        if wanted || self.sources.live_state.wants_reports() {
+            self.sources.live_state.set_wants_reports(wanted);
             self.sources.vitals.gateway.send(GatewayMessage::WatchReports { wanted });
         }
     }
 
-    fn seen(&self) -> MutexGuard<'_, Seen> {
+    fn seen(&self) -> MutexGuard<'_, Observed> {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

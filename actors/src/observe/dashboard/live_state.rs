@@ -17,21 +17,21 @@ use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 /// Written on the links' tasks and read by the dashboard; the later replaces the earlier, so that neither waits for the
 /// other.
 #[derive(Debug, Default)]
-pub struct Feed {
+pub struct LiveState {
     reports: [AtomicU64; ReportKind::COUNT],
-    watches: AtomicBool,
-    held: Mutex<Held>,
+    wants_reports: AtomicBool,
+    held: Mutex<Latest>,
 }
 
 #[derive(Debug, Default)]
-struct Held {
-    sightings: BTreeMap<(NodeName, ReportKind), Sighting>,
-    statuses: BTreeMap<NodeName, Told>,
+struct Latest {
+    sightings: BTreeMap<(NodeName, ReportKind), LatestReport>,
+    statuses: BTreeMap<NodeName, ReportedStatus>,
 }
 
 /// What a node said of itself last, or a broker of it.
 #[derive(Debug, Clone)]
-pub(crate) struct Told {
+pub(crate) struct ReportedStatus {
     /// The status.
     pub status: Arc<NodeStatus>,
     /// The brokers that passed on what it said, while the links to them hold.
@@ -41,7 +41,7 @@ pub(crate) struct Told {
 
 /// A vehicle's latest report of a kind.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Sighting {
+pub struct LatestReport {
     /// What it is for.
     pub kind: ReportKind,
     /// When it came, by this node's clock.
@@ -58,13 +58,13 @@ pub const MAX_SHOWN: usize = 256;
 /// From when on a vehicle that does not report gives way to another.
 const SILENCE: Duration = Duration::from_secs(10);
 
-impl Feed {
+impl LiveState {
     /// Notes what came in or was published by this node.
     pub fn note(&self, message: &Incoming, received_at: Timestamp) {
         match message {
             Incoming::Report { kind, report } => {
                 self.reports[*kind as usize].fetch_add(1, Relaxed);
-                let sighting = Sighting { kind: *kind, received_at, report: Arc::clone(report) };
+                let sighting = LatestReport { kind: *kind, received_at, report: Arc::clone(report) };
                 put(&mut self.held().sightings, (report.node.clone(), *kind), sighting, |held| {
                     let (key, oldest) = held.iter().min_by_key(|(_, old)| old.received_at)?;
                     (received_at.since(oldest.received_at) > SILENCE).then(|| key.clone())
@@ -74,9 +74,9 @@ impl Feed {
                 let mut held = self.held();
                 let mut via = held.statuses.remove(&status.node).map(|told| told.via).unwrap_or_default();
                 via.insert(broker.clone());
-                let told = Told { status: Arc::clone(status), via, at: received_at };
+                let told = ReportedStatus { status: Arc::clone(status), via, at: received_at };
                 put(&mut held.statuses, status.node.clone(), told, |held| {
-                    let rank = |told: &Told| (told.status.state != NodeState::Offline, told.at);
+                    let rank = |told: &ReportedStatus| (told.status.state != NodeState::Offline, told.at);
                     held.iter().min_by_key(|(_, told)| rank(told)).map(|(name, _)| name.clone())
                 });
             }
@@ -95,27 +95,27 @@ impl Feed {
     }
 
     /// Whether reports are taken only to be looked at, where the node does not need them itself.
-    pub fn watches(&self) -> bool {
-        self.watches.load(Relaxed)
+    pub fn wants_reports(&self) -> bool {
+        self.wants_reports.load(Relaxed)
     }
 
-    pub(crate) fn set_watches(&self, watches: bool) {
-        self.watches.store(watches, Relaxed);
+    pub(crate) fn set_wants_reports(&self, wants_reports: bool) {
+        self.wants_reports.store(wants_reports, Relaxed);
     }
 
     /// The latest reports received at or after a time, by vehicle and kind; older ones are forgotten.
-    pub(crate) fn sightings_since(&self, time: Timestamp) -> Vec<Sighting> {
+    pub(crate) fn sightings_since(&self, time: Timestamp) -> Vec<LatestReport> {
         let mut held = self.held();
         held.sightings.retain(|_, sighting| sighting.received_at >= time);
         held.sightings.values().cloned().collect()
     }
 
     /// What nodes said of themselves last.
-    pub(crate) fn statuses(&self) -> BTreeMap<NodeName, Told> {
+    pub(crate) fn statuses(&self) -> BTreeMap<NodeName, ReportedStatus> {
         self.held().statuses.clone()
     }
 
-    fn held(&self) -> MutexGuard<'_, Held> {
+    fn held(&self) -> MutexGuard<'_, Latest> {
         self.held.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -159,40 +159,40 @@ mod tests {
 
     #[test]
     fn the_latest_report_is_kept_and_strangers_find_no_room() {
-        let feed = Feed::default();
+        let live_state = LiveState::default();
         for seq in 1..=3 {
-            feed.note(&report("euclid", seq), Timestamp(seq));
+            live_state.note(&report("euclid", seq), Timestamp(seq));
         }
         for stranger in 0..2 * MAX_SHOWN {
-            feed.note(&report(&format!("stranger-{stranger}"), 9), Timestamp(2));
+            live_state.note(&report(&format!("stranger-{stranger}"), 9), Timestamp(2));
         }
-        feed.note(&report("euclid", 4), Timestamp(4));
-        assert_eq!(feed.sightings_since(Timestamp(0)).len(), MAX_SHOWN);
-        let fresh = feed.sightings_since(Timestamp(4));
+        live_state.note(&report("euclid", 4), Timestamp(4));
+        assert_eq!(live_state.sightings_since(Timestamp(0)).len(), MAX_SHOWN);
+        let fresh = live_state.sightings_since(Timestamp(4));
         assert_eq!(fresh.iter().map(|s| (s.report.node.as_str(), s.report.seq)).collect::<Vec<_>>(), [("euclid", 4)]);
-        assert_eq!(feed.reports(ReportKind::Detections), 4 + 2 * MAX_SHOWN as u64);
-        feed.note(&report("gauss", 1), Timestamp(5));
-        assert_eq!(feed.sightings_since(Timestamp(5)).len(), 1, "there is room when old ones are forgotten");
+        assert_eq!(live_state.reports(ReportKind::Detections), 4 + 2 * MAX_SHOWN as u64);
+        live_state.note(&report("gauss", 1), Timestamp(5));
+        assert_eq!(live_state.sightings_since(Timestamp(5)).len(), 1, "there is room when old ones are forgotten");
     }
 
     #[test]
     fn nodes_that_left_and_vehicles_that_fell_silent_give_way() {
-        let feed = Feed::default();
+        let live_state = LiveState::default();
         let status = |node: String, state| {
             let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
             Incoming::Status { status: Arc::new(NodeStatus { state, ..starting }), via: broker("10.0.0.2:1883") }
         };
         for n in 0..MAX_SHOWN {
             let state = if n % 2 == 0 { NodeState::Following } else { NodeState::Offline };
-            feed.note(&status(format!("node-{n}"), state), Timestamp(n as u64));
-            feed.note(&report(&format!("node-{n}"), 1), Timestamp(n as u64));
+            live_state.note(&status(format!("node-{n}"), state), Timestamp(n as u64));
+            live_state.note(&report(&format!("node-{n}"), 1), Timestamp(n as u64));
         }
         let later = Timestamp(0) + SILENCE * 2;
-        feed.note(&status("late".into(), NodeState::Following), later);
-        feed.note(&report("late", 1), later);
-        let statuses = feed.statuses();
+        live_state.note(&status("late".into(), NodeState::Following), later);
+        live_state.note(&report("late", 1), later);
+        let statuses = live_state.statuses();
         let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
         assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
-        assert_eq!((statuses.len(), feed.sightings_since(later).len()), (MAX_SHOWN, 1));
+        assert_eq!((statuses.len(), live_state.sightings_since(later).len()), (MAX_SHOWN, 1));
     }
 }
