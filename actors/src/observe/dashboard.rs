@@ -1,4 +1,4 @@
-//! The page, API, metrics and health of a node by HTTP.
+//! Page, API, metrics and health of a node over HTTP.
 
 pub(crate) mod access;
 pub(crate) mod assets;
@@ -15,8 +15,8 @@ pub(crate) mod response_cache;
 pub(crate) mod routes;
 pub(crate) mod server;
 pub(crate) mod snapshot;
+
 pub use assets::paths as page_paths;
 pub use config::{DEFAULT_ADDRESS, DashboardConfig};
 pub use live_state::{LatestReport, LiveState, MAX_SHOWN};
-pub use node_sources::NodeSources;
-pub use snapshot::{LandmarkFacts, NodeFacts};
+pub use node_sources::{LandmarkFacts, NodeFacts, NodeSources};

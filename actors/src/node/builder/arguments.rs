@@ -106,7 +106,7 @@ impl NodeBuilder {
         let (intake, counters) = (self.intake.clone(), self.counters());
         Arc::new(move |delivery| {
             let at = delivery.received_at;
-            live_state.note(&delivery.message, at);
+            live_state.update(&delivery.message, at);
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
                     recording.report(*kind, report, at);

@@ -1,4 +1,4 @@
-//! Who may be connected: whoever has not shown that he may look gives way to those who come.
+//! Limit on connections: those without an allowed request make room for new ones.
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
@@ -8,85 +8,83 @@ use tokio::sync::oneshot;
 
 use crate::platform::throttle::source;
 
-/// Limits connections. While a request that may be answered is being answered its connection is kept; the others give
-/// way when there is no room, first the oldest of the address that has most of them.
+/// Limits connections. A connection with an allowed request is kept until it is answered. When full, a new connection
+/// displaces the oldest other one of the address that has most of them.
 #[derive(Debug, Clone)]
 pub(crate) struct ConnectionLimit {
-    most: usize,
-    taken: Arc<Mutex<OpenConnections>>,
+    max: usize,
+    open: Arc<Mutex<OpenConnections>>,
 }
 
 #[derive(Debug, Default)]
 struct OpenConnections {
-    /// In the order in which they came.
-    connections: BTreeMap<Number, Connection>,
-    next: Number,
+    /// By number, which is the order of arrival.
+    by_number: BTreeMap<u64, Connection>,
+    next: u64,
 }
-
-type Number = u64;
 
 #[derive(Debug)]
 struct Connection {
     source: IpAddr,
     kept: bool,
-    /// Dropped with it, which tells the connection.
-    _leave: oneshot::Sender<()>,
+    /// Closes [`Admitted::displaced`] when dropped.
+    _displace: oneshot::Sender<()>,
 }
 
-/// A connection's slot; free when dropped.
+/// A connection's slot; freed when dropped.
 #[derive(Debug)]
 pub(crate) struct ConnectionSlot {
-    taken: Arc<Mutex<OpenConnections>>,
-    number: Number,
+    open: Arc<Mutex<OpenConnections>>,
+    number: u64,
 }
 
-/// What became of a new connection.
+/// An admitted connection.
 #[derive(Debug)]
 pub(crate) struct Admitted {
     pub(crate) slot: ConnectionSlot,
-    /// Ends when the connection has to give way.
+    /// Ends when the connection is displaced.
     pub(crate) displaced: oneshot::Receiver<()>,
-    /// Whether another had to give way.
+    /// Whether it displaced another.
     pub(crate) displaces: bool,
 }
 
 impl ConnectionLimit {
-    pub(crate) fn new(most: usize) -> Self {
-        Self { most, taken: Arc::default() }
+    pub(crate) fn new(max: usize) -> Self {
+        Self { max, open: Arc::default() }
     }
 
-    /// A slot for a connection from an address; none while all are kept.
+    /// A slot for a connection from an address; none while all connections are kept.
     pub(crate) fn admit(&self, from: IpAddr) -> Option<Admitted> {
-        let mut taken = lock(&self.taken);
-        let displaces = taken.connections.len() >= self.most;
+        let mut open = lock(&self.open);
+        let displaces = open.by_number.len() >= self.max;
         if displaces {
-            let leaves = taken.next_to_leave()?;
-            taken.connections.remove(&leaves);
+            let number = open.next_displaced()?;
+            open.by_number.remove(&number);
         }
-        let number = taken.next;
-        taken.next += 1;
-        let (leave, displaced) = oneshot::channel();
-        taken.connections.insert(number, Connection { source: source(from), kept: false, _leave: leave });
-        Some(Admitted { slot: ConnectionSlot { taken: Arc::clone(&self.taken), number }, displaced, displaces })
+        let number = open.next;
+        open.next += 1;
+        let (displace, displaced) = oneshot::channel();
+        open.by_number.insert(number, Connection { source: source(from), kept: false, _displace: displace });
+        Some(Admitted { slot: ConnectionSlot { open: Arc::clone(&self.open), number }, displaced, displaces })
     }
 }
 
 impl OpenConnections {
-    fn next_to_leave(&self) -> Option<Number> {
-        let waiting = || self.connections.iter().filter(|(_, connection)| !connection.kept);
-        let mut held = HashMap::<IpAddr, usize>::new();
-        for (_, connection) in waiting() {
-            *held.entry(connection.source).or_default() += 1;
+    fn next_displaced(&self) -> Option<u64> {
+        let candidates = || self.by_number.iter().filter(|(_, connection)| !connection.kept);
+        let mut per_source = HashMap::<IpAddr, usize>::new();
+        for (_, connection) in candidates() {
+            *per_source.entry(connection.source).or_default() += 1;
         }
-        // Of equals the last counts, which is the oldest this way round.
-        waiting().rev().max_by_key(|(_, connection)| held[&connection.source]).map(|(number, _)| *number)
+        // `max_by_key` returns the last of equals; reversed, this is the oldest.
+        candidates().rev().max_by_key(|(_, connection)| per_source[&connection.source]).map(|(number, _)| *number)
     }
 }
 
 impl ConnectionSlot {
-    /// Its connection no longer gives way.
+    /// Protects the connection from being displaced.
     pub(crate) fn keep(&self) {
-        if let Some(connection) = lock(&self.taken).connections.get_mut(&self.number) {
+        if let Some(connection) = lock(&self.open).by_number.get_mut(&self.number) {
             connection.kept = true;
         }
     }
@@ -94,12 +92,12 @@ impl ConnectionSlot {
 
 impl Drop for ConnectionSlot {
     fn drop(&mut self) {
-        lock(&self.taken).connections.remove(&self.number);
+        lock(&self.open).by_number.remove(&self.number);
     }
 }
 
-fn lock(taken: &Mutex<OpenConnections>) -> MutexGuard<'_, OpenConnections> {
-    taken.lock().unwrap_or_else(PoisonError::into_inner)
+fn lock(open: &Mutex<OpenConnections>) -> MutexGuard<'_, OpenConnections> {
+    open.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

@@ -1,5 +1,4 @@
-//! What passes through the node and is not kept elsewhere: the latest reports of each vehicle, what nodes say of
-//! themselves.
+//! Latest message of each node, as it passes through this one.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::Ordering::Relaxed;
@@ -14,27 +13,26 @@ use serde::Serialize;
 
 use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 
-/// Written on the links' tasks and read by the dashboard; the later replaces the earlier, so that neither waits for the
-/// other.
+/// Latest report and status of each node. The links' tasks write, the dashboard reads; neither waits for the other.
 #[derive(Debug, Default)]
 pub struct LiveState {
     reports: [AtomicU64; ReportKind::COUNT],
     wants_reports: AtomicBool,
-    held: Mutex<Latest>,
+    latest: Mutex<Latest>,
 }
 
 #[derive(Debug, Default)]
 struct Latest {
-    sightings: BTreeMap<(NodeName, ReportKind), LatestReport>,
+    reports: BTreeMap<(NodeName, ReportKind), LatestReport>,
     statuses: BTreeMap<NodeName, ReportedStatus>,
 }
 
-/// What a node said of itself last, or a broker of it.
+/// A node's latest status.
 #[derive(Debug, Clone)]
 pub(crate) struct ReportedStatus {
-    /// The status.
+    /// The status, or the node's last will.
     pub status: Arc<NodeStatus>,
-    /// The brokers that passed on what it said, while the links to them hold.
+    /// Brokers that passed it on and whose links still hold.
     pub via: BTreeSet<BrokerAddress>,
     at: Timestamp,
 }
@@ -42,98 +40,97 @@ pub(crate) struct ReportedStatus {
 /// A vehicle's latest report of a kind.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LatestReport {
-    /// What it is for.
+    /// Algorithm that the report is for.
     pub kind: ReportKind,
-    /// When it came, by this node's clock.
+    /// Time of receipt by this node's clock.
     #[serde(rename = "received_at_us")]
     pub received_at: Timestamp,
     /// The report.
     pub report: Arc<ObjectReport>,
 }
 
-/// Most vehicles and most nodes that are kept. Further ones are shown in place of vehicles that have been silent, and
-/// of nodes that are offline or, if none is, spoke longest ago.
+/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or long silent nodes.
 pub const MAX_SHOWN: usize = 256;
 
-/// From when on a vehicle that does not report gives way to another.
+/// Silence after which a vehicle may be replaced by another.
 const SILENCE: Duration = Duration::from_secs(10);
 
 impl LiveState {
-    /// Notes what came in or was published by this node.
-    pub fn note(&self, message: &Incoming, received_at: Timestamp) {
+    /// Takes a message that this node received or published.
+    pub fn update(&self, message: &Incoming, received_at: Timestamp) {
+        let mut latest = self.latest();
         match message {
             Incoming::Report { kind, report } => {
                 self.reports[*kind as usize].fetch_add(1, Relaxed);
-                let sighting = LatestReport { kind: *kind, received_at, report: Arc::clone(report) };
-                put(&mut self.held().sightings, (report.node.clone(), *kind), sighting, |held| {
-                    let (key, oldest) = held.iter().min_by_key(|(_, old)| old.received_at)?;
+                let entry = LatestReport { kind: *kind, received_at, report: Arc::clone(report) };
+                insert(&mut latest.reports, (report.node.clone(), *kind), entry, |all| {
+                    let (key, oldest) = all.iter().min_by_key(|(_, old)| old.received_at)?;
                     (received_at.since(oldest.received_at) > SILENCE).then(|| key.clone())
                 });
             }
             Incoming::Status { status, via: broker } => {
-                let mut held = self.held();
-                let mut via = held.statuses.remove(&status.node).map(|told| told.via).unwrap_or_default();
+                let mut via = latest.statuses.remove(&status.node).map(|before| before.via).unwrap_or_default();
                 via.insert(broker.clone());
-                let told = ReportedStatus { status: Arc::clone(status), via, at: received_at };
-                put(&mut held.statuses, status.node.clone(), told, |held| {
-                    let rank = |told: &ReportedStatus| (told.status.state != NodeState::Offline, told.at);
-                    held.iter().min_by_key(|(_, told)| rank(told)).map(|(name, _)| name.clone())
+                let entry = ReportedStatus { status: Arc::clone(status), via, at: received_at };
+                insert(&mut latest.statuses, status.node.clone(), entry, |all| {
+                    let rank = |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
+                    all.iter().min_by_key(|(_, entry)| rank(entry)).map(|(name, _)| name.clone())
                 });
             }
             Incoming::Link { broker, state: LinkState::Down | LinkState::Refused } => {
-                self.held().statuses.values_mut().for_each(|told| {
-                    told.via.remove(broker);
-                });
+                for entry in latest.statuses.values_mut() {
+                    entry.via.remove(broker);
+                }
             }
             _ => {}
         }
     }
 
-    /// How many reports of this kind came in.
+    /// Number of reports of this kind so far.
     pub fn reports(&self, kind: ReportKind) -> u64 {
         self.reports[kind as usize].load(Relaxed)
     }
 
-    /// Whether reports are taken only to be looked at, where the node does not need them itself.
+    /// Whether this node receives reports only to show them.
     pub fn wants_reports(&self) -> bool {
         self.wants_reports.load(Relaxed)
     }
 
-    pub(crate) fn set_wants_reports(&self, wants_reports: bool) {
-        self.wants_reports.store(wants_reports, Relaxed);
+    pub(crate) fn set_wants_reports(&self, wanted: bool) {
+        self.wants_reports.store(wanted, Relaxed);
     }
 
-    /// The latest reports received at or after a time, by vehicle and kind; older ones are forgotten.
-    pub(crate) fn sightings_since(&self, time: Timestamp) -> Vec<LatestReport> {
-        let mut held = self.held();
-        held.sightings.retain(|_, sighting| sighting.received_at >= time);
-        held.sightings.values().cloned().collect()
+    /// Latest reports received at or after a time, by vehicle and kind. Drops older ones.
+    pub(crate) fn reports_since(&self, time: Timestamp) -> Vec<LatestReport> {
+        let mut latest = self.latest();
+        latest.reports.retain(|_, entry| entry.received_at >= time);
+        latest.reports.values().cloned().collect()
     }
 
-    /// What nodes said of themselves last.
+    /// Latest status of each node.
     pub(crate) fn statuses(&self) -> BTreeMap<NodeName, ReportedStatus> {
-        self.held().statuses.clone()
+        self.latest().statuses.clone()
     }
 
-    fn held(&self) -> MutexGuard<'_, Latest> {
-        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+    fn latest(&self) -> MutexGuard<'_, Latest> {
+        self.latest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Keeps a value; where there is no room, in place of the one that `gives_way` names.
-fn put<K: Ord, T>(held: &mut BTreeMap<K, T>, key: K, value: T, gives_way: impl FnOnce(&BTreeMap<K, T>) -> Option<K>) {
-    if held.len() >= MAX_SHOWN
-        && !held.contains_key(&key)
-        && let Some(oldest) = gives_way(held)
+/// Inserts a value. A full map first drops the key that `evict` names, or else keeps what it has.
+fn insert<K: Ord, T>(map: &mut BTreeMap<K, T>, key: K, value: T, evict: impl FnOnce(&BTreeMap<K, T>) -> Option<K>) {
+    if map.len() >= MAX_SHOWN
+        && !map.contains_key(&key)
+        && let Some(evicted) = evict(map)
     {
-        held.remove(&oldest);
+        map.remove(&evicted);
     }
-    if held.len() < MAX_SHOWN || held.contains_key(&key) {
-        held.insert(key, value);
+    if map.len() < MAX_SHOWN || map.contains_key(&key) {
+        map.insert(key, value);
     }
 }
 
-/// The first level of a kind's topic.
+/// First level of the topic of this kind of report.
 pub(crate) fn kind_label(kind: ReportKind) -> &'static str {
     match kind {
         ReportKind::Detections => "detections",
@@ -161,18 +158,18 @@ mod tests {
     fn the_latest_report_is_kept_and_strangers_find_no_room() {
         let live_state = LiveState::default();
         for seq in 1..=3 {
-            live_state.note(&report("euclid", seq), Timestamp(seq));
+            live_state.update(&report("euclid", seq), Timestamp(seq));
         }
         for stranger in 0..2 * MAX_SHOWN {
-            live_state.note(&report(&format!("stranger-{stranger}"), 9), Timestamp(2));
+            live_state.update(&report(&format!("stranger-{stranger}"), 9), Timestamp(2));
         }
-        live_state.note(&report("euclid", 4), Timestamp(4));
-        assert_eq!(live_state.sightings_since(Timestamp(0)).len(), MAX_SHOWN);
-        let fresh = live_state.sightings_since(Timestamp(4));
+        live_state.update(&report("euclid", 4), Timestamp(4));
+        assert_eq!(live_state.reports_since(Timestamp(0)).len(), MAX_SHOWN);
+        let fresh = live_state.reports_since(Timestamp(4));
         assert_eq!(fresh.iter().map(|s| (s.report.node.as_str(), s.report.seq)).collect::<Vec<_>>(), [("euclid", 4)]);
         assert_eq!(live_state.reports(ReportKind::Detections), 4 + 2 * MAX_SHOWN as u64);
-        live_state.note(&report("gauss", 1), Timestamp(5));
-        assert_eq!(live_state.sightings_since(Timestamp(5)).len(), 1, "there is room when old ones are forgotten");
+        live_state.update(&report("gauss", 1), Timestamp(5));
+        assert_eq!(live_state.reports_since(Timestamp(5)).len(), 1, "there is room when old ones are forgotten");
     }
 
     #[test]
@@ -184,15 +181,15 @@ mod tests {
         };
         for n in 0..MAX_SHOWN {
             let state = if n % 2 == 0 { NodeState::Following } else { NodeState::Offline };
-            live_state.note(&status(format!("node-{n}"), state), Timestamp(n as u64));
-            live_state.note(&report(&format!("node-{n}"), 1), Timestamp(n as u64));
+            live_state.update(&status(format!("node-{n}"), state), Timestamp(n as u64));
+            live_state.update(&report(&format!("node-{n}"), 1), Timestamp(n as u64));
         }
         let later = Timestamp(0) + SILENCE * 2;
-        live_state.note(&status("late".into(), NodeState::Following), later);
-        live_state.note(&report("late", 1), later);
+        live_state.update(&status("late".into(), NodeState::Following), later);
+        live_state.update(&report("late", 1), later);
         let statuses = live_state.statuses();
         let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
         assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
-        assert_eq!((statuses.len(), live_state.sightings_since(later).len()), (MAX_SHOWN, 1));
+        assert_eq!((statuses.len(), live_state.reports_since(later).len()), (MAX_SHOWN, 1));
     }
 }

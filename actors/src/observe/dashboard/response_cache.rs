@@ -1,44 +1,42 @@
-//! What is made once for all who ask for it.
+//! A response that is computed once for all clients.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Keeps what was made until it is old enough for the next, so that making it takes a small share of a core at most,
-/// however many ask and however large it is.
+/// Keeps a response until it expires. Computing it takes a small share of a core at most, however many clients ask.
 #[derive(Debug)]
 pub(crate) struct ResponseCache<T> {
-    least_pause: Duration,
-    made: Mutex<Option<CachedResponse<T>>>,
+    min_age: Duration,
+    cached: Mutex<Option<CachedResponse<T>>>,
 }
 
-/// What was made.
+/// A computed response.
 #[derive(Debug, Clone)]
 pub(crate) struct CachedResponse<T> {
     pub(crate) value: T,
-    /// When it is old enough for the next.
-    pub(crate) next: Instant,
+    pub(crate) expires_at: Instant,
 }
 
-/// Pauses are at least so many times as long as making took.
-const PAUSE_FACTOR: u32 = 20;
+/// Minimum age at which a response is replaced, as a multiple of the time that it took to compute.
+const AGE_PER_COST: u32 = 20;
 
 impl<T: Clone> ResponseCache<T> {
-    pub(crate) fn new(least_pause: Duration) -> Self {
-        Self { least_pause, made: Mutex::default() }
+    pub(crate) fn new(min_age: Duration) -> Self {
+        Self { min_age, cached: Mutex::default() }
     }
 
-    /// What was made last, or anew when that is old enough.
-    pub(crate) fn get(&self, make: impl FnOnce() -> T) -> CachedResponse<T> {
-        let mut kept = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+    /// The cached response, or a new one where that has expired.
+    pub(crate) fn get(&self, compute: impl FnOnce() -> T) -> CachedResponse<T> {
+        let mut cached = self.cached.lock().unwrap_or_else(PoisonError::into_inner);
         let begun = Instant::now();
-        if let Some(made) = kept.as_ref().filter(|made| begun < made.next) {
-            return made.clone();
+        if let Some(response) = cached.as_ref().filter(|response| begun < response.expires_at) {
+            return response.clone();
         }
-        let value = make();
-        let next = Instant::now() + self.least_pause.max(begun.elapsed() * PAUSE_FACTOR);
-        kept.insert(CachedResponse { value, next }).clone()
+        let value = compute();
+        let expires_at = Instant::now() + self.min_age.max(begun.elapsed() * AGE_PER_COST);
+        cached.insert(CachedResponse { value, expires_at }).clone()
     }
 }
 

@@ -1,4 +1,4 @@
-//! The listener, on a thread of its own: whatever browsers do, the cell's threads do not notice.
+//! HTTP listener on a thread of its own, so that browsers cannot delay the cell.
 
 use std::io;
 use std::net::SocketAddr;
@@ -24,28 +24,31 @@ use super::node_monitor::NodeMonitor;
 use super::routes::HttpApi;
 use crate::telemetry::counters::Event;
 
-/// A running server; dropping it stops it.
+/// A running HTTP server; stops when dropped.
 #[derive(Debug)]
-pub(crate) struct Server {
+pub struct Server {
     stop: Option<oneshot::Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// First and longest wait before an address that was not free is tried again.
+/// First and longest wait before an address in use is tried again.
 const RETRY_MIN: Duration = Duration::from_millis(500);
 const RETRY_MAX: Duration = Duration::from_secs(10);
 
-/// How long a browser may take for its request.
+/// Wait after a connection could not be accepted, most likely for want of file descriptors.
+const ACCEPT_RETRY: Duration = Duration::from_millis(100);
+
+/// Maximum time for the head of a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How long a browser may read nothing of what it asked for.
+/// Maximum time in which a browser reads nothing of an answer.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Most bytes that wait for one browser, beside what its socket holds.
+/// Maximum bytes that wait for one browser, beside its socket's buffer.
 const MAX_BUFFER_BYTES: usize = 64 * 1024;
 
 impl Server {
-    /// Starts the thread; `bound` gets the address as soon as it is listened on.
+    /// Starts the thread; `bound` receives the address once the server listens.
     ///
     /// # Errors
     /// When the operating system gives no thread.
@@ -61,7 +64,7 @@ impl Server {
                 tokio::select! {
                     () = monitor.run() => {}
                     () = serve(&config, &monitor, &bound) => {}
-                    // The sender is dropped too when its owner is.
+                    // Ends when the sender is dropped, too.
                     _ = stopped => {}
                 }
             });
@@ -70,7 +73,7 @@ impl Server {
         Ok(Self { stop: Some(stop), thread: Some(thread) })
     }
 
-    /// Whether the thread has ended by itself.
+    /// Whether the thread ended by itself.
     pub(crate) fn has_ended(&self) -> bool {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
@@ -80,56 +83,54 @@ impl Drop for Server {
     fn drop(&mut self) {
         drop(self.stop.take());
         if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
-            tracing::warn!("the dashboard's thread panicked");
+            tracing::warn!("dashboard thread panicked");
         }
     }
 }
 
 async fn serve(config: &DashboardConfig, monitor: &Arc<NodeMonitor>, bound: &watch::Sender<Option<SocketAddr>>) {
-    // A run before this one may have been given a port, which browsers now know.
+    // Browsers may know the port of an earlier run.
     let wanted = bound.borrow().or(config.listen);
     let listener = match wanted {
         Some(address) => listen(address, monitor).await,
         None => listen_anywhere(monitor).await,
     };
     let Ok(address) = listener.local_addr() else { return };
-    let node = &monitor.sources().node.name;
-    let access = AccessPolicy::new(config.token.as_ref(), address, node);
+    let access = AccessPolicy::new(config.token.as_ref(), address, &monitor.sources.node.name);
     tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
     bound.send_replace(Some(address));
     let router = HttpApi::new(Arc::clone(monitor), access, config.max_connections).router();
-    let connection_limit = ConnectionLimit::new(config.max_connections);
+    let limit = ConnectionLimit::new(config.max_connections);
     loop {
         let (stream, from) = match listener.accept().await {
             Ok(accepted) => accepted,
             Err(error) => {
-                // Out of file descriptors, most likely: some may be free soon.
                 tracing::debug!(%error, "no connection accepted");
-                tokio::time::sleep(Duration::from_millis(100)).await;
+                tokio::time::sleep(ACCEPT_RETRY).await;
                 continue;
             }
         };
-        let admitted = connection_limit.admit(from.ip());
+        let admitted = limit.admit(from.ip());
         if admitted.as_ref().is_none_or(|admitted| admitted.displaces) {
-            monitor.sources().counters.count(Event::BrowserRefused);
+            monitor.sources.counters.count(Event::BrowserRefused);
         }
         let Some(Admitted { slot, displaced, .. }) = admitted else { continue };
         let router = router.clone();
         tokio::spawn(async move {
             tokio::select! {
                 answered = answer(stream, Arc::new(slot), router) => if let Err(error) = answered {
-                    tracing::debug!(%error, "connection of a browser ended");
+                    tracing::debug!(%error, "connection of a browser failed");
                 },
-                _ = displaced => tracing::debug!(%from, "connection of a browser gave way to another"),
+                _ = displaced => tracing::debug!(%from, "connection of a browser displaced by another"),
             }
         });
     }
 }
 
-/// Answers one request. What keeps its connection between two requests would take a slot for nothing.
+/// Answers one request and closes the connection: an idle one would occupy a slot.
 async fn answer(stream: TcpStream, slot: Arc<ConnectionSlot>, router: Router) -> hyper::Result<()> {
     if let Err(error) = stream.set_nodelay(true) {
-        tracing::debug!(%error, "small packets may wait");
+        tracing::debug!(%error, "cannot set TCP_NODELAY, small packets may be delayed");
     }
     let mut stream = TimeoutStream::new(stream);
     stream.set_write_timeout(Some(WRITE_TIMEOUT));
@@ -147,7 +148,7 @@ async fn answer(stream: TcpStream, slot: Arc<ConnectionSlot>, router: Router) ->
         .await
 }
 
-/// Listens at the default address or, as other nodes of the machine do it too, on a free port of loopback.
+/// Listens at the default address or, if another node of the machine does, on a free port of loopback.
 async fn listen_anywhere(monitor: &NodeMonitor) -> TcpListener {
     match TcpListener::bind(DEFAULT_ADDRESS).await {
         Ok(listener) => listener,
@@ -168,7 +169,7 @@ async fn listen(address: SocketAddr, monitor: &NodeMonitor) -> TcpListener {
                 if wait == RETRY_MIN {
                     tracing::warn!(%address, %error, "dashboard cannot listen, key `dashboard.listen`; trying again");
                 }
-                monitor.sources().counters.count(Event::DashboardNotBound);
+                monitor.sources.counters.count(Event::DashboardNotBound);
             }
         }
         tokio::time::sleep(wait).await;
