@@ -37,10 +37,10 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
-use crate::observe::dashboard::Feed;
+use crate::observe::dashboard::LiveState;
 #[cfg(feature = "camera")]
-use crate::observe::recorder::Pictures;
-use crate::observe::recorder::Recording;
+use crate::observe::recorder::ImageRecorder;
+use crate::observe::recorder::LogSender;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
@@ -58,14 +58,14 @@ pub(super) struct NodeBuilder {
     counters: Arc<Counters>,
     newest: Newest,
     book: SharedBook,
-    recording: Recording,
+    recording: LogSender,
     intake: Intake,
     broker_address: watch::Sender<Option<SocketAddr>>,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
-    feed: Arc<Feed>,
+    live_state: Arc<LiveState>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
 }
@@ -88,7 +88,7 @@ impl NodeBuilder {
             run: Uuid::now_v7(),
             started_at: clock::now(),
             slots: ActorSlots::default(),
-            recording: Recording::new(Arc::clone(&counters)),
+            recording: LogSender::new(Arc::clone(&counters)),
             counters,
             newest: Newest::default(),
             intake: Intake::default(),
@@ -98,7 +98,7 @@ impl NodeBuilder {
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
-            feed: Arc::default(),
+            live_state: Arc::default(),
             dashboard_address: watch::Sender::new(None),
             failed,
         }
@@ -217,7 +217,7 @@ impl NodeBuilder {
             }
             #[cfg(feature = "camera")]
             ActorKind::Detector => {
-                let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
+                let pictures = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
                 let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
                 let arguments = arguments.map_err(in_full)?;

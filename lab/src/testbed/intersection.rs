@@ -23,7 +23,7 @@ use ecod::view::ViewConfig;
 use ecod::vote::{VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, ReportKind};
 use ecod_actors::camera::lens::Lens;
-use ecod_actors::camera::perception::{Perception, Vantage};
+use ecod_actors::camera::perception::{Perception, VehicleCamera};
 use nalgebra::Point2;
 use serde::Serialize;
 use serde_json::json;
@@ -259,7 +259,7 @@ fn fusion(mode: VoteMode) -> FusionConfig {
 }
 
 fn perception(recording: &IntersectionRecording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -> Perception {
-    let vantage = Vantage {
+    let vehicle_camera = VehicleCamera {
         node: cav.name.clone(),
         pose: cav.pose,
         mount: Mount::default(),
@@ -276,5 +276,5 @@ fn perception(recording: &IntersectionRecording, cav: &Cav, landmarks: Arc<Landm
         position_sigma_m: 0.02,
         ..ProjectionConfig::default()
     };
-    Perception::new(vantage, projection, ViewConfig::default(), GATE)
+    Perception::new(vehicle_camera, projection, ViewConfig::default(), GATE)
 }

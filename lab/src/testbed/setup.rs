@@ -19,7 +19,7 @@ use ecod_actors::camera::detect::placard::PlacardConfig;
 use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::camera::frame_source::capture::CaptureConfig;
 use ecod_actors::camera::lens::Lens;
-use ecod_actors::camera::perception::{Perception, Vantage};
+use ecod_actors::camera::perception::{Perception, VehicleCamera};
 use ecod_actors::camera::vehicle_pose::PoseConfig;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::dashboard::DashboardConfig;
@@ -85,14 +85,14 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
 /// A vehicle's way from detections to reports.
 pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
     let gate = fusion(testbed).pace.gate();
-    let vantage = Vantage {
+    let vehicle_camera = VehicleCamera {
         node: cav.name.clone(),
         pose: cav.pose,
         mount: Mount::default(),
         lens: Lens::ideal(testbed.camera.intrinsics),
         landmarks: Arc::new(LandmarkIndex::new(scene.landmarks(&testbed.placard), gate.radius_m)),
     };
-    Perception::new(vantage, projection(&testbed.placard), view(&testbed.placard), gate)
+    Perception::new(vehicle_camera, projection(&testbed.placard), view(&testbed.placard), gate)
 }
 
 /// Fusion of reports: a round for every frame, which counts until some more have come.

@@ -1,4 +1,4 @@
-//! Pictures of the camera, a few a second.
+//! ImageRecorder of the camera, a few a second.
 
 use std::time::Duration;
 
@@ -6,20 +6,20 @@ use ecod::time::Timestamp;
 use opencv::core::Vector;
 use opencv::imgcodecs;
 
-use super::{RecordConfig, Recording};
+use super::{LogSender, RecordConfig};
 use crate::camera::frame::Frame;
 
 /// Takes a frame now and then and records it as JPEG.
 #[derive(Debug, Clone)]
-pub struct Pictures {
-    recording: Recording,
+pub struct ImageRecorder {
+    recording: LogSender,
     period: Duration,
     due: Timestamp,
 }
 
-impl Pictures {
+impl ImageRecorder {
     /// As the configuration asks for; `None` without a log, or pictures in it.
-    pub fn new(config: Option<&RecordConfig>, recording: Recording) -> Option<Self> {
+    pub fn new(config: Option<&RecordConfig>, recording: LogSender) -> Option<Self> {
         let hz = config.map(|record| record.camera_hz).filter(|hz| *hz > 0.0)?;
         Some(Self { recording, period: Duration::from_secs_f64(1.0 / hz), due: Timestamp::default() })
     }

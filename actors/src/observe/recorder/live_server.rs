@@ -14,8 +14,8 @@ use foxglove::{
 use mcap::McapResult;
 
 use super::channels::SchemaName;
-use super::recording::Entry;
-use super::scribe::{Message, Scribe, Sink};
+use super::entry_encoder::{EncodedMessage, EntryEncoder, MessageSink};
+use super::log_sender::LogEntry;
 
 /// The address of viewers.
 const LOOPBACK: &str = "127.0.0.1";
@@ -24,9 +24,9 @@ const LOOPBACK: &str = "127.0.0.1";
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
 /// A server that starts with the first entry.
-pub(crate) struct Live {
+pub(crate) struct LiveServer {
     port: u16,
-    scribe: Scribe,
+    encoder: EntryEncoder,
     state: State,
 }
 
@@ -42,20 +42,20 @@ struct Channels {
     by_topic: HashMap<(SchemaName, String), Arc<RawChannel>>,
 }
 
-impl Live {
+impl LiveServer {
     pub(crate) fn new(port: u16, node: NodeName) -> Self {
-        Self { port, scribe: Scribe::new(node, true), state: State::Down { retry_at: None } }
+        Self { port, encoder: EntryEncoder::new(node, true), state: State::Down { retry_at: None } }
     }
 
     /// Shows an entry to whoever looks; a port that is busy is tried again.
-    pub(crate) fn show(&mut self, entry: &Entry) {
+    pub(crate) fn show(&mut self, entry: &LogEntry) {
         if let State::Down { retry_at } = self.state
             && retry_at.is_none_or(|at| Instant::now() >= at)
         {
             self.state = self.start(retry_at.is_none());
         }
         let State::Up(channels) = &mut self.state else { return };
-        if let Err(error) = self.scribe.write(entry, channels) {
+        if let Err(error) = self.encoder.write(entry, channels) {
             tracing::debug!(%error, "not shown to viewers");
         }
     }
@@ -84,9 +84,9 @@ impl Channels {
     }
 }
 
-impl Sink for Channels {
-    fn put(&mut self, message: Message<'_>) -> McapResult<()> {
-        let Message { schema, topic, at, json, .. } = message;
+impl MessageSink for Channels {
+    fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()> {
+        let EncodedMessage { schema, topic, at, json, .. } = message;
         let key = (schema, topic.to_owned());
         let channel = match self.by_topic.get(&key) {
             Some(channel) => channel,

@@ -1,135 +1,88 @@
-//! The picture of a cell that browsers get: everything the page shows, as one JSON object.
+//! Everything that the page shows of a cell, as one JSON object.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 
 use ecod::leadership::readiness::Readiness;
 use ecod::leadership::{Leadership, Position};
-use ecod::names::{LandmarkId, NodeName};
+use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
 use serde::Serialize;
 
-use super::feed::{MAX_SHOWN, Sighting, Told};
-use super::sources::Sources;
+use super::live_state::{LatestReport, MAX_SHOWN, ReportedStatus};
+use super::node_sources::{NodeFacts, NodeSources};
 use crate::messages::newest::Received;
 use crate::telemetry::counters::CounterSnapshot;
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::{BrokerAddress, LinkState};
 
-/// How the link to each broker is.
+/// State of the link to each broker.
 pub(crate) type Links = BTreeMap<BrokerAddress, LinkState>;
 
-/// Version of [`Picture`] and of the other answers of the API.
+/// Version of [`Snapshot`] and of the other answers of the API.
 pub(crate) const API_VERSION: u32 = 1;
 
-/// What the node knows of its cell at one moment. Times are Unix microseconds by the node's clock unless they come from
-/// a message.
+/// A node's knowledge of its cell at one moment. Times are Unix microseconds by the node's clock, except in messages.
 #[derive(Debug, Clone, Serialize)]
-pub(crate) struct Picture {
+pub(crate) struct Snapshot {
     /// [`API_VERSION`].
     pub schema: u32,
-    /// When it was made.
+    /// Time of the snapshot.
     pub now_us: Timestamp,
     /// This node.
     pub node: NodeFacts,
-    /// Whether the node does what it is there for.
+    /// Whether this node is ready.
     pub readiness: Readiness,
-    /// Who leads.
+    /// The leader, its standby and this node's position.
     pub leadership: LeadershipFacts,
-    /// The newest map accepted.
-    pub map: Option<Stamped<GlobalMap>>,
-    /// The newest verdicts accepted.
-    pub verdicts: Option<Stamped<Verdicts>>,
-    /// The newest reputations accepted.
-    pub reputations: Option<Stamped<Reputations>>,
-    /// The latest report of each vehicle.
-    pub vehicles: Vec<Sighting>,
-    /// This node and the others.
+    /// Newest map accepted.
+    pub map: Option<Received<GlobalMap>>,
+    /// Newest verdicts accepted.
+    pub verdicts: Option<Received<Verdicts>>,
+    /// Newest reputations accepted.
+    pub reputations: Option<Received<Reputations>>,
+    /// Latest report of each vehicle and kind.
+    pub vehicles: Vec<LatestReport>,
+    /// All nodes, this one included.
     pub nodes: Vec<NodeEntry>,
     /// State of the link to each broker: `up`, `stalled`, `down` or `refused`.
-    pub links: BTreeMap<String, &'static str>,
-    /// What went wrong or was left out, by reason.
+    pub links: BTreeMap<String, String>,
+    /// Counters of failures and losses, by reason.
     pub counters: CounterSnapshot,
 }
 
-/// A message and when it came.
-#[derive(Debug, Clone, Serialize)]
-pub(crate) struct Stamped<T> {
-    /// When it came.
-    pub received_at_us: Timestamp,
-    /// The message as it is on the wire.
-    pub message: Arc<T>,
-}
-
-/// What does not change while a node runs.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct NodeFacts {
-    /// Its name.
-    pub name: NodeName,
-    /// The name of its cell.
-    pub cell: NodeName,
-    /// Its role.
-    pub role: Role,
-    /// Version of the software.
-    pub version: &'static str,
-    /// When it started.
-    pub started_at_us: Timestamp,
-    /// Longest time between two rounds of a living aggregator, in seconds.
-    pub round_period_s: f64,
-}
-
-/// Who leads, for a browser.
+/// The leadership of the cell, for a browser.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct LeadershipFacts {
-    /// What this node has to do with it.
+    /// This node's position.
     pub position: Position,
-    /// Who leads; absent while the node seeks.
+    /// The leader; absent while the node seeks one.
     pub leader: Option<NodeName>,
-    /// The highest term known.
+    /// Highest term known.
     pub epoch: Option<u64>,
-    /// Who leads next.
+    /// The node that leads next.
     pub standby: Option<NodeName>,
-    /// When this node took the leader for it.
+    /// Time at which this node began to follow the leader.
     pub since_us: Option<Timestamp>,
-    /// How often the leader changed since the node started.
+    /// Changes of the leader since the node started.
     pub failovers: u64,
 }
 
 /// A node of the cell.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct NodeEntry {
-    /// Its name.
+    /// Name of the node.
     pub name: NodeName,
     /// Its role.
     pub role: Role,
-    /// Whether it answers; of a node that never has, whether a broker to which there is a link says that it is there.
+    /// Whether it answers. A node that never answered is alive while a linked broker reports its status.
     pub alive: bool,
-    /// What it said it does.
+    /// State that it reported.
     pub state: Option<NodeState>,
-    /// Whether it said it could lead.
+    /// Whether it reported that it could lead.
     pub fit: Option<bool>,
-    /// Its software, as it said.
+    /// Version of its software.
     pub version: Option<String>,
-}
-
-/// A known location.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct LandmarkFacts {
-    /// Its name.
-    pub id: LandmarkId,
-    /// East in metres.
-    pub x_m: f64,
-    /// North in metres.
-    pub y_m: f64,
-    /// Direction that it faces in radians, counter-clockwise from east.
-    pub facing_rad: Option<f64>,
-}
-
-impl<T> From<Received<T>> for Stamped<T> {
-    fn from(received: Received<T>) -> Self {
-        Self { received_at_us: received.received_at, message: received.message }
-    }
 }
 
 impl LeadershipFacts {
@@ -145,39 +98,37 @@ impl LeadershipFacts {
     }
 }
 
-/// A value as JSON; cut short if it cannot be written, which is logged.
+/// A value as JSON; truncated where it cannot be encoded, which is logged.
 pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
     let mut text = Vec::new();
     if let Err(error) = serde_json::to_writer(&mut text, value) {
-        tracing::warn!(%error, "answer for browsers cut short");
+        tracing::warn!(%error, "answer to a browser truncated");
     }
     text
 }
 
-/// This node, those that answer, and those that only brokers tell of; `met` are names of nodes that have answered at
-/// some time, `links` how the links are, if the gateway tells.
-pub(crate) fn nodes(sources: &Sources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
+/// This node and the others by name. `met` holds the nodes that have ever answered; `links` is absent if unknown.
+pub(crate) fn nodes(sources: &NodeSources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
     let own = &sources.node;
     let leading = sources.vitals.leadership.borrow().is_leading();
-    let me = NodeEntry {
+    let mut nodes = others(&sources.members.borrow(), sources.live_state.statuses(), met, links);
+    nodes.retain(|node| node.name != own.name);
+    nodes.push(NodeEntry {
         name: own.name.clone(),
         role: own.role,
         alive: true,
         state: Some(if leading { NodeState::Aggregating } else { NodeState::Following }),
         fit: None,
         version: Some(own.version.to_owned()),
-    };
-    let mut nodes = others(&sources.members.borrow(), sources.feed.statuses(), met, links);
-    nodes.retain(|node| node.name != own.name);
-    nodes.push(me);
+    });
     nodes.sort_by(|a, b| a.name.cmp(&b.name));
     nodes
 }
 
-/// A node that has answered is there while it does; of one that never has, a broker's word counts while it is heard.
+/// Members are alive while they answer. Of nodes that never answered, the status from a linked broker counts.
 fn others(
     members: &[Member],
-    mut statuses: BTreeMap<NodeName, Told>,
+    mut statuses: BTreeMap<NodeName, ReportedStatus>,
     met: &BTreeSet<NodeName>,
     links: Option<&Links>,
 ) -> Vec<NodeEntry> {
@@ -192,16 +143,16 @@ fn others(
     let (shown, further) = members.split_at(members.len().min(MAX_SHOWN));
     let mut nodes = Vec::new();
     for Member { name, role, .. } in shown {
-        let told = statuses.remove(name);
-        nodes.push(entry(name, *role, true, told.as_ref().map(|told| &*told.status)));
+        let reported = statuses.remove(name);
+        nodes.push(entry(name, *role, true, reported.as_ref().map(|reported| &*reported.status)));
     }
-    let is_heard = |broker: &BrokerAddress| {
+    let is_linked = |broker: &BrokerAddress| {
         links.is_none_or(|links| matches!(links.get(broker), Some(LinkState::Up | LinkState::Stalled)))
     };
-    for Told { status, via, .. } in statuses.values() {
+    for ReportedStatus { status, via, .. } in statuses.values() {
         let name = &status.node;
-        let is_told = status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_heard);
-        let alive = is_told || further.iter().any(|member| member.name == *name);
+        let is_online = status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_linked);
+        let alive = is_online || further.iter().any(|member| member.name == *name);
         nodes.push(entry(name, status.role, alive, Some(status)));
     }
     nodes
@@ -209,10 +160,12 @@ fn others(
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use uuid::Uuid;
 
     use super::*;
-    use crate::observe::dashboard::Feed;
+    use crate::observe::dashboard::LiveState;
     use crate::transport::mqtt::Incoming;
 
     #[test]
@@ -227,10 +180,10 @@ mod tests {
             broker: None,
             role: Role::Auto,
         };
-        let feed = Feed::default();
+        let live_state = LiveState::default();
         let say = |node, via: &BrokerAddress| {
             let status = NodeStatus::starting(name(node), Uuid::nil(), Role::Cav, "0.1.0");
-            feed.note(&Incoming::Status { status: Arc::new(status), via: via.clone() }, Timestamp(1));
+            live_state.update(&Incoming::Status { status: Arc::new(status), via: via.clone() }, Timestamp(1));
         };
         for node in ["edge", "euclid", "plain"] {
             say(node, &edge);
@@ -239,14 +192,14 @@ mod tests {
         say("both", &euclid);
         let alive = |members: &[Member], links: &Links| {
             let met = [name("edge"), name("euclid")].into();
-            let nodes = others(members, feed.statuses(), &met, Some(links));
+            let nodes = others(members, live_state.statuses(), &met, Some(links));
             nodes.into_iter().filter(|node| node.alive).map(|node| node.name.to_string()).collect::<Vec<_>>()
         };
         let up = [(edge.clone(), LinkState::Up), (euclid.clone(), LinkState::Up)].into();
         assert_eq!(alive(std::slice::from_ref(&member), &up), ["euclid", "both", "plain"], "the edge does not answer");
         let left = [(euclid.clone(), LinkState::Up)].into();
         assert_eq!(alive(std::slice::from_ref(&member), &left), ["euclid", "both"], "the link was given up");
-        feed.note(&Incoming::Link { broker: edge, state: LinkState::Refused }, Timestamp(2));
+        live_state.update(&Incoming::Link { broker: edge, state: LinkState::Refused }, Timestamp(2));
         assert_eq!(
             alive(&[member], &up),
             ["euclid", "both"],

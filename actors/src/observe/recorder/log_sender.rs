@@ -15,14 +15,14 @@ use crate::transport::mqtt::{BrokerAddress, LinkState};
 
 /// Something to be recorded and when it happened, by the node's clock.
 #[derive(Debug, Clone)]
-pub(crate) struct Entry {
+pub(crate) struct LogEntry {
     pub(crate) at: Timestamp,
-    pub(crate) item: Item,
+    pub(crate) item: LogItem,
 }
 
 /// Something to be recorded.
 #[derive(Debug, Clone)]
-pub(crate) enum Item {
+pub(crate) enum LogItem {
     /// A report as the aggregator took it, or as an observer saw it.
     Report {
         kind: ReportKind,
@@ -47,7 +47,7 @@ pub(crate) enum Item {
     Picture(Vec<u8>),
 }
 
-impl Item {
+impl LogItem {
     /// Whether there is anything of it in the log.
     pub(crate) fn is_written(&self) -> bool {
         !matches!(self, Self::Round(_))
@@ -61,26 +61,26 @@ impl Item {
 
 /// Takes what is to be recorded; clones lead to the same place. Nothing is recorded until a [`super::Recorder`] runs.
 #[derive(Debug, Clone, Default)]
-pub struct Recording(Arc<Shared>);
+pub struct LogSender(Arc<Shared>);
 
 #[derive(Debug, Default)]
 struct Shared {
-    queue: RwLock<Option<SyncSender<Entry>>>,
+    queue: RwLock<Option<SyncSender<LogEntry>>>,
     /// Journal entries that were lost and have not been told of in the log.
     missing: AtomicU64,
-    standing: Mutex<Standing>,
+    aggregator_state: Mutex<AggregatorState>,
     counters: Arc<Counters>,
 }
 
 /// How the aggregator stands after the last entry that was taken from the queue.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Standing {
+pub(crate) struct AggregatorState {
     pub(crate) runs: bool,
     pub(crate) leads: Option<Epoch>,
     pub(crate) next_round: u64,
 }
 
-impl Recording {
+impl LogSender {
     /// Counts in `counters`.
     pub fn new(counters: Arc<Counters>) -> Self {
         Self(Arc::new(Shared { counters, ..Shared::default() }))
@@ -88,59 +88,59 @@ impl Recording {
 
     /// What the aggregator was told beside reports.
     pub fn journal(&self, at: Timestamp, event: JournalEvent) {
-        self.put(at, Item::Journal(event));
+        self.put(at, LogItem::Journal(event));
     }
 
     /// A report as the aggregator takes it, or as an observer sees it.
     pub fn report(&self, kind: ReportKind, report: &Arc<ObjectReport>, at: Timestamp) {
-        self.put(at, Item::Report { kind, report: Arc::clone(report) });
+        self.put(at, LogItem::Report { kind, report: Arc::clone(report) });
     }
 
     /// The aggregator made this round.
     pub fn round(&self, round: u64, at: Timestamp) {
-        self.put(at, Item::Round(round));
+        self.put(at, LogItem::Round(round));
     }
 
     /// A map that the node took.
     pub fn map(&self, map: &Arc<GlobalMap>, at: Timestamp) {
-        self.put(at, Item::Map(Arc::clone(map)));
+        self.put(at, LogItem::Map(Arc::clone(map)));
     }
 
     /// Verdicts that the node took.
     pub fn verdicts(&self, verdicts: &Arc<Verdicts>, at: Timestamp) {
-        self.put(at, Item::Verdicts(Arc::clone(verdicts)));
+        self.put(at, LogItem::Verdicts(Arc::clone(verdicts)));
     }
 
     /// Reputations that the node took.
     pub fn reputations(&self, reputations: &Arc<Reputations>, at: Timestamp) {
-        self.put(at, Item::Reputations(Arc::clone(reputations)));
+        self.put(at, LogItem::Reputations(Arc::clone(reputations)));
     }
 
     /// Another candidate's evidence.
     pub fn share(&self, share: &Arc<LedgerShare>, at: Timestamp) {
-        self.put(at, Item::Share(Arc::clone(share)));
+        self.put(at, LogItem::Share(Arc::clone(share)));
     }
 
     /// What another node says about itself.
     pub fn status(&self, status: &Arc<NodeStatus>, at: Timestamp) {
-        self.put(at, Item::Status(Arc::clone(status)));
+        self.put(at, LogItem::Status(Arc::clone(status)));
     }
 
     /// A link changed.
     pub fn link(&self, broker: &BrokerAddress, state: LinkState, at: Timestamp) {
-        self.put(at, Item::Link { broker: broker.clone(), state });
+        self.put(at, LogItem::Link { broker: broker.clone(), state });
     }
 
     /// A picture of the camera as JPEG.
     pub fn picture(&self, jpeg: Vec<u8>, at: Timestamp) {
-        self.put(at, Item::Picture(jpeg));
+        self.put(at, LogItem::Picture(jpeg));
     }
 
-    pub(crate) fn put(&self, at: Timestamp, item: Item) {
+    pub(crate) fn put(&self, at: Timestamp, item: LogItem) {
         let queue = self.0.queue.read().unwrap_or_else(PoisonError::into_inner);
         let Some(queue) = &*queue else { return };
         let is_of_journal = item.is_of_journal();
-        if queue.try_send(Entry { at, item }).is_err() {
+        if queue.try_send(LogEntry { at, item }).is_err() {
             self.lost(1, u64::from(is_of_journal));
         }
     }
@@ -156,8 +156,8 @@ impl Recording {
         self.0.missing.swap(0, Ordering::Relaxed)
     }
 
-    pub(crate) fn standing(&self) -> MutexGuard<'_, Standing> {
-        self.0.standing.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(crate) fn aggregator_state(&self) -> MutexGuard<'_, AggregatorState> {
+        self.0.aggregator_state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(crate) fn counters(&self) -> &Counters {
@@ -165,7 +165,7 @@ impl Recording {
     }
 
     /// Sends to another queue from now on, or to none.
-    pub(crate) fn connect(&self, queue: Option<SyncSender<Entry>>) {
+    pub(crate) fn connect(&self, queue: Option<SyncSender<LogEntry>>) {
         *self.0.queue.write().unwrap_or_else(PoisonError::into_inner) = queue;
     }
 }

@@ -1,4 +1,4 @@
-//! What the process costs, under the names that every Prometheus client uses.
+//! Resources used by the process, under the names common to Prometheus clients.
 
 use std::sync::atomic::AtomicU64;
 
@@ -9,7 +9,7 @@ use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::{Registry, Unit};
 
-/// Registers CPU time, memory and time of start; what the system does not tell is left out.
+/// Registers CPU time, memory and time of start, as far as the operating system tells them.
 pub(crate) fn register(registry: &mut Registry, started_at: Timestamp) {
     let started = Gauge::<f64, AtomicU64>::default();
     started.set(started_at.micros() as f64 / 1e6);

@@ -1,16 +1,15 @@
-//! How late maps come, as histograms over the whole run.
+//! Latency of maps as histograms over the whole run.
 
 use ecod::time::Timestamp;
 use prometheus_client::metrics::histogram::Histogram;
 
-/// Upper bounds of the buckets in seconds: from a local round to one that nobody should wait for.
+/// Upper bounds of the buckets in seconds.
 const BOUNDS_S: [f64; 12] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0];
 
-/// The way of a map in two parts and as a whole. Each part but the first compares two clocks where the aggregator is
-/// another machine; the histogram then holds their difference too.
+/// Latency of maps in two parts and as a whole. All but the first compare the clocks of aggregator and node.
 #[derive(Debug)]
-pub(crate) struct Latencies {
-    /// From the oldest capture in a map, put on the aggregator's clock, to its fusion.
+pub(crate) struct MapLatency {
+    /// From the oldest capture in a map, on the aggregator's clock, to its fusion.
     pub capture_to_fused: Histogram,
     /// From its fusion to its receipt here.
     pub fused_to_received: Histogram,
@@ -18,14 +17,14 @@ pub(crate) struct Latencies {
     pub capture_to_received: Histogram,
 }
 
-impl Default for Latencies {
+impl Default for MapLatency {
     fn default() -> Self {
         let new = || Histogram::new(BOUNDS_S);
         Self { capture_to_fused: new(), fused_to_received: new(), capture_to_received: new() }
     }
 }
 
-impl Latencies {
+impl MapLatency {
     pub(crate) fn observe(&self, captured_at: Option<Timestamp>, fused_at: Timestamp, received_at: Timestamp) {
         self.fused_to_received.observe(received_at.since(fused_at).as_secs_f64());
         if let Some(captured_at) = captured_at {

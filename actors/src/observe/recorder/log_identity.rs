@@ -9,8 +9,8 @@ use uuid::Uuid;
 
 /// Who wrote a log.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Identity {
-    /// Version of the form of the log, [`Identity::VERSION`].
+pub struct LogIdentity {
+    /// Version of the form of the log, [`LogIdentity::VERSION`].
     pub log: u64,
     /// The recording node.
     pub node: NodeName,
@@ -28,7 +28,7 @@ pub struct Identity {
 
 /// A log whose metadata cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum IdentityError {
+pub enum LogIdentityError {
     /// A key is missing or has an unusable value.
     #[error("metadata `{key}` of the log cannot be used: {reason}")]
     Key {
@@ -39,7 +39,7 @@ pub enum IdentityError {
     },
 }
 
-impl Identity {
+impl LogIdentity {
     /// Version of the form of the logs that this program writes; it reads this and earlier ones.
     pub const VERSION: u64 = 1;
 
@@ -87,8 +87,8 @@ impl Identity {
     /// Reads the record's content.
     ///
     /// # Errors
-    /// [`IdentityError`] naming the first key that cannot be used.
-    pub(crate) fn from_map(map: &BTreeMap<String, String>) -> Result<Self, IdentityError> {
+    /// [`LogIdentityError`] naming the first key that cannot be used.
+    pub(crate) fn from_map(map: &BTreeMap<String, String>) -> Result<Self, LogIdentityError> {
         let fusion: FusionConfig = json(map, "fusion")?;
         fusion.validate().map_err(|error| unusable("fusion", &error))?;
         let landmarks: Vec<LandmarkConfig> = json(map, "landmarks")?;
@@ -105,14 +105,17 @@ impl Identity {
     }
 }
 
-fn text<'a>(map: &'a BTreeMap<String, String>, key: &'static str) -> Result<&'a str, IdentityError> {
+fn text<'a>(map: &'a BTreeMap<String, String>, key: &'static str) -> Result<&'a str, LogIdentityError> {
     map.get(key).map(String::as_str).ok_or_else(|| unusable(key, &"it is missing"))
 }
 
-fn json<T: serde::de::DeserializeOwned>(map: &BTreeMap<String, String>, key: &'static str) -> Result<T, IdentityError> {
+fn json<T: serde::de::DeserializeOwned>(
+    map: &BTreeMap<String, String>,
+    key: &'static str,
+) -> Result<T, LogIdentityError> {
     serde_json::from_str(text(map, key)?).map_err(|error| unusable(key, &error))
 }
 
-fn unusable(key: &'static str, reason: &dyn std::fmt::Display) -> IdentityError {
-    IdentityError::Key { key, reason: reason.to_string() }
+fn unusable(key: &'static str, reason: &dyn std::fmt::Display) -> LogIdentityError {
+    LogIdentityError::Key { key, reason: reason.to_string() }
 }
