@@ -50,6 +50,12 @@ impl Counts {
         self.correct.saturating_add(self.incorrect)
     }
 
+    /// Counts one vote.
+    pub(crate) fn add(&mut self, correct: bool) {
+        let count = if correct { &mut self.correct } else { &mut self.incorrect };
+        *count = count.saturating_add(1);
+    }
+
     fn plus(self, other: Self) -> Self {
         Self {
             correct: self.correct.saturating_add(other.correct),
@@ -170,10 +176,8 @@ impl ReputationLedger {
         let lane = (epoch, aggregator);
         let Some(record) = self.record_mut(lane, &evidence.node, Some(&evidence.label), Some(lane)) else { return };
         let counts = record.labels.entry(evidence.label.clone()).or_default();
-        for Counts { correct, incorrect } in [counts, &mut record.sum] {
-            let count = if evidence.correct { correct } else { incorrect };
-            *count = count.saturating_add(1);
-        }
+        counts.add(evidence.correct);
+        record.sum.add(evidence.correct);
         let sum = record.sum;
         self.reach_mark(lane, &evidence.node, sum);
     }
