@@ -17,7 +17,7 @@ pub use share::{EntryKey, MAX_ENTRIES, MAX_LANES};
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::config_section;
 use crate::names::{Label, NodeName};
 use crate::wire::{LedgerMark, Reputation};
 
@@ -69,36 +69,20 @@ impl Counts {
     }
 }
 
-/// Settings of reputations.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ReputationConfig {
-    /// Score of a vehicle without evidence, 0.3 to 1; default 0.5. Below what a proven vehicle reaches.
-    pub initial: f64,
-    /// Weight of the initial score in votes; default 10. More trusts newcomers and new liars later.
-    pub initial_votes: f64,
-    /// Votes that are remembered of a vehicle, the latest; default 500. Where they begin is
-    /// interpolated between marks. Less notices a change of mind sooner.
-    pub memory_votes: f64,
-}
-
-impl Default for ReputationConfig {
-    fn default() -> Self {
-        Self { initial: 0.5, initial_votes: 10.0, memory_votes: 500.0 }
+config_section! {
+    /// Settings of reputations.
+    pub struct ReputationConfig {
+        /// Score of a vehicle without evidence, 0.3 to 1; default 0.5. Below what a proven vehicle reaches.
+        pub initial: f64 = 0.5, in 0.3 to 1.0;
+        /// Weight of the initial score in votes; default 10. More trusts newcomers and new liars later.
+        pub initial_votes: f64 = 10.0, in 1e-3 to 1e6;
+        /// Votes that are remembered of a vehicle, the latest; default 500. Where they begin is
+        /// interpolated between marks. Less notices a change of mind sooner.
+        pub memory_votes: f64 = 500.0, in 1.0 to 1e9;
     }
 }
 
 impl ReputationConfig {
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// [`ConfigError`] naming the first value out of range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("initial", self.initial, 0.3, 1.0)?;
-        check_range("initial_votes", self.initial_votes, 1e-3, 1e6)?;
-        check_range("memory_votes", self.memory_votes, 1.0, 1e9)
-    }
-
     /// The reputation of a vehicle with so many right and wrong votes: the mean of a Beta distribution (Jøsang, Ismail
     /// 2002).
     pub fn mean(&self, correct: f64, incorrect: f64) -> f64 {

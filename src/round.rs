@@ -17,19 +17,20 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::config_section;
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::ReportKind;
 
-/// The rhythm of rounds.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct RoundConfig {
-    /// Longest time between rounds in seconds, the paper's τ. Default 0.1.
-    pub period_s: f64,
-    /// What closes a round before the period is over.
-    pub close: RoundClose,
+config_section! {
+    /// The rhythm of rounds.
+    #[derive(JsonSchema)]
+    pub struct RoundConfig {
+        /// Longest time between rounds in seconds, the paper's τ. Default 0.1.
+        pub period_s: f64 = 0.1, in 0.005 to 60.0;
+        /// What closes a round before the period is over.
+        pub close: RoundClose = RoundClose::WhenComplete;
+    }
 }
 
 /// What closes a round.
@@ -43,21 +44,7 @@ pub enum RoundClose {
     WhenComplete,
 }
 
-impl Default for RoundConfig {
-    fn default() -> Self {
-        Self { period_s: 0.1, close: RoundClose::WhenComplete }
-    }
-}
-
 impl RoundConfig {
-    /// Checks all values.
-    ///
-    /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("period_s", self.period_s, 0.005, 60.0)
-    }
-
     fn period(&self) -> Duration {
         Duration::from_secs_f64(self.period_s)
     }

@@ -4,65 +4,34 @@
 //! much hurts more than to claim too little: each condition alone rules a location out.
 
 use nalgebra::{Point2, Point3, Vector2};
-use serde::{Deserialize, Serialize};
 
 use crate::camera::Intrinsics;
-use crate::config::{ConfigError, check_range};
+use crate::config::config_section;
 use crate::geometry::{Pose, wrap_angle};
 use crate::landmark::Landmark;
 use crate::names::LandmarkId;
 use crate::projection::ObjectSizes;
 use crate::wire::PerceivedObject;
 
-/// What it takes to have a location in view.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ViewConfig {
-    /// Width of the target or object to be recognised at a location, in metres; default 0.05.
-    pub target_width_m: f64,
-    /// Pixels that the target must take across, as it is turned; default 36: a placard code of 21 modules at 1.7
-    /// pixels each. Less claims more locations and with them some whose object is overlooked.
-    pub min_target_px: f64,
-    /// Pixels that the target must keep from the left and right edges of the image; default 8.
-    pub margin_px: f64,
-    /// Farthest location in metres; default 20.
-    pub max_range_m: f64,
-    /// Most that the camera may stand off the direction that the location faces, in radians; default 0.87 (50°).
-    pub max_yaw_rad: f64,
-    /// Width in metres of a perceived object whose label has no listed size, for what it hides; default 0.07.
-    pub occluder_width_m: f64,
-    /// Metres by which an object must be nearer than a location to hide it; default 0.05. Must exceed the error of a
-    /// position, or an object hides the place where it stands.
-    pub clearance_m: f64,
-}
-
-impl Default for ViewConfig {
-    fn default() -> Self {
-        Self {
-            target_width_m: 0.05,
-            min_target_px: 36.0,
-            margin_px: 8.0,
-            max_range_m: 20.0,
-            max_yaw_rad: 0.87,
-            occluder_width_m: 0.07,
-            clearance_m: 0.05,
-        }
-    }
-}
-
-impl ViewConfig {
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// [`ConfigError`] with the first key out of range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("target_width_m", self.target_width_m, 1e-4, 1e3)?;
-        check_range("min_target_px", self.min_target_px, 0.0, 1e5)?;
-        check_range("margin_px", self.margin_px, 0.0, 1e5)?;
-        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
-        check_range("max_yaw_rad", self.max_yaw_rad, 0.0, std::f64::consts::PI)?;
-        check_range("occluder_width_m", self.occluder_width_m, 0.0, 1e3)?;
-        check_range("clearance_m", self.clearance_m, 0.0, 1e3)
+config_section! {
+    /// What it takes to have a location in view.
+    pub struct ViewConfig {
+        /// Width of the target or object to be recognised at a location, in metres; default 0.05.
+        pub target_width_m: f64 = 0.05, in 1e-4 to 1e3;
+        /// Pixels that the target must take across, as it is turned; default 36: a placard code of 21 modules at 1.7
+        /// pixels each. Less claims more locations and with them some whose object is overlooked.
+        pub min_target_px: f64 = 36.0, in 0.0 to 1e5;
+        /// Pixels that the target must keep from the left and right edges of the image; default 8.
+        pub margin_px: f64 = 8.0, in 0.0 to 1e5;
+        /// Farthest location in metres; default 20.
+        pub max_range_m: f64 = 20.0, in 1e-3 to 1e6;
+        /// Most that the camera may stand off the direction that the location faces, in radians; default 0.87 (50°).
+        pub max_yaw_rad: f64 = 0.87, in 0.0 to std::f64::consts::PI;
+        /// Width in metres of a perceived object whose label has no listed size, for what it hides; default 0.07.
+        pub occluder_width_m: f64 = 0.07, in 0.0 to 1e3;
+        /// Metres by which an object must be nearer than a location to hide it; default 0.05. Must exceed the error of a
+        /// position, or an object hides the place where it stands.
+        pub clearance_m: f64 = 0.05, in 0.0 to 1e3;
     }
 }
 

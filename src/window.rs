@@ -11,45 +11,26 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::config_section;
 use crate::delay::MinimumDelay;
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::{ObjectReport, RejectReason};
 
-/// Which reports are fresh enough to be used.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct WindowConfig {
-    /// Age in seconds beyond which a report is stale. Default 1.0; higher bridges slower links, lower forgets sooner.
-    pub max_age_s: f64,
-    /// How far in seconds a vehicle's clock may be from the aggregator's. Default 2.0; offsets within it are estimated
-    /// and removed, reports beyond it rejected.
-    pub max_clock_offset_s: f64,
-    /// Clock offsets in seconds up to which clocks count as synchronised and nothing is removed. Default 0.05.
-    pub clock_tolerance_s: f64,
-    /// Most vehicles kept at once. Default 4096.
-    pub max_vehicles: usize,
-}
-
-impl Default for WindowConfig {
-    fn default() -> Self {
-        Self { max_age_s: 1.0, max_clock_offset_s: 2.0, clock_tolerance_s: 0.05, max_vehicles: 4096 }
-    }
-}
-
-impl WindowConfig {
-    /// Checks all values.
-    ///
-    /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("max_age_s", self.max_age_s, 0.01, 3600.0)?;
-        check_range("max_clock_offset_s", self.max_clock_offset_s, 0.0, 3600.0)?;
-        check_range("clock_tolerance_s", self.clock_tolerance_s, 0.0, self.max_clock_offset_s)?;
-        check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e6)
+config_section! {
+    /// Which reports are fresh enough to be used.
+    #[derive(JsonSchema)]
+    pub struct WindowConfig {
+        /// Age in seconds beyond which a report is stale. Default 1.0; higher bridges slower links, lower forgets sooner.
+        pub max_age_s: f64 = 1.0, in 0.01 to 3600.0;
+        /// How far in seconds a vehicle's clock may be from the aggregator's. Default 2.0; offsets within it are estimated
+        /// and removed, reports beyond it rejected.
+        pub max_clock_offset_s: f64 = 2.0, in 0.0 to 3600.0;
+        /// Clock offsets in seconds up to which clocks count as synchronised and nothing is removed. Default 0.05.
+        pub clock_tolerance_s: f64 = 0.05, in 0.0 to *max_clock_offset_s;
+        /// Most vehicles kept at once. Default 4096.
+        pub max_vehicles: usize = 4096, in 1.0 to 1e6;
     }
 }
 

@@ -1,4 +1,4 @@
-//! The evidence that one vehicle has gathered, place by place.
+//! The belief of one vehicle: its evidence about each place, as log-odds in nats.
 
 use nalgebra::Point2;
 use smallvec::SmallVec;
@@ -7,11 +7,11 @@ use crate::geometry::Covariance;
 use crate::landmark::Candidate;
 use crate::names::{Label, NodeName};
 use crate::pace::PaceConfig;
-use crate::pace::grouping::{Held, Place};
+use crate::pace::grouping::{Place, VehicleItems};
 use crate::time::Timestamp;
 use crate::wire::PerceivedObject;
 
-/// A vehicle can look at the object and at the vacancy sign of a landmark, in configuration order.
+/// Places of `bayes` PACE: the object and the vacancy sign of each landmark, in configuration order.
 impl Place {
     pub(super) fn of(candidate: &Candidate) -> Self {
         if candidate.is_vacancy_sign {
@@ -30,27 +30,27 @@ impl Place {
     }
 }
 
-/// What one vehicle knows.
+/// All beliefs of one vehicle.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Vehicle {
+pub(super) struct VehicleBelief {
     last_capture: Option<Timestamp>,
-    /// When the look that is longest ago was.
-    oldest_look: Option<Timestamp>,
+    /// Time of the belief that was observed least recently.
+    oldest_seen: Option<Timestamp>,
     /// Ascending.
     places: Vec<Place>,
     /// One for each place.
-    looks: Vec<Look>,
+    beliefs: Vec<Belief>,
 }
 
-/// One vehicle's view of one place.
+/// The belief of one vehicle about one place.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Look {
-    last_look: Timestamp,
-    /// Log-odds that anything is there.
+pub(super) struct Belief {
+    last_seen: Timestamp,
+    /// Log-odds that any object is there.
     pub(super) anything: f64,
-    /// Log-odds of the labels that have any evidence left.
+    /// Log-odds of the labels that have evidence left.
     pub(super) labels: SmallVec<[LabelEvidence; 1]>,
-    /// Where the object was last.
+    /// The last position of the object.
     pub(super) position: Option<(Point2<f64>, Covariance)>,
 }
 
@@ -61,63 +61,64 @@ pub(super) struct LabelEvidence {
     pub(super) nats: f64,
 }
 
-/// A place that was looked at in one frame, and what was found there.
+/// A place that was in view in one frame, and the object that was found there.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Sighting<'a> {
+pub(super) struct Observation<'a> {
     pub(super) place: Place,
     pub(super) found: Option<&'a PerceivedObject>,
 }
 
-/// What a hit and a miss in one frame are worth.
+/// Evidence of a hit and of a miss in one frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Worth {
+pub(super) struct Increments {
     pub(super) hit_nats: f64,
     pub(super) miss_nats: f64,
 }
 
-impl Worth {
+impl Increments {
     pub(super) fn new(config: &PaceConfig) -> Self {
         let (p_d, p_f) = (config.detection_probability, config.false_alarm_probability);
         Self { hit_nats: (p_d / p_f).ln(), miss_nats: ((1.0 - p_f) / (1.0 - p_d)).ln() }
     }
 }
 
-impl Vehicle {
-    /// Takes one frame's sightings, ascending by place.
+impl VehicleBelief {
+    /// Takes one frame's observations, ascending by place.
     pub(super) fn observe(
         &mut self,
-        sightings: &[Sighting<'_>],
+        observations: &[Observation<'_>],
         captured_at: Timestamp,
-        worth: Worth,
+        increments: Increments,
         config: &PaceConfig,
     ) {
         let elapsed_s = self.last_capture.map_or(f64::INFINITY, |last| captured_at.since(last).as_secs_f64());
         let independence =
             if elapsed_s < config.independent_after_s { elapsed_s / config.independent_after_s } else { 1.0 };
-        let worth = Worth { hit_nats: worth.hit_nats * independence, miss_nats: worth.miss_nats * independence };
+        let increments =
+            Increments { hit_nats: increments.hit_nats * independence, miss_nats: increments.miss_nats * independence };
         self.last_capture = Some(captured_at);
-        self.add_places(sightings);
+        self.add_places(observations);
         let outdated = captured_at - config.max_age();
         let mut at = 0;
-        for sighting in sightings {
-            while self.places[at] < sighting.place {
+        for observation in observations {
+            while self.places[at] < observation.place {
                 at += 1;
             }
-            let look = &mut self.looks[at];
-            if look.last_look < outdated {
-                *look = Look::default();
+            let belief = &mut self.beliefs[at];
+            if belief.last_seen < outdated {
+                *belief = Belief::default();
             }
-            look.last_look = captured_at;
-            look.update(sighting.found, worth, config);
+            belief.last_seen = captured_at;
+            belief.update(observation.found, increments, config);
         }
-        self.oldest_look = self.looks.iter().map(|look| look.last_look).min();
+        self.oldest_seen = self.beliefs.iter().map(|belief| belief.last_seen).min();
     }
 
-    /// Makes a look for every place that is sighted for the first time.
-    fn add_places(&mut self, sightings: &[Sighting<'_>]) {
+    /// Adds a belief for every place that is observed for the first time.
+    fn add_places(&mut self, observations: &[Observation<'_>]) {
         let mut known = self.places.iter().peekable();
         let mut added: Vec<Place> = Vec::new();
-        for Sighting { place, .. } in sightings {
+        for Observation { place, .. } in observations {
             while known.next_if(|known| *known < place).is_some() {}
             if known.peek() != Some(&place) && added.last() != Some(place) {
                 added.push(*place);
@@ -126,41 +127,41 @@ impl Vehicle {
         if added.is_empty() {
             return;
         }
-        let known = std::mem::take(&mut self.places).into_iter().zip(std::mem::take(&mut self.looks));
-        let mut all: Vec<(Place, Look)> =
-            known.chain(added.into_iter().map(|place| (place, Look::default()))).collect();
+        let known = std::mem::take(&mut self.places).into_iter().zip(std::mem::take(&mut self.beliefs));
+        let mut all: Vec<(Place, Belief)> =
+            known.chain(added.into_iter().map(|place| (place, Belief::default()))).collect();
         all.sort_by_key(|(place, _)| *place);
-        (self.places, self.looks) = all.into_iter().unzip();
+        (self.places, self.beliefs) = all.into_iter().unzip();
     }
 
-    /// Drops what was last looked at before `limit`; the time of the oldest look that is left, `None` when none is.
+    /// Drops beliefs that were last observed before `limit`; returns the time of the oldest one left, if any is.
     pub(super) fn forget_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
-        if self.oldest_look.is_some_and(|oldest| oldest < limit) {
-            let mut looks = self.looks.iter();
-            self.places.retain(|_| looks.next().is_some_and(|look| look.last_look >= limit));
-            self.looks.retain(|look| look.last_look >= limit);
-            self.oldest_look = self.looks.iter().map(|look| look.last_look).min();
+        if self.oldest_seen.is_some_and(|oldest| oldest < limit) {
+            let mut beliefs = self.beliefs.iter();
+            self.places.retain(|_| beliefs.next().is_some_and(|belief| belief.last_seen >= limit));
+            self.beliefs.retain(|belief| belief.last_seen >= limit);
+            self.oldest_seen = self.beliefs.iter().map(|belief| belief.last_seen).min();
         }
-        self.oldest_look
+        self.oldest_seen
     }
 
-    /// The vehicle's looks under its name.
-    pub(super) fn held_by(&self, node: &NodeName) -> Held<'_, Look> {
-        Held { node: node.clone(), places: &self.places, items: &self.looks }
+    /// The vehicle's beliefs under its name.
+    pub(super) fn items_of(&self, node: &NodeName) -> VehicleItems<'_, Belief> {
+        VehicleItems { node: node.clone(), places: &self.places, items: &self.beliefs }
     }
 }
 
-impl Look {
-    fn update(&mut self, found: Option<&PerceivedObject>, worth: Worth, config: &PaceConfig) {
+impl Belief {
+    fn update(&mut self, found: Option<&PerceivedObject>, increments: Increments, config: &PaceConfig) {
         match found {
-            Some(object) => self.hit(object, worth, config),
-            None => self.miss(worth, config),
+            Some(object) => self.hit(object, increments, config),
+            None => self.miss(increments, config),
         }
         self.labels.retain(|evidence| evidence.nats > 0.0);
     }
 
-    fn hit(&mut self, object: &PerceivedObject, worth: Worth, config: &PaceConfig) {
-        let nats = worth.hit_nats * object.confidence;
+    fn hit(&mut self, object: &PerceivedObject, increments: Increments, config: &PaceConfig) {
+        let nats = increments.hit_nats * object.confidence;
         let mut is_known = false;
         for evidence in &mut self.labels {
             let is_same = evidence.label == object.label;
@@ -174,11 +175,11 @@ impl Look {
         self.position = Some((Point2::new(object.x_m, object.y_m), config.covariance(object)));
     }
 
-    fn miss(&mut self, worth: Worth, config: &PaceConfig) {
+    fn miss(&mut self, increments: Increments, config: &PaceConfig) {
         for evidence in &mut self.labels {
-            evidence.nats -= worth.miss_nats;
+            evidence.nats -= increments.miss_nats;
         }
-        self.anything = (self.anything - worth.miss_nats).max(-config.absence_limit);
+        self.anything = (self.anything - increments.miss_nats).max(-config.absence_limit);
     }
 
     pub(super) fn nats_for(&self, label: &Label) -> f64 {
