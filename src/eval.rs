@@ -19,7 +19,7 @@ use serde::Serialize;
 pub use truth::{Truth, TruthError};
 pub use votes::VehicleScores;
 
-use crate::landmark::{Gate, LandmarkIndex};
+use crate::landmark::{LandmarkGate, LandmarkIndex};
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::replay::FusedLine;
 use crate::time::Timestamp;
@@ -90,7 +90,7 @@ pub struct Confusion {
 #[derive(Debug, Clone)]
 pub struct Evaluation {
     truth: Truth,
-    cell: Option<(LandmarkIndex, Gate)>,
+    cell: Option<(LandmarkIndex, LandmarkGate)>,
     synonyms: BTreeMap<Label, Label>,
     pace: Tally,
     vote: Tally,
@@ -128,7 +128,7 @@ impl Evaluation {
 
     /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
     #[must_use]
-    pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: Gate) -> Self {
+    pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: LandmarkGate) -> Self {
         self.cell = Some((landmarks, gate));
         self
     }

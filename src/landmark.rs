@@ -8,7 +8,7 @@ use nalgebra::Point2;
 
 pub(crate) use config::check_synonyms;
 pub use config::{LandmarkConfig, VacancyConfig};
-pub use index::{Candidate, Gate, LandmarkIndex};
+pub use index::{LandmarkCandidate, LandmarkGate, LandmarkIndex};
 
 use crate::names::{Label, LandmarkId};
 

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::config_section;
 use crate::geometry::Covariance;
-use crate::landmark::{Gate, Landmark, LandmarkIndex};
+use crate::landmark::{Landmark, LandmarkGate, LandmarkIndex};
 use crate::time::Timestamp;
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
 
@@ -87,8 +87,8 @@ impl PaceConfig {
     }
 
     /// The gate between a detection and its landmark.
-    pub fn gate(&self) -> Gate {
-        Gate { radius_m: self.gate_m, sigmas: self.gate_sigmas, floor_m: self.position_floor_m }
+    pub fn gate(&self) -> LandmarkGate {
+        LandmarkGate { radius_m: self.gate_m, sigmas: self.gate_sigmas, floor_m: self.position_floor_m }
     }
 }
 

@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::truth::Truth;
 use super::{Item, percent};
 use crate::geometry::Covariance;
-use crate::landmark::{Gate, Landmark, LandmarkIndex};
+use crate::landmark::{Landmark, LandmarkGate, LandmarkIndex};
 use crate::names::{Label, NodeName};
 use crate::wire::PerceivedObject;
 
@@ -110,7 +110,11 @@ fn chance(ballot: &Ballot) -> Option<f64> {
 }
 
 /// The location that an object is taken for: the one it names, or else the best by position.
-pub(super) fn place<'a>(object: &PerceivedObject, landmarks: &'a LandmarkIndex, gate: &Gate) -> Option<&'a Landmark> {
+pub(super) fn place<'a>(
+    object: &PerceivedObject,
+    landmarks: &'a LandmarkIndex,
+    gate: &LandmarkGate,
+) -> Option<&'a Landmark> {
     let index = match &object.landmark {
         Some(id) => landmarks.position_of(id)?,
         None => {

@@ -23,7 +23,7 @@ pub struct LandmarkIndex {
 
 /// A landmark that a detection may belong to.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Candidate {
+pub struct LandmarkCandidate {
     /// Position of the landmark in configuration order.
     pub landmark: usize,
     /// Whether the detection is the landmark's vacancy sign rather than an object before it.
@@ -34,7 +34,7 @@ pub struct Candidate {
 
 /// How near a detection must be to a landmark.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gate {
+pub struct LandmarkGate {
     /// Largest distance in metres, the paper's δ.
     pub radius_m: f64,
     /// Largest distance in standard deviations.
@@ -92,7 +92,13 @@ impl LandmarkIndex {
     ///
     /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
     /// with where objects stand.
-    pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
+    pub fn best(
+        &self,
+        label: &Label,
+        point: &Point2<f64>,
+        covariance: &Covariance,
+        gate: &LandmarkGate,
+    ) -> Option<LandmarkCandidate> {
         // A fold from nothing: `min_by` steps to the first candidate, which keeps the search from becoming plain loops.
         self.candidates(label, *point, *covariance, *gate).fold(None, |best, candidate| match best {
             Some(best) if candidate.compare(&best) != Ordering::Less => Some(best),
@@ -106,12 +112,12 @@ impl LandmarkIndex {
         label: &'a Label,
         point: Point2<f64>,
         covariance: Covariance,
-        gate: Gate,
-    ) -> impl Iterator<Item = Candidate> + 'a {
+        gate: LandmarkGate,
+    ) -> impl Iterator<Item = LandmarkCandidate> + 'a {
         let near = move |grid: &'a Grid, is_vacancy_sign: bool| {
             grid.within(point, gate.radius_m)
                 .filter(move |(near, _)| self.reads_sign(label, near) == is_vacancy_sign)
-                .map(move |(near, offset)| Candidate {
+                .map(move |(near, offset)| LandmarkCandidate {
                     landmark: near.landmark as usize,
                     is_vacancy_sign,
                     mahalanobis_squared: covariance.mahalanobis_squared(&offset, gate.floor_m),
@@ -129,7 +135,7 @@ impl LandmarkIndex {
     }
 }
 
-impl Candidate {
+impl LandmarkCandidate {
     fn compare(&self, other: &Self) -> Ordering {
         self.mahalanobis_squared.total_cmp(&other.mahalanobis_squared).then(self.landmark.cmp(&other.landmark))
     }

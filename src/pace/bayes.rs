@@ -29,7 +29,7 @@ use self::consensus::{LabelScores, NamedBelief, WeightedMean};
 use super::assignment::{Pairing, one_to_one};
 use super::grouping::{ByPlace, Grouping, Place};
 use super::{PaceConfig, PaceRound};
-use crate::landmark::{Candidate, Landmark, LandmarkIndex};
+use crate::landmark::{Landmark, LandmarkCandidate, LandmarkIndex};
 use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
@@ -117,7 +117,7 @@ impl BayesPace {
     /// The objects at their nearest places, with `one_to_one` settled so that they share none; ascending by place.
     fn associate<'a>(&self, objects: &'a [PerceivedObject]) -> Vec<Observation<'a>> {
         let gate = self.config.gate();
-        let pairing = |object, candidate: Candidate| Pairing {
+        let pairing = |object, candidate: LandmarkCandidate| Pairing {
             place: Place::of(&candidate),
             object,
             distance_squared: candidate.mahalanobis_squared,

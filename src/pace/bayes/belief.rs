@@ -4,7 +4,7 @@ use nalgebra::Point2;
 use smallvec::SmallVec;
 
 use crate::geometry::Covariance;
-use crate::landmark::Candidate;
+use crate::landmark::LandmarkCandidate;
 use crate::names::{Label, NodeName};
 use crate::pace::PaceConfig;
 use crate::pace::grouping::{Place, VehicleItems};
@@ -13,7 +13,7 @@ use crate::wire::PerceivedObject;
 
 /// Places of `bayes` PACE: the object and the vacancy sign of each landmark, in configuration order.
 impl Place {
-    pub(super) fn of(candidate: &Candidate) -> Self {
+    pub(super) fn of(candidate: &LandmarkCandidate) -> Self {
         if candidate.is_vacancy_sign {
             Self::vacancy_sign(candidate.landmark)
         } else {
