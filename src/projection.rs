@@ -124,7 +124,7 @@ impl Projection {
             return Err(ProjectionError::DegenerateBox(label.clone()));
         }
         Ok(PerceivedObject {
-            covariance_m2: Some([covariance.xx, covariance.xy, covariance.yy]),
+            covariance_m2: Some(covariance.into()),
             ..PerceivedObject::new(label.clone(), detection.confidence, position.0, position.1)
         })
     }

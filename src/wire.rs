@@ -16,13 +16,12 @@
 
 #![deny(clippy::indexing_slicing)]
 
-mod check;
 mod codec;
 mod compact;
-mod ledger;
 mod object;
 mod reject;
 mod topic;
+mod validation;
 
 use std::collections::BTreeMap;
 
@@ -31,17 +30,17 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-pub use check::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, Payload, check_fused_at, is_label};
-pub use codec::{Encoding, decode, decode_report, encode};
-pub use ledger::{MAX_SHARE_ENTRIES, decode_share};
+pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
+pub use validation::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload, check_fused_at, is_label};
 
+use crate::epoch::Epoch;
 use crate::geometry::Pose;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::time::Timestamp;
-use compact::{Form, Half, Id, Millimetres, Single, Text, if_any};
+use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
 
 /// Major version of every payload; others are rejected.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -150,7 +149,7 @@ pub struct GlobalMap {
     pub objects: Vec<FusedObject>,
     /// By vehicle, how its positions were corrected before they were fused.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    #[cbor(n(8), with = "if_any", has_nil)]
+    #[cbor(n(8), with = "skip_empty", has_nil)]
     pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
 }
 
@@ -178,7 +177,7 @@ pub struct LandmarkState {
     /// The nodes that had the location in view, with or without a detection: a null label with observers is
     /// known to be empty, without observers it is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[cbor(n(6), with = "if_any", has_nil)]
+    #[cbor(n(6), with = "skip_empty", has_nil)]
     pub observers: Vec<NodeName>,
 }
 
@@ -203,6 +202,20 @@ pub struct Verdicts {
     /// One entry per known location.
     #[n(5)]
     pub verdicts: Vec<Verdict>,
+}
+
+impl Verdicts {
+    /// The verdicts of a leadership's round that closed at `fused_at`.
+    pub fn new(epoch: &Epoch, round: u64, fused_at: Timestamp, verdicts: Vec<Verdict>) -> Self {
+        Self {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader.clone(),
+            epoch: epoch.term,
+            round,
+            fused_at_us: fused_at,
+            verdicts,
+        }
+    }
 }
 
 /// The agreed label of one known location.
@@ -341,7 +354,7 @@ pub struct NodeStatus {
     #[n(1)]
     pub node: NodeName,
     /// Identity of this run of the node.
-    #[cbor(n(2), with = "Id")]
+    #[cbor(n(2), with = "UuidBytes")]
     pub id: Uuid,
     /// The role it was started with.
     #[n(3)]

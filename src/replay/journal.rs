@@ -140,7 +140,7 @@ impl Rerun {
     }
 
     fn standby(&self, at: Timestamp) -> Aggregator {
-        Aggregator::standby(self.fusion.clone(), self.landmarks.clone(), at)
+        Aggregator::new_standby(self.fusion.clone(), self.landmarks.clone(), at)
     }
 
     /// The present run; one whose beginning is not in the journal began as a standby.

@@ -7,13 +7,13 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-use super::compact::{Form, Half, Id, Millimetres, Single, Spread, Text};
+use super::compact::{CovarianceForm, Form, Half, Millimetres, Single, Text, UuidBytes};
 use crate::geometry::Covariance;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::time::Timestamp;
 
 /// A detection with its place in the world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct PerceivedObject {
     /// Class label or decoded text.
     #[cbor(n(0), with = "Text")]
@@ -29,7 +29,7 @@ pub struct PerceivedObject {
     pub y_m: f64,
     /// Position covariance `[xx, xy, yy]` in m².
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cbor(n(4), with = "Spread", has_nil)]
+    #[cbor(n(4), with = "CovarianceForm", has_nil)]
     pub covariance_m2: Option<[f64; 3]>,
     /// The known location that the node takes this object for; required in VOTE.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -54,25 +54,14 @@ pub struct PerceivedObject {
 }
 
 impl PerceivedObject {
-    /// An object of which no more is known than what and where it is.
+    /// An object with label, confidence and position only.
     pub fn new(label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64) -> Self {
-        Self {
-            label: label.into(),
-            confidence,
-            x_m,
-            y_m,
-            covariance_m2: None,
-            landmark: None,
-            velocity_mps: None,
-            heading_rad: None,
-            size_m: None,
-            scores: BTreeMap::new(),
-        }
+        Self { label: label.into(), confidence, x_m, y_m, ..Self::default() }
     }
 
     /// The reported covariance, if any.
     pub fn covariance(&self) -> Option<Covariance> {
-        self.covariance_m2.map(|[xx, xy, yy]| Covariance { xx, xy, yy })
+        self.covariance_m2.map(Covariance::from)
     }
 }
 
@@ -88,10 +77,10 @@ pub struct FieldOfView {
 }
 
 /// An object of the open world, where it is at the time of fusion.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FusedObject {
     /// Stable identity of the object.
-    #[cbor(n(0), with = "Id")]
+    #[cbor(n(0), with = "UuidBytes")]
     pub id: Uuid,
     /// The agreed label.
     #[cbor(n(1), with = "Text")]
@@ -107,7 +96,7 @@ pub struct FusedObject {
     #[cbor(n(4), with = "Millimetres")]
     pub y_m: f64,
     /// Position covariance `[xx, xy, yy]` in m².
-    #[cbor(n(5), with = "Spread")]
+    #[cbor(n(5), with = "CovarianceForm")]
     pub covariance_m2: [f64; 3],
     /// The nodes whose detections went into the entry.
     #[n(6)]
@@ -147,31 +136,14 @@ pub struct FusedObject {
 }
 
 impl FusedObject {
-    /// An object of which no more is known than what and where it is.
+    /// An object with label, confidence and position only.
     pub fn new(id: Uuid, label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64, covariance: Covariance) -> Self {
-        Self {
-            id,
-            label: label.into(),
-            confidence,
-            x_m,
-            y_m,
-            covariance_m2: [covariance.xx, covariance.xy, covariance.yy],
-            contributors: Vec::new(),
-            existence: None,
-            scores: BTreeMap::new(),
-            velocity_mps: None,
-            heading_rad: None,
-            size_m: None,
-            age_s: None,
-            first_seen_us: None,
-            vehicle: None,
-        }
+        Self { id, label: label.into(), confidence, x_m, y_m, covariance_m2: covariance.into(), ..Self::default() }
     }
 
     /// The position covariance.
     pub fn covariance(&self) -> Covariance {
-        let [xx, xy, yy] = self.covariance_m2;
-        Covariance { xx, xy, yy }
+        self.covariance_m2.into()
     }
 }
 

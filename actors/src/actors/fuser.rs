@@ -119,7 +119,7 @@ impl Actor for Fuser {
                 state.alarm = Timestamp(u64::MAX);
             }
             FuserMessage::StopPublishing => {
-                state.command(Command::StandBy);
+                state.command(Command::StepDown);
                 state.keeper.send(ReputationKeeperMessage::StandBy);
             }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),

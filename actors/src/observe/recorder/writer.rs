@@ -150,7 +150,7 @@ impl LogWriter {
             Item::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
                 (standing.leads, standing.next_round) = (Some(epoch.clone()), *first_round);
             }
-            Item::Journal(JournalEvent::Command(Command::StandBy)) => standing.leads = None,
+            Item::Journal(JournalEvent::Command(Command::StepDown)) => standing.leads = None,
             Item::Round(round) => standing.next_round = round.saturating_add(1),
             _ => {}
         }
