@@ -1,4 +1,4 @@
-//! Points in square cells: a query looks at the few cells around it, however many points there are elsewhere.
+//! A hashed grid of points in square cells: a query visits the few cells around it only.
 
 use nalgebra::{Point2, Vector2};
 
@@ -12,24 +12,23 @@ pub(super) struct GridPoint {
     pub(super) has_sign: bool,
 }
 
-/// Points grouped by cell, and cells by bucket. The cells of a row have successive buckets: a query reads one row_cells
-/// of memory for each row, and what one vehicle asks for is near what it asked for before.
+/// Points grouped by cell, and cells by bucket. The cells of a row have successive buckets, so that a query reads one
+/// contiguous range of memory for each row and successive queries of a vehicle are near each other.
 #[derive(Debug, Clone)]
 pub(super) struct Grid {
     cell_m: f64,
     /// Ascending by bucket, each with its row.
     points: Vec<(i32, GridPoint)>,
-    /// Where the points of each bucket end; as many as a power of two.
+    /// End of the points of each bucket; the number of buckets is a power of two.
     ends: Vec<u32>,
 }
 
-/// Keeps the rows of a grid apart: the fraction of the golden ratio in 64 bits (Knuth, "The Art of Computer
-/// Programming", volume 3, section 6.4).
+/// Multiplier that spreads the rows over the buckets: the fraction of the golden ratio in 64 bits (Knuth, "The Art of
+/// Computer Programming", volume 3, section 6.4).
 const ROW_STEP: u64 = 0x9e37_79b9_7f4a_7c15;
 
 impl Grid {
-    /// Groups the points into cells of `cell_m` metres; a query looks at one to four cells for radii up to half of
-    /// that.
+    /// Groups the points into cells of `cell_m` metres; a query visits one to four cells for radii up to half of that.
     pub(super) fn new(points: impl IntoIterator<Item = GridPoint>, cell_m: f64) -> Self {
         let mut points: Vec<_> = points.into_iter().collect();
         let buckets = (2 * points.len()).next_power_of_two();
@@ -65,7 +64,7 @@ impl Grid {
             .filter(move |(_, offset)| offset.norm_squared() <= radius_m * radius_m)
     }
 
-    /// The points in the buckets of a cell and of so many more of its row, and whatever shares the buckets.
+    /// The points in the buckets of a cell and of the `more` next ones of its row, with all others in these buckets.
     fn row_cells(&self, first: i32, more: usize, row: i32) -> impl Iterator<Item = &(i32, GridPoint)> {
         let buckets = self.ends.len();
         let first = bucket(first, row, buckets);
@@ -83,7 +82,7 @@ fn bucket(column: i32, row: i32, buckets: usize) -> usize {
     spread as usize & (buckets - 1)
 }
 
-/// The column or row that a coordinate lies in; those beyond 32 bits share the outermost.
+/// The column or row of a coordinate; those beyond 32 bits share the outermost.
 fn cell_index(coordinate_m: f64, cell_m: f64) -> i32 {
     let scaled = coordinate_m / cell_m;
     let truncated = scaled as i32;
