@@ -281,7 +281,12 @@ mod tests {
             cell: name("lot-1"),
             patience: Some(Duration::from_secs(3)),
             now,
-            leadership: Leadership { position: Position::Following, epoch: Some(epoch), standby: Some(name("gauss")) },
+            leadership: Leadership {
+                position: Position::Following,
+                epoch: Some(epoch),
+                standby: Some(name("gauss")),
+                term: 0,
+            },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
             members: vec![Member {
                 name: name("gauss"),

@@ -49,7 +49,7 @@ impl Vehicle {
         Self {
             name,
             election,
-            aggregator: Aggregator::standby(fusion, landmarks, now),
+            aggregator: Aggregator::new_standby(fusion, landmarks, now),
             ledger: ReputationLedger::default(),
             gate: EpochGate::default(),
             map: None,
@@ -143,7 +143,7 @@ impl Vehicle {
                 }
                 Effect::StopPublishing { epoch } => {
                     self.news.push(format!("{epoch} stops"));
-                    self.aggregator.stand_by();
+                    self.aggregator.step_down();
                 }
                 Effect::Prepare { .. } => self.handle(Input::Prepared, now),
                 Effect::SendState { to } => self.share(Some(to)),

@@ -96,7 +96,7 @@ fuzz_target!(|cell: Cell| {
                 now = now + Duration::from_millis(ms.into());
                 aggregator.tick(now).iter().for_each(check);
             }
-            Step::StandBy => aggregator.stand_by(),
+            Step::StandBy => aggregator.step_down(),
             Step::Lead => {
                 epoch += 1;
                 aggregator.lead(Epoch::new(epoch, NodeName::from_static("edge")), 1, FirstRound::OnTime, now);

@@ -6,7 +6,7 @@
 
 use std::sync::LazyLock;
 
-use ecod::detection::detections_in;
+use ecod::detection::parse_detections;
 use ecod::time::Timestamp;
 use ecod_actors::actors::reputation_keeper::read_saved;
 use ecod_actors::camera::vehicle_pose::read_pose;
@@ -27,7 +27,7 @@ fuzz_target!(|input: &[u8]| {
             }
         }
         1 => {
-            let detections = detections_in(text).unwrap_or_default();
+            let detections = parse_detections(text).unwrap_or_default();
             assert!(detections.iter().all(|detection| detection.bounding_box.is_valid()));
         }
         2 => assert!(SIGNING.keeps_shut("ecod/lot-1/detections/euclid", bytes)),

@@ -14,7 +14,7 @@ mod votes;
 
 use std::collections::BTreeMap;
 
-use ecod::landmark::{Gate, LandmarkIndex};
+use ecod::landmark::{LandmarkGate, LandmarkIndex};
 use ecod::names::{Label, LandmarkId, NodeName};
 use ecod::replay::FusedLine;
 use ecod::time::Timestamp;
@@ -90,7 +90,7 @@ pub struct ConfusionCell {
 #[derive(Debug, Clone)]
 pub struct Evaluation {
     truth: Truth,
-    cell: Option<(LandmarkIndex, Gate)>,
+    cell: Option<(LandmarkIndex, LandmarkGate)>,
     synonyms: BTreeMap<Label, Label>,
     pace: Tally,
     vote: Tally,
@@ -128,7 +128,7 @@ impl Evaluation {
 
     /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
     #[must_use]
-    pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: Gate) -> Self {
+    pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: LandmarkGate) -> Self {
         self.cell = Some((landmarks, gate));
         self
     }

@@ -281,7 +281,7 @@ mod tests {
             fused_at_us: ms(100 * round),
             verdicts: Vec::new(),
         };
-        let mut is_sign = |round: u64, filter: &mut RoundFilter| {
+        let is_sign = |round: u64, filter: &mut RoundFilter| {
             filter.accept_verdicts(&verdicts(round), ms(100 * round), &leadership).unwrap().is_sign_of_life
         };
         assert!(is_sign(1, &mut filter));

@@ -112,7 +112,7 @@ impl Actor for Fuser {
                 state.alarm = Timestamp(u64::MAX);
             }
             FuserMessage::StopPublishing => {
-                state.command(Command::StandBy);
+                state.command(Command::StepDown);
                 state.keeper.send(ReputationKeeperMessage::StepDown);
             }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),

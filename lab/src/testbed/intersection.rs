@@ -13,7 +13,7 @@ use std::time::Duration;
 use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::camera::Mount;
 use ecod::geometry::{Pose, wrap_angle};
-use ecod::landmark::{Gate, Landmark, LandmarkIndex};
+use ecod::landmark::{Landmark, LandmarkGate, LandmarkIndex};
 use ecod::names::{Label, LandmarkId, NodeName};
 use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ecod::replay::{FusedLine, Replay, ReplayConfig};
@@ -57,7 +57,7 @@ const SIZES: [(&str, f64, f64); 16] = [
 /// Height in metres of what has any other label, to find its bearing with.
 const ANY_HEIGHT_M: f64 = 0.11;
 /// Which location an object of known size is taken for.
-const GATE: Gate = Gate { radius_m: 0.5, sigmas: 3.0, floor_m: 0.02 };
+const GATE: LandmarkGate = LandmarkGate { radius_m: 0.5, sigmas: 3.0, floor_m: 0.02 };
 /// Greatest angle in radians between an object of unknown size and the location that it is taken for.
 const MAX_BESIDE_RAD: f64 = 0.15;
 /// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.

@@ -63,7 +63,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         fuser.get().unwrap().drain_and_wait(None).await.unwrap();
 
         let mut fuser = FuserState::new(FuserArguments {
-            aggregator: Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
+            aggregator: Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
             intake: Intake::default(),
             newest: None,
             recording: LogSender::default(),

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use anyhow::anyhow;
 use ecod::landmark::Landmark;
-use ecod::replay::{FusedLine, JournalEntry, Replay, ReplayConfig, Rerun};
+use ecod::replay::{FusedLine, JournalEntry, JournalReplay, Replay, ReplayConfig};
 use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
 
 use super::{Failure, report, write_all};
@@ -21,7 +21,7 @@ enum ReplayEngine {
     /// Nothing has been read that says which.
     Undecided,
     /// The aggregator's journal.
-    Journal(Box<Rerun>),
+    Journal(Box<JournalReplay>),
     /// Reports by their time of receipt.
     Reports(Box<Replay>),
 }
@@ -106,7 +106,7 @@ impl<'a> LogReplay<'a> {
                 let Ok(entry) = serde_json::from_slice::<JournalEntry>(&message.json) else {
                     return self.reject(RejectReason::Malformed);
                 };
-                self.rerun().map(|rerun| rerun.entry(&entry)).unwrap_or_default()
+                self.journal_replay().map(|rerun| rerun.entry(&entry)).unwrap_or_default()
             }
             SchemaName::ObjectReport => match read_report(message) {
                 Ok((kind, report)) => match self.machine() {
@@ -126,10 +126,10 @@ impl<'a> LogReplay<'a> {
     }
 
     /// A journal precedes the reports that it is about.
-    fn rerun(&mut self) -> Option<&mut Rerun> {
+    fn journal_replay(&mut self) -> Option<&mut JournalReplay> {
         if matches!(self.machine, ReplayEngine::Undecided) {
             let ReplayConfig { fusion, landmarks, .. } = self.config();
-            self.machine = ReplayEngine::Journal(Box::new(Rerun::new(fusion, landmarks)));
+            self.machine = ReplayEngine::Journal(Box::new(JournalReplay::new(fusion, landmarks)));
         }
         if let ReplayEngine::Journal(rerun) = &mut self.machine { Some(rerun) } else { None }
     }
@@ -190,7 +190,7 @@ fn end(replay: Replay) -> Vec<FusedLine> {
     lines
 }
 
-fn say(rerun: &Rerun) {
+fn say(rerun: &JournalReplay) {
     let summary = rerun.summary();
     let used = summary.reports - summary.rejected.values().sum::<u64>();
     eprintln!("{} reports, {used} used, {} written", summary.reports, summary.written);

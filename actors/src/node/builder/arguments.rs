@@ -190,7 +190,7 @@ impl NodeBuilder {
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
         let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
-        let mut aggregator = Aggregator::standby(fusion, landmarks, now);
+        let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
         self.recording.journal(now, JournalEvent::Start { ledger });
         FuserArguments {

@@ -1,24 +1,23 @@
-//! Going on from a ledger.
+//! Evidence taken over from a reputation ledger.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
-use super::WeightedTally;
+use super::WeightedVoting;
 use crate::names::{Label, NodeName};
 use crate::reputation::{RememberedVotes, ReputationLedger};
+use crate::vote::config::VoteConfig;
 use crate::vote::confusion::{Confusion, LabelIndex};
 
-impl WeightedTally {
-    /// Takes over what a ledger remembers beyond what was counted here, as a standby has counted the latest itself; in
-    /// place of what it took over before. Of more than `most_vehicles` or `most_labels` those with most evidence are
-    /// taken, of vehicles that they were right, and those heard in the latest lanes.
+impl WeightedVoting {
+    /// Takes over the ledger's remembered votes beyond those that were counted here: a standby has counted the latest
+    /// ones itself. They replace those of an earlier ledger.
     ///
-    /// A ledger counts by stated label; what was right instead of a wrong one is taken to be any other label alike.
-    pub(in super::super) fn adopt(&mut self, ledger: &ReputationLedger, (most_vehicles, most_labels): (usize, usize)) {
-        let own = |node: &NodeName| {
-            let (correct, incorrect) = self.vehicles.get(node).map_or((0, 0), |&vehicle| self.records[vehicle]);
-            correct.saturating_add(incorrect)
-        };
+    /// Where room is short, the labels with most evidence are taken, and the vehicles that were right most often, on a
+    /// tie those in the latest lanes. A ledger counts by stated label only: the truth behind a wrong vote is taken to
+    /// be any other label with equal probability.
+    pub(super) fn take_over(&mut self, ledger: &ReputationLedger, limits: &VoteConfig) {
+        let own = |node: &NodeName| self.vehicles.get(node).map_or(0, |&vehicle| self.counts[vehicle].total());
         let (heard, mut others): (Vec<_>, Vec<_>) = ledger
             .remembered(self.config.memory_votes, own)
             .into_iter()
@@ -28,13 +27,13 @@ impl WeightedTally {
             let correct: f64 = labels.values().map(|(correct, _)| correct).sum();
             (Reverse(correct.round() as u64), Reverse(lanes.get(node).copied()), node.clone())
         });
-        others.truncate(most_vehicles.saturating_sub(self.vehicles.len()));
+        others.truncate(limits.max_vehicles.saturating_sub(self.vehicles.len()));
         let known = [heard, others].concat();
-        self.adopt_labels(&known, most_labels);
+        self.take_over_labels(&known, limits.max_labels);
         for (node, labels) in known {
             let mut inherited = Confusion::default();
             for (label, (correct, incorrect)) in labels {
-                let Some(label) = self.labels.number(&label) else { continue };
+                let Some(label) = self.labels.index(&label) else { continue };
                 inherited.add(label, label, correct);
                 let others: Vec<_> = (0..self.labels.len() as LabelIndex).filter(|l| *l != label).collect();
                 let each = incorrect / others.len().max(1) as f64;
@@ -43,20 +42,20 @@ impl WeightedTally {
                 }
             }
             let vehicle = self.vehicle(&node);
-            self.model.witnesses[vehicle].inherited = inherited;
+            self.model.vehicles[vehicle].inherited = inherited;
         }
     }
 
-    fn adopt_labels(&mut self, known: &[(NodeName, RememberedVotes)], most: usize) {
+    fn take_over_labels(&mut self, known: &[(NodeName, RememberedVotes)], max_labels: usize) {
         let mut votes: BTreeMap<&Label, f64> = BTreeMap::new();
         for (label, (correct, incorrect)) in known.iter().flat_map(|(_, labels)| labels) {
-            // What is mostly wrong is of use as long as there is room.
+            // A label that is mostly wrong is of use only where there is room.
             *votes.entry(label).or_default() += correct + 1e-3 * incorrect;
         }
         let mut labels: Vec<_> = votes.into_iter().collect();
         labels.sort_by(|a, b| b.1.total_cmp(&a.1));
         for (label, _) in labels {
-            if self.labels.has_room_for(label, most) {
+            if self.labels.has_room_for(label, max_labels) {
                 self.label(label, None);
             }
         }

@@ -1,4 +1,4 @@
-//! One line of input or output.
+//! Lines of a replay's input and output.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,15 +16,15 @@ pub enum FusedLine {
     Verdicts(Verdicts),
 }
 
-/// A report, what it is for, and when its line takes place.
+/// A report of a recording, with its kind and the virtual time of its line.
 #[derive(Debug, Clone)]
-pub(super) struct Line {
+pub(super) struct RecordedReport {
     pub(super) kind: ReportKind,
     pub(super) at: Timestamp,
     pub(super) report: ObjectReport,
 }
 
-/// What a line may say beside its report.
+/// The optional fields of a line beside its report.
 #[derive(Debug, Deserialize)]
 struct Envelope {
     #[serde(default)]
@@ -33,7 +33,7 @@ struct Envelope {
     received_at_us: Option<Timestamp>,
 }
 
-impl Line {
+impl RecordedReport {
     pub(super) fn read(text: &[u8], limits: &Limits) -> Result<Self, RejectReason> {
         let text = text.trim_ascii();
         if text.len() > limits.payload_bytes {
@@ -49,7 +49,8 @@ impl Line {
     }
 }
 
-/// `detections` or `vote_detections`, or a whole MQTT topic that ends with it and the node's name.
+/// The kind of a `topic` field: `detections` or `vote_detections`, or a whole MQTT topic that ends with it and the node's
+/// name.
 fn kind(topic: &str, node: &NodeName) -> Result<ReportKind, RejectReason> {
     let mut levels = topic.rsplit('/');
     let last = levels.next().unwrap_or_default();

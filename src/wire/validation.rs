@@ -1,4 +1,4 @@
-//! What a payload may say: every value that came from outside is checked before anything is made of it.
+//! Validation of payloads: every value from outside is checked before it is used.
 
 use std::collections::BTreeMap;
 
@@ -7,21 +7,21 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_SHARE_ENTRIES, NodeStatus, ObjectReport,
-    PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
+    FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, NodeStatus, ObjectReport, PerceivedObject,
+    PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
 };
 use crate::geometry::Covariance;
 use crate::names::{Label, MAX_NAME_BYTES};
 use crate::time::Timestamp;
 
-/// Bounds that a payload must keep to be decoded at all.
+/// Bounds of a payload; one beyond them is not decoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Most bytes of a report or status.
+    /// Maximum size of a report, status or share in bytes.
     pub payload_bytes: usize,
-    /// Most bytes of what an aggregator sends: maps, verdicts and reputations grow with the cell.
+    /// Maximum size of a map, verdicts or reputations in bytes; they grow with the cell.
     pub map_bytes: usize,
-    /// Most objects, and most seen landmarks, in one report.
+    /// Maximum number of objects, and of seen landmarks, in one report.
     pub objects: usize,
 }
 
@@ -34,34 +34,37 @@ impl Default for Limits {
 /// Largest epoch, round, count or time: every JSON reader keeps integers up to 2⁵³ − 1 exact (RFC 8259, section 6).
 pub const MAX_INTEGER: u64 = (1 << 53) - 1;
 
-/// How far in seconds a map's or verdict's time of fusion may be ahead of the receiver's clock. Maps say nothing that
-/// needs clocks to agree, so this keeps out only what would look fresh for hours.
+/// Maximum lead in seconds of a round's time of fusion over the receiver's clock. Maps do not need synchronised clocks;
+/// this only rejects rounds that would look fresh for hours.
 pub const MAX_FUSED_AHEAD_S: u64 = 3600;
 
-/// Largest coordinate in metres that is taken for a position on Earth.
+/// Maximum number of counts, and of marks, in one share: it stays below the default of [`Limits::payload_bytes`].
+pub const MAX_SHARE_ENTRIES: usize = 512;
+
+/// Largest coordinate of a position on Earth in metres.
 const WORLD_BOUND_M: f64 = 1e8;
 
 /// Fastest object in metres per second.
 const SPEED_BOUND_MPS: f64 = 1e4;
 
-/// Largest object, and farthest range of a sensor, in metres.
+/// Largest size of an object and largest range of a sensor in metres.
 const SIZE_BOUND_M: f64 = 1e5;
 
-/// Largest heading in radians: whoever counts turns need not stop at the first.
+/// Largest angle in radians: headings may count full turns.
 const ANGLE_BOUND_RAD: f64 = 1e6;
 
-/// Most classes that one object can have scores for.
+/// Maximum number of classes with scores of one object.
 const MAX_SCORES: usize = 256;
 
-/// Largest score of a label: far beyond the votes of all vehicles that a cell can have.
+/// Largest score of a label: far more than the votes of all vehicles of a cell.
 const SCORE_BOUND: f64 = 1e9;
 
-/// What travels on a topic, with the version of its form.
+/// A message on a topic, with a version of its schema.
 pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b, ()> {
-    /// Major version that the payload claims to have.
+    /// Major version that the payload states.
     fn schema(&self) -> u32;
 
-    /// The limit that its size must keep.
+    /// Maximum size in bytes.
     fn max_bytes(limits: &Limits) -> usize {
         limits.payload_bytes
     }
@@ -75,97 +78,31 @@ pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b
     }
 }
 
-impl Payload for ObjectReport {
-    fn schema(&self) -> u32 {
-        self.schema
-    }
+macro_rules! payloads {
+    ($($type:ty: at most $max_bytes:ident, checked by $check:path;)*) => {
+        $(impl Payload for $type {
+            fn schema(&self) -> u32 {
+                self.schema
+            }
 
-    fn check(&self, limits: &Limits) -> Result<(), RejectReason> {
-        self.validate(limits)
-    }
+            fn max_bytes(limits: &Limits) -> usize {
+                limits.$max_bytes
+            }
+
+            fn check(&self, limits: &Limits) -> Result<(), RejectReason> {
+                $check(self, limits)
+            }
+        })*
+    };
 }
 
-impl Payload for GlobalMap {
-    fn schema(&self) -> u32 {
-        self.schema
-    }
-
-    fn max_bytes(limits: &Limits) -> usize {
-        limits.map_bytes
-    }
-
-    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
-        let times = [Some(self.fused_at_us), self.oldest_capture_us];
-        check_integers([self.epoch, self.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
-        self.landmarks.iter().try_for_each(check_landmark)?;
-        self.objects.iter().try_for_each(check_object)?;
-        self.pose_corrections.values().try_for_each(check_correction)
-    }
-}
-
-impl Payload for Verdicts {
-    fn schema(&self) -> u32 {
-        self.schema
-    }
-
-    fn max_bytes(limits: &Limits) -> usize {
-        limits.map_bytes
-    }
-
-    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
-        check_integers([self.epoch, self.round, self.fused_at_us.micros()])?;
-        self.verdicts.iter().try_for_each(check_verdict)
-    }
-}
-
-impl Payload for Reputations {
-    fn schema(&self) -> u32 {
-        self.schema
-    }
-
-    fn max_bytes(limits: &Limits) -> usize {
-        limits.map_bytes
-    }
-
-    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
-        check_integers([self.epoch, self.round])?;
-        self.reputations.values().try_for_each(|reputation| {
-            check_integers([reputation.correct, reputation.incorrect])?;
-            let trusted = (0.0..=1.0).contains(&reputation.score);
-            if trusted { Ok(()) } else { Err(number_reason(reputation.score)) }
-        })
-    }
-}
-
-impl Payload for LedgerShare {
-    fn schema(&self) -> u32 {
-        self.schema
-    }
-
-    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
-        if self.entries.len() > MAX_SHARE_ENTRIES || self.marks.len() > MAX_SHARE_ENTRIES {
-            return Err(RejectReason::TooManyObjects);
-        }
-        check_integers(self.epoch)?;
-        self.marks
-            .iter()
-            .try_for_each(|mark| check_integers([mark.epoch, mark.number, mark.correct, mark.incorrect]))?;
-        self.entries.iter().try_for_each(|entry| {
-            check_integers([entry.epoch, entry.correct, entry.incorrect])?;
-            check_labels([&*entry.label])
-        })
-    }
-}
-
-impl Payload for NodeStatus {
-    fn schema(&self) -> u32 {
-        self.schema
-    }
-
-    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
-        check_integers([self.epoch])?;
-        check_labels([&*self.version])
-    }
+payloads! {
+    ObjectReport: at most payload_bytes, checked by ObjectReport::validate;
+    GlobalMap: at most map_bytes, checked by check_map;
+    Verdicts: at most map_bytes, checked by check_verdicts;
+    Reputations: at most map_bytes, checked by check_reputations;
+    LedgerShare: at most payload_bytes, checked by check_share;
+    NodeStatus: at most payload_bytes, checked by check_status;
 }
 
 impl ObjectReport {
@@ -207,13 +144,52 @@ impl PerceivedObject {
     }
 }
 
-/// Checks that a time of fusion is not so far ahead that it would look fresh for hours.
+/// Checks that a time of fusion is less than [`MAX_FUSED_AHEAD_S`] ahead.
 ///
 /// # Errors
 /// [`RejectReason::FromTheFuture`].
 pub fn check_fused_at(fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
     let ahead = fused_at.since(received_at);
     if ahead.as_secs() < MAX_FUSED_AHEAD_S { Ok(()) } else { Err(RejectReason::FromTheFuture) }
+}
+
+fn check_map(map: &GlobalMap, _: &Limits) -> Result<(), RejectReason> {
+    let times = [Some(map.fused_at_us), map.oldest_capture_us];
+    check_integers([map.epoch, map.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
+    map.landmarks.iter().try_for_each(check_landmark)?;
+    map.objects.iter().try_for_each(check_object)?;
+    map.pose_corrections.values().try_for_each(check_correction)
+}
+
+fn check_verdicts(verdicts: &Verdicts, _: &Limits) -> Result<(), RejectReason> {
+    check_integers([verdicts.epoch, verdicts.round, verdicts.fused_at_us.micros()])?;
+    verdicts.verdicts.iter().try_for_each(check_verdict)
+}
+
+fn check_reputations(reputations: &Reputations, _: &Limits) -> Result<(), RejectReason> {
+    check_integers([reputations.epoch, reputations.round])?;
+    reputations.reputations.values().try_for_each(|reputation| {
+        check_integers([reputation.correct, reputation.incorrect])?;
+        check_between(reputation.score, 0.0, 1.0)
+    })
+}
+
+fn check_share(share: &LedgerShare, _: &Limits) -> Result<(), RejectReason> {
+    if share.entries.len() > MAX_SHARE_ENTRIES || share.marks.len() > MAX_SHARE_ENTRIES {
+        return Err(RejectReason::TooManyObjects);
+    }
+    check_integers(share.epoch)?;
+    let mut marks = share.marks.iter();
+    marks.try_for_each(|mark| check_integers([mark.epoch, mark.number, mark.correct, mark.incorrect]))?;
+    share.entries.iter().try_for_each(|entry| {
+        check_integers([entry.epoch, entry.correct, entry.incorrect])?;
+        check_labels([&*entry.label])
+    })
+}
+
+fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
+    check_integers([status.epoch])?;
+    check_labels([&*status.version])
 }
 
 fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
@@ -267,16 +243,16 @@ fn check_scores(scores: &BTreeMap<Label, f64>) -> Result<(), RejectReason> {
 }
 
 fn check_between(value: f64, low: f64, high: f64) -> Result<(), RejectReason> {
-    if (low..=high).contains(&value) { Ok(()) } else { Err(number_reason(value)) }
+    match value {
+        _ if (low..=high).contains(&value) => Ok(()),
+        _ if value.is_finite() => Err(RejectReason::OutOfRange),
+        _ => Err(RejectReason::NotFinite),
+    }
 }
 
 fn check_verdict(verdict: &Verdict) -> Result<(), RejectReason> {
-    let scores = [verdict.score, verdict.margin].into_iter().chain(verdict.votes.values().copied());
-    for score in scores {
-        if !(-SCORE_BOUND..=SCORE_BOUND).contains(&score) {
-            return Err(number_reason(score));
-        }
-    }
+    let mut scores = [verdict.score, verdict.margin].into_iter().chain(verdict.votes.values().copied());
+    scores.try_for_each(|score| check_between(score, -SCORE_BOUND, SCORE_BOUND))?;
     let labels = verdict.votes.keys().chain(&verdict.label);
     check_labels([&*verdict.landmark].into_iter().chain(labels.map(|label| &**label)))
 }
@@ -303,11 +279,6 @@ fn check_labels<'a>(labels: impl IntoIterator<Item = &'a str>) -> Result<(), Rej
 
 fn check_integers(values: impl IntoIterator<Item = u64>) -> Result<(), RejectReason> {
     if values.into_iter().all(|value| value <= MAX_INTEGER) { Ok(()) } else { Err(RejectReason::OutOfRange) }
-}
-
-/// The reason for a number outside its bounds.
-fn number_reason(value: f64) -> RejectReason {
-    if value.is_finite() { RejectReason::OutOfRange } else { RejectReason::NotFinite }
 }
 
 fn in_world(coordinate_m: f64) -> bool {

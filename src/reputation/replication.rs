@@ -1,77 +1,72 @@
-//! The ledger in pieces that fit into messages, and bounded.
+//! Replication: the ledger in pieces that fit into messages, and its bounds.
 
 use std::collections::BTreeSet;
 
-use super::{Counts, Record, ReputationLedger, Vehicles};
+use super::Counts;
+use super::ledger::{Record, ReputationLedger};
 use crate::epoch::Epoch;
 use crate::names::{Label, NodeName};
 use crate::wire::{LedgerEntry, LedgerMark};
 
-/// Most lanes that are kept: the latest.
+/// Maximum number of lanes: the latest are kept.
 pub const MAX_LANES: usize = 64;
 
-/// Most counts and marks that are kept: for a new one the oldest lanes are dropped, and it is not taken where only its
-/// own and later ones are left, unless it is of the present leader's lane, to which later ones give way too.
+/// Maximum number of counts and marks. For a new one the oldest lanes are dropped. It is not taken where only its own
+/// and later lanes are left, except in the present leader's lane, to which later lanes give way too.
 pub const MAX_ENTRIES: usize = 65_536;
 
-/// Which count: what an entry is about, without the numbers.
+/// The key of a count: an entry without its numbers.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct EntryKey {
     /// The lane.
     pub lane: Epoch,
-    /// Who voted.
+    /// The vehicle.
     pub node: NodeName,
-    /// What for.
+    /// The label that it stated.
     pub label: Label,
 }
-
-/// A lane: its term and who writes it.
-pub(super) type Lane<'a> = (u64, &'a NodeName);
 
 impl ReputationLedger {
     /// Every count, lane by lane.
     pub fn entries(&self) -> impl Iterator<Item = LedgerEntry> {
-        self.lanes.iter().flat_map(|(epoch, aggregators)| {
-            aggregators.iter().flat_map(move |(aggregator, vehicles)| {
-                vehicles.iter().flat_map(move |(node, record)| {
-                    record.labels.iter().map(move |(label, counts)| entry(*epoch, aggregator, node, label, *counts))
-                })
-            })
+        self.records().flat_map(|(lane, node, record)| {
+            record.labels.iter().map(move |(label, counts)| entry(lane, node, label, *counts))
         })
     }
 
     /// The counts that `keys` name, as they are now.
     pub fn entries_of(&self, keys: &BTreeSet<EntryKey>) -> Vec<LedgerEntry> {
         let find = |EntryKey { lane, node, label }: &EntryKey| {
-            let counts = self.lanes.get(&lane.term)?.get(&lane.leader)?.get(node)?.labels.get(label)?;
-            Some(entry(lane.term, &lane.leader, node, label, *counts))
+            Some(entry(lane, node, label, *self.lanes.get(lane)?.get(node)?.labels.get(label)?))
         };
         keys.iter().filter_map(find).collect()
     }
 
-    /// The counts and marks that `other` would learn something from.
+    /// The counts and marks that are missing in `other` or larger than there.
     pub fn beyond(&self, other: &Self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
+        let known = |epoch: u64, aggregator: &NodeName, node: &NodeName| {
+            other.lanes.get(&Epoch::new(epoch, aggregator.clone()))?.get(node)
+        };
         let is_news = |entry: &LedgerEntry| {
-            let lane = other.lane((entry.epoch, &entry.aggregator));
-            let known = lane.and_then(|lane| lane.get(&entry.node)?.labels.get(&entry.label));
-            known.is_none_or(|known| known.correct < entry.correct || known.incorrect < entry.incorrect)
+            let counts = known(entry.epoch, &entry.aggregator, &entry.node).and_then(|r| r.labels.get(&entry.label));
+            counts.is_none_or(|counts| counts.correct < entry.correct || counts.incorrect < entry.incorrect)
         };
         let is_new_mark = |mark: &LedgerMark| {
-            let lane = other.lane((mark.epoch, &mark.aggregator));
-            let known = lane.and_then(|lane| lane.get(&mark.node)).map(|record| &record.marks);
-            known.is_none_or(|known| known.would_keep(mark.number) && !known.has(mark.number))
+            let marks = known(mark.epoch, &mark.aggregator, &mark.node).map(|record| &record.marks);
+            marks.is_none_or(|marks| marks.would_keep(mark.number) && !marks.has(mark.number))
         };
         (self.entries().filter(is_news).collect(), self.marks().filter(is_new_mark).collect())
     }
 
-    /// Takes the larger of every count; true when that changed anything. What is beyond [`MAX_LANES`] and
-    /// [`MAX_ENTRIES`] is forgotten, the oldest lanes first, so that all who merge the same forget the same. The lane of the
-    /// `present` leader always has room and is never forgotten.
+    /// Takes the larger of every count; true when that changed anything.
+    ///
+    /// Beyond [`MAX_LANES`] and [`MAX_ENTRIES`] the oldest lanes are forgotten, so that all who merge the same entries
+    /// forget the same lanes. The lane of the `present` leader always has room and is never forgotten.
     pub fn merge_entries(&mut self, entries: impl IntoIterator<Item = LedgerEntry>, present: Option<&Epoch>) -> bool {
-        let present = present.map(|epoch| (epoch.term, &epoch.leader));
         let mut changed = false;
         for LedgerEntry { epoch, aggregator, node, label, correct, incorrect } in entries {
-            let Some(record) = self.record_mut((epoch, &aggregator), &node, Some(&label), present) else { continue };
+            let lane = Epoch::new(epoch, aggregator);
+            let Some(record) = self.record_mut(&lane, &node, Some(&label), present) else { continue };
             let counts = record.labels.entry(label).or_default();
             let before = *counts;
             counts.merge(Counts { correct, incorrect });
@@ -83,39 +78,33 @@ impl ReputationLedger {
         changed
     }
 
-    /// How many lanes there are.
+    /// Number of lanes.
     pub fn lanes(&self) -> usize {
-        self.lanes.values().map(|aggregators| aggregators.len()).sum()
+        self.lanes.len()
     }
 
-    /// What a lane knows of a vehicle, where there is room for `label` or other lanes make some; `None` elsewhere.
+    /// The record of a vehicle in a lane. `None` if it lacks `label` and there is no room for one more count.
     pub(super) fn record_mut(
         &mut self,
-        lane: Lane<'_>,
+        lane: &Epoch,
         node: &NodeName,
         label: Option<&Label>,
-        present: Option<Lane<'_>>,
+        present: Option<&Epoch>,
     ) -> Option<&mut Record> {
-        let known = self.lane(lane).and_then(|known| known.get(node));
-        let knows = |label| known.is_some_and(|record| record.labels.contains_key(label));
-        if label.is_some_and(|label| !knows(label)) {
+        let known = self.lanes.get(lane).and_then(|vehicles| vehicles.get(node));
+        if label.is_some_and(|label| known.is_none_or(|record| !record.labels.contains_key(label))) {
             if !self.make_room(lane, present) {
                 return None;
             }
             self.entries += 1;
         }
-        let (epoch, aggregator) = lane;
-        let lane = self.lanes.entry(epoch).or_default().entry(aggregator.clone()).or_default();
-        Some(lane.entry(node.clone()).or_default())
+        Some(self.lanes.entry(lane.clone()).or_default().entry(node.clone()).or_default())
     }
 
-    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false where only those are
-    /// left that do not give way to it.
-    pub(super) fn make_room(&mut self, lane: Lane<'_>, present: Option<Lane<'_>>) -> bool {
-        let is_full = |ledger: &Self| {
-            ledger.entries >= MAX_ENTRIES || (ledger.lane(lane).is_none() && ledger.lanes() >= MAX_LANES)
-        };
-        while is_full(self) {
+    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false if the lanes that are
+    /// left do not give way to it.
+    pub(super) fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
+        while self.entries >= MAX_ENTRIES || (!self.lanes.contains_key(lane) && self.lanes.len() >= MAX_LANES) {
             if !self.forget_oldest(lane, present) {
                 return false;
             }
@@ -123,35 +112,26 @@ impl ReputationLedger {
         true
     }
 
-    pub(super) fn lane(&self, (epoch, aggregator): Lane<'_>) -> Option<&Vehicles<Record>> {
-        self.lanes.get(&epoch)?.get(aggregator)
-    }
-
-    /// Forgets the oldest lane but the present one: one that is older than `lane`, or any if that is the present one.
-    fn forget_oldest(&mut self, lane: Lane<'_>, present: Option<Lane<'_>>) -> bool {
-        let lanes = self.lanes.iter().flat_map(|(epoch, aggregators)| aggregators.keys().map(|name| (*epoch, name)));
-        let oldest = lanes.into_iter().find(|other| *other != lane && Some(*other) != present);
-        let Some((epoch, name)) = oldest.filter(|oldest| *oldest < lane || present == Some(lane)) else { return false };
-        let name = name.clone();
-        let Some(aggregators) = self.lanes.get_mut(&epoch) else { return false };
-        let forgotten = aggregators.remove(&name);
-        if aggregators.is_empty() {
-            self.lanes.remove(&epoch);
-        }
-        let records = forgotten.iter().flat_map(|lane| lane.values());
-        self.entries -= records.map(|record| record.labels.len() + record.marks.len()).sum::<usize>();
+    /// Forgets the oldest lane except the present one, if it is older than `lane` or `lane` is the present one.
+    fn forget_oldest(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
+        let oldest = self.lanes.keys().find(|other| *other != lane && Some(*other) != present).cloned();
+        let gives_way = |oldest: &Epoch| oldest < lane || present == Some(lane);
+        let Some(forgotten) = oldest.filter(gives_way).and_then(|oldest| self.lanes.remove(&oldest)) else {
+            return false;
+        };
+        self.entries -= forgotten.values().map(|record| record.labels.len() + record.marks.len()).sum::<usize>();
         true
     }
 }
 
-fn entry(epoch: u64, aggregator: &NodeName, node: &NodeName, label: &Label, counts: Counts) -> LedgerEntry {
+fn entry(lane: &Epoch, node: &NodeName, label: &Label, Counts { correct, incorrect }: Counts) -> LedgerEntry {
     LedgerEntry {
-        epoch,
-        aggregator: aggregator.clone(),
+        epoch: lane.term,
+        aggregator: lane.leader.clone(),
         node: node.clone(),
         label: label.clone(),
-        correct: counts.correct,
-        incorrect: counts.incorrect,
+        correct,
+        incorrect,
     }
 }
 
@@ -211,8 +191,8 @@ mod tests {
     fn only_the_latest_lanes_are_kept() {
         let mut ledger = ReputationLedger::default();
         for epoch in 0..(2 * MAX_LANES as u64) {
-            let entry =
-                entry(epoch, &name("edge"), &name("euclid"), &"cup".into(), Counts { correct: 1, incorrect: 0 });
+            let lane = Epoch::new(epoch, name("edge"));
+            let entry = entry(&lane, &name("euclid"), &"cup".into(), Counts { correct: 1, incorrect: 0 });
             ledger.merge_entries([entry], None);
         }
         assert_eq!(ledger.lanes(), MAX_LANES);
@@ -226,8 +206,8 @@ mod tests {
     fn the_present_leaders_lane_has_room_whatever_others_claim() {
         let counted = Counts { correct: 1, incorrect: 0 };
         let flood = |epoch: u64| {
-            (0..2 * MAX_LANES)
-                .map(move |n| entry(epoch, &name(&format!("forger{n:03}")), &name("liar"), &"cup".into(), counted))
+            let lane = move |n| Epoch::new(epoch, name(&format!("forger{n:03}")));
+            (0..2 * MAX_LANES).map(move |n| entry(&lane(n), &name("liar"), &"cup".into(), counted))
         };
         let present = Epoch::new(7, name("edge"));
         let vote_of = |ledger: &ReputationLedger| ledger.totals().get(&name("euclid")).copied();
@@ -241,7 +221,7 @@ mod tests {
 
         let mut copy = ReputationLedger::default();
         copy.merge_entries(flood(8), None);
-        let told = entry(7, &name("edge"), &name("euclid"), &"cup".into(), counted);
+        let told = entry(&present, &name("euclid"), &"cup".into(), counted);
         assert!(!copy.merge_entries([told.clone()], None));
         assert!(copy.merge_entries([told], Some(&present)), "nor does it at whoever follows");
     }

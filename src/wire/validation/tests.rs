@@ -1,3 +1,5 @@
+mod shares;
+
 use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
 use uuid::Uuid;
