@@ -283,9 +283,9 @@ mod tests {
             now,
             leadership: Leadership {
                 position: Position::Following,
+                term: epoch.term,
                 epoch: Some(epoch),
                 standby: Some(name("gauss")),
-                term: 0,
             },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
             members: vec![Member {
