@@ -26,7 +26,7 @@ pub mod reputation;
 pub mod round;
 pub mod testbed;
 pub mod time;
-pub mod tracks;
+pub mod tracking;
 pub mod traffic;
 pub mod view;
 pub mod vote;

@@ -23,7 +23,7 @@ use ecod::replay::JournalEvent;
 use ecod::reputation::ReputationLedger;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::TracksLosses;
+use ecod::tracking::TracksLosses;
 use ecod::wire::{GlobalMap, Reputation};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;

@@ -4,10 +4,10 @@ use std::f64::consts::PI;
 
 use nalgebra::{Matrix2, Vector2};
 
-use super::align::Alignment;
 use super::calibration::Calibration;
 use super::config::TracksConfig;
-use super::evidence::Rates;
+use super::existence::Rates;
+use super::registration::Alignment;
 use super::trust::Standing;
 use crate::geometry::Covariance;
 use crate::names::NodeName;

@@ -12,8 +12,8 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use uuid::Uuid;
 
-use super::motion::{Measurement, Motion};
-use super::source::View;
+use super::kinematics::{Measurement, Motion};
+use super::sensors::View;
 use super::*;
 use crate::geometry::Covariance;
 use crate::wire::{FieldOfView, GlobalMap, SCHEMA_VERSION, WirePose};

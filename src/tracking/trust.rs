@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::witnesses::Witnesses;
+use super::history::Witnesses;
 use crate::names::NodeName;
 use crate::reputation::ReputationConfig;
 use crate::time::Timestamp;

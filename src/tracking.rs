@@ -8,24 +8,24 @@
 //! how much its pose is off, are learnt from what it has in common with the others. An object is never founded on a
 //! map: maps that are received lend identities, not evidence.
 
-mod align;
 mod assignment;
 mod calibration;
 mod config;
-mod evidence;
+mod existence;
 mod grid;
+mod history;
 mod joining;
-mod motion;
+mod kinematics;
+mod lifecycle;
+mod occlusion;
 mod pairs;
-mod shadows;
-mod source;
-mod taking;
+mod registration;
+mod sensors;
 #[cfg(test)]
 mod tests;
 mod track;
 mod trust;
-mod upkeep;
-mod witnesses;
+mod update;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -38,13 +38,13 @@ use crate::names::NodeName;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{FusedObject, ObjectReport, PerceivedObject, PoseCorrection};
-use align::{Alignment, Spread};
 use grid::Grid;
 use pairs::Sightings;
-use source::Source;
-use taking::Taking;
+use registration::{Alignment, Spread};
+use sensors::Source;
 use track::Track;
 use trust::{Fleet, Standing, Standings};
+use update::Taking;
 
 /// What a round came to.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -1,8 +1,8 @@
 //! Vehicles that invent or hide objects.
 
 use super::*;
-use crate::tracks::trust::{Standing, Standings};
-use crate::tracks::witnesses::Witnesses;
+use crate::tracking::history::Witnesses;
+use crate::tracking::trust::{Standing, Standings};
 
 #[test]
 fn whoever_invents_or_hides_objects_loses_its_standing() {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use smallvec::SmallVec;
 
-use super::evidence::Witness;
+use super::existence::Witness;
 use crate::time::Timestamp;
 
 /// Vehicles that an object can be known from at once; whoever has not looked for [`SEAT_KEPT`] makes room.

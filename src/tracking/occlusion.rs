@@ -2,7 +2,7 @@
 
 use nalgebra::Vector2;
 
-use super::source::turn;
+use super::sensors::turn;
 use crate::wire::PerceivedObject;
 
 /// How far the sight goes in one frame.

@@ -5,7 +5,7 @@ use std::time::Duration;
 use nalgebra::Vector2;
 
 use super::Tracker;
-use super::align::Pair;
+use super::registration::Pair;
 use crate::time::Timestamp;
 
 /// Within how much time another vehicle's detection still tells where an object was.

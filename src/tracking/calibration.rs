@@ -5,7 +5,7 @@
 //! [`EVEN_REHITS`] of the detections come again, about half are real. That confidence is found from rates by
 //! confidence, and the spread of the confidences above it gives their scale.
 
-use super::evidence::logistic;
+use super::existence::logistic;
 
 /// Part of the detections that come again among those of which half are real.
 const EVEN_REHITS: f64 = 0.62;

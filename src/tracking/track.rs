@@ -8,10 +8,10 @@ use smallvec::SmallVec;
 use uuid::Uuid;
 
 use super::config::TracksConfig;
-use super::evidence::{Witness, logistic};
+use super::existence::{Witness, logistic};
+use super::history::Witnesses;
 use super::joining::Neighbours;
-use super::motion::{Measurement, Motion};
-use super::witnesses::Witnesses;
+use super::kinematics::{Measurement, Motion};
 use crate::geometry::{Covariance, wrap_angle};
 use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
