@@ -8,6 +8,7 @@
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
 pub mod aggregator;
+pub mod association;
 pub mod camera;
 pub mod config;
 pub mod delay;

@@ -208,7 +208,7 @@ impl Tracker {
                 }
             });
         }
-        assign(seen.len(), &pairings)
+        assign(pairings)
     }
 
     /// The same for what is left and goes too fast for that: objects that are so new that their velocity may be any.
@@ -234,7 +234,7 @@ impl Tracker {
                 }
             });
         }
-        for pairing in assign(seen.len(), &pairings) {
+        for pairing in assign(pairings) {
             self.tracks[pairing.track as usize].motion.doubt_velocity(speed_mps / 2.0);
             chosen.push(pairing);
         }
