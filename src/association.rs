@@ -37,7 +37,7 @@ pub struct ClusterSize {
 ///
 /// `limit` may assign a cluster in its own way: the time to solve one grows with the cube of its size.
 pub fn assign<C: Candidate>(candidates: Vec<C>, limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>) -> Vec<C> {
-    let mut by_cluster: Vec<(u32, C)> = clusters(&candidates).into_iter().zip(candidates).collect();
+    let mut by_cluster = by_cluster(candidates);
     by_cluster.sort_by_key(|(cluster, _)| *cluster);
     let mut assigned = Vec::with_capacity(by_cluster.len());
     for cluster in by_cluster.chunk_by(|a, b| a.0 == b.0) {
@@ -52,20 +52,22 @@ pub fn assign<C: Candidate>(candidates: Vec<C>, limit: impl Fn(ClusterSize, &[C]
     assigned
 }
 
-/// The cluster of each candidate: disjoint sets (Tarjan 1975).
-fn clusters<C: Candidate>(candidates: &[C]) -> Vec<u32> {
+/// The candidates, each with the number of its cluster: disjoint sets (Tarjan 1975).
+fn by_cluster<C: Candidate>(candidates: Vec<C>) -> Vec<(u32, C)> {
     let mut parents: Vec<u32> = (0..candidates.len() as u32).collect();
     let rows = candidates.iter().map(|candidate| candidate.row() as usize + 1).max().unwrap_or(0);
-    let mut of_row: Vec<Option<u32>> = vec![None; rows];
+    let mut of_row: Vec<u32> = vec![u32::MAX; rows];
     let mut of_column: HashMap<u32, u32> = HashMap::with_capacity(candidates.len());
     for (number, candidate) in candidates.iter().enumerate() {
-        let own = number as u32;
-        let cluster = root(&mut parents, *of_row[candidate.row() as usize].get_or_insert(own));
+        let of_row = &mut of_row[candidate.row() as usize];
+        *of_row = (*of_row).min(number as u32);
+        let cluster = root(&mut parents, *of_row);
         parents[number] = cluster;
         let of_column = *of_column.entry(candidate.column()).or_insert(cluster);
         parents[cluster as usize] = root(&mut parents, of_column);
     }
-    (0..candidates.len() as u32).map(|number| root(&mut parents, number)).collect()
+    let numbered = (0..).zip(candidates);
+    numbered.map(|(number, candidate)| (root(&mut parents, number), candidate)).collect()
 }
 
 /// The set that a member belongs to, by path halving.

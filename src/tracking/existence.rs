@@ -1,100 +1,115 @@
-//! How likely an object is to exist, by what every vehicle saw and did not see of it.
+//! Probability that an object exists, from the detections and misses of every vehicle.
 //!
-//! In the manner of integrated probabilistic data association (Musicki, Evans, Stankovic, 1994), every frame in which a
-//! vehicle looks at an object adds the log-likelihood ratio of "there" to "not there". Unlike there, frames are not
-//! taken as independent: whatever makes a detector see a thing that is not, or overlook one that is, is still there a
-//! tenth of a second later. So hits and misses follow a Markov chain, what they can say together is bounded, and n
-//! confidences that correlate by ρ weigh as n/(1+ρ(n−1)) (the design effect; Kish, "Survey Sampling", 1965).
+//! As in integrated probabilistic data association (Musicki, Evans, Stankovic, 1994), every look of a vehicle at an
+//! object adds the log-likelihood ratio of "exists" to "is clutter". Here frames are not independent: the cause of a
+//! false alarm or a miss is still there a tenth of a second later. So hits and misses follow a Markov chain and their
+//! sum is bounded. n confidences with correlation ρ weigh as n/(1+ρ(n−1)) (the design effect; Kish, "Survey Sampling",
+//! 1965).
 
 use nalgebra::Vector2;
 
-use super::trust::SETTLED_AFTER;
+use super::sensors::SensorId;
+use super::trust::JUDGED_AFTER;
 use crate::time::Timestamp;
 
-/// Time in seconds over which evidence fades.
+/// Time constant in seconds with which evidence fades.
 const MEMORY_S: f64 = 3.0;
 
 /// Correlation of the confidences of successive frames.
 const CORRELATION: f64 = 0.3;
 
-/// Time in seconds between independent frames: frames in quicker succession count in proportion.
+/// Seconds between independent frames; frames in quicker succession count in proportion.
 const INDEPENDENT_S: f64 = 0.1;
 
-/// Most nats that the order of hits and misses can speak for an object, and against it.
-const MOST_NATS: f64 = 2.5;
-const LEAST_NATS: f64 = 2.5;
+/// Maximum evidence of the sequence of hits and misses, for and against an object, nats.
+const MAX_SEQUENCE_NATS: f64 = 2.5;
 
-/// Most nats that one vehicle can speak for an object in all, so that a few others together outweigh it.
-const MOST_WORD_NATS: f64 = 8.0;
+/// Maximum evidence of one vehicle for an object, nats: a few others together outweigh it.
+const MAX_SENSOR_NATS: f64 = 8.0;
 
-/// What one vehicle has seen of one object.
+/// Minimum number of looks before a vehicle's statement is judged.
+const MIN_JUDGED_LOOKS: u32 = 5;
+
+/// Detections and misses of one object by one vehicle.
 #[derive(Debug, Clone)]
-pub(super) struct Witness {
-    /// Number of the vehicle.
-    pub(super) source: u32,
+pub(super) struct SensorHistory {
+    pub(super) sensor: SensorId,
     pub(super) last_look: Timestamp,
     pub(super) last_hit: Option<Timestamp>,
-    /// Whether it was detected at the last look.
+    /// Whether the last look was a hit.
     pub(super) was_hit: bool,
-    /// Where it was last detected, corrected.
+    /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
     pub(super) looks: u32,
     /// Log-odds of the last confidence.
-    pub(super) log_odds: f64,
-    /// Since when its word is unjudged, with hits and looks since.
-    unsettled: (Timestamp, u32, u32),
-    /// Evidence of the order of hits and misses, nats.
-    pattern: f64,
-    /// Sum of log-odds of confidences, and of their weights, fading.
+    pub(super) confidence_log_odds: f64,
+    /// Hits and looks since the last judgement.
+    unjudged: Statement,
+    judged_at: Timestamp,
+    /// Evidence of the sequence of hits and misses, nats.
+    sequence: f64,
+    /// Fading sums of the log-odds of confidences and of their weights.
     score: f64,
     weight: f64,
 }
 
-/// Probabilities of being detected at a look.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Rates {
-    /// After a look at which it was.
-    pub(super) stay: f64,
-    /// After a look at which it was not.
-    pub(super) find: f64,
+/// Hits and looks of one vehicle at one object over some time.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Statement {
+    pub(super) hits: u32,
+    pub(super) looks: u32,
 }
 
-impl Rates {
-    pub(super) fn of(&self, was_hit: bool) -> f64 {
-        if was_hit { self.stay } else { self.find }
+/// Probabilities of detection at a look.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct DetectionRates {
+    pub(super) after_hit: f64,
+    pub(super) after_miss: f64,
+}
+
+impl DetectionRates {
+    /// Rates of a real object in an unknown view.
+    pub(super) const PRIOR: Self = Self { after_hit: 0.9, after_miss: 0.15 };
+
+    /// Rates of clutter.
+    const CLUTTER: Self = Self { after_hit: 0.5, after_miss: 0.02 };
+
+    /// The rate after a hit or a miss.
+    pub(super) fn after(&self, was_hit: bool) -> f64 {
+        if was_hit { self.after_hit } else { self.after_miss }
     }
 }
 
-/// The same for what only seems to be there.
-const UNREAL: Rates = Rates { stay: 0.5, find: 0.02 };
-
-impl Witness {
-    pub(super) fn new(source: u32, at: Timestamp) -> Self {
+impl SensorHistory {
+    /// A vehicle that has not looked yet.
+    pub(super) fn new(sensor: SensorId, at: Timestamp) -> Self {
         Self {
-            source,
+            sensor,
             last_look: at,
             last_hit: None,
             was_hit: false,
             position: Vector2::zeros(),
             looks: 0,
-            log_odds: 0.0,
-            unsettled: (at, 0, 0),
-            pattern: 0.0,
+            confidence_log_odds: 0.0,
+            unjudged: Statement::default(),
+            judged_at: at,
+            sequence: 0.0,
             score: 0.0,
             weight: 0.0,
         }
     }
 
-    /// The object was detected with a confidence of so many nats. `found` is whether it was known already.
-    pub(super) fn hit(&mut self, at: Timestamp, position: Vector2<f64>, nats: f64, rates: Rates, known: bool) {
+    /// Records a detection whose confidence is worth `nats`. `rates` are `None` for the detection that spawns a track:
+    /// it is no evidence that a known object was found again.
+    pub(super) fn hit(&mut self, at: Timestamp, position: Vector2<f64>, nats: f64, rates: Option<DetectionRates>) {
         let share = self.look(at);
-        if known {
-            let (real, unreal) = (rates.of(self.was_hit), UNREAL.of(self.was_hit));
-            self.add(share * (real / unreal).ln());
+        if let Some(rates) = rates {
+            let ratio = rates.after(self.was_hit) / DetectionRates::CLUTTER.after(self.was_hit);
+            self.add(share * ratio.ln());
         }
         self.score += nats;
         self.weight += 1.0;
-        self.unsettled.1 += 1;
+        self.unjudged.hits += 1;
         if at >= self.last_look {
             self.was_hit = true;
         }
@@ -104,52 +119,51 @@ impl Witness {
         }
     }
 
-    /// The object was in view and not detected.
-    pub(super) fn miss(&mut self, at: Timestamp, rates: Rates) {
+    /// Records a look at the object in view without a detection.
+    pub(super) fn miss(&mut self, at: Timestamp, rates: DetectionRates) {
         let share = self.look(at);
-        let (real, unreal) = (rates.of(self.was_hit), UNREAL.of(self.was_hit));
-        self.add(share * ((1.0 - real) / (1.0 - unreal)).ln().min(0.0));
+        let ratio = (1.0 - rates.after(self.was_hit)) / (1.0 - DetectionRates::CLUTTER.after(self.was_hit));
+        self.add(share * ratio.ln().min(0.0));
         self.was_hit = false;
     }
 
-    /// Lets earlier evidence fade; returns how independent this look is of the last one.
+    /// Fades earlier evidence; returns the independence of this look from the last, 0 to 1.
     fn look(&mut self, at: Timestamp) -> f64 {
         let dt = at.since(self.last_look).as_secs_f64();
         let share = if self.looks == 0 { 1.0 } else { (dt / INDEPENDENT_S).min(1.0) };
         let kept = (-dt / MEMORY_S).exp();
         self.score *= kept;
         self.weight *= kept;
-        self.pattern *= kept;
+        self.sequence *= kept;
         self.last_look = self.last_look.max(at);
         self.looks = self.looks.saturating_add(1);
-        self.unsettled.2 += 1;
+        self.unjudged.looks += 1;
         share
     }
 
-    /// Hits and looks since its word was last judged, if it is time to judge it again.
-    pub(super) fn settled(&mut self, at: Timestamp) -> Option<(u32, u32)> {
-        let (since, hits, looks) = self.unsettled;
-        (at.since(since) >= SETTLED_AFTER && looks >= 5).then(|| {
-            self.unsettled = (at, 0, 0);
-            (hits, looks)
+    /// The statement since the last judgement, if a judgement is due.
+    pub(super) fn take_due(&mut self, at: Timestamp) -> Option<Statement> {
+        (at.since(self.judged_at) >= JUDGED_AFTER && self.unjudged.looks >= MIN_JUDGED_LOOKS).then(|| {
+            self.judged_at = at;
+            std::mem::take(&mut self.unjudged)
         })
     }
 
     fn add(&mut self, nats: f64) {
-        self.pattern = (self.pattern + nats).clamp(-LEAST_NATS, MOST_NATS);
+        self.sequence = (self.sequence + nats).clamp(-MAX_SEQUENCE_NATS, MAX_SEQUENCE_NATS);
     }
 
-    /// All that the vehicle has to say at `at`, in nats.
+    /// Evidence of the vehicle for the object at `at`, nats.
     pub(super) fn nats(&self, at: Timestamp) -> f64 {
         let kept = (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp();
         let weight = kept * self.weight;
         let confidence = if weight > 1e-3 {
-            let worth = weight / (1.0 + CORRELATION * (weight - 1.0).max(0.0));
-            self.score / self.weight * worth
+            let effective = weight / (1.0 + CORRELATION * (weight - 1.0).max(0.0));
+            self.score / self.weight * effective
         } else {
             0.0
         };
-        (kept * self.pattern + confidence).min(MOST_WORD_NATS)
+        (kept * self.sequence + confidence).min(MAX_SENSOR_NATS)
     }
 }
 

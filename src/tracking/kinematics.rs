@@ -1,18 +1,17 @@
-//! Where an object is and how it moves: nearly constant velocity, with an error of its own and one that it shares.
+//! Position and velocity of a track: nearly constant velocity, with an independent and a common part of the error.
 //!
-//! The state is position and velocity, driven by white noise acceleration of density q (Bar-Shalom, Li, Kirubarajan,
-//! "Estimation with Applications to Tracking and Navigation", 2001, section 6.2.2). The covariance is split in two
-//! (Julier, Uhlmann, "General decentralized data fusion with covariance intersection", 2001, section 12.4): the part
-//! that is independent from one report to the next shrinks as reports come in, by Joseph's form, which holds for any
-//! gain. The part that may be common to them in any way, such as an error of a vehicle's pose, never shrinks below what
-//! the best of the reports has: of errors of standard deviations b₁, b₂ that are weighted by k and 1−k, the standard
-//! deviation is at most k·b₁ + (1−k)·b₂, whatever their correlation.
+//! White noise acceleration of density q drives the state (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications
+//! to Tracking and Navigation", 2001, section 6.2.2). The covariance is split in two (Julier, Uhlmann, "General
+//! decentralized data fusion with covariance intersection", 2001, section 12.4). The part that is independent from
+//! report to report shrinks with every report, by Joseph's form, which holds for any gain. The common part, such as the
+//! error of a vehicle's pose, never shrinks below that of the best report: errors of standard deviations b₁ and b₂ that
+//! are weighted by k and 1−k have a standard deviation of at most k·b₁ + (1−k)·b₂, whatever their correlation.
 
 use nalgebra::{Matrix2, Vector2};
 
 use crate::time::Timestamp;
 
-/// What is measured of an object in one frame, with its errors.
+/// Measured position of an object in one frame, with its errors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Measurement {
     pub(super) position: Vector2<f64>,
@@ -22,10 +21,10 @@ pub(super) struct Measurement {
     pub(super) common_m: f64,
 }
 
-/// A measurement held against an object.
+/// Difference between a measurement and the state.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Innovation {
-    /// The measured position less the expected one.
+    /// Measured less predicted position, metres.
     pub(super) offset: Vector2<f64>,
     /// Covariance of the offset, m².
     pub(super) covariance: Matrix2<f64>,
@@ -33,13 +32,15 @@ pub(super) struct Innovation {
     pub(super) distance_squared: f64,
 }
 
-/// State and covariance at a point in time.
+/// State and covariance of a track at a point in time.
 #[derive(Debug, Clone)]
-pub(super) struct Motion {
+pub(super) struct KinematicState {
     pub(super) at: Timestamp,
+    /// Metres.
     pub(super) position: Vector2<f64>,
+    /// m/s.
     pub(super) velocity: Vector2<f64>,
-    /// Covariances of position, of position and velocity, and of velocity: the independent part.
+    /// Independent covariances of position, of position and velocity, and of velocity.
     pp: Matrix2<f64>,
     pv: Matrix2<f64>,
     vv: Matrix2<f64>,
@@ -47,17 +48,17 @@ pub(super) struct Motion {
     common_m: f64,
 }
 
-impl Motion {
-    /// An object that was seen once and may move at `speed_mps` (standard deviation) in each direction.
-    pub(super) fn new(at: Timestamp, seen: &Measurement, speed_mps: f64) -> Self {
+impl KinematicState {
+    /// The state after one measurement; `speed_mps` is the standard deviation of the velocity in each direction.
+    pub(super) fn new(at: Timestamp, measurement: &Measurement, speed_mps: f64) -> Self {
         Self {
             at,
-            position: seen.position,
+            position: measurement.position,
             velocity: Vector2::zeros(),
-            pp: seen.independent,
+            pp: measurement.independent,
             pv: Matrix2::zeros(),
             vv: Matrix2::identity() * (speed_mps * speed_mps),
-            common_m: seen.common_m,
+            common_m: measurement.common_m,
         }
     }
 
@@ -73,7 +74,7 @@ impl Motion {
 
     /// Covariance of the position at `at`, both parts, m².
     pub(super) fn covariance_at(&self, at: Timestamp, density: f64) -> Matrix2<f64> {
-        self.independent_at(self.seconds_to(at), density) + common(self.common_m)
+        self.independent_at(self.seconds_to(at), density) + isotropic(self.common_m)
     }
 
     /// Covariance of the velocity, (m/s)².
@@ -99,46 +100,49 @@ impl Motion {
         self.at = at;
     }
 
-    /// Holds a measurement taken at `at` against the state.
-    pub(super) fn innovation(&self, at: Timestamp, seen: &Measurement, density: f64) -> Innovation {
-        let offset = seen.position - self.position_at(at);
-        let covariance = self.covariance_at(at, density) + seen.independent + common(seen.common_m);
+    /// The innovation of a measurement taken at `at`.
+    pub(super) fn innovation(&self, at: Timestamp, measurement: &Measurement, density: f64) -> Innovation {
+        let offset = measurement.position - self.position_at(at);
+        let covariance = self.covariance_at(at, density) + measurement.independent + isotropic(measurement.common_m);
         let distance_squared = inverse(&covariance).map_or(f64::INFINITY, |inverse| offset.dot(&(inverse * offset)));
         Innovation { offset, covariance, distance_squared }
     }
 
-    /// Takes a measurement in. One taken before the state's time is held against where the object was then (Bar-Shalom,
-    /// "Update with out-of-sequence measurements in tracking", 2002, with the process noise in between counted in
-    /// full).
-    pub(super) fn update(&mut self, at: Timestamp, seen: &Measurement, density: f64) {
+    /// Updates the state with a measurement taken at `at`.
+    ///
+    /// A measurement from before the state's time is compared with the position at its own time (Bar-Shalom, "Update
+    /// with out-of-sequence measurements in tracking", 2002). The process noise in between counts in full.
+    pub(super) fn update(&mut self, at: Timestamp, measurement: &Measurement, density: f64) {
         self.predict(at, density);
         let dt = self.seconds_to(at).min(0.0);
-        let noise = self.independent_at(dt, density) + seen.independent;
-        let Some(inverse) = inverse(&(noise + common(self.common_m) + common(seen.common_m))) else { return };
-        let offset = seen.position - self.position_at(at);
+        let noise = self.independent_at(dt, density) + measurement.independent;
+        let total = noise + isotropic(self.common_m) + isotropic(measurement.common_m);
+        let Some(inverse) = inverse(&total) else { return };
+        let offset = measurement.position - self.position_at(at);
         let at_position = self.pp + self.pv * dt;
         let at_velocity = self.pv.transpose() + self.vv * dt;
-        let position_gain = (at_position + common(self.common_m)) * inverse;
+        let position_gain = (at_position + isotropic(self.common_m)) * inverse;
         let velocity_gain = at_velocity * inverse;
         self.position += position_gain * offset;
         self.velocity += velocity_gain * offset;
         self.joseph([at_position, at_velocity], [position_gain, velocity_gain], &noise);
         let share = (position_gain.trace() / 2.0).clamp(0.0, 1.0);
-        self.common_m = (1.0 - share) * self.common_m + share * seen.common_m;
+        self.common_m = (1.0 - share) * self.common_m + share * measurement.common_m;
     }
 
-    /// Takes in what the velocity was at `at`, not after the state, of standard deviation `sigma_mps` in each
-    /// direction. As errors of all that is said of it may be the same, the velocity is never better known for it than
-    /// one says.
+    /// Updates the state with a velocity measured at `at`, not after the state; `sigma_mps` is its standard deviation
+    /// in each direction.
+    ///
+    /// Errors of successive velocities may be the same. The velocity is therefore never better known than by one.
     pub(super) fn update_velocity(&mut self, at: Timestamp, velocity: Vector2<f64>, sigma_mps: f64, density: f64) {
         let stated = sigma_mps * sigma_mps + density * self.seconds_to(at).abs();
         let known = self.vv.trace() / 2.0;
         if known <= stated {
             return;
         }
-        // With this variance, what comes of it has the stated one.
-        let enough = known * stated / (known - stated);
-        let noise = self.vv + Matrix2::identity() * enough;
+        // A measurement of this variance leaves the stated one.
+        let variance = known * stated / (known - stated);
+        let noise = self.vv + Matrix2::identity() * variance;
         let Some(inverse) = inverse(&noise) else { return };
         let offset = velocity - self.velocity;
         let gains = [self.pv * inverse, self.vv * inverse];
@@ -147,30 +151,32 @@ impl Motion {
         self.joseph([self.pv, self.vv], gains, &noise);
     }
 
-    /// The covariance after any gain, given those of the state with what was measured, and of the innovation.
-    fn joseph(&mut self, with: [Matrix2<f64>; 2], gain: [Matrix2<f64>; 2], noise: &Matrix2<f64>) {
-        let kept = [0, 1].map(|i| gain[i] * noise - with[i]);
-        let after = |i: usize, j: usize| kept[i] * gain[j].transpose() - gain[i] * with[j].transpose();
-        self.pp = symmetric(self.pp + after(0, 0));
-        self.pv += after(0, 1);
-        self.vv = symmetric(self.vv + after(1, 1));
+    /// Joseph's form of the covariance update, for any gain.
+    ///
+    /// `cross` are the covariances of the state with the measured quantity, `noise` is that of the innovation.
+    fn joseph(&mut self, cross: [Matrix2<f64>; 2], gain: [Matrix2<f64>; 2], noise: &Matrix2<f64>) {
+        let kept = [0, 1].map(|i| gain[i] * noise - cross[i]);
+        let change = |i: usize, j: usize| kept[i] * gain[j].transpose() - gain[i] * cross[j].transpose();
+        self.pp = symmetric(self.pp + change(0, 0));
+        self.pv += change(0, 1);
+        self.vv = symmetric(self.vv + change(1, 1));
     }
 
-    /// The velocity may be another one altogether, by a standard deviation of `speed_mps` in each direction.
-    pub(super) fn doubt_velocity(&mut self, speed_mps: f64) {
+    /// Adds a standard deviation of `speed_mps` in each direction to the velocity.
+    pub(super) fn inflate_velocity_covariance(&mut self, speed_mps: f64) {
         self.vv += Matrix2::identity() * (speed_mps * speed_mps);
     }
 
-    /// Keeps the speed within what an object can have.
-    pub(super) fn limit_speed(&mut self, most_mps: f64) {
+    /// Limits the speed to `max_mps`.
+    pub(super) fn limit_speed(&mut self, max_mps: f64) {
         let speed = self.velocity.norm();
-        if speed > most_mps {
-            self.velocity *= most_mps / speed;
+        if speed > max_mps {
+            self.velocity *= max_mps / speed;
         }
     }
 }
 
-fn common(sigma_m: f64) -> Matrix2<f64> {
+fn isotropic(sigma_m: f64) -> Matrix2<f64> {
     Matrix2::identity() * (sigma_m * sigma_m)
 }
 
@@ -178,9 +184,8 @@ fn symmetric(matrix: Matrix2<f64>) -> Matrix2<f64> {
     (matrix + matrix.transpose()) * 0.5
 }
 
-/// The inverse of a covariance that has one.
-fn inverse(matrix: &Matrix2<f64>) -> Option<Matrix2<f64>> {
-    let determinant = matrix.determinant();
-    (determinant > 0.0 && determinant.is_finite())
-        .then(|| Matrix2::new(matrix.m22, -matrix.m12, -matrix.m21, matrix.m11) / determinant)
+/// The inverse of a covariance; `None` unless its determinant is positive and finite.
+fn inverse(covariance: &Matrix2<f64>) -> Option<Matrix2<f64>> {
+    let determinant = covariance.determinant();
+    covariance.try_inverse().filter(|_| determinant > 0.0 && determinant.is_finite())
 }

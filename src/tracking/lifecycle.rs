@@ -1,5 +1,4 @@
-//! What happens to the objects between reports: they are indexed, those that are gone are forgotten, and those of
-//! another aggregator's map taken over.
+//! Lifecycle of tracks between reports: merging duplicates, pruning, and taking over another aggregator's map.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -7,128 +6,146 @@ use std::time::Duration;
 use nalgebra::Vector2;
 use uuid::Uuid;
 
-use super::Tracker;
-use super::grid::Point;
-use super::joining::SAME_M;
+use super::config::TracksConfig;
 use super::kinematics::Measurement;
-use super::sensors::Source;
+use super::sensors::Sensors;
+use super::store::{TrackIndex, TrackStore};
 use super::track::Track;
 use crate::geometry::Covariance;
 use crate::time::Timestamp;
-use crate::wire::{FusedObject, GlobalMap};
+use crate::wire::{FusedObject, GlobalMap, ObjectReport};
 
-/// How long a silent vehicle is remembered after its last object.
+/// Maximum distance of two tracks of one object, metres.
+const MERGE_M: f64 = 2.0;
+
+/// The same in metres if their labels differ: people get in and out of cars, and stand beside each other.
+const MERGE_UNLIKE_M: f64 = 1.0;
+
+/// The same in standard deviations.
+const MERGE_SIGMAS: f64 = 3.0;
+
+/// Time for which a silent vehicle is remembered after its last object.
 const REMEMBERED: Duration = Duration::from_secs(10);
 
-/// Probability of being there below which an unseen object is forgotten.
-const LEAST_PRESENCE: f64 = 0.02;
+/// Minimum survival probability of a track.
+const MIN_SURVIVAL: f64 = 0.02;
 
-impl Tracker {
-    /// Adds an object unless there is no room for it; says where.
-    pub(super) fn add(&mut self, track: Track) -> Option<usize> {
-        let position = track.motion.position;
-        let crowd = self.grid.crowd(&position, self.config.gate_m);
-        if self.tracks.len() >= self.config.max_tracks || crowd >= self.config.max_density {
-            self.refused += 1;
-            return None;
-        }
-        let index = self.tracks.len();
-        self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        let (at, velocity) = (track.motion.position_at(self.indexed_at), track.motion.velocity);
-        self.grid.insert(Point { at, velocity, number: index as u32 });
-        self.tracks.push(track);
-        Some(index)
+/// Two tracks near each other.
+struct Neighbouring {
+    older: TrackIndex,
+    later: TrackIndex,
+    /// Whether a vehicle resolves them as two objects.
+    is_resolved: bool,
+}
+
+/// Merges tracks of one object: near each other, and not resolved by a vehicle. The older one stays.
+pub(super) fn merge(tracks: &mut TrackStore, now: Timestamp, config: &TracksConfig) {
+    tracks.reindex(now);
+    let neighbouring = neighbouring(tracks, now);
+    for Neighbouring { older, later, is_resolved } in &neighbouring {
+        let (id, seen) = (tracks[*later].id, tracks[*later].last_seen);
+        let track = &mut tracks[*older];
+        track.neighbours.observe(id, *is_resolved, seen.max(track.last_seen));
     }
-
-    /// Indexes the objects where they are at `at`.
-    pub(super) fn index(&mut self, at: Timestamp) {
-        self.indexed_at = at;
-        self.fastest_mps = self.tracks.iter().map(|track| track.motion.velocity.norm()).fold(0.0, f64::max);
-        self.grid.clear();
-        self.own.clear();
-        for (index, track) in self.tracks.iter().enumerate() {
-            self.own.extend(track.vehicle.map(|number| (number, index as u32)));
-            let (at, velocity) = (track.motion.position_at(at), track.motion.velocity);
-            self.grid.insert(Point { at, velocity, number: index as u32 });
+    let mut merged = BTreeSet::new();
+    for Neighbouring { older, later, is_resolved } in neighbouring {
+        // A merge before may have separated the older track from this one.
+        let is_candidate = !is_resolved && !merged.contains(&older) && !merged.contains(&later);
+        if is_candidate && is_same(&tracks[older], &tracks[later], now, config) {
+            tracks.merge(older, later);
+            merged.insert(later);
         }
     }
+    tracks.retain(|index, _| !merged.contains(&index));
+}
 
-    /// How far any object may have gone at `at` from where it is indexed.
-    pub(super) fn drift_m(&self, at: Timestamp) -> f64 {
-        self.fastest_mps * (at.micros_from(self.indexed_at) as f64 * 1e-6).abs()
-    }
-
-    /// The same with what the round's reports move an object by as a rule; a new one may be moved farther, and is found
-    /// there from the next round on.
-    pub(super) fn slack_m(&self, at: Timestamp) -> f64 {
-        self.drift_m(at) + self.config.gate_m / 2.0
-    }
-
-    /// Forgets objects that are gone, and vehicles that have been silent for longer than any object lives,
-    /// save what their word is worth.
-    pub(super) fn forget(&mut self, now: Timestamp) {
-        let life = Duration::from_secs_f64(self.config.life_s);
-        self.tracks.retain(|track| now.since(track.last_seen) <= life && track.presence(now) > LEAST_PRESENCE);
-        let limit = now - life - REMEMBERED;
-        let silent = |slot: &Option<Box<Source>>| slot.as_ref().is_some_and(|source| source.last_report < limit);
-        if !self.sources.iter().any(silent) {
-            return;
-        }
-        let mut forgotten = Vec::new();
-        for slot in self.sources.iter_mut().filter(|slot| silent(slot)) {
-            if let Some(source) = slot.take() {
-                self.numbers.remove(&source.node);
-                forgotten.push((source.node, source.standing));
+fn neighbouring(tracks: &TrackStore, now: Timestamp) -> Vec<Neighbouring> {
+    let mut neighbouring = Vec::new();
+    for (older, track) in tracks.indexed() {
+        let position = track.state.position_at(now);
+        tracks.near(&position, MERGE_M, |indexed| {
+            let (later, other) = (indexed.track, &tracks[indexed.track]);
+            if later > older && (other.state.position_at(now) - position).norm() < MERGE_M {
+                neighbouring.push(Neighbouring { older, later, is_resolved: track.is_resolved_from(other) });
             }
-        }
-        self.standings.keep(forgotten);
-        for track in &mut self.tracks {
-            track.witnesses.keep(|number| self.sources[number as usize].is_some());
-            track.vehicle = track.vehicle.filter(|number| self.sources[*number as usize].is_some());
-        }
+        });
     }
+    neighbouring
+}
 
-    /// Takes over the objects of another aggregator's map, received at `now`: its identities for those known by
-    /// another, and those unknown, on its word, which fades.
-    pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
-        self.index(now);
-        let stated: BTreeSet<Uuid> = map.objects.iter().map(|object| object.id).collect();
-        let mut known: BTreeSet<Uuid> = self.tracks.iter().map(|track| track.id).collect();
-        for object in &map.objects {
-            if !known.insert(object.id) {
-                continue;
-            }
-            let seen = self.inherited(object);
-            let mut nearest: Option<(usize, f64)> = None;
-            self.grid.around(&seen.position, SAME_M, |point| {
-                let track = &self.tracks[point.number as usize];
-                let distance_m = (track.motion.position_at(now) - seen.position).norm();
-                let is_nearest = nearest.is_none_or(|(_, least_m)| distance_m < least_m);
-                if distance_m < SAME_M && is_nearest && !stated.contains(&track.id) {
-                    nearest = Some((point.number as usize, distance_m));
-                }
-            });
-            match nearest {
-                Some((track, _)) => self.tracks[track].id = object.id,
-                None => {
-                    let mut track = Track::new(object.id, now, &seen, &self.config);
-                    if let Some([x, y]) = object.velocity_mps {
-                        track.motion.update_velocity(now, Vector2::new(x, y), 1.0, self.config.density());
-                    }
-                    track.motion.limit_speed(self.config.max_speed_mps);
-                    track.inherit(object, now);
-                    self.add(track);
-                }
-            }
-        }
+fn is_same(track: &Track, other: &Track, now: Timestamp, config: &TracksConfig) -> bool {
+    let distance_m = (other.state.position_at(now) - track.state.position_at(now)).norm();
+    let are_vehicles = track.vehicle.is_some() && other.vehicle.is_some();
+    let are_unlike = track.label(config) != other.label(config) && distance_m >= MERGE_UNLIKE_M;
+    if are_vehicles || are_unlike || track.is_resolved_from(other) || track.neighbours.is_separate(other.id, now) {
+        return false;
     }
+    let density = config.density();
+    let covariance = track.state.covariance_at(now, density) + other.state.covariance_at(now, density);
+    distance_m * distance_m < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
+}
 
-    fn inherited(&self, object: &FusedObject) -> Measurement {
-        let floor = Covariance::isotropic(self.config.noise_floor_m);
-        Measurement {
-            position: Vector2::new(object.x_m, object.y_m),
-            independent: (object.covariance() + floor).matrix(),
-            common_m: self.config.common_m,
-        }
+/// Removes tracks of objects that have disappeared, and vehicles that have been silent for longer than any track lives.
+pub(super) fn prune(tracks: &mut TrackStore, sensors: &mut Sensors, now: Timestamp, config: &TracksConfig) {
+    let life = Duration::from_secs_f64(config.life_s);
+    tracks.retain(|_, track| now.since(track.last_seen) <= life && track.survival(now) > MIN_SURVIVAL);
+    if sensors.forget_silent(now - life - REMEMBERED) {
+        tracks.retain_vehicles(|vehicle| sensors.get(vehicle).is_some());
     }
+}
+
+/// Takes over the objects of another aggregator's map, received at `now`: the identities of known objects, and unknown
+/// objects as tracks whose existence fades.
+pub(super) fn adopt_map(tracks: &mut TrackStore, map: &GlobalMap, now: Timestamp, config: &TracksConfig) {
+    tracks.reindex(now);
+    let stated: BTreeSet<Uuid> = map.objects.iter().map(|object| object.id).collect();
+    let mut known: BTreeSet<Uuid> = tracks.iter().map(|track| track.id).collect();
+    for object in &map.objects {
+        if !known.insert(object.id) {
+            continue;
+        }
+        let measurement = measurement(object, config);
+        let mut nearest: Option<(TrackIndex, f64)> = None;
+        tracks.near(&measurement.position, MERGE_M, |indexed| {
+            let track = &tracks[indexed.track];
+            let distance_m = (track.state.position_at(now) - measurement.position).norm();
+            let is_nearest = nearest.is_none_or(|(_, nearest_m)| distance_m < nearest_m);
+            if distance_m < MERGE_M && is_nearest && !stated.contains(&track.id) {
+                nearest = Some((indexed.track, distance_m));
+            }
+        });
+        if let Some((track, _)) = nearest {
+            tracks[track].id = object.id;
+            continue;
+        }
+        let mut track = Track::new(object.id, now, &measurement, config);
+        if let Some([x, y]) = object.velocity_mps {
+            track.state.update_velocity(now, Vector2::new(x, y), 1.0, config.density());
+        }
+        track.state.limit_speed(config.max_speed_mps);
+        track.inherit(object, now);
+        tracks.add(track);
+    }
+}
+
+fn measurement(object: &FusedObject, config: &TracksConfig) -> Measurement {
+    let floor = Covariance::isotropic(config.noise_floor_m);
+    Measurement {
+        position: Vector2::new(object.x_m, object.y_m),
+        independent: (object.covariance() + floor).matrix(),
+        common_m: config.common_m,
+    }
+}
+
+/// Identity of the track that object `index` of a report spawns: a UUID of version 8, equal on every aggregator.
+///
+/// It is the 128-bit FNV-1a hash of the object's name (draft-eastlake-fnv). Maps and logs contain it, so the hash must
+/// not change.
+pub(super) fn track_id(report: &ObjectReport, index: usize) -> Uuid {
+    const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
+    const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
+    let numbers = [report.captured_at_us.micros(), report.seq, index as u64];
+    let bytes = report.node.as_str().bytes().chain([0]).chain(numbers.into_iter().flat_map(u64::to_be_bytes));
+    let hash = bytes.fold(OFFSET, |hash, byte| (hash ^ u128::from(byte)).wrapping_mul(PRIME));
+    Uuid::new_v8(hash.to_be_bytes())
 }

@@ -1,42 +1,42 @@
-//! What a vehicle cannot see in a frame, because something that it did detect stands in front of it.
+//! Occlusion map of one frame: the directions in which a detection hides what is behind it.
 
 use nalgebra::Vector2;
 
-use super::sensors::turn;
+use super::coverage::turn;
 use crate::wire::PerceivedObject;
 
-/// How far the sight goes in one frame.
+/// Distance of the nearest detection in each direction, seen from the vehicle.
 #[derive(Debug)]
-pub(super) struct Shadows {
-    /// Where the vehicle is; where that is not known, nothing is hidden.
-    from: Option<Vector2<f64>>,
-    /// By direction, how far the sight goes before it meets what was detected, metres.
+pub(super) struct OcclusionMap {
+    /// Position of the vehicle; where it is unknown, nothing is hidden.
+    origin: Option<Vector2<f64>>,
+    /// Line of sight by direction, metres.
     sight_m: [f32; Self::RAYS],
 }
 
-impl Shadows {
+impl OcclusionMap {
     const RAYS: usize = 360;
 
-    /// Half the width in metres of what hides others.
-    const HIDES_M: f64 = 0.6;
+    /// Half the width of an occluder, metres.
+    const HALF_WIDTH_M: f64 = 0.6;
 
-    /// Distance in metres behind a detection from which an object is hidden by it, and not the same.
-    const BEHIND_M: f64 = 3.0;
+    /// Minimum distance in metres of a hidden object behind its occluder; what is nearer may be the same object.
+    const MIN_BEHIND_M: f64 = 3.0;
 
-    /// A frame without detections, seen from there.
-    pub(super) fn new(from: Option<Vector2<f64>>) -> Self {
-        Self { from, sight_m: [f32::INFINITY; Self::RAYS] }
+    /// A frame without detections, seen from `origin`.
+    pub(super) fn new(origin: Option<Vector2<f64>>) -> Self {
+        Self { origin, sight_m: [f32::INFINITY; Self::RAYS] }
     }
 
-    /// A detection hides what is behind it; a vehicle's own parts, nearer than `nearest_m`, hide nothing.
-    pub(super) fn cast(&mut self, object: &PerceivedObject, nearest_m: f64) {
-        let Some(from) = self.from else { return };
-        let offset = Vector2::new(object.x_m, object.y_m) - from;
+    /// Adds a detection as an occluder, unless it is nearer than `min_m`: a part of the vehicle itself.
+    pub(super) fn add(&mut self, object: &PerceivedObject, min_m: f64) {
+        let Some(origin) = self.origin else { return };
+        let offset = Vector2::new(object.x_m, object.y_m) - origin;
         let distance_m = offset.norm();
-        if distance_m <= nearest_m.max(2.0 * Self::HIDES_M) {
+        if distance_m <= min_m.max(2.0 * Self::HALF_WIDTH_M) {
             return;
         }
-        let aside = Vector2::new(-offset.y, offset.x) * (Self::HIDES_M / distance_m);
+        let aside = Vector2::new(-offset.y, offset.x) * (Self::HALF_WIDTH_M / distance_m);
         let (first, last) = (Self::ray(&(offset - aside)), Self::ray(&(offset + aside)));
         let count = (last + Self::RAYS - first) % Self::RAYS + 1;
         for ray in (first..first + count).map(|ray| ray % Self::RAYS) {
@@ -44,11 +44,11 @@ impl Shadows {
         }
     }
 
-    /// Whether nothing could be seen at a reported position.
-    pub(super) fn hide(&self, reported: &Vector2<f64>) -> bool {
-        self.from.is_some_and(|from| {
-            let offset = reported - from;
-            offset.norm() > f64::from(self.sight_m[Self::ray(&offset)]) + Self::BEHIND_M
+    /// Whether a reported position is hidden from the vehicle.
+    pub(super) fn hides(&self, reported: &Vector2<f64>) -> bool {
+        self.origin.is_some_and(|origin| {
+            let offset = reported - origin;
+            offset.norm() > f64::from(self.sight_m[Self::ray(&offset)]) + Self::MIN_BEHIND_M
         })
     }
 

@@ -1,163 +1,242 @@
-//! By how much a vehicle's positions and stamps are off, from what others see of the same objects.
+//! Registration: the offset, rotation and delay of each vehicle's pose, estimated from objects that others detect too.
 //!
-//! The error is an offset, a rotation and a delay, small and changing slowly: a Gauss-Markov process of four states with
-//! a known spread at rest, so that what all vehicles are off by together, which nobody can see, decays. A delay puts
-//! what moves one way too far ahead and what moves the other way too far behind; taken for offsets, those of two
-//! vehicles that each heed one direction would pull each other along without end. Every round is
-//! one step of an extended Kalman filter in information form over all pairs, reweighted against wrong ones by Cauchy's
-//! function (Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
+//! The errors are a Gauss-Markov process of four states: small, changing slowly, with a known spread at rest. An error
+//! that all vehicles share is not observable; it decays. Every round is one step of an extended Kalman filter in
+//! information form over all correspondences, reweighted against wrong ones by Cauchy's function (Holland, Welsch,
+//! "Robust regression using iteratively reweighted least-squares", 1977).
+//!
+//! The delay tells the directions of traffic apart: it shifts oncoming objects and overtaking ones in opposite
+//! directions. Without it, two vehicles that each see one direction would take their delays for offsets and pull each
+//! other along without end.
+
+use std::time::Duration;
 
 use nalgebra::{Matrix2, Matrix4, Rotation2, Vector2, Vector4};
 
+use super::config::TracksConfig;
+use super::sensors::{SensorId, Sensors};
+use super::store::{TrackIndex, TrackStore};
 use crate::geometry::wrap_angle;
 use crate::time::Timestamp;
 use crate::wire::PoseCorrection;
 
-/// A position as a vehicle reported it, and where others saw the same object.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Pair {
-    pub(super) reported: Vector2<f64>,
-    pub(super) reference: Vector2<f64>,
-    /// How fast the object goes, m/s.
-    pub(super) velocity: Vector2<f64>,
-    /// Variance of the difference in each direction, m²: what is independent from pair to pair.
-    pub(super) variance: f64,
-    /// Variance of what the references may be off by together, m².
-    pub(super) common: f64,
+/// Maximum time between two detections of an object that correspond.
+const SIMULTANEOUS: Duration = Duration::from_millis(300);
+
+/// Number of reweighting steps in a round.
+const ITERATIONS: usize = 3;
+
+/// Residual, in standard deviations, at which a correspondence counts half.
+const CAUCHY: f64 = 2.0;
+
+/// Maximum delay, in standard deviations.
+const MAX_DELAY: f64 = 3.0;
+
+/// Minimum number of correspondences of a published correction.
+const MIN_PAIRS: f64 = 3.0;
+
+/// Detections of one report that others may correspond to.
+#[derive(Debug)]
+pub(super) struct RegistrationFrame {
+    pub(super) sensor: SensorId,
+    /// Time of capture: the stamp less `delay_s`, the estimate at that time.
+    pub(super) at: Timestamp,
+    pub(super) delay_s: f64,
+    pub(super) samples: Vec<RegistrationSample>,
 }
 
-/// The spread of pose errors and how fast they change.
+/// One detection of an established track.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Spread {
+pub(super) struct RegistrationSample {
+    pub(super) track: TrackIndex,
+    /// Position as the vehicle reported it, metres.
+    pub(super) reported: Vector2<f64>,
+    /// Variance of the detection in each direction, m².
+    pub(super) variance: f64,
+}
+
+/// Updates the registration of every vehicle from the frames of a round.
+///
+/// Uses simultaneous detections only, so that filter lag is not mistaken for pose error.
+pub(super) fn register(
+    frames: Vec<RegistrationFrame>,
+    tracks: &TrackStore,
+    sensors: &mut Sensors,
+    config: &TracksConfig,
+) {
+    let prior = config.bias_prior();
+    let mut pairs: Vec<Correspondence> = Vec::new();
+    for frame in frames {
+        pairs.clear();
+        pairs.extend(frame.samples.iter().filter_map(|sample| Correspondence::of(sample, &frame, tracks, sensors)));
+        if let Some(sensor) = sensors.get_mut(frame.sensor) {
+            sensor.registration.observe(frame.at, frame.delay_s, &pairs, &prior);
+        }
+    }
+}
+
+/// A reported position and the position at which others detected the same object.
+#[derive(Debug, Clone, Copy)]
+struct Correspondence {
+    reported: Vector2<f64>,
+    reference: Vector2<f64>,
+    /// Velocity of the object, m/s.
+    velocity: Vector2<f64>,
+    /// Variance of the difference in each direction that is independent between correspondences, m².
+    variance: f64,
+    /// Variance of the error that the references may share, m².
+    common: f64,
+}
+
+impl Correspondence {
+    /// Compares a detection with the mean of the others' positions, weighted by trust.
+    fn of(
+        sample: &RegistrationSample,
+        frame: &RegistrationFrame,
+        tracks: &TrackStore,
+        sensors: &Sensors,
+    ) -> Option<Self> {
+        let track = &tracks[sample.track];
+        let velocity = track.state.velocity;
+        let (mut sum, mut weight, mut common) = (Vector2::zeros(), 0.0, 0.0);
+        for other in track.seen_by(frame.at - SIMULTANEOUS).filter(|history| history.sensor != frame.sensor) {
+            let (Some(hit), Some(theirs)) = (other.last_hit, sensors.get(other.sensor)) else { continue };
+            let passed_us = frame.at.micros_from(hit);
+            let trust = sensors.fleet.trust(other.sensor);
+            if passed_us.unsigned_abs() > SIMULTANEOUS.as_micros() as u64 || trust <= 0.0 {
+                continue;
+            }
+            sum += (other.position + velocity * (passed_us as f64 * 1e-6)) * trust;
+            common += theirs.registration.variance_at(&sample.reported, &velocity) * trust;
+            weight += trust;
+        }
+        (weight > 0.0).then(|| Self {
+            reported: sample.reported,
+            reference: sum / weight,
+            velocity,
+            variance: sample.variance * (1.0 + 1.0 / weight),
+            common: common / weight,
+        })
+    }
+}
+
+/// Standard deviations of pose errors at rest, and the time over which they change.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct BiasPrior {
     pub(super) offset_m: f64,
     pub(super) heading_rad: f64,
     pub(super) delay_s: f64,
     pub(super) memory_s: f64,
 }
 
-impl Spread {
+impl BiasPrior {
     fn covariance(&self) -> Matrix4<f64> {
         let deviations = Vector4::new(self.offset_m, self.offset_m, self.heading_rad, self.delay_s);
         Matrix4::from_diagonal(&deviations.component_mul(&deviations))
     }
 }
 
-/// The estimate for one vehicle.
+/// Estimated pose error of one vehicle.
 #[derive(Debug, Clone)]
-pub(super) struct Alignment {
+pub(super) struct Registration {
     at: Timestamp,
-    about: Vector2<f64>,
-    /// East, north, rotation, and seconds by which stamps are late.
+    /// Centre of the rotation, metres.
+    pivot: Vector2<f64>,
+    /// Offset east and north, rotation, and delay of the stamps in seconds.
     error: Vector4<f64>,
     covariance: Matrix4<f64>,
+    /// Fading number of correspondences.
     pairs: f64,
 }
 
-/// How often pairs are weighted anew in a round.
-const ITERATIONS: usize = 3;
-
-/// Residual, in standard deviations, at which a pair counts half.
-const CAUCHY: f64 = 2.0;
-
-/// Largest delay, in standard deviations.
-const MOST_DELAY: f64 = 3.0;
-
-/// Fewest pairs that a correction is published for.
-const MIN_PAIRS: f64 = 3.0;
-
-impl Alignment {
-    pub(super) fn new(at: Timestamp, spread: &Spread) -> Self {
-        Self { at, about: Vector2::zeros(), error: Vector4::zeros(), covariance: spread.covariance(), pairs: 0.0 }
+impl Registration {
+    /// An estimate without correspondences.
+    pub(super) fn new(at: Timestamp, prior: &BiasPrior) -> Self {
+        Self { at, pivot: Vector2::zeros(), error: Vector4::zeros(), covariance: prior.covariance(), pairs: 0.0 }
     }
 
-    /// The vehicle is there now, or what it sees: the error of its pose goes with it.
-    pub(super) fn turn_about(&mut self, about: Vector2<f64>) {
-        self.about = about;
+    /// Sets the centre of the rotation; the error goes with the vehicle.
+    pub(super) fn set_pivot(&mut self, pivot: Vector2<f64>) {
+        self.pivot = pivot;
     }
 
-    /// Where a reported position belongs.
-    pub(super) fn correct(&self, reported: &Vector2<f64>) -> Vector2<f64> {
-        self.correction()(reported)
+    /// A function that corrects reported positions.
+    pub(super) fn corrector(&self) -> impl Fn(&Vector2<f64>) -> Vector2<f64> + use<> {
+        let (pivot, rotation, offset) = (self.pivot, self.rotation(), self.error.xy());
+        move |reported| pivot + rotation * (reported - pivot) + offset
     }
 
-    /// The same for many.
-    pub(super) fn correction(&self) -> impl Fn(&Vector2<f64>) -> Vector2<f64> + use<> {
-        let (about, rotation, offset) = (self.about, self.rotation(), self.error.xy());
-        move |reported| about + rotation * (reported - about) + offset
-    }
-
-    /// A reported direction as it should be.
+    /// A reported heading, corrected.
     pub(super) fn correct_heading(&self, heading_rad: f64) -> f64 {
         wrap_angle(heading_rad + self.error.z)
     }
 
-    /// A reported velocity as it should be.
-    pub(super) fn turned(&self, vector: &Vector2<f64>) -> Vector2<f64> {
-        self.rotation() * vector
+    /// A reported velocity, corrected.
+    pub(super) fn correct_velocity(&self, velocity: &Vector2<f64>) -> Vector2<f64> {
+        self.rotation() * velocity
     }
 
     fn rotation(&self) -> Rotation2<f64> {
         Rotation2::new(self.error.z)
     }
 
-    /// Seconds by which stamps are late.
+    /// Delay of the vehicle's stamps, seconds.
     pub(super) fn delay_s(&self) -> f64 {
         self.error.w
     }
 
-    /// Variance of a corrected position in each direction, on average, m², of what goes at `velocity` m/s.
-    pub(super) fn variance_at(&self, reported: &Vector2<f64>, velocity: &Vector2<f64>) -> f64 {
-        let lever = (reported - self.about).norm_squared();
-        let turned_and_moved = lever * self.covariance.m33 + velocity.norm_squared() * self.covariance.m44;
-        (self.covariance.m11 + self.covariance.m22 + turned_and_moved) / 2.0
+    /// Mean variance of a corrected position in each direction, m², of an object with a velocity in m/s.
+    fn variance_at(&self, reported: &Vector2<f64>, velocity: &Vector2<f64>) -> f64 {
+        let lever = (reported - self.pivot).norm_squared();
+        let rotation_and_delay = lever * self.covariance.m33 + velocity.norm_squared() * self.covariance.m44;
+        (self.covariance.m11 + self.covariance.m22 + rotation_and_delay) / 2.0
     }
 
-    /// Takes the pairs of a report in, whose references are where the objects were at `at`: the report's stamp, less
-    /// `delay_s`.
-    pub(super) fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Pair], spread: &Spread) {
-        self.fade(at, spread);
+    /// Updates the estimate. The references hold for `at`, which is the report's stamp less `delay_s`.
+    fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) {
+        self.fade(at, prior);
         let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty()) else { return };
-        let prior = self.error;
+        let predicted = self.error;
         let mut counted = 0.0;
         for _ in 0..ITERATIONS {
             let (rotation, offset) = (self.rotation(), self.error.xy());
-            let mut normal = Normal::default();
+            let mut normal = NormalEquations::default();
             counted = 0.0;
             for pair in pairs {
-                let arm = rotation * (pair.reported - self.about);
+                let arm = rotation * (pair.reported - self.pivot);
                 let later = pair.velocity * (self.error.w - delay_s);
-                let residual = pair.reference - (self.about + arm + offset) - later;
+                let residual = pair.reference - (self.pivot + arm + offset) - later;
                 let squared = residual.norm_squared() / (pair.variance + pair.common);
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
-                // What the references share is no better known for their number.
+                // More references do not reduce the error that they share.
                 let weight = trust / (pair.variance + pair.common * pairs.len() as f64);
                 normal.add(&Matrix2::from_columns(&[Vector2::new(-arm.y, arm.x), pair.velocity]), &residual, weight);
                 counted += trust;
             }
             let (information, gradient) = (normal.information(), normal.gradient());
             let Some(covariance) = (prior_information + information).try_inverse() else { return };
-            self.error = covariance * (prior_information * prior + information * self.error + gradient);
-            // Nobody's stamps move the time at which all reports are fused.
-            let most_s = MOST_DELAY * spread.delay_s;
-            self.error.w = self.error.w.clamp(-most_s, most_s);
+            self.error = covariance * (prior_information * predicted + information * self.error + gradient);
+            // The stamps of one vehicle must not move the time at which all reports are fused.
+            let max_s = MAX_DELAY * prior.delay_s;
+            self.error.w = self.error.w.clamp(-max_s, max_s);
             self.covariance = (covariance + covariance.transpose()) * 0.5;
         }
         self.pairs += counted;
     }
 
-    /// Forgets with time.
-    fn fade(&mut self, at: Timestamp, spread: &Spread) {
-        let kept = (-at.since(self.at).as_secs_f64() / spread.memory_s).exp();
+    /// Predicts the errors at `at`: they decay, and their covariance returns to the prior.
+    fn fade(&mut self, at: Timestamp, prior: &BiasPrior) {
+        let kept = (-at.since(self.at).as_secs_f64() / prior.memory_s).exp();
         self.error *= kept;
-        self.covariance = self.covariance * (kept * kept) + spread.covariance() * (1.0 - kept * kept);
+        self.covariance = self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
         self.pairs *= kept;
         self.at = self.at.max(at);
     }
 
-    /// For the map, if there is anything to say.
-    pub(super) fn published(&self) -> Option<PoseCorrection> {
+    /// The correction for the map; `None` with too few correspondences.
+    pub(super) fn correction(&self) -> Option<PoseCorrection> {
         (self.pairs >= MIN_PAIRS).then(|| PoseCorrection {
-            about_m: [self.about.x, self.about.y],
+            about_m: [self.pivot.x, self.pivot.y],
             dx_m: self.error.x,
             dy_m: self.error.y,
             dheading_rad: self.error.z,
@@ -166,12 +245,11 @@ impl Alignment {
     }
 }
 
-/// Sums over pairs for the normal equations. A residual's derivatives are the identity by the offset, and those by
-/// rotation and delay, which are the columns of a matrix: no more than these blocks has to be summed.
+/// Sums over correspondences for the normal equations. The derivatives of a residual by the offset are the identity, so
+/// that these blocks are enough.
 #[derive(Default)]
-struct Normal {
-    /// With w for the weights, r for the residuals and D for their derivatives by rotation and delay: Σw, ΣwD, ΣwDᵀD,
-    /// Σwr, ΣwDᵀr.
+struct NormalEquations {
+    /// Σw, ΣwD, ΣwDᵀD, Σwr, ΣwDᵀr: weights w, residuals r, derivatives D by rotation and delay.
     weight: f64,
     first: Matrix2<f64>,
     second: Matrix2<f64>,
@@ -179,7 +257,7 @@ struct Normal {
     turned: Vector2<f64>,
 }
 
-impl Normal {
+impl NormalEquations {
     fn add(&mut self, by_rotation_and_delay: &Matrix2<f64>, residual: &Vector2<f64>, weight: f64) {
         let weighted = by_rotation_and_delay * weight;
         self.weight += weight;
@@ -213,10 +291,10 @@ mod tests {
     /// four metres away, always on the same side.
     #[test]
     fn three_wrong_pairs_in_ten_do_not_mislead() {
-        let spread = Spread { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
+        let prior = BiasPrior { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let start = Timestamp(1_732_154_400_000_000);
-        let mut alignment = Alignment::new(start, &spread);
+        let mut registration = Registration::new(start, &prior);
         let error = Vector2::new(0.6, -0.4);
         for round in 0..50 {
             let pair = |n: u32| {
@@ -225,13 +303,13 @@ mod tests {
                 let reference = reported + error + Vector2::new(noise(), noise());
                 let wrong = if rng.random_bool(0.3) { rng.random_range(2.0..4.0) } else { 0.0 };
                 let reference = reference + Vector2::new(0.0, wrong);
-                Pair { reported, reference, velocity: Vector2::zeros(), variance: 0.04, common: 0.02 }
+                Correspondence { reported, reference, velocity: Vector2::zeros(), variance: 0.04, common: 0.02 }
             };
             let pairs: Vec<_> = (0..12).map(pair).collect();
-            alignment.observe(Timestamp(start.0 + round * 100_000), 0.0, &pairs, &spread);
+            registration.observe(Timestamp(start.0 + round * 100_000), 0.0, &pairs, &prior);
         }
-        let off = alignment.correct(&Vector2::zeros()) - error;
+        let off = registration.corrector()(&Vector2::zeros()) - error;
         assert!(off.norm() < 0.15, "off by {off:?}");
-        assert!(alignment.published().is_some_and(|correction| correction.dheading_rad.abs() < 0.004));
+        assert!(registration.correction().is_some_and(|correction| correction.dheading_rad.abs() < 0.004));
     }
 }

@@ -1,4 +1,4 @@
-//! One object that is followed.
+//! One track: an object that is followed.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -8,75 +8,78 @@ use smallvec::SmallVec;
 use uuid::Uuid;
 
 use super::config::TracksConfig;
-use super::existence::{Witness, logistic};
-use super::history::Witnesses;
-use super::joining::Neighbours;
-use super::kinematics::{Measurement, Motion};
+use super::detection_history::DetectionHistory;
+use super::existence::{SensorHistory, logistic};
+use super::grid::IndexedTrack;
+use super::kinematics::{KinematicState, Measurement};
+use super::neighbours::Neighbours;
+use super::sensors::SensorId;
+use super::store::TrackIndex;
 use crate::geometry::{Covariance, wrap_angle};
 use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
 use crate::wire::{FusedObject, PerceivedObject};
 
-/// Within how much time another vehicle's detection confirms that an object is there.
+/// Maximum age of another vehicle's detection that confirms a track.
 const CONFIRMED_WITHIN: Duration = Duration::from_millis(500);
 
-/// Labels that are kept of an object, the likeliest.
+/// Maximum number of labels of a track; the likeliest stay.
 const MAX_LABELS: usize = 8;
 
-/// Probability of a label that was never read, for the association.
-pub(super) const OTHER_LABEL: f64 = 0.02;
+/// Similarity to a label that was never read.
+pub(super) const MIN_LABEL_SIMILARITY: f64 = 0.02;
 
-/// Distance in metres within which a position is of use.
+/// Maximum position error of a useful object, metres.
 const USABLE_M: f64 = 1.5;
 
-/// Log-odds of an object before any evidence.
+/// Log-odds of existence before any evidence.
 const PRIOR_NATS: f64 = 0.4;
 
-/// Objects that go for good, per second.
-const GONE_RATE: f64 = 0.02;
+/// Rate at which objects disappear, per second.
+const DISAPPEARANCE_RATE: f64 = 0.02;
 
-/// Time in seconds after which an object that nobody looks for is as good as gone.
+/// Time constant in seconds with which an unseen object disappears.
 const UNSEEN_S: f64 = 2.0;
 
-/// Odds that what is followed is none of the things that only seem to be there: most tracks are of these.
+/// Prior odds that a track is an object: most are clutter.
 const PRIOR_ODDS: f64 = 0.07;
 
-/// See the module.
+/// State of one track.
 #[derive(Debug, Clone)]
 pub(super) struct Track {
     pub(super) id: Uuid,
-    pub(super) motion: Motion,
-    pub(super) witnesses: Witnesses,
-    /// Weights of the labels that were read, fading.
+    pub(super) state: KinematicState,
+    pub(super) history: DetectionHistory,
+    /// Fading weights of the labels that were read.
     labels: SmallVec<[(Label, f64); 1]>,
     heading_rad: Option<f64>,
     size_m: Option<[f64; 2]>,
     pub(super) first_seen: Timestamp,
     pub(super) last_seen: Timestamp,
-    /// Odds that it has gone since it was last seen.
-    gone: f64,
-    /// Number of the vehicle that it is, by its own word.
-    pub(super) vehicle: Option<u32>,
-    /// Detections so far.
+    /// Odds that the object has disappeared since it was last seen.
+    disappeared: f64,
+    /// The vehicle that this track is, by its reported pose.
+    pub(super) vehicle: Option<SensorId>,
+    /// Number of detections.
     pub(super) hits: u32,
     pub(super) neighbours: Neighbours,
-    /// Log-odds taken over from another aggregator, fading, and when they were renewed.
+    /// Log-odds from another aggregator, which fade, and the time at which they came.
     inherited: Option<(f64, Timestamp)>,
 }
 
 impl Track {
-    /// An object that was seen once.
-    pub(super) fn new(id: Uuid, at: Timestamp, seen: &Measurement, config: &TracksConfig) -> Self {
+    /// A track with one measurement.
+    pub(super) fn new(id: Uuid, at: Timestamp, measurement: &Measurement, config: &TracksConfig) -> Self {
         Self {
             id,
-            motion: Motion::new(at, seen, config.speed_mps),
-            witnesses: Witnesses::default(),
+            state: KinematicState::new(at, measurement, config.speed_mps),
+            history: DetectionHistory::default(),
             labels: SmallVec::new(),
             heading_rad: None,
             size_m: None,
             first_seen: at,
             last_seen: at,
-            gone: 0.0,
+            disappeared: 0.0,
             vehicle: None,
             hits: 0,
             neighbours: Neighbours::default(),
@@ -84,15 +87,20 @@ impl Track {
         }
     }
 
-    /// Takes over what a detection says beside its place.
-    pub(super) fn describe(&mut self, object: &PerceivedObject, heading_rad: Option<f64>) {
+    /// The entry of the grid at `at`.
+    pub(super) fn indexed(&self, track: TrackIndex, at: Timestamp) -> IndexedTrack {
+        IndexedTrack { position: self.state.position_at(at), velocity: self.state.velocity, track }
+    }
+
+    /// Updates labels, heading and size from a detection.
+    pub(super) fn update_attributes(&mut self, object: &PerceivedObject, heading_rad: Option<f64>) {
         const KEPT: f64 = 0.95;
         const SHARE: f64 = 0.3;
         self.labels.iter_mut().for_each(|(_, weight)| *weight *= KEPT);
-        let one = [(&object.label, object.confidence)];
-        let many = object.scores.iter().map(|(label, score)| (label, *score));
-        let alone = object.scores.is_empty();
-        for (label, score) in many.chain(one.into_iter().filter(|_| alone)) {
+        let label = [(&object.label, object.confidence)];
+        let scores = object.scores.iter().map(|(label, score)| (label, *score));
+        let has_no_scores = object.scores.is_empty();
+        for (label, score) in scores.chain(label.into_iter().filter(|_| has_no_scores)) {
             match self.labels.iter_mut().find(|(known, _)| known == label) {
                 Some((_, weight)) => *weight += score,
                 None => self.labels.push((label.clone(), score)),
@@ -112,22 +120,23 @@ impl Track {
         }
     }
 
-    /// It was detected at `at`.
-    pub(super) fn refresh(&mut self, at: Timestamp) {
+    /// Records a detection at `at`.
+    pub(super) fn record_hit(&mut self, at: Timestamp) {
         self.last_seen = self.last_seen.max(at);
-        self.gone = 0.0;
+        self.disappeared = 0.0;
         self.hits = self.hits.saturating_add(1);
     }
 
-    /// A vehicle that had seen it looked in vain, `dt_s` after it looked before; `rate` is how surely it would be seen.
-    pub(super) fn overlooked(&mut self, at: Timestamp, dt_s: f64, rate: f64) {
+    /// Records a miss at `at` by a vehicle that had detected the object and last looked `dt_s` before; `rate` is its
+    /// probability of detection.
+    pub(super) fn record_miss(&mut self, at: Timestamp, dt_s: f64, rate: f64) {
         if at > self.last_seen {
-            self.gone = ((self.gone + GONE_RATE * dt_s) / (1.0 - rate)).min(1e6);
+            self.disappeared = ((self.disappeared + DISAPPEARANCE_RATE * dt_s) / (1.0 - rate)).min(1e6);
         }
     }
 
-    /// How well a detection's labels go with those read so far, 0 to 1.
-    pub(super) fn likeness(&self, object: &PerceivedObject) -> f64 {
+    /// Similarity of a detection's labels to those of the track, 0 to 1.
+    pub(super) fn label_similarity(&self, object: &PerceivedObject) -> f64 {
         if self.labels.is_empty() {
             return 1.0;
         }
@@ -141,56 +150,56 @@ impl Track {
             }
         };
         let common: f64 = self.labels.iter().map(|(label, weight)| weight / total * share(label)).sum();
-        common.max(OTHER_LABEL)
+        common.max(MIN_LABEL_SIMILARITY)
     }
 
-    /// Log-odds that there is such an object, each vehicle's word weighted by the trust in it.
-    pub(super) fn nats(&self, at: Timestamp, trust: impl Fn(u32) -> f64) -> f64 {
-        let witnessed: f64 = self.witnesses.iter().map(|witness| trust(witness.source) * witness.nats(at)).sum();
+    /// Log-odds of existence; `trust` weighs the evidence of each vehicle.
+    fn existence_nats(&self, at: Timestamp, trust: impl Fn(SensorId) -> f64) -> f64 {
+        let evidence: f64 = self.history.iter().map(|history| trust(history.sensor) * history.nats(at)).sum();
         let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
-        PRIOR_NATS + witnessed + inherited
+        PRIOR_NATS + evidence + inherited
     }
 
-    /// Probability that it is still there, if it ever was.
-    pub(super) fn presence(&self, now: Timestamp) -> f64 {
+    /// Probability that an object that existed is still there.
+    pub(super) fn survival(&self, now: Timestamp) -> f64 {
         let age = now.since(self.last_seen).as_secs_f64();
-        (-age / UNSEEN_S).exp() / (1.0 + self.gone)
+        (-age / UNSEEN_S).exp() / (1.0 + self.disappeared)
     }
 
-    /// The vehicles that detected it since `limit`.
-    pub(super) fn seen_by(&self, limit: Timestamp) -> impl Iterator<Item = &Witness> {
-        self.witnesses.iter().filter(move |witness| witness.last_hit.is_some_and(|hit| hit >= limit))
+    /// The histories of the vehicles that detected the object since `limit`.
+    pub(super) fn seen_by(&self, limit: Timestamp) -> impl Iterator<Item = &SensorHistory> {
+        self.history.iter().filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
     }
 
-    /// Whether any but the vehicle `source` detected it shortly before `at`.
-    pub(super) fn is_confirmed(&self, source: u32, at: Timestamp) -> bool {
-        self.seen_by(at - CONFIRMED_WITHIN).any(|witness| witness.source != source)
+    /// Whether another vehicle than `sensor` detected the object shortly before `at`.
+    pub(super) fn is_confirmed(&self, sensor: SensorId, at: Timestamp) -> bool {
+        self.seen_by(at - CONFIRMED_WITHIN).any(|history| history.sensor != sensor)
     }
 
-    /// Whether one vehicle told the two apart in one frame.
-    pub(super) fn is_told_apart(&self, other: &Self) -> bool {
-        self.witnesses.iter().any(|mine| {
-            mine.last_hit.is_some()
-                && other.witnesses.iter().any(|theirs| theirs.source == mine.source && theirs.last_hit == mine.last_hit)
+    /// Whether a vehicle detected both objects in the frame of its last detection.
+    pub(super) fn is_resolved_from(&self, other: &Self) -> bool {
+        self.history.iter().any(|own| {
+            own.last_hit.is_some()
+                && other.history.iter().any(|theirs| theirs.sensor == own.sensor && theirs.last_hit == own.last_hit)
         })
     }
 
-    /// Takes in a later track of the same object; what this one is called holds.
-    pub(super) fn absorb(&mut self, other: Self) {
-        self.witnesses.absorb(other.witnesses);
+    /// Merges a later track of the same object; the identity and labels of this one stay.
+    pub(super) fn merge(&mut self, other: Self) {
+        self.history.merge(other.history);
         if self.last_seen < other.last_seen {
-            self.motion = other.motion;
+            self.state = other.state;
             self.last_seen = other.last_seen;
-            self.gone = other.gone;
+            self.disappeared = other.disappeared;
         }
-        self.neighbours.absorb(other.neighbours, self.id);
+        self.neighbours.merge(other.neighbours, self.id);
         self.hits = self.hits.saturating_add(other.hits);
         self.vehicle = self.vehicle.or(other.vehicle);
         self.heading_rad = self.heading_rad.or(other.heading_rad);
         self.size_m = self.size_m.or(other.size_m);
     }
 
-    /// Takes over what another aggregator knew.
+    /// Takes existence and attributes from another aggregator's object.
     pub(super) fn inherit(&mut self, object: &FusedObject, at: Timestamp) {
         let existence = object.existence.unwrap_or(object.confidence).clamp(0.01, 0.99);
         self.inherited = Some(((existence / (1.0 - existence) / PRIOR_ODDS).ln() - PRIOR_NATS, at));
@@ -200,33 +209,33 @@ impl Track {
         self.size_m = object.size_m;
     }
 
-    /// The entry of the map at `now`.
-    pub(super) fn fused(
+    /// The object of the map at `now`.
+    pub(super) fn object(
         &self,
         now: Timestamp,
         config: &TracksConfig,
-        trust: impl Fn(u32) -> f64,
-        name: impl Fn(u32) -> Option<NodeName>,
+        trust: impl Fn(SensorId) -> f64,
+        name: impl Fn(SensorId) -> Option<NodeName>,
     ) -> FusedObject {
-        let covariance = self.motion.covariance_at(now, config.density());
-        let position = self.motion.position_at(now);
-        let there = believed(logistic(self.nats(now, trust))) * self.presence(now);
+        let covariance = self.state.covariance_at(now, config.density());
+        let position = self.state.position_at(now);
+        let existence = with_prior_odds(logistic(self.existence_nats(now, trust))) * self.survival(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
         let mut scores = BTreeMap::new();
         scores.extend(self.labels.iter().map(|(label, weight)| (label.clone(), weight / total.max(1e-9))));
         let variance = covariance.trace() / 2.0;
         let usable = 1.0 - (-USABLE_M * USABLE_M / (2.0 * variance)).exp();
         let covariance = Covariance { xx: covariance.m11, xy: covariance.m12, yy: covariance.m22 };
-        let confidence = there * usable;
-        let moving = self.hits > 1;
+        let confidence = existence * usable;
+        let has_velocity = self.hits > 1;
         let seen_by = self.seen_by(now - Duration::from_secs_f64(config.life_s));
-        let mut contributors = Vec::with_capacity(self.witnesses.len());
-        contributors.extend(seen_by.filter_map(|witness| name(witness.source)));
+        let mut contributors = Vec::with_capacity(self.history.len());
+        contributors.extend(seen_by.filter_map(|history| name(history.sensor)));
         FusedObject {
             contributors,
-            existence: Some(there),
+            existence: Some(existence),
             scores,
-            velocity_mps: moving.then_some([self.motion.velocity.x, self.motion.velocity.y]),
+            velocity_mps: has_velocity.then_some([self.state.velocity.x, self.state.velocity.y]),
             heading_rad: self.heading_rad.or_else(|| self.course_rad()),
             size_m: self.size_m,
             age_s: Some(now.since(self.last_seen).as_secs_f64()),
@@ -236,22 +245,22 @@ impl Track {
         }
     }
 
-    /// What it is taken for; what nobody has read a label of is a vehicle by its own word.
+    /// The likeliest label; a track without labels is a vehicle that only its own pose reports.
     pub(super) fn label(&self, config: &TracksConfig) -> Label {
         let best = self.labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
         best.map_or_else(|| config.vehicle_label.clone(), |(label, _)| label.clone())
     }
 
-    /// The direction of travel, where it is well known.
+    /// Direction of the velocity, radians; `None` unless the velocity is well known.
     fn course_rad(&self) -> Option<f64> {
-        let velocity: Vector2<f64> = self.motion.velocity;
-        let sigma = (self.motion.velocity_covariance().trace() / 2.0).sqrt();
+        let velocity: Vector2<f64> = self.state.velocity;
+        let sigma = (self.state.velocity_covariance().trace() / 2.0).sqrt();
         (velocity.norm() > (3.0 * sigma).max(1.0)).then(|| velocity.y.atan2(velocity.x))
     }
 }
 
-/// A probability that was reckoned with even odds, with those that tracks have.
-fn believed(probability: f64) -> f64 {
+/// A probability at even prior odds, converted to [`PRIOR_ODDS`].
+fn with_prior_odds(probability: f64) -> f64 {
     let probability = probability.clamp(0.0, 1.0);
     PRIOR_ODDS * probability / (PRIOR_ODDS * probability + 1.0 - probability)
 }

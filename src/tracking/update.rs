@@ -1,413 +1,313 @@
-//! What becomes of one report: detections are matched to objects, the rest found new ones, and what is overlooked
-//! counts.
-
-use std::time::Duration;
+//! Update of the tracks by one report.
+//!
+//! [`ReportUpdate::run`] updates the vehicle's own track, associates the detections with tracks, updates those, counts
+//! misses of the others in view, and spawns tracks from what is left.
 
 use nalgebra::{Matrix2, Vector2};
-use uuid::Uuid;
 
-use super::Tracker;
-use super::assignment::{Pairing, assign};
 use super::calibration::log_odds;
 use super::config::TracksConfig;
-use super::existence::Rates;
-use super::grid::Point;
-use super::kinematics::{Measurement, Motion};
-use super::occlusion::Shadows;
-use super::pairs::Sighting;
-use super::registration::Alignment;
-use super::sensors::Source;
-use super::track::{OTHER_LABEL, Track};
-use super::trust::{Others, Word, judge};
+use super::existence::{DetectionRates, Statement};
+use super::kinematics::{KinematicState, Measurement};
+use super::lifecycle::track_id;
+use super::occlusion::OcclusionMap;
+use super::registration::RegistrationSample;
+use super::sensors::SensorModel;
+use super::store::{TrackIndex, TrackStore};
+use super::track::Track;
+use super::trust::{Fleet, Judgement};
 use crate::reputation::Evidence;
 use crate::time::Timestamp;
 use crate::wire::{ObjectReport, PerceivedObject};
 
-/// A detection on its way to an object.
-struct Seen<'a> {
-    /// Its place in the report.
-    index: usize,
-    object: &'a PerceivedObject,
-    /// Of its confidence.
-    log_odds: f64,
-    reported: Vector2<f64>,
-    measurement: Measurement,
-}
-
-/// One vehicle's report on its way in.
-pub(super) struct Taking<'a> {
-    /// Number of the vehicle.
-    pub(super) number: u32,
-    pub(super) source: &'a mut Source,
-    pub(super) report: &'a ObjectReport,
-    pub(super) at: Timestamp,
-    /// Weight of the vehicle's word, 0 to 1.
-    pub(super) trust: f64,
-    /// Whether the vehicle is somewhere else all at once, and nothing is known of its alignment any more.
-    pub(super) has_jumped: bool,
-    /// What the vehicle's alignment is estimated from.
-    pub(super) sightings: Vec<Sighting>,
-}
-
-/// Where nothing is known of a vehicle's view.
-const UNKNOWN: Rates = Rates { stay: 0.9, find: 0.15 };
-
 /// Standard deviation of reported velocities, m/s.
 const VELOCITY_SIGMA_MPS: f64 = 1.0;
 
-/// Trust that positions are weighed by at least.
-const LEAST_TRUST: f64 = 0.05;
+/// Minimum trust by which the covariances of positions are divided.
+const MIN_TRUST: f64 = 0.05;
 
-/// Detections after which a track is known well enough to measure detections by.
+/// Number of detections from which a track measures the noise of detections.
 const MATURE_HITS: u32 = 8;
 
-/// Detections after which a track says what a vehicle sees.
-const SURE_HITS: u32 = 5;
+/// Number of detections from which a track measures registration and detection rates.
+pub(super) const ESTABLISHED_HITS: u32 = 5;
 
-/// Within how much time a new object may be anywhere that the highest speed allows.
-const FAST_WITHIN: Duration = Duration::from_millis(250);
+/// Log-odds of a vehicle's confidence that it exists itself.
+const OWN_NATS: f64 = 4.0;
 
-/// Most detections of a report that are held against such objects: where more are new, nothing is known yet, or somebody
-/// makes them up.
-const MOST_FAST: usize = 64;
+/// A detection of a report, corrected by the vehicle's registration.
+pub(super) struct Detection<'a> {
+    /// Index into the objects of the report.
+    pub(super) index: usize,
+    pub(super) object: &'a PerceivedObject,
+    /// Log-odds of the confidence.
+    log_odds: f64,
+    /// Position as reported, metres.
+    reported: Vector2<f64>,
+    pub(super) measurement: Measurement,
+}
 
-/// Confidence of a vehicle that it exists itself, log-odds.
-const SELF_NATS: f64 = 4.0;
+/// Update of the tracks by one report of one vehicle.
+pub(super) struct ReportUpdate<'a> {
+    pub(super) config: &'a TracksConfig,
+    pub(super) tracks: &'a mut TrackStore,
+    pub(super) sensor: &'a mut SensorModel,
+    pub(super) at: Timestamp,
+    fleet: &'a mut Fleet,
+    report: &'a ObjectReport,
+    /// Weight of the vehicle's evidence before the update, 0 to 1.
+    trust: f64,
+    occlusion: OcclusionMap,
+    outcome: ReportOutcome,
+}
 
-impl Tracker {
-    pub(super) fn take(&mut self, taking: &mut Taking<'_>) {
-        let Taking { source, report, at, .. } = taking;
-        source.last_report = source.last_report.max(*at);
-        taking.has_jumped = source.view.observe(report);
-        if taking.has_jumped {
-            source.alignment = Alignment::new(*at, &self.spread());
-        }
-        if let Some(centre) = source.view.centre() {
-            source.alignment.turn_about(centre);
-        }
-        let is_trusted = taking.trust > 0.0;
-        let is_likely = source.calibration.likely();
-        let mut shadows = Shadows::new(source.view.position());
+/// Result of an update.
+#[derive(Debug, Default)]
+pub(super) struct ReportOutcome {
+    /// Whether the vehicle has jumped to another place, so that its earlier samples are void.
+    pub(super) has_jumped: bool,
+    pub(super) samples: Vec<RegistrationSample>,
+    /// Judgements of the vehicle's statements.
+    pub(super) evidence: Vec<Evidence>,
+}
+
+impl<'a> ReportUpdate<'a> {
+    /// An update by `report`, captured at `at`; the sensor model takes note of it.
+    pub(super) fn new(
+        config: &'a TracksConfig,
+        tracks: &'a mut TrackStore,
+        (sensor, fleet): (&'a mut SensorModel, &'a mut Fleet),
+        report: &'a ObjectReport,
+        at: Timestamp,
+    ) -> Self {
+        let has_jumped = sensor.observe(report, at, config);
+        let is_likely = sensor.calibration.likely();
+        let mut occlusion = OcclusionMap::new(sensor.coverage.position());
         for object in report.objects.iter().filter(|object| is_likely(object.confidence)) {
-            shadows.cast(object, self.config.vehicle_radius_m);
+            occlusion.add(object, config.vehicle_radius_m);
         }
-        // What a proven liar says is judged where others say something of it, and counts for nothing.
-        if is_trusted {
-            self.take_own_pose(taking);
-        }
-        let seen = self.seen(taking);
-        let mut chosen = self.associate(taking.number, &seen, taking.at);
-        if is_trusted {
-            self.associate_fast(taking.source, &seen, taking.at, &mut chosen);
-        }
-        let mut detected: Vec<u32> = chosen.iter().map(|pairing| pairing.track).collect();
-        detected.sort_unstable();
-        let mut chosen = chosen.iter().peekable();
-        let mut founding = Vec::new();
-        for (detection, seen) in seen.iter().enumerate() {
-            match chosen.next_if(|pairing| pairing.detection as usize == detection) {
-                Some(pairing) => self.confirm(taking, &shadows, pairing.track, seen),
-                None => founding.push(seen),
-            }
-        }
-        self.look(taking, &shadows, &detected);
-        for seen in founding.into_iter().filter(|_| is_trusted) {
-            self.found(taking, seen);
-        }
+        let trust = fleet.trust(sensor.id);
+        let samples = Vec::with_capacity(report.objects.len());
+        let outcome = ReportOutcome { has_jumped, samples, evidence: Vec::new() };
+        Self { config, tracks, sensor, at, fleet, report, trust, occlusion, outcome }
     }
 
-    /// The vehicle is an object too, and the only one whose word that is.
-    fn take_own_pose(&mut self, taking: &mut Taking<'_>) {
-        let Some(pose) = taking.report.pose else { return };
-        let reported = Vector2::new(pose.x_m, pose.y_m);
+    /// Carries out the update.
+    pub(super) fn run(mut self) -> ReportOutcome {
+        if self.is_trusted() {
+            self.update_own_track();
+        }
+        let detections = self.detections();
+        let mut pairings = self.associate(&detections);
+        if self.is_trusted() {
+            self.associate_fast(&detections, &mut pairings);
+        }
+        let mut detected: Vec<TrackIndex> = pairings.iter().map(|pairing| pairing.track).collect();
+        detected.sort_unstable();
+        let mut pairings = pairings.iter().peekable();
+        let mut unassociated = Vec::new();
+        for (number, detection) in detections.iter().enumerate() {
+            match pairings.next_if(|pairing| pairing.detection == number) {
+                Some(pairing) => self.update_track(pairing.track, detection),
+                None => unassociated.push(detection),
+            }
+        }
+        self.count_misses(&detected);
+        if self.is_trusted() {
+            unassociated.into_iter().for_each(|detection| self.spawn(detection));
+        }
+        self.outcome
+    }
+
+    /// Whether the report changes tracks. A proven liar's statements are judged and have no other effect.
+    fn is_trusted(&self) -> bool {
+        self.trust > 0.0
+    }
+
+    /// Updates or spawns the track of the vehicle itself from its pose; no other report may do so.
+    fn update_own_track(&mut self) {
+        let Some(pose) = self.report.pose else { return };
         let sigma_m = (self.config.vehicle_radius_m / 2.0).max(self.config.noise_floor_m);
         let measurement = Measurement {
-            position: taking.source.alignment.correct(&reported),
+            position: self.sensor.registration.corrector()(&Vector2::new(pose.x_m, pose.y_m)),
             independent: Matrix2::identity() * (sigma_m * sigma_m),
             common_m: self.config.common_m,
         };
-        let (density, number, at) = (self.config.density(), taking.number, taking.at);
-        let known = self.own.get(&number).copied();
+        let (density, vehicle, at) = (self.config.density(), self.sensor.id, self.at);
+        let known = self.tracks.of_vehicle(vehicle);
         let is_in_reach = known.is_some_and(|track| {
-            let innovation = self.tracks[track as usize].motion.innovation(at, &measurement, density);
+            let innovation = self.tracks[track].state.innovation(at, &measurement, density);
             innovation.offset.norm() <= self.config.gate_m || innovation.distance_squared <= self.config.gate()
         });
-        let track = match known {
-            Some(track) => track as usize,
-            None => {
-                let id = founding_id(taking.report, usize::MAX);
-                let Some(track) = self.add(Track::new(id, at, &measurement, &self.config)) else { return };
-                track
-            }
-        };
-        self.own.insert(number, track as u32);
-        let track = &mut self.tracks[track];
-        track.vehicle = Some(number);
+        let spawn = || Track::new(track_id(self.report, usize::MAX), at, &measurement, self.config);
+        let Some(index) = known.or_else(|| self.tracks.add(spawn())) else { return };
+        self.tracks.set_vehicle(index, vehicle);
+        let track = &mut self.tracks[index];
         if is_in_reach {
-            track.motion.update(at, &measurement, density);
-            track.motion.limit_speed(self.config.max_speed_mps);
-        } else if at >= track.motion.at {
-            // New, or somewhere else all at once, where nobody else can have seen it before.
-            track.motion = Motion::new(at, &measurement, self.config.speed_mps);
-            track.witnesses.clear();
+            track.state.update(at, &measurement, density);
+            track.state.limit_speed(self.config.max_speed_mps);
+        } else if at >= track.state.at {
+            // The vehicle is new or has jumped; no other vehicle can have seen it here before.
+            track.state = KinematicState::new(at, &measurement, self.config.speed_mps);
+            track.history.clear();
         }
-        track.refresh(at);
-        self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        if let Some(witness) = track.witnesses.detecting(number, at) {
-            witness.hit(at, measurement.position, SELF_NATS, UNKNOWN, true);
+        track.record_hit(at);
+        if let Some(history) = track.history.for_hit(vehicle, at) {
+            history.hit(at, measurement.position, OWN_NATS, Some(DetectionRates::PRIOR));
         }
+        self.tracks.note_speed(index);
     }
 
-    /// The report's detections, corrected; those of the vehicle itself are left out.
-    fn seen<'a>(&self, taking: &Taking<'a>) -> Vec<Seen<'a>> {
-        let Taking { source, report, trust, .. } = taking;
-        let own = report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
-        let trust = trust.max(LEAST_TRUST);
-        let correct = source.alignment.correction();
-        let seen = |(index, object): (usize, &'a PerceivedObject)| {
+    /// The report's detections, but for those of the vehicle itself.
+    fn detections(&self) -> Vec<Detection<'a>> {
+        let own = self.report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
+        let trust = self.trust.max(MIN_TRUST);
+        let correct = self.sensor.registration.corrector();
+        let detection = |(index, object): (usize, &'a PerceivedObject)| {
             let reported = Vector2::new(object.x_m, object.y_m);
             let is_itself = own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
             let measurement = Measurement {
                 position: correct(&reported),
-                independent: source.noise.covariance(object, &self.config) / trust,
+                independent: self.sensor.noise.covariance(object, self.config) / trust,
                 common_m: self.config.common_m,
             };
-            (!is_itself).then(|| Seen { index, object, log_odds: log_odds(object.confidence), reported, measurement })
+            let log_odds = log_odds(object.confidence);
+            (!is_itself).then_some(Detection { index, object, log_odds, reported, measurement })
         };
-        let mut all = Vec::with_capacity(report.objects.len());
-        all.extend(report.objects.iter().enumerate().filter_map(seen));
-        all
+        let mut detections = Vec::with_capacity(self.report.objects.len());
+        detections.extend(self.report.objects.iter().enumerate().filter_map(detection));
+        detections
     }
 
-    /// Which detections are which objects: within the gate, and the likeliest for all together.
-    fn associate(&self, number: u32, seen: &[Seen<'_>], at: Timestamp) -> Vec<Pairing> {
-        let gate = self.config.gate();
-        let density = self.config.density();
-        let gate_m_squared = self.config.gate_m.powi(2);
-        let reach_m = self.config.gate_m + self.slack_m(at);
-        let mut pairings = Vec::with_capacity(2 * seen.len());
-        for (detection, seen) in seen.iter().enumerate() {
-            let alone = seen.measurement.independent.trace() / 2.0 + self.config.common_m.powi(2);
-            self.grid.around(&seen.measurement.position, reach_m, |point| {
-                let track = &self.tracks[point.number as usize];
-                let offset = seen.measurement.position - track.motion.position_at(at);
-                if track.vehicle == Some(number) || offset.norm_squared() > gate_m_squared {
-                    return;
-                }
-                let innovation = track.motion.innovation(at, &seen.measurement, density);
-                if innovation.distance_squared > gate {
-                    return;
-                }
-                let likeness = track.likeness(seen.object);
-                let spread = innovation.covariance.determinant().sqrt() / alone;
-                let maturity = f64::from(track.hits.clamp(1, 10));
-                let benefit = gate - innovation.distance_squared + (maturity * likeness.powi(2) / spread).ln();
-                if benefit > 0.0 || likeness > OTHER_LABEL {
-                    let benefit = benefit.max(0.01);
-                    pairings.push(Pairing { detection: detection as u32, track: point.number, benefit });
-                }
-            });
-        }
-        assign(pairings)
-    }
-
-    /// The same for what is left and goes too fast for that: objects that are so new that their velocity may be any.
-    fn associate_fast(&mut self, source: &Source, seen: &[Seen<'_>], at: Timestamp, chosen: &mut Vec<Pairing>) {
-        if chosen.len() == seen.len() {
-            return;
-        }
-        let speed_mps = self.config.max_speed_mps;
-        let reach_m = speed_mps * FAST_WITHIN.as_secs_f64() + self.slack_m(at);
-        let mut continued: Vec<u32> = chosen.iter().map(|pairing| pairing.track).collect();
-        continued.sort_unstable();
-        let mut matched = chosen.iter().map(|pairing| pairing.detection as usize).peekable();
-        let left = seen.iter().enumerate().filter(|(detection, _)| matched.next_if_eq(detection).is_none());
-        let is_likely = source.calibration.likely();
-        let likely = left.filter(|(_, seen)| is_likely(seen.object.confidence));
-        let mut pairings = Vec::new();
-        for (detection, seen) in likely.take(MOST_FAST) {
-            self.grid.around(&seen.measurement.position, reach_m, |&Point { number: track, .. }| {
-                if continued.binary_search(&track).is_err()
-                    && let Some(benefit) = self.benefit_if_fast(&self.tracks[track as usize], seen, at)
-                {
-                    pairings.push(Pairing { detection: detection as u32, track, benefit });
-                }
-            });
-        }
-        for pairing in assign(pairings) {
-            self.tracks[pairing.track as usize].motion.doubt_velocity(speed_mps / 2.0);
-            chosen.push(pairing);
-        }
-        chosen.sort_by_key(|pairing| pairing.detection);
-    }
-
-    /// What it is worth to take a detection for a new object of whatever velocity; `None` if it cannot be.
-    fn benefit_if_fast(&self, track: &Track, seen: &Seen<'_>, at: Timestamp) -> Option<f64> {
-        let passed = at.since(track.last_seen);
-        let is_new = track.hits < SURE_HITS && track.vehicle.is_none();
-        let offset = seen.measurement.position - track.motion.position_at(at);
-        let speed_mps = self.config.max_speed_mps;
-        if !is_new || passed > FAST_WITHIN || offset.norm() > speed_mps * passed.as_secs_f64() {
-            return None;
-        }
-        let likeness = track.likeness(seen.object);
-        let mut motion = track.motion.clone();
-        motion.doubt_velocity(speed_mps / 2.0);
-        let innovation = motion.innovation(at, &seen.measurement, self.config.density());
-        let is_possible = innovation.distance_squared <= self.config.gate() && likeness > OTHER_LABEL;
-        is_possible.then(|| (self.config.gate() - innovation.distance_squared + 2.0 * likeness.ln()).max(0.01))
-    }
-
-    /// An object was detected again.
-    fn confirm(&mut self, taking: &mut Taking<'_>, shadows: &Shadows, track: u32, seen: &Seen<'_>) {
-        let Taking { number, source, at, trust, sightings, .. } = taking;
-        let (number, at, is_trusted, config) = (*number, *at, *trust > 0.0, &self.config);
-        let index = track as usize;
+    /// Updates a track with its detection, and the sensor model with what the track tells of it.
+    fn update_track(&mut self, index: TrackIndex, detection: &Detection<'_>) {
+        let (id, at, density) = (self.sensor.id, self.at, self.config.density());
+        let Detection { object, reported, measurement, .. } = detection;
         let track = &mut self.tracks[index];
-        let density = config.density();
-        if track.hits >= MATURE_HITS && track.vehicle.is_none() {
-            let offset = seen.measurement.position - track.motion.position_at(at);
-            let expected = track.motion.covariance_at(at, density).trace();
-            source.noise.learn(seen.object, offset.norm_squared(), expected, config);
+        let is_vehicle = track.vehicle.is_some();
+        if track.hits >= MATURE_HITS && !is_vehicle {
+            let offset = measurement.position - track.state.position_at(at);
+            let expected = track.state.covariance_at(at, density).trace();
+            self.sensor.noise.learn(object, offset.norm_squared(), expected, self.config);
         }
-        if track.hits >= SURE_HITS && track.vehicle.is_none() {
-            let variance = seen.measurement.independent.trace() / 2.0;
-            sightings.push(Sighting { track: index as u32, reported: seen.reported, variance });
+        if track.hits >= ESTABLISHED_HITS && !is_vehicle {
+            let variance = measurement.independent.trace() / 2.0;
+            self.outcome.samples.push(RegistrationSample { track: index, reported: *reported, variance });
         }
-        let rates = source.view.rates_at(&seen.reported).filter(|_| !shadows.hide(&seen.reported));
-        let witness = track.witnesses.get(number);
-        let is_heard = witness.is_some() || track.witnesses.hears(number, at);
-        let last = witness.filter(|witness| witness.was_hit).map(|witness| witness.log_odds);
-        let was_hit = last.is_some();
-        let is_sure = track.hits >= SURE_HITS && (was_hit || track.is_confirmed(number, at));
-        if rates.is_some() && is_sure && is_heard {
-            source.view.learn(&seen.reported, was_hit, true);
+        let rates = self.sensor.coverage.rates_at(reported).filter(|_| !self.occlusion.hides(reported));
+        let history = track.history.get(id);
+        let has_room = history.is_some() || track.history.has_room(id, at);
+        let last_hit = history.filter(|history| history.was_hit).map(|history| history.confidence_log_odds);
+        let was_hit = last_hit.is_some();
+        let exists = track.hits >= ESTABLISHED_HITS && (was_hit || track.is_confirmed(id, at));
+        if rates.is_some() && exists && has_room {
+            self.sensor.coverage.learn(reported, was_hit, true);
         }
-        if is_trusted {
-            track.motion.update(at, &seen.measurement, density);
-            describe(track, source, seen, at, config);
+        if self.trust > 0.0 {
+            track.state.update(at, measurement, density);
+            detection.describe(track, self.sensor, at, self.config);
         }
-        self.fastest_mps = self.fastest_mps.max(track.motion.velocity.norm());
-        if let Some(log_odds) = last {
-            source.calibration.learn(log_odds, true);
+        if let Some(log_odds) = last_hit {
+            self.sensor.calibration.learn(log_odds, true);
         }
-        let nats = source.calibration.nats(seen.log_odds);
-        let seat = if is_trusted { track.witnesses.detecting(number, at) } else { track.witnesses.looking(number, at) };
-        let Some(witness) = seat else { return };
-        witness.hit(at, seen.measurement.position, nats, rates.unwrap_or(UNKNOWN), true);
-        witness.log_odds = seen.log_odds;
-        if let Some(said) = witness.settled(at) {
-            self.settle(taking, index, &seen.reported, said);
+        let nats = self.sensor.calibration.nats(detection.log_odds);
+        let slot = if self.trust > 0.0 { track.history.for_hit(id, at) } else { track.history.for_look(id, at) };
+        let due = slot.and_then(|history| {
+            history.hit(at, measurement.position, nats, Some(rates.unwrap_or(DetectionRates::PRIOR)));
+            history.confidence_log_odds = detection.log_odds;
+            history.take_due(at)
+        });
+        self.tracks.note_speed(index);
+        if let Some(statement) = due {
+            self.judge(index, reported, statement);
         }
     }
 
-    /// What is in the vehicle's view, where the index has it, and is none of the `detected`, by number: what the round's
-    /// reports moved it by does not matter, unless it is somewhere else all at once.
-    fn look(&mut self, taking: &mut Taking<'_>, shadows: &Shadows, detected: &[u32]) {
-        let (number, at) = (taking.number, taking.at);
-        let Some(centre) = taking.source.view.centre() else { return };
-        let reach_m = taking.source.view.reach_m() + self.slack_m(at);
-        let since_indexed_s = at.micros_from(self.indexed_at) as f64 * 1e-6;
+    /// Counts a miss for every track in the vehicle's view that is not among the `detected`.
+    fn count_misses(&mut self, detected: &[TrackIndex]) {
+        let (id, at) = (self.sensor.id, self.at);
+        let Some(centre) = self.sensor.coverage.centre() else { return };
+        // Positions are those of the index, so that updates of the same round make no difference.
+        let since_indexed_s = self.tracks.seconds_since_indexed(at);
         let mut in_view = Vec::new();
-        self.grid.around(&centre, reach_m, |point| {
-            let position = point.at + point.velocity * since_indexed_s;
-            if detected.binary_search(&point.number).is_err()
-                && let Some(rates) = taking.source.view.rates_at(&position).filter(|_| !shadows.hide(&position))
+        let reach_m = self.sensor.coverage.range_m() + self.tracks.slack_m(at);
+        self.tracks.near(&centre, reach_m, |indexed| {
+            let position = indexed.position + indexed.velocity * since_indexed_s;
+            if detected.binary_search(&indexed.track).is_err()
+                && let Some(rates) =
+                    self.sensor.coverage.rates_at(&position).filter(|_| !self.occlusion.hides(&position))
             {
-                in_view.push((point.number, position, rates));
+                in_view.push((indexed.track, position, rates));
             }
         });
-        for (candidate, position, rates) in in_view {
-            let track = &mut self.tracks[candidate as usize];
-            let has_gone_elsewhere = (track.motion.position_at(at) - position).norm() > self.config.gate_m;
-            if track.vehicle == Some(number) || has_gone_elsewhere {
+        for (index, position, rates) in in_view {
+            let track = &mut self.tracks[index];
+            let has_jumped = (track.state.position_at(at) - position).norm() > self.config.gate_m;
+            if track.vehicle == Some(id) || has_jumped {
                 continue;
             }
-            let witness = track.witnesses.get(number);
-            if witness.map_or(!track.witnesses.hears(number, at), |witness| witness.last_look >= at) {
+            let history = track.history.get(id);
+            if history.map_or(!track.history.has_room(id, at), |history| history.last_look >= at) {
                 continue;
             }
-            let was_hit = witness.is_some_and(|witness| witness.was_hit);
-            if let Some(witness) = witness.filter(|witness| witness.was_hit) {
-                taking.source.calibration.learn(witness.log_odds, false);
+            let was_hit = history.is_some_and(|history| history.was_hit);
+            if let Some(history) = history.filter(|history| history.was_hit) {
+                self.sensor.calibration.learn(history.confidence_log_odds, false);
             }
-            let knew_it = witness.is_some_and(|witness| witness.last_hit.is_some());
-            let dt_s = witness.map_or(0.0, |witness| at.since(witness.last_look).as_secs_f64());
-            if track.hits >= SURE_HITS && (was_hit || track.is_confirmed(number, at)) {
-                taking.source.view.learn(&position, was_hit, false);
+            let had_detected = history.is_some_and(|history| history.last_hit.is_some());
+            let dt_s = history.map_or(0.0, |history| at.since(history.last_look).as_secs_f64());
+            if track.hits >= ESTABLISHED_HITS && (was_hit || track.is_confirmed(id, at)) {
+                self.sensor.coverage.learn(&position, was_hit, false);
             }
-            let settled = track.witnesses.looking(number, at).and_then(|witness| {
-                witness.miss(at, rates);
-                witness.settled(at)
+            let due = track.history.for_look(id, at).and_then(|history| {
+                history.miss(at, rates);
+                history.take_due(at)
             });
-            if knew_it && taking.trust > 0.0 {
-                track.overlooked(at, dt_s, rates.of(was_hit));
+            if had_detected && self.trust > 0.0 {
+                track.record_miss(at, dt_s, rates.after(was_hit));
             }
-            if let Some(said) = settled {
-                self.settle(taking, candidate as usize, &position, said);
+            if let Some(statement) = due {
+                self.judge(index, &position, statement);
             }
         }
     }
 
-    /// Holds what the vehicle `said` of an object for a while, (hits, looks), against the others' word.
-    fn settle(&mut self, taking: &mut Taking<'_>, track: usize, reported: &Vector2<f64>, said: (u32, u32)) {
-        let (number, at) = (taking.number, taking.at);
-        let track = &self.tracks[track];
-        let source = |number: u32| self.sources.get(number as usize).and_then(Option::as_ref);
-        let trust = |other: u32| source(other).map_or(0.0, |source| source.trust(&self.reputation));
-        let others = Others::of(&track.witnesses, number, at, trust);
-        let Some(word) = judge(said, &others) else { return };
-        let distance_m = taking.source.view.centre().map_or(0.0, |centre| (reported - centre).norm());
-        if word != Word::Invented {
-            self.fleet.learn(distance_m, word == Word::True);
-        }
-        if word == Word::Denied && !self.fleet.expects(distance_m) {
-            return;
-        }
-        let correct = word == Word::True;
-        taking.source.standing.count(correct, &self.reputation);
-        if at >= self.recorded_from {
-            self.evidence.push(Evidence {
-                node: taking.source.node.clone(),
-                label: track.label(&self.config),
-                correct,
-            });
-        }
+    /// Judges the vehicle's statement about a track by the evidence of the others.
+    fn judge(&mut self, index: TrackIndex, reported: &Vector2<f64>, statement: Statement) {
+        let track = &self.tracks[index];
+        let distance_m = self.sensor.coverage.centre().map_or(0.0, |centre| (reported - centre).norm());
+        let judgement = self.fleet.judge(self.sensor.id, statement, &track.history, distance_m, self.at);
+        let Some(judgement) = judgement else { return };
+        let correct = judgement == Judgement::Correct;
+        self.fleet.count(self.sensor.id, &mut self.sensor.counts, correct);
+        let label = track.label(self.config);
+        self.outcome.evidence.push(Evidence { node: self.sensor.node.clone(), label, correct });
     }
 
-    /// A detection that is none of the known objects is a new one.
-    fn found(&mut self, taking: &Taking<'_>, seen: &Seen<'_>) {
-        let (number, at) = (taking.number, taking.at);
-        let mut track = Track::new(founding_id(taking.report, seen.index), at, &seen.measurement, &self.config);
-        describe(&mut track, taking.source, seen, at, &self.config);
-        let nats = taking.source.calibration.nats(seen.log_odds);
-        if let Some(witness) = track.witnesses.detecting(number, at) {
-            witness.hit(at, seen.measurement.position, nats, UNKNOWN, false);
-            witness.log_odds = seen.log_odds;
+    /// Spawns a track from a detection that no track explains.
+    fn spawn(&mut self, detection: &Detection<'_>) {
+        let (id, at) = (track_id(self.report, detection.index), self.at);
+        let mut track = Track::new(id, at, &detection.measurement, self.config);
+        detection.describe(&mut track, self.sensor, at, self.config);
+        let nats = self.sensor.calibration.nats(detection.log_odds);
+        if let Some(history) = track.history.for_hit(self.sensor.id, at) {
+            history.hit(at, detection.measurement.position, nats, None);
+            history.confidence_log_odds = detection.log_odds;
         }
-        self.add(track);
+        self.tracks.add(track);
     }
 }
 
-/// Takes over what a detection says beside its place.
-fn describe(track: &mut Track, source: &Source, seen: &Seen<'_>, at: Timestamp, config: &TracksConfig) {
-    if let Some([x, y]) = seen.object.velocity_mps {
-        let velocity = source.alignment.turned(&Vector2::new(x, y));
-        track.motion.update_velocity(at, velocity, VELOCITY_SIGMA_MPS, config.density());
+impl Detection<'_> {
+    /// Updates velocity, attributes and time of a track.
+    fn describe(&self, track: &mut Track, sensor: &SensorModel, at: Timestamp, config: &TracksConfig) {
+        if let Some([x, y]) = self.object.velocity_mps {
+            let velocity = sensor.registration.correct_velocity(&Vector2::new(x, y));
+            track.state.update_velocity(at, velocity, VELOCITY_SIGMA_MPS, config.density());
+        }
+        track.state.limit_speed(config.max_speed_mps);
+        let heading_rad = self.object.heading_rad.map(|heading_rad| sensor.registration.correct_heading(heading_rad));
+        track.update_attributes(self.object, heading_rad);
+        track.record_hit(at);
     }
-    track.motion.limit_speed(config.max_speed_mps);
-    let heading_rad = seen.object.heading_rad.map(|heading_rad| source.alignment.correct_heading(heading_rad));
-    track.describe(seen.object, heading_rad);
-    track.refresh(at);
-}
-
-/// The same for whoever hears of the founding detection: FNV-1a of 128 bits over what names it
-/// (draft-eastlake-fnv), as a UUID of version 8.
-fn founding_id(report: &ObjectReport, index: usize) -> Uuid {
-    const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
-    const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
-    let numbers = [report.captured_at_us.micros(), report.seq, index as u64];
-    let bytes = report.node.as_str().bytes().chain([0]).chain(numbers.into_iter().flat_map(u64::to_be_bytes));
-    let hash = bytes.fold(OFFSET, |hash, byte| (hash ^ u128::from(byte)).wrapping_mul(PRIME));
-    Uuid::new_v8(hash.to_be_bytes())
 }
