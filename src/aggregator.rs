@@ -28,7 +28,7 @@ use crate::pace::Pace;
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
-use crate::tracks::{Tracker, TracksLosses, TracksMode, TracksRound};
+use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::window::{Admitted, ReportWindow};
 use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};

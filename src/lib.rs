@@ -8,6 +8,7 @@
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
 pub mod aggregator;
+pub mod association;
 pub mod camera;
 pub mod config;
 pub mod delay;
@@ -24,7 +25,7 @@ pub mod replay;
 pub mod reputation;
 pub mod round;
 pub mod time;
-pub mod tracks;
+pub mod tracking;
 pub mod view;
 pub mod vote;
 pub mod window;

@@ -27,7 +27,7 @@ use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
 use crate::landmark::{Landmark, LandmarkConfig};
 use crate::names::{LandmarkId, NodeName};
 use crate::time::Timestamp;
-use crate::tracks::TracksLosses;
+use crate::tracking::TracksLosses;
 use crate::vote::MAX_LABELS;
 use crate::wire::{Limits, ObjectReport, RejectReason, ReportKind};
 use clock::VirtualClock;

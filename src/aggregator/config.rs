@@ -6,7 +6,7 @@ use crate::config::ConfigError;
 use crate::pace::PaceConfig;
 use crate::reputation::ReputationConfig;
 use crate::round::RoundConfig;
-use crate::tracks::{TracksConfig, TracksMode};
+use crate::tracking::{TracksConfig, TracksMode};
 use crate::vote::VoteConfig;
 use crate::window::WindowConfig;
 

@@ -22,7 +22,7 @@ use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::replay::JournalEvent;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::TracksLosses;
+use ecod::tracking::TracksLosses;
 use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;

@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
         use ecod::aggregator::Algorithms::{Both, Pace};
-        use ecod::tracks::TracksMode::{Auto, Off, On};
+        use ecod::tracking::TracksMode::{Auto, Off, On};
         let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
         for (algorithms, mode, landmarks, expected) in [
             (Both, Off, vec![], true),

@@ -1,11 +1,12 @@
-//! Vehicles that invent or hide objects.
+//! Vehicles that fabricate or hide objects.
 
 use super::*;
-use crate::tracks::trust::{Standing, Standings};
-use crate::tracks::witnesses::Witnesses;
+use crate::tracking::detection_history::DetectionHistory;
+use crate::tracking::sensors::{SensorId, Sensors};
+use crate::tracking::trust::{DormantCounts, TrustCounts};
 
 #[test]
-fn whoever_invents_or_hides_objects_loses_its_standing() {
+fn whoever_fabricates_or_hides_objects_loses_its_trust() {
     let mut tracker = tracker();
     let counts = liars(&mut tracker);
     for honest in ["a", "b", "c", "d"] {
@@ -39,11 +40,14 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
 
 #[test]
 fn whoever_sees_an_object_is_heard_before_those_who_overlook_it() {
-    let mut witnesses = Witnesses::default();
-    let taken = (0..100).filter(|vehicle| witnesses.looking(*vehicle, at(0)).is_some()).count();
-    assert!(taken < 100 && witnesses.looking(100, at(1)).is_none());
-    assert!(witnesses.detecting(100, at(1)).is_some());
-    assert!(witnesses.hears(100, at(1)) && !witnesses.hears(0, at(1)));
+    let mut sensors = Sensors::new(ReputationConfig::default());
+    let mut id = |n: u32| sensors.hear(&name(&format!("v{n}")), at(0), &TracksConfig::default()).0.id;
+    let ids: Vec<SensorId> = (0..=100).map(&mut id).collect();
+    let mut history = DetectionHistory::default();
+    let with_slot = ids[..100].iter().filter(|id| history.for_look(**id, at(0)).is_some()).count();
+    assert!(with_slot < 100 && history.for_look(ids[100], at(1)).is_none());
+    assert!(history.for_hit(ids[100], at(1)).is_some());
+    assert!(history.has_room(ids[100], at(1)) && !history.has_room(ids[0], at(1)));
 }
 
 /// Four look straight at the place, and one that they otherwise agree with is sure that something is there.
@@ -68,15 +72,15 @@ fn one_sure_vehicle_does_not_outweigh_all_that_see_nothing() {
 }
 
 /// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
-/// says as much; of many others that nothing is known of.
+/// says as much; of many others nothing is known.
 #[test]
 fn a_liar_that_was_silent_is_still_a_liar() {
     let mut tracker = tracker();
     liars(&mut tracker);
     let mut round = tracker.close(at(400));
-    assert!(round.objects.is_empty() && tracker.numbers.is_empty(), "all are forgotten");
-    let strangers = (0..2 * Standings::MOST).map(|n| (name(&format!("z{n}")), Standing::default()));
-    tracker.standings.keep(strangers.collect::<Vec<_>>());
+    assert!(round.objects.is_empty() && tracker.sensors.iter().next().is_none(), "all are forgotten");
+    let strangers = (0..2 * DormantCounts::MAX).map(|n| (name(&format!("z{n}")), TrustCounts::default()));
+    tracker.sensors.dormant.keep(strangers.collect::<Vec<_>>());
     for frame in 400..420 {
         tracker.observe(report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
         tracker.observe(report("newcomer", frame, vec![car(50.0, 25.0)]), at(frame));
@@ -88,13 +92,13 @@ fn a_liar_that_was_silent_is_still_a_liar() {
 
 #[test]
 fn of_the_silent_those_are_forgotten_of_whom_least_is_known() {
-    let mut standings = Standings::default();
+    let mut dormant = DormantCounts::default();
     let config = ReputationConfig::default();
-    standings.keep([(name("liar"), Standing::new(0, 40, &config)), (name("hero"), Standing::new(40, 0, &config))]);
-    standings.keep((0..2 * Standings::MOST).map(|n| (name(&format!("a{n}")), Standing::new(1, 0, &config))));
-    assert_eq!((standings.of(&name("liar")).trust(&config), standings.of(&name("hero")).trust(&config)), (0.0, 1.0));
-    let known = (0..2 * Standings::MOST).filter(|n| standings.of(&name(&format!("a{n}"))) != Standing::default());
-    assert_eq!(known.count(), Standings::MOST - 2);
+    dormant.keep([(name("liar"), TrustCounts::new(0, 40, &config)), (name("hero"), TrustCounts::new(40, 0, &config))]);
+    dormant.keep((0..2 * DormantCounts::MAX).map(|n| (name(&format!("a{n}")), TrustCounts::new(1, 0, &config))));
+    assert_eq!((dormant.of(&name("liar")).trust(&config), dormant.of(&name("hero")).trust(&config)), (0.0, 1.0));
+    let known = (0..2 * DormantCounts::MAX).filter(|n| dormant.of(&name(&format!("a{n}"))) != TrustCounts::default());
+    assert_eq!(known.count(), DormantCounts::MAX - 2);
 }
 
 /// What VOTE has settled weighs in tracks too, as what the ledger says does.

@@ -3,18 +3,19 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::registration::BiasPrior;
 use crate::config::{ConfigError, check_range};
 use crate::names::Label;
 use crate::wire::is_label;
 
-/// Whether objects without a known place are tracked.
+/// Cells in which objects at no known location are tracked.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum TracksMode {
     /// In a cell without known locations.
     #[default]
     Auto,
-    /// Everywhere: whatever is not within PACE's gate of a known location.
+    /// Everywhere: objects that are not within PACE's gate of a known location.
     On,
     /// Nowhere.
     Off,
@@ -24,57 +25,54 @@ pub enum TracksMode {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct TracksConfig {
-    /// Whether objects are tracked: `auto`, the default, in a cell without known locations; `on`; `off`.
+    /// When objects are tracked: `auto`, the default, in a cell without known locations; `on`; `off`.
     pub mode: TracksMode,
-    /// Standard deviation in metres, in each direction, of positions reported without covariance, until it has been
-    /// learnt. Default 0.3.
+    /// Standard deviation in metres, in each direction, of positions reported without covariance, until it is learnt.
+    /// Default 0.3.
     pub noise_m: f64,
-    /// Least standard deviation in metres of any reported position. Default 0.1.
+    /// Minimum standard deviation in metres of any reported position. Default 0.1.
     pub noise_floor_m: f64,
-    /// Standard deviation in metres of what all positions of a vehicle may be off by together; it is never averaged
-    /// away. Default 0.2. More joins what vehicles with poor poses see, less tells closer objects apart.
+    /// Standard deviation in metres of the error that all positions of a vehicle may share; it is never averaged away.
+    /// Default 0.2. Trade-off: more merges what vehicles with poor poses see; less tells closer objects apart.
     pub common_m: f64,
-    /// Largest distance of a detection from its object in standard deviations. Default 3.5.
+    /// Maximum distance of a detection from its track in standard deviations. Default 3.5.
     pub gate_sigmas: f64,
-    /// Largest distance of a detection from its object in metres. Default 4.
+    /// Maximum distance of a detection from its track in metres. Default 4.
     pub gate_m: f64,
-    /// Change of velocity in metres per second that an object makes within a second. Default 2.2; more follows
-    /// manoeuvres, less smooths.
+    /// Standard deviation in metres per second of the change of velocity within a second. Default 2.2. Trade-off: more
+    /// follows manoeuvres; less smooths.
     pub manoeuvre_mps: f64,
     /// Standard deviation of an object's unknown velocity in metres per second, in each direction. Default 8.
     pub speed_mps: f64,
-    /// Highest speed in metres per second. Default 70.
+    /// Maximum speed in metres per second. Default 70.
     pub max_speed_mps: f64,
-    /// Time in seconds after its last detection for which an object is kept at most. Default 3.
+    /// Maximum time in seconds for which an object is kept after its last detection. Default 3.
     pub life_s: f64,
-    /// How late in seconds a report may be behind what has been fused already. Default 0.5; later ones are counted.
+    /// Maximum time in seconds of a report behind the latest that was fused. Default 0.5; later reports are counted.
     pub max_lag_s: f64,
-    /// Confidence at which a detection is as likely real as not. Default 0.3; it is learnt from there.
+    /// Confidence at which a detection is as likely real as not, until it is learnt. Default 0.3.
     pub even_confidence: f64,
-    /// Least confidence of an object that is published. Default 0.002: whoever needs certainty sets a limit of
-    /// its own.
+    /// Minimum confidence of a published object. Default 0.002: users that need certainty set a limit of their own.
     pub min_confidence: f64,
-    /// Distance in metres from a vehicle's pose within which it sees itself, and others see it. Default 1.5.
+    /// Distance in metres from a vehicle's pose within which it detects itself, and others detect it. Default 1.5.
     pub vehicle_radius_m: f64,
-    /// What a vehicle is called that nobody else has seen. Default `car`: the label that the cell's detectors give
-    /// vehicles.
+    /// Label of a vehicle that no other has detected. Default `car`: the label that the cell's detectors give vehicles.
     pub vehicle_label: Label,
-    /// Whether offsets and rotations of vehicles' poses, and delays of their stamps, are estimated and corrected. Default
-    /// true.
+    /// Estimation and correction of the offsets and rotations of vehicles' poses, and of the delays of their stamps.
+    /// Default true.
     pub align: bool,
     /// Standard deviation in metres of a pose's offset. Default 0.5.
     pub align_offset_m: f64,
     /// Standard deviation in radians of a pose's rotation. Default 0.01.
     pub align_heading_rad: f64,
-    /// Standard deviation in seconds by which a vehicle's stamps are late or early, beyond what its clock is known to be
-    /// off by; three times as much is corrected at most. Default 0.02.
+    /// Standard deviation in seconds of the delay of a vehicle's stamps, beyond the known offset of its clock. Default
+    /// 0.02. At most three times as much is corrected.
     pub align_delay_s: f64,
-    /// Time in seconds over which errors of a pose change. Default 10.
+    /// Time constant in seconds of the errors of a pose. Default 10.
     pub align_memory_s: f64,
-    /// Most objects kept at once. Default 20000.
+    /// Maximum number of objects. Default 20000.
     pub max_tracks: usize,
-    /// Most objects kept in a square with `gate_m` as side. Default 16: an area holds no more than that, whatever is
-    /// claimed.
+    /// Maximum number of objects in a square with `gate_m` as side. Default 16: reports cannot claim more in an area.
     pub max_density: usize,
 }
 
@@ -137,7 +135,7 @@ impl TracksConfig {
         check_range("max_density", self.max_density as f64, 1.0, 1e4)
     }
 
-    /// Largest squared Mahalanobis distance of a detection from its object.
+    /// Maximum squared Mahalanobis distance of a detection from its track.
     pub(super) fn gate(&self) -> f64 {
         self.gate_sigmas * self.gate_sigmas
     }
@@ -145,5 +143,15 @@ impl TracksConfig {
     /// Density of the white noise acceleration, m²/s³.
     pub(super) fn density(&self) -> f64 {
         self.manoeuvre_mps * self.manoeuvre_mps
+    }
+
+    /// Standard deviations of pose errors at rest.
+    pub(super) fn bias_prior(&self) -> BiasPrior {
+        BiasPrior {
+            offset_m: self.align_offset_m,
+            heading_rad: self.align_heading_rad,
+            delay_s: self.align_delay_s,
+            memory_s: self.align_memory_s,
+        }
     }
 }

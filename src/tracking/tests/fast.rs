@@ -75,16 +75,16 @@ fn a_car_that_all_have_seen_for_long_is_still_there_a_moment_later() {
 
 #[test]
 fn a_glimpse_of_something_far_away_widens_no_view() {
-    let mut view = View::default();
+    let mut coverage = Coverage::default();
     let mut objects: Vec<_> = (0..20).map(|n| car(f64::from(n), 0.0)).collect();
-    assert!(!view.observe(&report("euclid", 0, objects.clone())));
+    assert!(!coverage.observe(&report("euclid", 0, objects.clone())));
     objects.push(car(1e6, 0.0));
-    assert!(!view.observe(&report("euclid", 1, objects)), "the vehicle is where it was");
-    assert!(view.reach_m() < 30.0, "{}", view.reach_m());
+    assert!(!coverage.observe(&report("euclid", 1, objects)), "the vehicle is where it was");
+    assert!(coverage.range_m() < 30.0, "{}", coverage.range_m());
     let stated = ObjectReport {
         view: Some(FieldOfView { range_m: 100.0, angle_rad: 1.0 }),
         ..report("euclid", 2, (0..20).map(|n| car(f64::from(n), 0.0)).collect())
     };
-    view.observe(&stated);
-    assert!(view.reach_m() < 30.0, "a view without a pose says nothing of where it is");
+    coverage.observe(&stated);
+    assert!(coverage.range_m() < 30.0, "a view without a pose says nothing of where it is");
 }

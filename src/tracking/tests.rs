@@ -12,11 +12,12 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use uuid::Uuid;
 
-use super::motion::{Measurement, Motion};
-use super::source::View;
+use super::coverage::Coverage;
+use super::kinematics::{KinematicState, Measurement};
 use super::*;
 use crate::geometry::Covariance;
-use crate::wire::{FieldOfView, GlobalMap, SCHEMA_VERSION, WirePose};
+use crate::reputation::ReputationConfig;
+use crate::wire::{FieldOfView, GlobalMap, ObjectReport, PerceivedObject, SCHEMA_VERSION, WirePose};
 
 const START: Timestamp = Timestamp(1_732_154_400_000_000);
 
@@ -40,7 +41,7 @@ fn tracker() -> Tracker {
     Tracker::new(TracksConfig::default(), ReputationConfig::default())
 }
 
-/// What is published with more than even confidence.
+/// Objects with a confidence above 0.5.
 fn sure(round: &TracksRound) -> Vec<&FusedObject> {
     round.objects.iter().filter(|object| object.confidence > 0.5).collect()
 }
@@ -161,7 +162,7 @@ fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
 
 /// A vehicle's first pose counts once: half of what a second one says.
 #[test]
-fn the_pose_that_founds_a_track_is_not_counted_twice() {
+fn the_pose_that_spawns_a_track_is_not_counted_twice() {
     let mut tracker = tracker();
     for frame in 0..2 {
         let pose = Some(WirePose { x_m: frame as f64, y_m: 0.0, heading_rad: 0.0 });
@@ -180,14 +181,14 @@ fn the_pose_that_founds_a_track_is_not_counted_twice() {
 
 #[test]
 fn what_is_said_of_velocities_is_never_taken_for_better_than_one_of_them_says() {
-    let mut motion = Motion::new(at(5), &measurement(), 8.0);
+    let mut state = KinematicState::new(at(5), &measurement(), 8.0);
     let said = Vector2::new(10.0, 0.0);
     for _ in 0..1000 {
-        motion.update_velocity(at(5), said, 1.0, 4.0);
+        state.update_velocity(at(5), said, 1.0, 4.0);
     }
-    assert!((motion.velocity_covariance().trace() / 2.0 - 1.0).abs() < 1e-9);
-    assert!((motion.velocity.x - 10.0).abs() < 0.5);
-    let mut late = Motion::new(at(5), &measurement(), 8.0);
+    assert!((state.velocity_covariance().trace() / 2.0 - 1.0).abs() < 1e-9);
+    assert!((state.velocity.x - 10.0).abs() < 0.5);
+    let mut late = KinematicState::new(at(5), &measurement(), 8.0);
     late.update_velocity(at(0), said, 1.0, 4.0);
     assert!((late.velocity_covariance().trace() / 2.0 - 3.0).abs() < 1e-9, "half a second ago is less sure");
 }
@@ -241,25 +242,27 @@ fn a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m: f64) {
 
 #[test]
 fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
-    let mut view = View::default();
+    let mut coverage = Coverage::default();
     let place = |x_m: f64| vec![car(x_m - 20.0, 0.0), car(x_m + 20.0, 0.0)];
     for frame in 0..10 {
-        assert!(!view.observe(&report("euclid", frame, place(0.0))));
+        assert!(!coverage.observe(&report("euclid", frame, place(0.0))));
     }
-    assert!(view.observe(&report("euclid", 10, place(5_000.0))));
-    assert!((view.reach_m() - 20.0).abs() < 1e-9, "{}", view.reach_m());
-    assert!(view.rates_at(&Vector2::new(4_990.0, 0.0)).is_some());
-    assert!(view.rates_at(&Vector2::new(10.0, 0.0)).is_none());
+    assert!(coverage.observe(&report("euclid", 10, place(5_000.0))));
+    assert!((coverage.range_m() - 20.0).abs() < 1e-9, "{}", coverage.range_m());
+    assert!(coverage.rates_at(&Vector2::new(4_990.0, 0.0)).is_some());
+    assert!(coverage.rates_at(&Vector2::new(10.0, 0.0)).is_none());
 }
 
 #[test]
 fn a_view_has_its_stated_angle_and_no_more_than_all_around() {
     let sees = |angle_rad: f64, bearing_rad: f64| {
-        let mut view = View::default();
+        let mut coverage = Coverage::default();
         let pose = Some(WirePose { x_m: 10.0, y_m: -5.0, heading_rad: 2.0 });
         let stated = Some(FieldOfView { range_m: 50.0, angle_rad });
-        view.observe(&ObjectReport { pose, view: stated, ..report("euclid", 0, vec![]) });
-        view.rates_at(&(Vector2::new(10.0, -5.0) + Vector2::new(bearing_rad.cos(), bearing_rad.sin()) * 20.0)).is_some()
+        coverage.observe(&ObjectReport { pose, view: stated, ..report("euclid", 0, vec![]) });
+        coverage
+            .rates_at(&(Vector2::new(10.0, -5.0) + Vector2::new(bearing_rad.cos(), bearing_rad.sin()) * 20.0))
+            .is_some()
     };
     assert!(sees(1.0, 2.0) && sees(1.0, 2.45) && sees(1.0, 1.55));
     assert!(!sees(1.0, 2.55) && !sees(1.0, 1.45) && !sees(1.0, 5.1));

@@ -1,45 +1,46 @@
-//! What a vehicle's confidences are worth, learnt from which detections come again.
+//! Calibration of a vehicle's confidences, learnt from which detections recur.
 //!
-//! Nobody says which detections are real. But what is real is detected again at the next look, and what is not, less
-//! so, and the part that comes again rises with the confidence in much the same way for whatever detector: where
-//! [`EVEN_REHITS`] of the detections come again, about half are real. That confidence is found from rates by
-//! confidence, and the spread of the confidences above it gives their scale.
+//! There are no labels of real detections. But a real object is detected again at the next look more often than clutter,
+//! and the share that recurs rises with the confidence in much the same way for all detectors. Where [`EVEN_REHITS`] of
+//! the detections recur, about half are real: the even confidence. The spread of the confidences above it gives their
+//! scale.
 
-use super::evidence::logistic;
+use super::existence::logistic;
 
-/// Part of the detections that come again among those of which half are real.
+/// Share of detections that recur where half are real.
 const EVEN_REHITS: f64 = 0.62;
 
-/// Nats by which a detection is likelier real, where confidences spread as usual, for each nat of its log-odds.
+/// Log-odds of a real detection for each nat of its confidence's log-odds, at the usual spread of confidences.
 const SLOPE: f64 = 1.75;
 
-/// The usual distance of the median from the even confidence, among confidences above it, in nats.
+/// Usual distance of the median confidence above the even one from it, nats.
 const USUAL_SPREAD: f64 = 1.9;
 
-/// Departures from what was assumed that are within what scenes differ by: of the even confidence in nats, and of the
-/// logarithm of the spread. What goes beyond is the detector's.
+/// Deviation of the even confidence that differences between scenes explain, nats. More is due to the detector.
 const EVEN_TOLERANCE: f64 = 0.7;
+
+/// The same for the logarithm of the spread.
 const SPREAD_TOLERANCE: f64 = 0.5;
 
-/// Looks that the usual rates count as, in each bin.
+/// Number of looks that the usual rates count as in each bin.
 const PRIOR_LOOKS: f64 = 10.0;
 
-/// Looks in a bin beyond which earlier ones are forgotten.
+/// Number of looks in a bin beyond which earlier ones are forgotten.
 const MEMORY: f64 = 400.0;
 
-/// Looks after which the fit is made anew.
+/// Number of looks between two fits.
 const REFIT: u32 = 25;
 
 const BINS: usize = 24;
 const BIN_NATS: f64 = 0.4;
-const LOWEST_NATS: f64 = -4.8;
+const MIN_NATS: f64 = -4.8;
 
-/// See the module.
+/// Learnt relation between confidence and probability of one vehicle.
 #[derive(Debug, Clone)]
 pub(super) struct Calibration {
-    /// Detections that came again, and all, by log-odds of their confidence.
+    /// Numbers of detections that recurred, and of all, by log-odds of their confidence.
     bins: [(f64, f64); BINS],
-    /// Log-odds of the even confidence: as assumed, and as found.
+    /// Log-odds of the even confidence: assumed and learnt.
     assumed: f64,
     even: f64,
     slope: f64,
@@ -57,28 +58,28 @@ fn bounded(confidence: f64) -> f64 {
 }
 
 impl Calibration {
-    /// As if detections of `even_confidence` were as likely real as not.
+    /// A calibration that assumes the even confidence.
     pub(super) fn new(even_confidence: f64) -> Self {
         let assumed = log_odds(even_confidence);
         Self { bins: [(0.0, 0.0); BINS], assumed, even: assumed, slope: SLOPE, since_fit: 0 }
     }
 
-    /// Log-odds that a detection is real whose confidence has so many.
+    /// Log-odds that a detection is real, by the log-odds of its confidence.
     pub(super) fn nats(&self, log_odds: f64) -> f64 {
         (self.slope * (log_odds - self.even)).clamp(-4.0, 4.0)
     }
 
-    /// Whether detections of a confidence are likelier real than not.
+    /// A test for confidences of detections that are likelier real than not.
     pub(super) fn likely(&self) -> impl Fn(f64) -> bool + use<> {
         let even_confidence = logistic(self.even);
         move |confidence| bounded(confidence) > even_confidence
     }
 
-    /// A detection of so many log-odds came again at the next look, or did not.
-    pub(super) fn learn(&mut self, log_odds: f64, again: bool) {
-        let bin = (((log_odds - LOWEST_NATS) / BIN_NATS) as usize).min(BINS - 1);
+    /// Learns whether a detection recurred at the next look.
+    pub(super) fn learn(&mut self, log_odds: f64, has_recurred: bool) {
+        let bin = (((log_odds - MIN_NATS) / BIN_NATS) as usize).min(BINS - 1);
         let (rehits, looks) = &mut self.bins[bin];
-        *rehits += f64::from(u8::from(again));
+        *rehits += f64::from(u8::from(has_recurred));
         *looks += 1.0;
         let kept = (MEMORY / *looks).min(1.0);
         *rehits *= kept;
@@ -92,15 +93,15 @@ impl Calibration {
 
     fn fit(&mut self) {
         let total: f64 = self.bins.iter().map(|(_, looks)| looks).sum();
-        let median = self.quantile_above(f64::NEG_INFINITY).unwrap_or(self.assumed);
-        // From the surest detections down, until too few come again.
+        let median = self.median_above(f64::NEG_INFINITY).unwrap_or(self.assumed);
+        // From the highest confidence down, until too few recur.
         let mut above: Option<(f64, f64)> = None;
         let mut found = None;
         for (bin, (rehits, looks)) in self.bins.iter().enumerate().rev() {
             if *looks < 0.002 * total || *looks < 1.0 {
                 continue;
             }
-            let middle = LOWEST_NATS + BIN_NATS * (bin as f64 + 0.5);
+            let middle = MIN_NATS + BIN_NATS * (bin as f64 + 0.5);
             let rate = (rehits + PRIOR_LOOKS * self.usual(middle)) / (looks + PRIOR_LOOKS);
             if rate < EVEN_REHITS {
                 let (high, high_rate) = above.unwrap_or((middle + BIN_NATS, 1.0));
@@ -112,21 +113,21 @@ impl Calibration {
         }
         let lowest = above.map_or(self.assumed, |(lowest, _)| lowest);
         let even = found.unwrap_or_else(|| self.assumed.min(lowest - BIN_NATS)).min(median);
-        let spread = self.quantile_above(even).map_or(USUAL_SPREAD, |median| median - even);
+        let spread = self.median_above(even).map_or(USUAL_SPREAD, |median| median - even);
         let trust = total / (total + 10.0 * PRIOR_LOOKS);
         let wider = trust * (spread.max(0.1) / USUAL_SPREAD).ln();
-        self.even = self.assumed + beyond(even - self.assumed, EVEN_TOLERANCE);
-        self.slope = (SLOPE / beyond(wider, SPREAD_TOLERANCE).exp()).clamp(0.5, 8.0);
+        self.even = self.assumed + beyond_tolerance(even - self.assumed, EVEN_TOLERANCE);
+        self.slope = (SLOPE / beyond_tolerance(wider, SPREAD_TOLERANCE).exp()).clamp(0.5, 8.0);
     }
 
-    /// The rate of detections that come again as it usually is.
+    /// The usual share of detections that recur.
     fn usual(&self, log_odds: f64) -> f64 {
         0.92 / (1.0 + (-(1.6 * (log_odds - self.assumed) + 0.75)).exp())
     }
 
     /// The median of all log-odds above a limit.
-    fn quantile_above(&self, limit: f64) -> Option<f64> {
-        let middle = |bin: usize| LOWEST_NATS + BIN_NATS * (bin as f64 + 0.5);
+    fn median_above(&self, limit: f64) -> Option<f64> {
+        let middle = |bin: usize| MIN_NATS + BIN_NATS * (bin as f64 + 0.5);
         let above = || self.bins.iter().enumerate().filter(|(bin, _)| middle(*bin) > limit);
         let half = above().map(|(_, (_, looks))| looks).sum::<f64>() / 2.0;
         let mut sum = 0.0;
@@ -137,7 +138,7 @@ impl Calibration {
     }
 }
 
-/// A departure, unless it is within the tolerance.
-fn beyond(departure: f64, tolerance: f64) -> f64 {
-    departure * (1.0 - (-(departure / tolerance).powi(2)).exp())
+/// A deviation, reduced to almost nothing within the tolerance.
+fn beyond_tolerance(deviation: f64, tolerance: f64) -> f64 {
+    deviation * (1.0 - (-(deviation / tolerance).powi(2)).exp())
 }
