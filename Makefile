@@ -92,7 +92,7 @@ recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
 	python3 -m venv $(BUILD)/recording-venv
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap
-	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --nocapture python
+	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --include-ignored --nocapture python
 
 live-check: setup ## record with the feature foxglove, and look on as Foxglove does
 	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test recording
@@ -108,7 +108,7 @@ python-check: PACKAGES += mosquitto-clients python3-venv
 python-check: setup ## feed a live cell by the Python example; installs paho-mqtt in a directory of its own
 	python3 -m venv $(BUILD)/python-venv
 	$(BUILD)/python-venv/bin/pip install --quiet 'paho-mqtt>=2,<3'
-	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --nocapture
+	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --include-ignored --nocapture
 
 deb: setup ## Debian packages of a node, with camera and without, in target/debian
 	packaging/deb

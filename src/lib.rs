@@ -8,6 +8,7 @@
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
 pub mod aggregator;
+pub mod association;
 pub mod camera;
 pub mod config;
 pub mod delay;
@@ -16,15 +17,15 @@ pub mod epoch;
 pub mod geometry;
 pub mod landmark;
 pub mod leadership;
-pub mod motion;
 pub mod names;
 pub mod pace;
+pub mod pose_history;
 pub mod projection;
 pub mod replay;
 pub mod reputation;
 pub mod round;
 pub mod time;
-pub mod tracks;
+pub mod tracking;
 pub mod view;
 pub mod vote;
 pub mod window;

@@ -10,7 +10,7 @@ use ecod::names::NodeName;
 use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::{TracksConfig, TracksMode};
+use ecod::tracking::{TracksConfig, TracksMode};
 use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, RejectReason, ReportKind, encode};
 use nalgebra::Point2;
 

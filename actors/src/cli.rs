@@ -107,8 +107,8 @@ fn parse() -> Result<Cli, Failure> {
 
 /// Names the program that has the command, and how to get it.
 fn in_lab(command: &str) -> Failure {
-    let program = "`cargo build --release --bin ecod-lab` in the sources builds it";
-    Failure::usage(anyhow!("this is a command of another program: run `ecod-lab {command}`; {program}"))
+    let build = "build that program from the sources by `cargo build --release --bin ecod-lab`";
+    Failure::usage(anyhow!("run `ecod-lab {command}` instead; {build}"))
 }
 
 fn run_command(cli: Cli) -> Result<(), Failure> {

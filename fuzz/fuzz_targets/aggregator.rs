@@ -13,7 +13,7 @@ use ecod::names::NodeName;
 use ecod::pace::PaceMode;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::TracksMode;
+use ecod::tracking::TracksMode;
 use ecod::vote::VoteMode;
 use ecod::wire::{
     Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose, decode, encode,

@@ -6,12 +6,13 @@
 
 use std::sync::LazyLock;
 
-use ecod::detection::detections_in;
+use ecod::detection::parse_detections;
 use ecod::time::Timestamp;
 use ecod_actors::actors::reputation_keeper::read_saved;
 use ecod_actors::camera::vehicle_pose::read_pose;
 use ecod_actors::node::config::NodeConfig;
-use ecod_actors::transport::mqtt::{Secret, Security};
+use ecod_actors::platform::secret::Secret;
+use ecod_actors::transport::mqtt::Security;
 use ecod_lab::eval::Truth;
 use ecod_lab::eval::tracks::TrackTruth;
 use libfuzzer_sys::fuzz_target;
@@ -26,7 +27,7 @@ fuzz_target!(|input: &[u8]| {
             }
         }
         1 => {
-            let detections = detections_in(text).unwrap_or_default();
+            let detections = parse_detections(text).unwrap_or_default();
             assert!(detections.iter().all(|detection| detection.bounding_box.is_valid()));
         }
         2 => assert!(SIGNING.keeps_shut("ecod/lot-1/detections/euclid", bytes)),

@@ -76,7 +76,7 @@ fn target(index: usize) -> [Point2<f64>; 4] {
     [(0.0, 0.0), (0.9, 0.05), (0.9, 0.95), (0.0, 1.0)].map(|(x, y)| Point2::new(left + x * side, top + y * side))
 }
 
-/// What the first vehicle of the first recorded parking lot sees, as its camera renders it.
+/// Frame of the first vehicle in the first recorded parking lot.
 fn lot() -> anyhow::Result<Frame> {
     let path = format!("{}/../examples/testbed/pace_setup1.json", env!("CARGO_MANIFEST_DIR"));
     let testbed = Testbed::from_json(&std::fs::read_to_string(path)?)?;

@@ -1,4 +1,4 @@
-//! What an idle cell's membership costs: packets and processor time of each node, all in this one process.
+//! Costs of an idle cell's membership: packets and processor time of each node, all in this one process.
 //!
 //! The goals are 60 packets/s and 1.5 % of a core. `NODES` (32) nodes gossip on loopback without multicast for
 //! `SECONDS` (10), after they have all met.
@@ -16,10 +16,10 @@ use ecod::wire::Role;
 use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
 use ecod_actors::platform::clock;
+use ecod_actors::platform::secret::Secret;
 use ecod_actors::transport::gossip::{
     FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
-use ecod_actors::transport::mqtt::Secret;
 use ractor::{Actor, call_t};
 use tokio::sync::watch;
 

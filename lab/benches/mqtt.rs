@@ -14,7 +14,7 @@ use ecod_actors::actors::gateway::{Gateway, GatewayArguments, ReportKind};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Counters;
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{
     BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, MqttVersion, Security, SubscriptionRole,
 };
@@ -95,7 +95,7 @@ async fn through_gateways(broker: &BrokerAddress, version: MqttVersion, load: Lo
 
 async fn join(
     name: &str,
-    part: SubscriptionRole,
+    role: SubscriptionRole,
     version: MqttVersion,
     broker: &BrokerAddress,
 ) -> anyhow::Result<(ActorRef<GatewayMessage>, mpsc::UnboundedReceiver<Delivery>)> {
@@ -103,7 +103,7 @@ async fn join(
     let status = NodeStatus::starting(NodeName::new(name)?, Uuid::new_v4(), Role::Auto, env!("CARGO_PKG_VERSION"));
     let arguments = GatewayArguments {
         cell: NodeName::new("bench")?,
-        part,
+        role,
         status,
         mqtt: MqttConfig { version, ..MqttConfig::default() },
         security: Security::default(),

@@ -4,7 +4,6 @@ mod bench;
 mod columns;
 mod demo;
 mod eval;
-mod intersection;
 mod report;
 mod testbed;
 
@@ -17,7 +16,7 @@ use clap::{Parser, Subcommand};
 use ecod_actors::cli::{LogFormat, exit, start_log};
 use serde::Serialize;
 
-/// What measures and shows a cell of ECOD: its nodes are the program `ecod-node`, beside this one.
+/// Measures and shows a cell of ECOD; its nodes are the program `ecod-node`, which lies beside this one.
 #[derive(Debug, Parser)]
 #[command(name = "ecod-lab", version)]
 struct Cli {

@@ -46,7 +46,7 @@ pub struct Demo<'a> {
     pub testbed: &'a Testbed,
     /// The scene.
     pub scene: &'a Scene,
-    /// How long the maps are judged.
+    /// Time for which the maps are judged.
     pub duration: Duration,
     /// Where configurations and logs go.
     pub directory: &'a Path,
@@ -54,7 +54,7 @@ pub struct Demo<'a> {
     pub dashboard: SocketAddr,
 }
 
-/// What came of one scene, and what there is to draw.
+/// Result of one scene, with the data for its drawing.
 #[derive(Debug, Clone)]
 pub struct DemoResult {
     /// Accuracies.
@@ -71,20 +71,20 @@ pub struct DemoResult {
     pub reports: Vec<ObservedReport>,
     /// From when on the maps are judged.
     pub from: Timestamp,
-    /// Who led when.
+    /// Terms of all leaders, in order.
     pub terms: Vec<JudgedTerm>,
 }
 
-/// How far a running demo is.
+/// Progress of a running demo.
 #[derive(Debug, Clone, Copy)]
 pub struct Progress {
     /// Time judged so far.
     pub elapsed: Duration,
-    /// What there is to tell.
+    /// Event since the last call.
     pub news: News,
 }
 
-/// What happens in a running demo.
+/// Event of a running demo.
 #[derive(Debug, Clone, Copy)]
 pub enum News {
     /// So many reports were seen so far.
@@ -216,7 +216,7 @@ impl Demo<'_> {
         })
     }
 
-    /// What every vehicle would have known alone.
+    /// Accuracy of every vehicle alone.
     fn alone(&self, reports: &[ObservedReport], from: Timestamp) -> BTreeMap<NodeName, SpotScore> {
         let alone = |cav: &Cav| {
             let landmarks = self.scene.landmarks(&self.testbed.placard);

@@ -1,4 +1,4 @@
-//! How right maps and verdicts are, beside majority vote and every vehicle alone.
+//! Accuracy of maps and verdicts, beside majority vote and every vehicle alone.
 //!
 //! An item is one location for as long as its truth stays the same. It is judged by the last label that was given for
 //! it in that time, `null` if there was none; where nothing stands, by the last entry. Beside this, every entry of
@@ -14,7 +14,7 @@ mod votes;
 
 use std::collections::BTreeMap;
 
-use ecod::landmark::{Gate, LandmarkIndex};
+use ecod::landmark::{LandmarkGate, LandmarkIndex};
 use ecod::names::{Label, LandmarkId, NodeName};
 use ecod::replay::FusedLine;
 use ecod::time::Timestamp;
@@ -30,7 +30,7 @@ use votes::Votes;
 /// A location and the position of a span among its truths.
 type Item = (LandmarkId, usize);
 
-/// What came of an evaluation.
+/// Result of an evaluation.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EvalResult {
     /// Of maps; absent without any map or PACE report.
@@ -41,7 +41,7 @@ pub struct EvalResult {
     pub vote: Option<Scores>,
 }
 
-/// How right one algorithm is. Shares are percentages; `None` where nothing could be judged.
+/// Accuracy of one algorithm. Shares are percentages; `None` where nothing could be judged.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Scores {
     /// Maps, or sets of verdicts, that were read.
@@ -60,7 +60,7 @@ pub struct Scores {
     pub majority_accuracy_pct: Option<f64>,
     /// Every vehicle alone; with reports only.
     pub vehicles: BTreeMap<NodeName, VehicleScores>,
-    /// How often which truth was called what, by item; correct ones too.
+    /// Confusion matrix by item, correct labels included.
     pub confusion: Vec<ConfusionCell>,
 }
 
@@ -80,7 +80,7 @@ pub struct RoundScores {
 pub struct ConfusionCell {
     /// The first accepted label; null where nothing stands.
     pub truth: Option<Label>,
-    /// What was said; null for no label.
+    /// Label that was given; null for none.
     pub said: Option<Label>,
     /// Items.
     pub count: u64,
@@ -90,7 +90,7 @@ pub struct ConfusionCell {
 #[derive(Debug, Clone)]
 pub struct Evaluation {
     truth: Truth,
-    cell: Option<(LandmarkIndex, Gate)>,
+    cell: Option<(LandmarkIndex, LandmarkGate)>,
     synonyms: BTreeMap<Label, Label>,
     pace: Tally,
     vote: Tally,
@@ -128,7 +128,7 @@ impl Evaluation {
 
     /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
     #[must_use]
-    pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: Gate) -> Self {
+    pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: LandmarkGate) -> Self {
         self.cell = Some((landmarks, gate));
         self
     }

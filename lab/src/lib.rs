@@ -1,4 +1,4 @@
-//! ECOD's laboratory: what measures and shows a cell, and runs on no vehicle.
+//! The laboratory of ECOD: tools that measure and show a cell. None of them runs on a vehicle.
 //!
 //! ```text
 //! traffic   generated towns: reports and truth

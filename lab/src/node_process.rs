@@ -24,7 +24,7 @@ pub struct NodeProcess {
     killed: bool,
 }
 
-/// How long a node may take to stop.
+/// Time that a node may take to stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 
 impl NodeProcess {
@@ -62,12 +62,12 @@ impl NodeProcess {
         self.child.kill().await.with_context(|| format!("cannot kill node {}", self.name))
     }
 
-    /// Whether it was killed and not started again.
+    /// True if it was killed and not started again.
     pub fn is_killed(&self) -> bool {
         self.killed
     }
 
-    /// How often the node was started.
+    /// Number of times that the node was started.
     pub fn starts(&self) -> u32 {
         self.starts
     }
@@ -154,4 +154,15 @@ fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
         .kill_on_drop(true)
         .spawn()
         .with_context(|| format!("cannot start {}", program.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_without_a_node_beside_it_says_how_to_get_one() {
+        let error = node_beside(Path::new("/no/such/ecod-lab")).unwrap_err().to_string();
+        assert!(error.contains("/no/such/ecod-node") && error.contains("--bin ecod-node`"), "{error}");
+    }
 }

@@ -5,7 +5,7 @@ pub(crate) mod tracks;
 use ecod::landmark::{Landmark, LandmarkIndex};
 use ecod::replay::FusedLine;
 use ecod::wire::{ObjectReport, ReportKind};
-use ecod_actors::observe::recorder::Identity;
+use ecod_actors::observe::recorder::LogIdentity;
 use ecod_actors::observe::report::{Report, Section, bars, drawing, section, table};
 
 use crate::eval::tracks::{TrackEvaluation, TrackTruth};
@@ -27,7 +27,7 @@ pub fn judged_by_tracks(truth: TrackTruth) -> Report {
 struct Locations(Evaluation);
 
 impl Section for Locations {
-    fn identity(&mut self, identity: &Identity) {
+    fn identity(&mut self, identity: &LogIdentity) {
         // Each file may have been written under another configuration.
         let landmarks: Vec<_> = identity.landmarks.iter().map(Landmark::from).collect();
         let gate = identity.fusion.pace.gate();
@@ -72,7 +72,7 @@ impl Section for Locations {
 struct Objects(TrackEvaluation);
 
 impl Section for Objects {
-    fn identity(&mut self, _identity: &Identity) {}
+    fn identity(&mut self, _identity: &LogIdentity) {}
 
     fn report(&mut self, _kind: ReportKind, _report: &ObjectReport) {}
 

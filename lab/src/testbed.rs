@@ -60,7 +60,7 @@ impl Testbed {
         scene.spots.iter().flat_map(|spot| [spot.empty_card(&self.placard), spot.plate_card()]).flatten().collect()
     }
 
-    /// What the vehicle's camera could read at a spot, judged by the geometry alone: the plate of an occupied spot, the
+    /// Sign that the vehicle's camera could read at a spot, by the geometry alone: the plate of an occupied spot, the
     /// `EMPTY` placard of a free one; `None` when it is outside the image, seen from behind, too small in it, or mostly
     /// hidden. A free spot without a placard can be seen to be free where its plate could be read.
     pub fn sighting(&self, scene: &Scene, cav: &Cav, spot: &Spot) -> Option<Sighting> {
@@ -92,7 +92,7 @@ pub struct Placard {
     pub card_width_m: f64,
     /// Height of the card.
     pub card_height_m: f64,
-    /// What the placard of a free spot reads.
+    /// Text on the placard of a free spot.
     pub empty_text: Label,
 }
 
@@ -105,7 +105,7 @@ pub struct Scene {
     pub spots: Vec<Spot>,
     /// The vehicles that watch them.
     pub cavs: Vec<Cav>,
-    /// What was recorded on the physical testbed; may be empty.
+    /// Runs recorded on the physical testbed; may be empty.
     pub recorded: Vec<RecordedRun>,
 }
 
@@ -156,7 +156,7 @@ impl Spot {
 /// One placard that stands in a scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Card {
-    /// What its code reads.
+    /// Text of its code.
     pub text: Label,
     /// Where it stands, in metres.
     pub position: Point2<f64>,

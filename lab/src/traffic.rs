@@ -50,7 +50,7 @@ const STEP_S: f64 = 1.0 / STEPS_PER_S;
 const TRUTH_STEPS: u64 = 10;
 
 /// The shortest time in seconds that a report takes.
-const LEAST_LATENCY_S: f64 = 0.03;
+const MIN_LATENCY_S: f64 = 0.03;
 
 /// Standard deviation of an observer's clock in seconds.
 const CLOCK_S: f64 = 0.002;
@@ -75,7 +75,7 @@ pub struct ArrivedReport {
     pub report: ObjectReport,
 }
 
-/// What is true, as a file for [`crate::eval::tracks::TrackTruth`].
+/// Ground truth, as a file for [`crate::eval::tracks::TrackTruth`].
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct TrafficTruth {
     /// In the order of time.
@@ -87,7 +87,7 @@ pub struct TrafficTruth {
 pub struct TruthFrame {
     /// The moment.
     pub t_us: Timestamp,
-    /// What was there.
+    /// Objects that were there.
     pub objects: Vec<TruthObject>,
 }
 
@@ -261,7 +261,7 @@ impl<'a> Watch<'a> {
         watcher.sensor.observe(config, &around, &mut report, dice);
         watcher.due += (STEPS_PER_S / config.sensor.rate_hz).round() as u64;
         watcher.shutter = if config.synchronous { watcher.due } else { watcher.due - 1 + dice.below(3) as u64 };
-        let mut takes_s = LEAST_LATENCY_S + dice.exponential(config.sensor.latency_s);
+        let mut takes_s = MIN_LATENCY_S + dice.exponential(config.sensor.latency_s);
         if dice.chance(config.sensor.lost) {
             return;
         }
@@ -277,7 +277,7 @@ impl<'a> Watch<'a> {
         self.arrived.push((received, ArrivedReport { received_at_us, report }));
     }
 
-    /// What belongs to the truth.
+    /// Objects that belong to the truth.
     fn known(&self, step: u64, bodies: &[Body]) -> Vec<TruthObject> {
         let memory = (self.config.memory_s * STEPS_PER_S) as u64;
         let observers = if self.config.said.poses { self.observers.len() } else { 0 };

@@ -25,7 +25,7 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// What `ecod-node replay` makes of a file of reports.
+/// Output of `ecod-node replay` for a file of reports.
 fn replay(config: ReplayConfig, reports: &Path) -> (Vec<FusedLine>, Summary) {
     let mut replay = Replay::new(config);
     let lines = fs::read_to_string(reports).unwrap();

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::BrokerAddress;
 use ecod_lab::bench::two_hop::{Load, TwoHopError, raw};
 

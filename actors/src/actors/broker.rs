@@ -16,7 +16,7 @@
 use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
 
 use crate::messages::broker::BrokerMessage;
-use crate::transport::broker::{BrokerHealth, Mqtt};
+use crate::transport::broker::{BrokerHealth, MqttBroker};
 
 /// Owns the embedded broker; stops it when the actor ends, however it ends.
 #[derive(Debug, Default)]
@@ -24,8 +24,8 @@ pub struct Broker;
 
 impl Actor for Broker {
     type Msg = BrokerMessage;
-    type State = Box<dyn Mqtt>;
-    type Arguments = Box<dyn Mqtt>;
+    type State = Box<dyn MqttBroker>;
+    type Arguments = Box<dyn MqttBroker>;
 
     async fn pre_start(
         &self,
@@ -92,7 +92,7 @@ mod tests {
     #[derive(Debug)]
     struct Fallen;
 
-    impl Mqtt for Fallen {
+    impl MqttBroker for Fallen {
         fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
             Ok(address)
         }
@@ -106,7 +106,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_broker_that_ended_by_itself_ends_its_actor_so_that_it_is_started_anew() {
-        let (actor, ended) = Actor::spawn(None, Broker, Box::new(Fallen) as Box<dyn Mqtt>).await.unwrap();
+        let (actor, ended) = Actor::spawn(None, Broker, Box::new(Fallen) as Box<dyn MqttBroker>).await.unwrap();
         let health = ractor::call!(actor, |reply| BrokerMessage::Health { reply }).unwrap();
         assert_eq!(health, BrokerHealth::Dead);
         ended.await.unwrap();

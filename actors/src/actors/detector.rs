@@ -21,7 +21,7 @@ use crate::camera::image_size::{ImageSize, SizeMismatch};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
-use crate::observe::recorder::Pictures;
+use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::{Counters, Event};
 
 /// What a detector needs at its start.
@@ -37,7 +37,7 @@ pub struct DetectorArguments {
     /// Gets the detections.
     pub projector: ActorSlot<ProjectorMessage>,
     /// Gets the frames that were looked at, to record some.
-    pub pictures: Option<Pictures>,
+    pub pictures: Option<ImageRecorder>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -56,7 +56,7 @@ pub struct DetectorState {
     /// Whether the last frame could not be looked at: the first in a row is told of.
     failing: bool,
     projector: ActorSlot<ProjectorMessage>,
-    pictures: Option<Pictures>,
+    pictures: Option<ImageRecorder>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
 }

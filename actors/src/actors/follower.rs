@@ -27,7 +27,7 @@ use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
-use crate::observe::recorder::Recording;
+use crate::observe::recorder::LogSender;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::Incoming;
 
@@ -39,7 +39,7 @@ pub struct FollowerArguments {
     /// object a line.
     pub log: Option<PathBuf>,
     /// Where everything accepted is recorded.
-    pub recording: Recording,
+    pub recording: LogSender,
     /// The last term that an earlier run of the node wrote to disk.
     pub saved_term: u64,
     /// Who leads.
@@ -61,7 +61,7 @@ pub struct FollowerState {
     newest: Newest,
     filter: RoundFilter,
     log: Option<BufWriter<File>>,
-    recording: Recording,
+    recording: LogSender,
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
     fuser: ActorSlot<FuserMessage>,

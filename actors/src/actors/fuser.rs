@@ -22,7 +22,7 @@ use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::replay::JournalEvent;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::TracksLosses;
+use ecod::tracking::TracksLosses;
 use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
@@ -32,7 +32,7 @@ pub use intake::{Intake, Put};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
-use crate::observe::recorder::Recording;
+use crate::observe::recorder::LogSender;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::{Delivery, Incoming};
@@ -46,7 +46,7 @@ pub struct FuserArguments {
     /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
     pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
     /// Where the aggregator's inputs are recorded.
-    pub recording: Recording,
+    pub recording: LogSender,
     /// Where maps and verdicts are published.
     pub gateway: ActorSlot<GatewayMessage>,
     /// Is told what rounds say about vehicles.
@@ -63,7 +63,7 @@ pub struct Fuser;
 pub struct FuserState {
     aggregator: Aggregator,
     intake: Intake,
-    recording: Recording,
+    recording: LogSender,
     gateway: ActorSlot<GatewayMessage>,
     keeper: ActorSlot<ReputationKeeperMessage>,
     counters: Arc<Counters>,

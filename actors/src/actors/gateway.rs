@@ -30,9 +30,9 @@ pub use ecod::wire::ReportKind;
 use crate::messages::gateway::GatewayMessage;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
-use crate::transport::mqtt::connection::{Handling, LastWill, last_will};
+use crate::transport::mqtt::connection::{LastWill, Retention, offline_payload};
 use crate::transport::mqtt::inbox::Inbox;
-use crate::transport::mqtt::link::{Link, LinkId, LinkNews, LinkSetup, LinkSink};
+use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink};
 use crate::transport::mqtt::subscription_role::REPORTS;
 use crate::transport::mqtt::{
     BrokerAddress, Incoming, LinkEvent, LinkState, MqttConfig, Security, Subscriber, SubscriptionRole,
@@ -43,7 +43,7 @@ pub struct GatewayArguments {
     /// The cell's name.
     pub cell: NodeName,
     /// Which topics to take.
-    pub part: SubscriptionRole,
+    pub role: SubscriptionRole,
     /// What the node says about itself until told otherwise; names the node and this run of it.
     pub status: NodeStatus,
     /// Protocol, credentials and limits.
@@ -66,7 +66,7 @@ pub struct Gateway;
 #[derive(Debug)]
 pub struct GatewayState {
     topics: Topics,
-    part: SubscriptionRole,
+    role: SubscriptionRole,
     encoding: Encoding,
     report_brokers: Option<Vec<BrokerAddress>>,
     /// Whether reports are taken from every broker.
@@ -113,25 +113,25 @@ impl Actor for Gateway {
             GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
-                state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
+                state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient);
                 inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {
-                state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
+                state.publish(&Topic::GlobalDetections, &*map, Retention::Transient);
                 links_first().await;
                 inbox.deliver_local(Incoming::Map(map));
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
-                state.publish(&Topic::GlobalVerdicts, &*verdicts, Handling::Stream);
+                state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient);
                 links_first().await;
                 inbox.deliver_local(Incoming::Verdicts(verdicts));
             }
             GatewayMessage::PublishReputations { reputations } => {
-                state.publish(&Topic::Reputations, &*reputations, Handling::State);
+                state.publish(&Topic::Reputations, &*reputations, Retention::Retained);
                 inbox.deliver_local(Incoming::Reputations(reputations));
             }
             GatewayMessage::PublishShare { share } => {
-                state.publish(&Topic::Ledger(share.node.clone()), &share, Handling::Stream);
+                state.publish(&Topic::Ledger(share.node.clone()), &share, Retention::Transient);
             }
             GatewayMessage::PublishStatus { status } => state.set_status(status),
             GatewayMessage::Links { reply } => {
@@ -161,13 +161,13 @@ async fn links_first() {
 
 impl GatewayState {
     fn new(arguments: GatewayArguments) -> Self {
-        let GatewayArguments { cell, part, status, mqtt, security, counters, subscriber, seed } = arguments;
+        let GatewayArguments { cell, role, status, mqtt, security, counters, subscriber, seed } = arguments;
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
         let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
-        let filters = part.levels().iter().map(|level| topics.filter(level)).collect();
+        let filters = role.filters().iter().map(|level| topics.filter(level)).collect();
         let seal = |payload: Bytes| sealed(&security, &status_topic, payload);
-        let will = LastWill { topic: status_topic.clone(), payload: seal(last_will(&status, encoding)) };
+        let will = LastWill { topic: status_topic.clone(), payload: seal(offline_payload(&status, encoding)) };
         let status_payload = seal(encode(&status, encoding).into());
         let inbox = Inbox::new(
             (status.node.clone(), status.id),
@@ -186,7 +186,7 @@ impl GatewayState {
             report_brokers: None,
             watches_reports: false,
             topics,
-            part,
+            role,
             encoding,
             status_payload,
             status,
@@ -205,7 +205,7 @@ impl GatewayState {
         for (_, link) in gone {
             // The status is taken back: this node lives on, but that broker will not hear of it.
             if let Some(client) = &link.client {
-                client.publish(&self.status_topic, &Bytes::new(), Handling::State);
+                client.publish(&self.status_topic, &Bytes::new(), Retention::Retained);
             }
             tokio::spawn(link.leave(LEAVE_TIMEOUT));
         }
@@ -219,12 +219,12 @@ impl GatewayState {
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
         let reports = self.watches_reports || self.takes_reports_of(broker);
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
-        self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
+        self.role.filters().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
 
     /// Whether this node needs the reports that go to this broker, whoever else watches them.
     fn takes_reports_of(&self, broker: &BrokerAddress) -> bool {
-        match self.part {
+        match self.role {
             SubscriptionRole::Candidate => self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker)),
             SubscriptionRole::Observer => true,
             SubscriptionRole::Follower => false,
@@ -249,18 +249,18 @@ impl GatewayState {
     fn set_status(&mut self, status: NodeStatus) {
         let seal = |payload: Bytes| sealed(&self.setup.security, &self.status_topic, payload);
         self.status_payload = seal(encode(&status, self.encoding).into());
-        let will = seal(last_will(&status, self.encoding));
+        let will = seal(offline_payload(&status, self.encoding));
         self.setup.will.lock().unwrap_or_else(PoisonError::into_inner).payload = will;
         self.status = status;
-        self.send(&self.status_topic, &self.status_payload, Handling::State);
+        self.send(&self.status_topic, &self.status_payload, Retention::Retained);
     }
 
-    fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, handling: Handling) {
+    fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, retention: Retention) {
         let payload = Bytes::from(encode(payload, self.encoding));
         let path = self.topics.path(topic);
         if self.fits::<T>(&path, &payload) {
             let payload = sealed(&self.setup.security, &path, payload);
-            self.send(&path, &payload, handling);
+            self.send(&path, &payload, retention);
             self.expect_back(topic);
         }
     }
@@ -270,7 +270,7 @@ impl GatewayState {
         let now = clock::now();
         let of_all = matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts);
         let of_one = matches!(topic, Topic::Detections(_) | Topic::VoteDetections(_))
-            && self.part == SubscriptionRole::Candidate;
+            && self.role == SubscriptionRole::Candidate;
         let reports: Vec<_> = self.links.values().map(|link| of_one && self.takes_reports_of(&link.broker)).collect();
         for (link, reports) in self.links.values_mut().zip(reports) {
             if (of_all || reports) && link.state == LinkState::Up && link.misses_echo(now) {
@@ -300,49 +300,49 @@ impl GatewayState {
         false
     }
 
-    fn send(&self, topic: &str, payload: &Bytes, handling: Handling) {
+    fn send(&self, topic: &str, payload: &Bytes, retention: Retention) {
         for link in self.links.values() {
-            let sent = link.client.as_ref().is_some_and(|client| client.publish(topic, payload, handling));
+            let sent = link.client.as_ref().is_some_and(|client| client.publish(topic, payload, retention));
             self.setup.counters.count(if sent { Event::Published } else { Event::PublishRefused });
         }
     }
 
-    fn link_changed(&mut self, LinkEvent { link: id, news }: LinkEvent) {
+    fn link_changed(&mut self, LinkEvent { link: id, change }: LinkEvent) {
         // Computed for the one event that needs them.
-        let filters = match &news {
-            LinkNews::Accepted(_) => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
+        let filters = match &change {
+            LinkChange::Accepted(_) => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
             _ => Vec::new(),
         };
         let Some(link) = self.links.get_mut(&id) else { return };
-        let state = match news {
-            LinkNews::Accepted(client) => {
+        let state = match change {
+            LinkChange::Accepted(client) => {
                 // The queue of a new connection is empty, so that both fit.
-                client.publish(&self.status_topic, &self.status_payload, Handling::State);
+                client.publish(&self.status_topic, &self.status_payload, Retention::Retained);
                 client.subscribe(&filters);
                 link.client = Some(client);
                 LinkState::Up
             }
-            LinkNews::DeclaredOffline => {
+            LinkChange::DeclaredOffline => {
                 tracing::warn!(broker = %link.broker, "broker took this node for dead");
                 if let Some(client) = &link.client {
-                    client.publish(&self.status_topic, &self.status_payload, Handling::State);
+                    client.publish(&self.status_topic, &self.status_payload, Retention::Retained);
                 }
                 return;
             }
-            LinkNews::Namesake(run) => {
+            LinkChange::Namesake(run) => {
                 // Answered once for each, so that both know and neither goes on for ever.
                 if self.namesakes.len() < MAX_NAMESAKES && self.namesakes.insert(run) {
                     let node = &self.status.node;
                     tracing::warn!(broker = %link.broker, %node, %run, "another living node has this node's name, rename one");
                     if let Some(client) = &link.client {
-                        client.publish(&self.status_topic, &self.status_payload, Handling::State);
+                        client.publish(&self.status_topic, &self.status_payload, Retention::Retained);
                     }
                 }
                 return;
             }
-            LinkNews::Answered if link.state == LinkState::Stalled => LinkState::Up,
-            LinkNews::Answered => return,
-            LinkNews::Lost(state) => {
+            LinkChange::Answered if link.state == LinkState::Stalled => LinkState::Up,
+            LinkChange::Answered => return,
+            LinkChange::Lost(state) => {
                 link.client = None;
                 state
             }

@@ -22,7 +22,7 @@ use tokio::task::JoinSet;
 use crate::messages::membership::MembershipMessage;
 use crate::platform::clock;
 use crate::transport::gossip::key::{CellKey, SessionId};
-use crate::transport::gossip::machine::{Machine, Output, Setup};
+use crate::transport::gossip::machine::{GossipMachine, GossipOutput, GossipSetup};
 use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::socket::GossipSocket;
 use crate::transport::gossip::{
@@ -57,7 +57,7 @@ pub struct Membership;
 
 /// The membership and its socket.
 pub struct MembershipState {
-    machine: Machine,
+    machine: GossipMachine,
     socket: Arc<GossipSocket>,
     deadline: watch::Sender<Option<Timestamp>>,
     /// Tells the watch over the socket that a [`MembershipMessage::Wake`] was handled.
@@ -88,8 +88,8 @@ impl Actor for Membership {
         let gossip = config.advertise.unwrap_or(address);
         let own = NodeId { name, run, life: run.max(now.micros()), role, gossip, broker };
         let (session, secret, seed) = draw_secrets()?;
-        let setup = Setup { own, key, session, secret, seed, counters: Arc::clone(&counters) };
-        let machine = Machine::new(setup, &config, now);
+        let setup = GossipSetup { own, key, session, secret, seed, counters: Arc::clone(&counters) };
+        let machine = GossipMachine::new(setup, &config, now);
         let (deadline, deadlines) = watch::channel(machine.next_deadline());
         let handled = Arc::new(Notify::new());
         let mut tasks = JoinSet::new();
@@ -147,9 +147,9 @@ impl MembershipState {
         let mut changed = false;
         while let Some(output) = self.machine.poll() {
             let sent = match output {
-                Output::Send { to, frame } => Some(self.socket.send(&frame, to)),
-                Output::Multicast { frame } => self.socket.multicast(&frame),
-                Output::Tell(event) => {
+                GossipOutput::Send { to, frame } => Some(self.socket.send(&frame, to)),
+                GossipOutput::Multicast { frame } => self.socket.multicast(&frame),
+                GossipOutput::Tell(event) => {
                     changed |= !matches!(event, MembershipEvent::Received { .. });
                     (self.events)(event);
                     None

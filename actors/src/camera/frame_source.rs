@@ -172,12 +172,12 @@ fn default_fps() -> f64 {
 
 /// Lets recorded frames out at their own rate.
 #[derive(Debug)]
-struct Pace {
+struct FramePacer {
     period: Duration,
     due: Option<Instant>,
 }
 
-impl Pace {
+impl FramePacer {
     fn new(fps: f64) -> Self {
         Self { period: Duration::from_secs_f64(1.0 / fps), due: None }
     }

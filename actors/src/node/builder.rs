@@ -37,13 +37,13 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
-use crate::observe::dashboard::Feed;
+use crate::observe::dashboard::LiveState;
 #[cfg(feature = "camera")]
-use crate::observe::recorder::Pictures;
-use crate::observe::recorder::Recording;
+use crate::observe::recorder::ImageRecorder;
+use crate::observe::recorder::LogSender;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
-use crate::transport::broker::{BrokerError, Elected, EmbeddedBroker, Guard};
+use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
@@ -58,14 +58,14 @@ pub(super) struct NodeBuilder {
     counters: Arc<Counters>,
     newest: Newest,
     book: SharedBook,
-    recording: Recording,
+    recording: LogSender,
     intake: Intake,
     broker_address: watch::Sender<Option<SocketAddr>>,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
-    feed: Arc<Feed>,
+    live_state: Arc<LiveState>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
 }
@@ -88,7 +88,7 @@ impl NodeBuilder {
             run: Uuid::now_v7(),
             started_at: clock::now(),
             slots: ActorSlots::default(),
-            recording: Recording::new(Arc::clone(&counters)),
+            recording: LogSender::new(Arc::clone(&counters)),
             counters,
             newest: Newest::default(),
             intake: Intake::default(),
@@ -98,7 +98,7 @@ impl NodeBuilder {
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
-            feed: Arc::default(),
+            live_state: Arc::default(),
             dashboard_address: watch::Sender::new(None),
             failed,
         }
@@ -217,7 +217,7 @@ impl NodeBuilder {
             }
             #[cfg(feature = "camera")]
             ActorKind::Detector => {
-                let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
+                let pictures = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
                 let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
                 let arguments = arguments.map_err(in_full)?;
@@ -289,7 +289,7 @@ impl NodeBuilder {
         }
         let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
         let (limits, counters) = (self.config.mqtt.limits(), self.counters());
-        EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
+        EmbeddedBroker::protected(config, AccessPolicy { credentials, topics, limits, elected, counters })
     }
 
     /// The membership comes back at the address it had, as the broker does.
@@ -323,7 +323,7 @@ fn slot<M: Message>(
 }
 
 /// The rule of the node's own broker: who may publish for all.
-fn publish_rule(leadership: watch::Receiver<Leadership>) -> Elected {
+fn publish_rule(leadership: watch::Receiver<Leadership>) -> LeaderCheck {
     let filter = Mutex::<PublisherFilter>::default();
     Arc::new(move |name| {
         let mut filter = filter.lock().unwrap_or_else(PoisonError::into_inner);

@@ -21,7 +21,7 @@ pub use page::{drawing, section, table};
 pub use plot::bars;
 
 use crate::observe::recorder::{
-    CounterReading, Identity, LeadershipChange, LogError, LogEvent, LogMessage, LogReader, SchemaName,
+    CounterReading, LeadershipChange, LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName,
 };
 use losses::Losses;
 use series::Samples;
@@ -29,7 +29,7 @@ use series::Samples;
 /// An additional section of the page, made from what the log holds, in its order.
 pub trait Section: Debug {
     /// Takes the beginning of a file: whose log it is, under which configuration.
-    fn identity(&mut self, identity: &Identity);
+    fn identity(&mut self, identity: &LogIdentity);
 
     /// Takes a vehicle's report.
     fn report(&mut self, kind: ReportKind, report: &ObjectReport);
@@ -44,7 +44,7 @@ pub trait Section: Debug {
 /// What is gathered of a log; by default, nothing yet.
 #[derive(Debug, Default)]
 pub struct Report {
-    identity: Option<Identity>,
+    identity: Option<LogIdentity>,
     first: Option<Timestamp>,
     last: Timestamp,
     messages: u64,
@@ -135,7 +135,7 @@ impl Report {
         page::write(self)
     }
 
-    fn meet(&mut self, identity: &Identity) {
+    fn meet(&mut self, identity: &LogIdentity) {
         if let Some(known) = self.identity.replace(identity.clone())
             && known.node != identity.node
         {

@@ -2,22 +2,22 @@
 
 #![deny(clippy::indexing_slicing)]
 
-mod admission;
+mod connect_packet;
+mod connection_throttle;
 mod embedded;
-mod gate;
-mod holder;
-mod login;
+mod frontend;
+mod heartbeat;
 mod permissions;
-mod pulse;
+mod principal;
+mod publish_throttle;
 mod retained;
-mod throttle;
 use std::net::SocketAddr;
 
-pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, Mqtt};
-pub use gate::Guard;
 #[cfg(fuzzing)]
-pub use login::read_login;
-pub use permissions::Elected;
+pub use connect_packet::read_connect_packet;
+pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
+pub use frontend::AccessPolicy;
+pub use permissions::LeaderCheck;
 
 /// Whether the broker serves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -2,20 +2,20 @@
 
 #![deny(clippy::indexing_slicing)]
 
-pub(crate) mod answers;
 pub(crate) mod config;
 pub(crate) mod counters;
 pub(crate) mod frame;
 #[cfg(fuzzing)]
 pub mod fuzzing;
-pub(crate) mod gossip;
 pub(crate) mod key;
 pub(crate) mod machine;
 pub(crate) mod node_id;
 pub(crate) mod replay_window;
+pub(crate) mod reply_throttle;
 pub(crate) mod seeds;
 pub(crate) mod sessions;
 pub(crate) mod socket;
+pub(crate) mod swim;
 use std::net::SocketAddr;
 use std::sync::Arc;
 

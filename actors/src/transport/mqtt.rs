@@ -8,7 +8,7 @@ pub(crate) mod link;
 pub(crate) mod probe;
 pub(crate) mod security;
 pub(crate) mod subscription_role;
-pub use config::{HiddenSecret, MqttConfig, MqttVersion, Secret};
+pub use config::{MqttConfig, MqttVersion};
 pub use ecod::leadership::links::{DataPlane, LinkState};
 pub use ecod::leadership::{BrokerAddress, InvalidAddress};
 pub use inbox::{Delivery, Incoming, Subscriber};

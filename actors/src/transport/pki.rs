@@ -15,13 +15,13 @@ mod authority;
 mod broker_trust;
 mod config;
 mod credentials;
-mod identity;
+mod subject;
 
 pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
 pub use broker_trust::BrokerTrust;
 pub use config::TlsConfig;
-pub use credentials::{Credentials, CredentialsError, Current, external_broker};
-pub use identity::{Identity, InvalidCertificate};
+pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external_broker};
+pub use subject::{CertificateSubject, InvalidCertificate};
 
 /// The DNS name in the certificate of every node that may lead, below a domain that is reserved for private use.
 pub const BROKER_NAME: &str = "broker.ecod.internal";

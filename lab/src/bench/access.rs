@@ -1,4 +1,4 @@
-//! How the simulated clients get into a broker.
+//! Access of the simulated clients to a broker.
 
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::transport::mqtt::{BrokerAddress, Security};
@@ -100,8 +100,8 @@ const MAX_PACKET_BYTES: usize = 1 << 20;
 
 #[cfg(test)]
 mod tests {
+    use ecod_actors::platform::secret::Secret;
     use ecod_actors::transport::gossip::MembershipConfig;
-    use ecod_actors::transport::mqtt::Secret;
 
     use super::*;
 

@@ -18,7 +18,7 @@ use super::measurement::Target;
 use crate::node_process::{NodeProcess, free_address};
 
 /// All vehicles of the largest load vote.
-const MOST_VOTERS: usize = 1000;
+const MAX_VOTERS: usize = 1000;
 
 /// A running aggregator; killed when dropped, though only [`OwnAggregator::stop`] removes its files.
 #[derive(Debug)]
@@ -47,7 +47,7 @@ impl OwnAggregator {
             record: records.then(|| RecordConfig::new(directory.join("log"))),
             ..NodeConfig::default()
         };
-        config.fusion.vote.max_vehicles = MOST_VOTERS;
+        config.fusion.vote.max_vehicles = MAX_VOTERS;
         config.dashboard.listen = Some(page);
         config.membership.bind = Some(([127, 0, 0, 1], 0).into());
         config.membership.multicast.enabled = false;
@@ -67,7 +67,7 @@ impl OwnAggregator {
         Ok(Self { process, directory, target, page })
     }
 
-    /// What there is to measure.
+    /// Target of the measurement.
     ///
     /// # Errors
     /// When the process has ended.

@@ -11,16 +11,16 @@ use super::load::Load;
 use super::measurement::Target;
 use super::schedule::{Schedule, wait_until};
 
-/// What is sent for a vehicle.
+/// Messages of one vehicle.
 #[derive(Debug)]
 pub(super) struct Sender {
     pub(super) client: AsyncClient,
-    /// What goes out in every tick, in this order, and its topic.
+    /// Payloads of every tick, in this order, with their topics.
     pub(super) messages: Vec<(ObjectReport, String)>,
     pub(super) bare_topic: String,
 }
 
-/// What came of the sending.
+/// Result of the sending.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Sent {
     /// Most time by which a tick began late.

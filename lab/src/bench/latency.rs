@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::two_hop::latencies;
 
-/// What came back and how long it took.
+/// Answers of a cell with their latencies.
 #[derive(Debug, Clone)]
 pub struct Latencies {
     /// Nanoseconds. What never came back counts with the time for which it was waited.
@@ -16,7 +16,7 @@ pub struct Latencies {
     pub missing: u64,
 }
 
-/// What came back by one way.
+/// Latencies of one kind of answer.
 #[derive(Debug, Clone, Default)]
 pub struct Answers {
     /// As maps.
@@ -34,9 +34,9 @@ pub struct Quantiles {
     pub p99_us: f64,
     /// 999 of 1000 take at most as many microseconds.
     pub p999_us: f64,
-    /// How many there are.
+    /// Number of answers.
     pub n: u64,
-    /// How many of them never came back.
+    /// Number of answers that never came.
     pub missing: u64,
 }
 
@@ -61,7 +61,7 @@ impl Latencies {
         self.histogram.saturating_record(u64::try_from(taken.as_nanos()).unwrap_or(u64::MAX));
     }
 
-    /// What is usually said of a distribution.
+    /// Usual quantiles of the distribution.
     pub fn quantiles(&self) -> Quantiles {
         let micros = |quantile| self.histogram.value_at_quantile(quantile) as f64 / 1000.0;
         Quantiles {

@@ -1,4 +1,4 @@
-//! What the vehicles of a measurement send.
+//! Reports and votes of the vehicles of a measurement.
 
 use std::time::Duration;
 
@@ -16,11 +16,11 @@ pub struct Load {
     pub period: Duration,
     /// Time from the first vehicle's report to the last one's, evenly spaced; less than half a period.
     pub spread: Duration,
-    /// How long reports are sent; the first tenth warms up and is not counted.
+    /// Time for which reports are sent; the first tenth warms up and is not counted.
     pub duration: Duration,
-    /// Whether the bare way is measured too.
+    /// True to measure the bare way too.
     pub bare: bool,
-    /// Whether vehicles vote too, with a second report before that for the map.
+    /// True to let vehicles vote too, with a second report before that for the map.
     pub votes: bool,
 }
 
@@ -30,7 +30,7 @@ impl Load {
         Self { vehicles, period: Duration::from_millis(100), spread: Duration::ZERO, duration, bare: true, votes: true }
     }
 
-    /// How often every vehicle reports, at least twice.
+    /// Number of reports of every vehicle, at least two.
     pub(super) fn ticks(&self) -> u32 {
         u32::try_from(self.duration.as_micros() / self.period.as_micros().max(1)).unwrap_or(u32::MAX).max(2)
     }
@@ -49,7 +49,7 @@ pub fn landmarks() -> Vec<LandmarkConfig> {
     (0..32).map(|index| LandmarkConfig::at(format!("slot-{index}"), 3.0 * f64::from(index), 0.0)).collect()
 }
 
-/// What one vehicle says of ten neighbouring locations: an object at each, and that all were in view. In a cell that
+/// Report of one vehicle on ten neighbouring locations: an object at each, and that all were in view. In a cell that
 /// has no locations, objects stand where [`landmarks`] are.
 pub(super) fn report(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport {
     let spots = spots(vehicle, landmarks);

@@ -28,15 +28,15 @@ pub struct Target {
     pub cell: NodeName,
     /// Its known locations.
     pub landmarks: Vec<LandmarkConfig>,
-    /// How reports are written.
+    /// Encoding of reports.
     pub encoding: Encoding,
-    /// Whether its rounds make verdicts.
+    /// True if its rounds make verdicts.
     pub votes: bool,
     /// The aggregator's process, if it is on this machine and to be watched.
     pub aggregator: Option<u32>,
 }
 
-/// What came of a load.
+/// Result of a load.
 #[derive(Debug, Clone)]
 pub struct Measurement {
     /// From when a round's last report was due to the map that rests on the reports of all, and to the verdicts of that
@@ -54,9 +54,9 @@ pub struct Measurement {
     pub refused: u64,
     /// Most time by which sending began late; it is part of the latencies.
     pub latest: Duration,
-    /// What the aggregator's process used, if it is watched.
+    /// Usage of the aggregator's process, if it is watched.
     pub aggregator: Option<Usage>,
-    /// What this process, the vehicles', used.
+    /// Usage of this process, the vehicles'.
     pub vehicles: Usage,
 }
 

@@ -1,4 +1,4 @@
-//! What a browser is sent of a node's page, and how soon.
+//! Size of a node's page as a browser gets it, and the time to its first picture.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use ecod_actors::observe::dashboard;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-/// What the page weighs and how long it takes.
+/// Size and time of a page.
 #[derive(Debug, Clone, Copy)]
 pub struct PageFigures {
     /// Bytes of all its files as they are sent, uncompressed.
@@ -20,7 +20,7 @@ pub struct PageFigures {
 /// Where the first picture of a stream ends.
 const EVENT_END: &[u8] = b"\n\n";
 
-/// How long any part may take.
+/// Time that any part may take.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Asks for all that a browser asks for until it has something to draw.

@@ -1,4 +1,4 @@
-//! How many vehicles a cell carries.
+//! Search for the number of vehicles that a cell carries.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ pub const LIMIT: Duration = Duration::from_millis(100);
 pub struct Step {
     /// Vehicles, each with ten reports and ten votes a second.
     pub vehicles: usize,
-    /// Whether the load was carried.
+    /// True if the load was carried.
     pub carried: bool,
     /// From a round's last report to its map, at every vehicle.
     pub map: Quantiles,
@@ -30,7 +30,7 @@ pub struct Step {
     pub refused: u64,
     /// Most time in milliseconds by which sending began late.
     pub sent_late_ms: f64,
-    /// Who used how much.
+    /// Use of processors.
     pub shares: Shares,
 }
 
@@ -52,12 +52,12 @@ pub struct AggregatorShares {
     pub fusion: f64,
 }
 
-/// What a search came to.
+/// Result of a search.
 #[derive(Debug, Clone, Serialize)]
 pub struct Saturation {
     /// The most vehicles that were carried; none if not even the first load was.
     pub most_vehicles: Option<usize>,
-    /// What was at its end at the least load that was not carried, in words; none if all were carried.
+    /// Bottleneck at the least load that was not carried, in words; none if all were carried.
     pub first_saturated: Option<String>,
     /// All loads, as they were tried; of two tries the second.
     pub steps: Vec<Step>,
@@ -117,11 +117,11 @@ impl Step {
         }
     }
 
-    /// What has nothing left: the load itself, if it did not go out as it should, and then a processor.
+    /// Bottleneck: the load itself, if it did not go out as it should, and then a processor.
     fn blame(&self) -> String {
         let Self { refused, sent_late_ms, shares, .. } = self;
         let busiest = shares.busiest();
-        if *refused == 0 && *sent_late_ms <= MOST_LATE_MS {
+        if *refused == 0 && *sent_late_ms <= MAX_LATE_MS {
             return busiest;
         }
         format!(
@@ -132,7 +132,7 @@ impl Step {
 }
 
 impl Shares {
-    /// What a load cost.
+    /// Costs of a load.
     pub fn of(measured: &Measurement) -> Self {
         let aggregator = measured.aggregator.as_ref().map(|aggregator| {
             let broker = aggregator.percent_of(BROKER_THREAD);
@@ -141,7 +141,7 @@ impl Shares {
         Self { aggregator, vehicles: measured.vehicles.percent() }
     }
 
-    /// What has no processor left: a single thread with a core of its own, or all cores, and who takes most of them.
+    /// Exhausted processor: a single thread with a core of its own, or all cores, and who takes most of them.
     fn busiest(self) -> String {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let all_cores = BUSY_PERCENT * cores as f64;
@@ -172,7 +172,7 @@ const BROKER_THREAD: &str = "mqtt-broker";
 const BUSY_PERCENT: f64 = 80.0;
 
 /// From here on it is the sender that a load was too much for.
-const MOST_LATE_MS: f64 = 10.0;
+const MAX_LATE_MS: f64 = 10.0;
 
 #[cfg(test)]
 mod tests {

@@ -11,10 +11,10 @@ use tokio::time::{Instant, MissedTickBehavior};
 
 use super::access::BrokerAccess;
 
-/// What is sent.
+/// Messages that are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Load {
-    /// How many messages; those of the first tenth warm up and are not counted.
+    /// Number of messages; those of the first tenth warm up and are not counted.
     pub messages: u32,
     /// Time from one message to the next, whatever became of the last: a slow broker does not slow the load down.
     pub interval: Duration,
@@ -37,7 +37,7 @@ pub enum TwoHopError {
     Connection {
         /// The broker.
         broker: BrokerAddress,
-        /// What happened.
+        /// Cause.
         source: Box<rumqttc::ConnectionError>,
     },
     /// The broker did not answer or lost a message.

@@ -1,4 +1,4 @@
-//! What processes cost, by Linux's own count.
+//! Costs of processes, by Linux's own count.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,7 +12,7 @@ pub struct UsageMeter {
     before: BTreeMap<u32, (String, Duration)>,
 }
 
-/// What a process used.
+/// Processor time and memory of a process.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Usage {
     /// Percent of one core, by the names of its threads.
@@ -29,7 +29,7 @@ impl UsageMeter {
         Self { pid, begun: Instant::now(), before: threads(pid) }
     }
 
-    /// What was used until now; threads that ended in between are not counted.
+    /// Usage until now; threads that ended in between are not counted.
     pub fn stop(self) -> Usage {
         let span = self.begun.elapsed().as_secs_f64();
         let [resident_bytes, anonymous_bytes] = ["VmRSS:", "RssAnon:"].map(|key| memory_bytes(self.pid, key));

@@ -15,7 +15,7 @@ use super::access::BrokerAccess;
 use super::echo::{BACK, tick_of};
 use super::schedule::Schedule;
 
-/// What the vehicles of a run have in common.
+/// State that the vehicles of a run share.
 #[derive(Debug)]
 pub(super) struct Common {
     pub(super) access: BrokerAccess,
@@ -23,7 +23,7 @@ pub(super) struct Common {
     /// Set when all are connected.
     pub(super) schedule: OnceLock<Schedule>,
     pub(super) answer_bytes: Arc<AnswerBytes>,
-    /// Whether any map came.
+    /// True once a map has come.
     pub(super) has_map: watch::Sender<bool>,
 }
 
@@ -160,7 +160,7 @@ impl Arrivals {
     }
 }
 
-/// What a map says of its round.
+/// Fields of a map that tell its round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct MapHead {
     round: u64,

@@ -103,8 +103,8 @@ struct Goal {
     met: bool,
 }
 
-/// How much longer than the bare way an answer may take.
-const MOST_RATIO: f64 = 1.5;
+/// Maximum ratio of the cell's latency to that of the bare way.
+const MAX_RATIO: f64 = 1.5;
 
 /// Rounds of a measurement, between which vehicles connect anew.
 const PASSES: u64 = 4;
@@ -112,7 +112,7 @@ const PASSES: u64 = 4;
 /// Vehicles for which the costs are told.
 const COST_VEHICLES: usize = 32;
 
-/// How long they report for somebody who looks at the page.
+/// Time for which they report while somebody looks at the page.
 const LOOK: Duration = Duration::from_secs(4);
 
 /// The load at which the search begins.
@@ -208,8 +208,8 @@ async fn compare(target: &Target, arguments: &BenchArguments, figures: &mut Figu
         for (answer, ways) in [("map", Some(&map)), ("verdict", verdict.as_ref())] {
             let Some(ways) = ways else { continue };
             ways.tell(vehicles, answer, &mut rows);
-            figures.goal(format!("vehicles_{vehicles}_{answer}_p50_ratio"), ways.p50_ratio, MOST_RATIO);
-            figures.goal(format!("vehicles_{vehicles}_{answer}_p99_ratio"), ways.p99_ratio, MOST_RATIO);
+            figures.goal(format!("vehicles_{vehicles}_{answer}_p50_ratio"), ways.p50_ratio, MAX_RATIO);
+            figures.goal(format!("vehicles_{vehicles}_{answer}_p99_ratio"), ways.p99_ratio, MAX_RATIO);
         }
         let Measurement { report_bytes, map_bytes, verdict_bytes, refused, latest, .. } = last;
         let sent_late_us = latest.as_micros();
@@ -284,7 +284,7 @@ fn in_ms(us: Option<f64>) -> String {
     us.map_or_else(|| "-".to_owned(), |us| format!("{:.2}", us / 1000.0))
 }
 
-/// What a node without camera costs, with the dashboard on and nobody looking, and what recording adds; then how soon
+/// Costs of a node without camera, with the dashboard on and nobody looking, and of recording; then how soon
 /// somebody who looks sees something.
 async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
     let load = Load { bare: false, votes: false, ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds)) };
@@ -326,7 +326,7 @@ async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures
     Ok(())
 }
 
-/// What a browser gets of the page while the vehicles report.
+/// Figures of the page as a browser gets it while the vehicles report.
 async fn look(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigures> {
     let address = aggregator.page();
     let load = Load { bare: false, ..Load::new(COST_VEHICLES, LOOK) };

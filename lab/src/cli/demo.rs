@@ -93,7 +93,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     Ok(print(&format!("pictures, results, configurations and logs: {}\n", arguments.out.display()))?)
 }
 
-/// Who led when, how right its maps were, and what the change cost the vehicles.
+/// Terms of all leaders: times, accuracy, and gap for the vehicles.
 fn leaders(outcome: &DemoResult) -> String {
     let line = |term: &JudgedTerm| {
         let since = |time: Timestamp| time.since(outcome.from).as_secs_f64();

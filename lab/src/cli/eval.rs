@@ -44,7 +44,7 @@ pub(super) struct EvalArguments {
 const MAX_LINE_BYTES: usize = 1 << 28;
 
 /// Confusions that are printed; the file has all.
-const MOST_CONFUSIONS: usize = 12;
+const MAX_CONFUSIONS: usize = 12;
 
 /// A line of a replay's output or of a node's map log.
 #[derive(Deserialize)]
@@ -164,9 +164,9 @@ fn confusion(name: &str, scores: &Scores) -> String {
     let name_of = |label: &Option<ecod::names::Label>| label.as_deref().unwrap_or("-").to_owned();
     let mut rows = vec![header(&["truth", "said", "items"])];
     rows.extend(
-        cells.iter().take(MOST_CONFUSIONS).map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]),
+        cells.iter().take(MAX_CONFUSIONS).map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]),
     );
-    let more = cells.len().saturating_sub(MOST_CONFUSIONS);
+    let more = cells.len().saturating_sub(MAX_CONFUSIONS);
     let rest = if more > 0 { format!("and {more} more\n") } else { String::new() };
     format!("\n{name}, truth and what was said\n{}{rest}", columns(&rows))
 }

@@ -1,5 +1,7 @@
 //! `ecod-lab testbed`: the scenes of a file, rendered, detected and fused in virtual time; or a recorded intersection.
 
+mod intersection;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -9,7 +11,7 @@ use ecod_actors::cli::{Failure, lines, print};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
-use super::{intersection, write_json};
+use super::write_json;
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 use crate::testbed::trial::Trial;

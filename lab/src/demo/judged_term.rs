@@ -1,4 +1,4 @@
-//! Who led a cell when, and how long its vehicles waited when the lead changed hands.
+//! Terms of a cell's leaders, and how long its vehicles waited at each change.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -14,7 +14,7 @@ use crate::testbed::{Scene, Testbed};
 /// A leadership as the vehicles saw it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JudgedTerm {
-    /// Who led, in which term.
+    /// Leader and term.
     pub epoch: Epoch,
     /// When the first vehicle took the first map.
     pub from: Timestamp,
@@ -23,7 +23,7 @@ pub struct JudgedTerm {
     /// Longest time that a vehicle waited from the last map of another leader to the first of this one; none when there
     /// was no other.
     pub gap: Option<Duration>,
-    /// How right the maps were.
+    /// Accuracy of the maps.
     pub score: SpotScore,
 }
 

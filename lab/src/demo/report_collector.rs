@@ -43,7 +43,7 @@ impl ReportCollector {
         let status = NodeStatus::starting(name, Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static("testbed"),
-            part: SubscriptionRole::Candidate,
+            role: SubscriptionRole::Candidate,
             status,
             mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },
             security: Security::default(),
@@ -56,7 +56,7 @@ impl ReportCollector {
         Ok(Self { gateway, ended, seen })
     }
 
-    /// How many vehicles have reported.
+    /// Number of vehicles that have reported.
     pub(super) fn reporters(&self) -> usize {
         lock(&self.seen).reports.iter().map(|observed| observed.report.node.clone()).collect::<BTreeSet<_>>().len()
     }
@@ -66,7 +66,7 @@ impl ReportCollector {
         lock(&self.seen).leader.clone()
     }
 
-    /// How many reports have come.
+    /// Number of reports received.
     pub(super) fn reports(&self) -> usize {
         lock(&self.seen).reports.len()
     }

@@ -94,7 +94,7 @@ fn reports_that_name_no_location_are_placed_and_translated_as_in_the_cell() {
         vacancy: None,
         synonyms: vec![Synonym { from: "vase".into(), label: "sports ball".into() }],
     };
-    let gate = Gate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
+    let gate = LandmarkGate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
     let truth = Truth::parse(r#"{"ball": "sports ball"}"#).unwrap();
     let mut evaluation = Evaluation::new(truth).with_landmarks(LandmarkIndex::new(vec![ball], 0.5), gate);
     let mut unnamed = report("v", 1, &[("", "vase"), ("", "vase")]);

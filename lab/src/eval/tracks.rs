@@ -1,4 +1,4 @@
-//! How right the objects of maps are: detection, localisation and identity against a truth that moves.
+//! Accuracy of the objects of maps: detection, localisation and identity against a truth that moves.
 //!
 //! An object of a map can be taken for a true one of the same label that is near enough. Detection is judged by average
 //! precision at four distances and by the best F1; then, at a threshold on the confidence, by MODA and MODP, CLEAR MOT,
@@ -50,9 +50,9 @@ const REACH: f64 = 0.75;
 /// One moment: what stood where, and what was said.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Frame {
-    /// What stood there, each id once.
+    /// True objects, each id once.
     pub truth: Vec<TrueObject>,
-    /// What was said to stand there, each id once.
+    /// Objects of the map, each id once.
     pub said: Vec<SaidObject>,
 }
 
@@ -80,7 +80,7 @@ pub struct SaidObject {
     pub position: Point2<f64>,
 }
 
-/// What came of an evaluation. Shares are percentages; `None` where nothing could be judged.
+/// Result of an evaluation. Shares are percentages; `None` where nothing could be judged.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrackScores {
     /// Frames of the truth.
@@ -103,7 +103,7 @@ pub struct TrackScores {
     pub at_default: ThresholdScores,
 }
 
-/// What holds for the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes
+/// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes
 /// together.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThresholdScores {

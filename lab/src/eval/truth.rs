@@ -1,4 +1,4 @@
-//! What really stands at each location, and since when.
+//! Ground truth of known locations: the label of each, and since when.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,7 +8,7 @@ use ecod::wire::is_label;
 use serde::Deserialize;
 use serde_json::Value;
 
-/// What a sign of vacancy reads unless the file says otherwise.
+/// Default text of a sign of vacancy.
 const VACANT: &str = "EMPTY";
 
 /// The true label of every location that is judged; others are not.
@@ -30,7 +30,7 @@ pub struct Truth {
     empty: BTreeSet<Label>,
 }
 
-/// What is true from a time on.
+/// Truth from a time on.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Span {
     from: Timestamp,
@@ -56,7 +56,7 @@ pub enum TruthError {
     Location {
         /// The location.
         landmark: String,
-        /// What is wrong with it.
+        /// Reason.
         reason: String,
     },
     /// No location at all.
@@ -117,7 +117,7 @@ impl Truth {
         Ok(Self { landmarks, empty: BTreeSet::from([Label::new_static(VACANT)]) })
     }
 
-    /// What was true at a location, with the position of the span among the location's; `None` where no truth is known.
+    /// Truth at a location, with the position of its span among the location's; `None` where none is known.
     pub(super) fn at(&self, landmark: &LandmarkId, time: Timestamp) -> Option<(usize, &Span)> {
         let spans = self.landmarks.get(landmark)?;
         spans.iter().enumerate().rev().find(|(_, span)| span.from <= time)
@@ -128,7 +128,7 @@ impl Truth {
         self.landmarks.iter().flat_map(|(id, spans)| spans.iter().enumerate().map(move |(n, span)| (id, n, span)))
     }
 
-    /// Whether a label, or none, is right.
+    /// True if the label, or none, is right.
     pub(super) fn accepts(&self, span: &Span, label: Option<&Label>) -> bool {
         let said_empty = label.is_some_and(|label| self.empty.contains(label));
         span.accepted.iter().any(|right| right.as_ref() == label || (right.is_none() && said_empty))

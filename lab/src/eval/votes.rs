@@ -1,9 +1,9 @@
-//! What the vehicles said, without fusion: the baselines.
+//! Baselines: the vehicles' votes without fusion.
 
 use std::collections::BTreeMap;
 
 use ecod::geometry::Covariance;
-use ecod::landmark::{Gate, Landmark, LandmarkIndex};
+use ecod::landmark::{Landmark, LandmarkGate, LandmarkIndex};
 use ecod::names::{Label, NodeName};
 use ecod::wire::PerceivedObject;
 use nalgebra::Point2;
@@ -110,7 +110,11 @@ fn chance(ballot: &Ballot) -> Option<f64> {
 }
 
 /// The location that an object is taken for: the one it names, or else the best by position.
-pub(super) fn place<'a>(object: &PerceivedObject, landmarks: &'a LandmarkIndex, gate: &Gate) -> Option<&'a Landmark> {
+pub(super) fn place<'a>(
+    object: &PerceivedObject,
+    landmarks: &'a LandmarkIndex,
+    gate: &LandmarkGate,
+) -> Option<&'a Landmark> {
     let index = match &object.landmark {
         Some(id) => landmarks.position_of(id)?,
         None => {

@@ -2,7 +2,7 @@
 
 use crate::eval::tracks::{AP_DISTANCES_M, ThresholdScores, TrackScores};
 
-/// What holds at a threshold, in the order of [`at`].
+/// Headings of the figures at a threshold, in the order of [`at`].
 const AT_THRESHOLD: [&str; 12] = [
     "at confidence",
     "",
@@ -38,7 +38,7 @@ pub(crate) fn tables(scores: &TrackScores) -> [Vec<Vec<String>>; 2] {
     [precision, thresholds]
 }
 
-/// What there is to say where maps are missing.
+/// Warning about frames without a map.
 pub(crate) fn without_map(scores: &TrackScores) -> Option<String> {
     let TrackScores { frames, frames_with_map, .. } = scores;
     let missing = frames - frames_with_map;

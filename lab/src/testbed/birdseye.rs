@@ -74,7 +74,7 @@ fn check(scene: &Scene, detections: &[(NodeName, Point2<f64>)], map: Option<&Glo
     }
 }
 
-/// How the map's word about a spot compares with the truth.
+/// Comparison of a spot's label in the map with the truth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Judgement {
     Right,
@@ -187,7 +187,7 @@ impl Picture<'_> {
         bodies.fold(group, Group::add)
     }
 
-    /// What stands: plates of parked vehicles thick, `EMPTY` placards thin, each with a tick towards its front.
+    /// Cards in the scene: plates of parked vehicles thick, `EMPTY` placards thin, each with a tick towards its front.
     fn placards(&self) -> Group {
         let placard = |place: &Point2<f64>, facing_rad: f64, weight: f64| {
             let pose = Pose { position: *place, heading_rad: facing_rad };

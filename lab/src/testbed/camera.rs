@@ -64,7 +64,7 @@ pub enum RenderError {
     /// OpenCV refused an operation.
     #[error("opencv failed in {step}")]
     OpenCv {
-        /// What was being done.
+        /// Step that failed.
         step: &'static str,
         /// OpenCV's own words.
         #[source]

@@ -17,10 +17,10 @@ use super::{Camera, Cav, Placard, RecordedRun, Scene, Spot, Testbed};
 
 const METRES_PER_INCH: f64 = 0.0254;
 /// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is rendered.
-const LEAST_INTERVAL_S: f64 = 1e-4;
-const MOST_INTERVAL_S: f64 = 3600.0;
+const MIN_INTERVAL_S: f64 = 1e-4;
+const MAX_INTERVAL_S: f64 = 3600.0;
 /// Most frames that are rendered for one submission.
-const MOST_FRAMES_PER_SUBMISSION: f64 = 1000.0;
+const MAX_FRAMES_PER_SUBMISSION: f64 = 1000.0;
 /// Farthest coordinate, to keep squares and quotients finite.
 const MAX_COORDINATE_IN: f64 = 1e6;
 
@@ -37,7 +37,7 @@ pub enum TestbedError {
         place: String,
         /// Path of the key, such as `spots[2].truth`.
         key: String,
-        /// What is wrong, with the value found.
+        /// Reason, with the value found.
         reason: String,
     },
 }
@@ -163,10 +163,10 @@ impl CameraFields {
         let horizontal = place.number("camera.horizontal_fov_deg", self.horizontal_fov_deg, 0.0, 170.0)?;
         let vertical = place.number("camera.vertical_fov_deg", self.vertical_fov_deg, 0.0, 170.0)?;
         let capture_s =
-            place.number("camera.capture_interval_s", self.capture_interval_s, LEAST_INTERVAL_S, MOST_INTERVAL_S)?;
-        let most_s = (MOST_FRAMES_PER_SUBMISSION * capture_s).min(MOST_INTERVAL_S);
+            place.number("camera.capture_interval_s", self.capture_interval_s, MIN_INTERVAL_S, MAX_INTERVAL_S)?;
+        let most_s = (MAX_FRAMES_PER_SUBMISSION * capture_s).min(MAX_INTERVAL_S);
         let submission_s =
-            place.number("camera.submission_interval_s", self.submission_interval_s, LEAST_INTERVAL_S, most_s)?;
+            place.number("camera.submission_interval_s", self.submission_interval_s, MIN_INTERVAL_S, most_s)?;
         Ok(Camera {
             intrinsics: Intrinsics::from_field_of_view(
                 self.image_width,

@@ -1,4 +1,4 @@
-//! What a vehicle's camera sees, as image files: its node plays them as it would any others.
+//! Frames of a vehicle's camera as image files; its node plays them as it would any others.
 
 use std::fs;
 use std::path::Path;
@@ -14,8 +14,8 @@ use super::{Cav, Scene, Testbed};
 /// Frames that are rendered; they are played again and again.
 const FRAMES: u64 = 50;
 
-/// Renders the vehicle's first frames into `directory`, without loss, and gives the source that plays them at the rate of
-/// the scene's cameras.
+/// Renders the vehicle's first frames into `directory`, without loss. The returned source plays them at the rate of the
+/// scene's cameras.
 ///
 /// # Errors
 /// When a frame cannot be rendered or written.

@@ -13,7 +13,7 @@ use std::time::Duration;
 use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::camera::Mount;
 use ecod::geometry::{Pose, wrap_angle};
-use ecod::landmark::{Gate, Landmark, LandmarkIndex};
+use ecod::landmark::{Landmark, LandmarkGate, LandmarkIndex};
 use ecod::names::{Label, LandmarkId, NodeName};
 use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ecod::replay::{FusedLine, Replay, ReplayConfig};
@@ -23,7 +23,7 @@ use ecod::view::ViewConfig;
 use ecod::vote::{VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, ReportKind};
 use ecod_actors::camera::lens::Lens;
-use ecod_actors::camera::perception::{Perception, Vantage};
+use ecod_actors::camera::perception::{Perception, VehicleCamera};
 use nalgebra::Point2;
 use serde::Serialize;
 use serde_json::json;
@@ -57,20 +57,20 @@ const SIZES: [(&str, f64, f64); 16] = [
 /// Height in metres of what has any other label, to find its bearing with.
 const ANY_HEIGHT_M: f64 = 0.11;
 /// Which location an object of known size is taken for.
-const GATE: Gate = Gate { radius_m: 0.5, sigmas: 3.0, floor_m: 0.02 };
-/// How far in radians an object of unknown size may be beside a location that it is taken for.
+const GATE: LandmarkGate = LandmarkGate { radius_m: 0.5, sigmas: 3.0, floor_m: 0.02 };
+/// Greatest angle in radians between an object of unknown size and the location that it is taken for.
 const MAX_BESIDE_RAD: f64 = 0.15;
 /// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.
 const MAX_HEIGHT_FACTOR: f64 = 5.0;
 
-/// What came of a recording.
+/// Result of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct IntersectionResult {
     /// The scene's name.
     pub name: String,
-    /// How many scenes it is the mean of: 1 for a recording.
+    /// Number of scenes that it is the mean of: 1 for a recording.
     pub scenes: u64,
-    /// How many verdicts were judged: one for every object and frame.
+    /// Number of verdicts that were judged: one for every object and frame.
     pub verdicts: u64,
     /// Right verdicts in percent, default mode.
     pub vote_accuracy_pct: f64,
@@ -94,7 +94,7 @@ pub struct FrameLabel {
     pub landmark: LandmarkId,
     /// The verdict; null for none.
     pub label: Option<Label>,
-    /// Whether it is among the accepted labels.
+    /// True if it is among the accepted labels.
     pub right: bool,
 }
 
@@ -143,7 +143,7 @@ impl IntersectionResult {
     }
 }
 
-/// What the vehicles would have published, in order of arrival.
+/// Reports that the vehicles would have published, in order of arrival.
 pub fn reports(recording: &IntersectionRecording) -> Vec<ObjectReport> {
     let landmarks = Arc::new(LandmarkIndex::new(recording.landmarks(), GATE.radius_m));
     let mut vehicles: Vec<Perception> =
@@ -259,7 +259,7 @@ fn fusion(mode: VoteMode) -> FusionConfig {
 }
 
 fn perception(recording: &IntersectionRecording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -> Perception {
-    let vantage = Vantage {
+    let vehicle_camera = VehicleCamera {
         node: cav.name.clone(),
         pose: cav.pose,
         mount: Mount::default(),
@@ -276,5 +276,5 @@ fn perception(recording: &IntersectionRecording, cav: &Cav, landmarks: Arc<Landm
         position_sigma_m: 0.02,
         ..ProjectionConfig::default()
     };
-    Perception::new(vantage, projection, ViewConfig::default(), GATE)
+    Perception::new(vehicle_camera, projection, ViewConfig::default(), GATE)
 }

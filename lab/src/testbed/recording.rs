@@ -26,7 +26,7 @@ const MAX_BOXES: usize = 1_000_000;
 pub struct IntersectionRecording {
     /// The camera of every vehicle.
     pub intrinsics: Intrinsics,
-    /// What stands where.
+    /// Objects and their places.
     pub objects: Vec<KnownObject>,
     /// The vehicles.
     pub cavs: Vec<Cav>,
@@ -46,7 +46,7 @@ pub struct KnownObject {
 }
 
 impl IntersectionRecording {
-    /// Whether a JSON file is a recording rather than a list of scenes.
+    /// True if a JSON file is a recording, not a list of scenes.
     pub fn is_recording(file: &Value) -> bool {
         file.get("frames").is_some() && file.get("objects").is_some()
     }

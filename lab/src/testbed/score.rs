@@ -1,4 +1,4 @@
-//! How right maps are: the share of spots whose label is the truth.
+//! Accuracy of maps: the share of spots whose label is the truth.
 
 use std::collections::BTreeMap;
 
@@ -46,7 +46,7 @@ impl SpotScore {
     }
 }
 
-/// Whether what a map says of a spot is right; `None` when it does not know. A plate must be read to the letter. A free
+/// True if a map's label of a spot is right; `None` when the map does not know. A plate must be read to the letter. A free
 /// spot must be said to be empty: by its placard's text, or without a placard by vehicles that looked and found
 /// nothing.
 pub(super) fn is_right(testbed: &Testbed, spot: &Spot, state: &LandmarkState) -> Option<bool> {
@@ -59,12 +59,12 @@ pub(super) fn is_right(testbed: &Testbed, spot: &Spot, state: &LandmarkState) ->
     }
 }
 
-/// What came of one scene.
+/// Result of one scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SceneResult {
     /// The scene's name.
     pub name: String,
-    /// How many fused maps were judged.
+    /// Number of fused maps that were judged.
     pub verdicts: u64,
     /// Right spots in percent, fused.
     pub pace_accuracy_pct: f64,

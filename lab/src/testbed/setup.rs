@@ -19,7 +19,7 @@ use ecod_actors::camera::detect::placard::PlacardConfig;
 use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::camera::frame_source::capture::CaptureConfig;
 use ecod_actors::camera::lens::Lens;
-use ecod_actors::camera::perception::{Perception, Vantage};
+use ecod_actors::camera::perception::{Perception, VehicleCamera};
 use ecod_actors::camera::vehicle_pose::PoseConfig;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::dashboard::DashboardConfig;
@@ -30,10 +30,10 @@ use crate::testbed::{Cav, Placard, Scene, Testbed};
 /// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
 const GATE_M: f64 = 0.032;
 
-/// For how many frames a report counts at the least, as far as [`MOST_AGE_S`] allows.
+/// For how many frames a report counts at the least, as far as [`MAX_AGE_S`] allows.
 const FRAMES_REMEMBERED: f64 = 3.0;
 /// The most seconds that a report may count.
-const MOST_AGE_S: f64 = 3600.0;
+const MAX_AGE_S: f64 = 3600.0;
 
 /// The edge's configuration: role, known locations and fusion.
 pub fn edge(testbed: &Testbed, scene: &Scene) -> NodeConfig {
@@ -85,23 +85,23 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
 /// A vehicle's way from detections to reports.
 pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
     let gate = fusion(testbed).pace.gate();
-    let vantage = Vantage {
+    let vehicle_camera = VehicleCamera {
         node: cav.name.clone(),
         pose: cav.pose,
         mount: Mount::default(),
         lens: Lens::ideal(testbed.camera.intrinsics),
         landmarks: Arc::new(LandmarkIndex::new(scene.landmarks(&testbed.placard), gate.radius_m)),
     };
-    Perception::new(vantage, projection(&testbed.placard), view(&testbed.placard), gate)
+    Perception::new(vehicle_camera, projection(&testbed.placard), view(&testbed.placard), gate)
 }
 
-/// How reports are fused: a round for every frame, which counts until some more have come.
+/// Fusion of reports: a round for every frame, which counts until some more have come.
 pub fn fusion(testbed: &Testbed) -> FusionConfig {
     let period_s = testbed.camera.capture_interval.as_secs_f64();
     let (mut window, mut pace) = (WindowConfig::default(), PaceConfig::default());
     (pace.gate_m, pace.position_floor_m) = (GATE_M, 0.01);
-    pace.max_age_s = pace.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MOST_AGE_S);
-    window.max_age_s = window.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MOST_AGE_S);
+    pace.max_age_s = pace.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
+    window.max_age_s = window.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
     FusionConfig {
         algorithms: Algorithms::Pace,
         round: RoundConfig { period_s, ..RoundConfig::default() },
@@ -134,8 +134,8 @@ fn view(placard: &Placard) -> ViewConfig {
     }
 }
 
-/// What all nodes of the cell share; they gossip on loopback, where no other cell of this machine is met, and serve no
-/// page.
+/// Configuration that all nodes of the cell share. They gossip on loopback, where they meet no other cell of this machine,
+/// and serve no page.
 fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
     let membership = MembershipConfig {
         bind: Some(SocketAddr::from(([127, 0, 0, 1], 0))),

@@ -1,4 +1,4 @@
-//! Who sees which card, by the geometry: cards stand upright and the axis of the camera is level with their codes, so
+//! Views of cards, by the geometry: cards stand upright and the axis of the camera is level with their codes, so
 //! that one column of the image meets each card at one depth.
 
 use ecod::geometry::{Pose, wrap_angle};
@@ -24,7 +24,7 @@ pub struct Hit {
     pub depth_m: f64,
     /// Metres from the middle of the card to the right, as seen from its front.
     pub right_m: f64,
-    /// Whether the front of the card is towards the camera.
+    /// True if the front of the card is towards the camera.
     pub front: bool,
 }
 
@@ -51,7 +51,7 @@ impl Card {
     }
 }
 
-/// How a camera sees the code of a card.
+/// View of a card's code by a camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sighting {
     /// Distance of the card in metres.
@@ -65,7 +65,7 @@ pub struct Sighting {
 }
 
 impl Sighting {
-    /// How the camera at `camera` sees `card` among `cards`; `None` unless the code lies fully inside the image and
+    /// View of `card` among `cards` by the camera at `camera`; `None` unless the code lies fully inside the image and
     /// shows its front.
     pub fn of(card: &Card, cards: &[Card], camera: &Pose, testbed: &Testbed) -> Option<Self> {
         let (intrinsics, placard) = (&testbed.camera.intrinsics, &testbed.placard);
@@ -95,7 +95,7 @@ impl Sighting {
         Some(Self { range_m: to_camera.norm(), yaw_rad, width_px: right_px - left_px, shown })
     }
 
-    /// Whether the code is so large, and so little of it hidden, that it may be read.
+    /// True if the code is large enough, and little enough of it hidden, to be read.
     pub fn is_legible(&self) -> bool {
         self.shown >= CLEAR && self.width_px >= LEGIBLE_PX
     }

@@ -1,11 +1,11 @@
-//! What traffic to generate.
+//! Parameters of the traffic.
 
 use std::f64::consts::TAU;
 
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
-/// What traffic to generate and what its observers are like. The default is a quarter of a town with eight observers.
+/// Parameters of the traffic and of its observers. The default is a quarter of a town with eight observers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrafficConfig {
@@ -23,7 +23,7 @@ pub struct TrafficConfig {
     pub roads: usize,
     /// Metres between roads. Default 80.
     pub block_m: f64,
-    /// How long in seconds. Default 30.
+    /// Duration in seconds. Default 30.
     pub duration_s: f64,
     /// Seconds of traffic before the first report, so that it has sorted itself. Default 20.
     pub warm_up_s: f64,
@@ -34,13 +34,13 @@ pub struct TrafficConfig {
     pub synchronous: bool,
     /// Seconds for which an object that nobody can see any more still belongs to the truth. Default 1.
     pub memory_s: f64,
-    /// What observers see.
+    /// Sensors of the observers.
     pub sensor: SensorConfig,
-    /// What observers say beside labels, confidences and positions.
+    /// Optional parts of reports, beside labels, confidences and positions.
     pub said: SaidConfig,
 }
 
-/// What an observer sees, and how wrong.
+/// Sensor of an observer and its errors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SensorConfig {
@@ -52,7 +52,7 @@ pub struct SensorConfig {
     pub angle_rad: f64,
     /// Standard deviation of positions in metres near by. Default 0.12.
     pub noise_m: f64,
-    /// What is added to it for every metre of range. Default 0.005.
+    /// Addition to it for every metre of range. Default 0.005.
     pub noise_per_m: f64,
     /// Standard deviation in metres of what an observer is wrong about one object for about a second. Default 0.15.
     pub bias_m: f64,
@@ -72,7 +72,7 @@ pub struct SensorConfig {
     pub lost: f64,
 }
 
-/// What observers say beside labels, confidences and positions.
+/// Optional parts of reports, beside labels, confidences and positions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SaidConfig {
@@ -80,7 +80,7 @@ pub struct SaidConfig {
     pub poses: bool,
     /// Covariances of positions, without biases and pose errors, as detectors do. Default true.
     pub covariances: bool,
-    /// What their sensors cover; needs poses. Default true.
+    /// Area that their sensors cover; needs poses. Default true.
     pub views: bool,
     /// Velocities, with such a standard deviation in metres per second in each direction; absent by default.
     pub velocities_mps: Option<f64>,

@@ -32,7 +32,7 @@ impl Dice<'_> {
         -mean * (1.0 - (self.0)()).ln()
     }
 
-    /// How many of what happens independently at this mean: arrivals at exponential intervals.
+    /// Number of independent events at this mean: arrivals at exponential intervals.
     pub(super) fn poisson(&mut self, mean: f64) -> usize {
         let mut count = 0;
         let mut at = self.exponential(1.0);

@@ -82,7 +82,7 @@ pub(super) fn drive(roads: &Roads, vehicles: &mut [MovingVehicle], at_s: f64, st
     }
 }
 
-/// What a driver minds.
+/// Road conditions ahead of a driver.
 #[derive(Debug, Clone, Copy)]
 struct Ahead {
     /// Free metres before the next thing to stop behind, and its speed.
@@ -135,7 +135,7 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
     ahead
 }
 
-/// Whether nobody is on the crossing who would be in the way, and there is room behind it.
+/// True if nobody on the crossing is in the way, and there is room behind it.
 fn is_free(vehicles: &[MovingVehicle], number: usize, crossing: Crossing, heading: Direction, to: Direction) -> bool {
     let is_left = |from: Direction, to: Direction| (from + 1) % 4 == to % 4;
     vehicles.iter().enumerate().filter(|(place, _)| *place != number).all(|(_, other)| match other.path {
@@ -151,7 +151,7 @@ fn is_free(vehicles: &[MovingVehicle], number: usize, crossing: Crossing, headin
 }
 
 impl MovingVehicle {
-    /// What it drives on after this.
+    /// Path that it drives on after this.
     #[expect(clippy::expect_used, reason = "the grid of roads has no dead ends")]
     fn next(&self, roads: &Roads) -> Path {
         match self.path {
@@ -170,7 +170,7 @@ impl MovingVehicle {
         }
     }
 
-    /// Whether another is on the way that this goes on: behind the same stop line, wherever it turns to.
+    /// True if another is on this one's way: behind the same stop line, wherever it turns to.
     fn shares_beginning(&self, other: &Self, next: Path) -> bool {
         match (next, other.path) {
             (Path::Turn { at, from, .. }, Path::Turn { at: other_at, from: other_from, .. }) => {

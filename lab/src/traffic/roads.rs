@@ -10,7 +10,7 @@ const PARKED_M: f64 = 5.2;
 const BUILDING_M: f64 = 10.0;
 /// From the middle of a crossing to its stop lines.
 const CROSSING_M: f64 = 10.0;
-/// How long a signal is green, and red for all, in seconds.
+/// Times for which a signal is green, and red for all, in seconds.
 const GREEN_S: f64 = 9.0;
 const CLEARING_S: f64 = 2.0;
 
@@ -122,7 +122,7 @@ impl Roads {
         [begin, if from % 4 == to % 4 { nalgebra::center(&begin, &end) } else { corner }, end]
     }
 
-    /// Whether the signal lets this direction go.
+    /// True if the signal lets this direction go.
     pub(super) fn is_green(&self, (column, row): Crossing, heading: Direction, at_s: f64) -> bool {
         let cycle_s = 2.0 * (GREEN_S + CLEARING_S);
         let offset_s = (column * 7 + row * 5) as f64;
@@ -150,7 +150,7 @@ fn bezier([begin, control, end]: &[Point2<f64>; 3], share: f64) -> (Point2<f64>,
 }
 
 impl Building {
-    /// Whether it stands between two points: the segment crosses it (slab test).
+    /// True if it stands between two points: the segment crosses it (slab test).
     pub(super) fn hides(&self, from: &Point2<f64>, to: &Point2<f64>) -> bool {
         let (mut enter, mut leave) = (0.0f64, 1.0f64);
         for axis in 0..2 {

@@ -1,4 +1,4 @@
-//! Who can see what: vehicles and buildings hide what is behind them.
+//! Lines of sight: vehicles and buildings hide what is behind them.
 
 use ecod::geometry::wrap_angle;
 use nalgebra::{Point2, Vector2};
@@ -14,11 +14,11 @@ pub(super) struct Body {
     pub(super) speed_mps: f64,
     pub(super) length_m: f64,
     pub(super) width_m: f64,
-    /// Whether it hides what is behind it.
+    /// True if it hides what is behind it.
     pub(super) is_opaque: bool,
 }
 
-/// How much of a body is seen from somewhere.
+/// Visible part of a body, seen from somewhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Sight {
     /// Its place among the bodies.
@@ -32,7 +32,7 @@ pub(super) struct Sight {
     half_rad: f64,
 }
 
-/// What is within `range_m` of body number `own`, and how much of it is seen from there.
+/// Bodies within `range_m` of body number `own`, and how much of each is seen from there.
 pub(super) fn sights(own: usize, bodies: &[Body], buildings: &[Building], range_m: f64) -> Vec<Sight> {
     let from = bodies[own].center;
     let mut sights: Vec<Sight> = (0..bodies.len())

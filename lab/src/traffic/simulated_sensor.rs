@@ -1,6 +1,6 @@
-//! What one vehicle makes of what it could see.
+//! Sensor of one vehicle: from visible bodies to a report with errors.
 //!
-//! Whether something is found depends on range, on how much of it is hidden, on its class, and on a quality of each
+//! The chance of a detection depends on range, on how much of it is hidden, on its class, and on a quality of each
 //! pair of observer and object that changes within a second: misses come in runs. Confidences follow the same quality,
 //! so those of what is hardly seen look like those of what is not there. Of an object that is partly hidden, the middle
 //! of what is seen is reported.
@@ -19,7 +19,7 @@ const POSE_S: f64 = 25.0;
 /// Noise across the line of sight, as a share of that along it.
 const ACROSS: f64 = 0.6;
 /// Share that must be seen for anything to be found, and to count as seen.
-const LEAST_SHARE: f64 = 0.15;
+const MIN_SHARE: f64 = 0.15;
 /// Mean life of a ghost in seconds, and its chance to appear in a report.
 const GHOST_S: f64 = 1.5;
 const GHOST_CHANCE: f64 = 0.7;
@@ -39,7 +39,7 @@ pub(super) struct SimulatedSensor {
     last_s: f64,
 }
 
-/// How well an observer sees one body.
+/// Quality of an observer's view of one body.
 #[derive(Debug, Clone, Copy)]
 struct Glance {
     quality: Drift,
@@ -55,7 +55,7 @@ struct Ghost {
     until_s: f64,
 }
 
-/// What a detector finds.
+/// Detection, true or false.
 #[derive(Debug, Clone, Copy)]
 struct Found {
     position: Point2<f64>,
@@ -65,7 +65,7 @@ struct Found {
     body: Option<usize>,
 }
 
-/// What surrounds an observer.
+/// Surroundings of an observer.
 pub(super) struct Surroundings<'a> {
     pub(super) pose: Pose,
     pub(super) bodies: &'a [Body],
@@ -82,7 +82,7 @@ impl Surroundings<'_> {
     }
 }
 
-/// How sure a detector is, and how likely it finds something, as log odds.
+/// Confidence of a detector and its chance of a detection, as log odds.
 fn share_of(log_odds: f64) -> f64 {
     1.0 / (1.0 + (-log_odds).exp())
 }
@@ -99,10 +99,10 @@ impl SimulatedSensor {
         }
     }
 
-    /// Whether something counts as seen.
+    /// True if something counts as seen.
     pub(super) fn sees(config: &TrafficConfig, pose: &Pose, sight: &Sight) -> bool {
         let aside_rad = wrap_angle(sight.bearing_rad - pose.heading_rad).abs();
-        sight.share >= LEAST_SHARE && aside_rad <= config.sensor.angle_rad / 2.0
+        sight.share >= MIN_SHARE && aside_rad <= config.sensor.angle_rad / 2.0
     }
 
     /// Fills in a report.
@@ -164,7 +164,7 @@ impl SimulatedSensor {
         }
     }
 
-    /// What it makes of something that is there.
+    /// Detection of a body that is there.
     fn glance(
         &mut self,
         config: &TrafficConfig,
@@ -211,7 +211,7 @@ impl SimulatedSensor {
     }
 }
 
-/// What is said of an object beside its place, in a frame that is turned; what is not there seems to stand.
+/// Reported motion and size of an object, in a frame that is turned; a false alarm seems to stand.
 fn describe(
     said: &SaidConfig,
     object: &mut PerceivedObject,

@@ -45,7 +45,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         let arguments = FollowerArguments {
             newest: newest.clone(),
             log: None,
-            recording: Recording::default(),
+            recording: LogSender::default(),
             saved_term: 0,
             leadership: tokio::sync::watch::channel(leadership.clone()).1,
             election: ActorSlot::default(),
@@ -66,7 +66,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             aggregator: Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
             intake: Intake::default(),
             newest: None,
-            recording: Recording::default(),
+            recording: LogSender::default(),
             gateway: ActorSlot::default(),
             keeper: ActorSlot::default(),
             counters: Arc::default(),

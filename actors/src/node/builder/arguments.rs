@@ -28,9 +28,9 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::ActorSlots;
 use crate::node::config::NodeConfig;
 use crate::node::slots::ActorKind;
-use crate::observe::dashboard::{LandmarkFacts, NodeFacts, Sources};
+use crate::observe::dashboard::{LandmarkFacts, NodeFacts, NodeSources};
 use crate::observe::readiness::{Vitals, patience};
-use crate::observe::recorder::Identity;
+use crate::observe::recorder::LogIdentity;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
@@ -61,7 +61,7 @@ impl NodeBuilder {
     pub(super) fn gateway_arguments(&self) -> GatewayArguments {
         GatewayArguments {
             cell: self.config.cell.clone(),
-            part: self.gateway_part(),
+            role: self.gateway_part(),
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
             security: self.security.clone(),
@@ -82,11 +82,11 @@ impl NodeBuilder {
     }
 
     /// The identity of the node's log; `record.name` stands for the node's name where it is set.
-    fn log_identity(&self) -> Identity {
+    fn log_identity(&self) -> LogIdentity {
         let NodeConfig { cell, fusion, landmarks, record, .. } = &self.config;
         let named = record.as_ref().and_then(|record| record.name.clone());
         let node = named.unwrap_or_else(|| self.name.clone());
-        Identity::new(node, self.run, cell.clone(), fusion.clone(), landmarks.clone())
+        LogIdentity::new(node, self.run, cell.clone(), fusion.clone(), landmarks.clone())
     }
 
     pub(super) fn recorder_arguments(&self) -> Option<RecorderArguments> {
@@ -103,12 +103,12 @@ impl NodeBuilder {
     /// order in which they are fused.
     fn subscriber(&self) -> Subscriber {
         let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
-        let (name, feed, leadership) = (self.name.clone(), Arc::clone(&self.feed), self.leadership());
+        let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
         let (intake, counters) = (self.intake.clone(), self.counters());
         Arc::new(move |delivery| {
             let at = delivery.received_at;
-            feed.note(&delivery.message, at);
+            live_state.update(&delivery.message, at);
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
                     recording.report(*kind, report, at);
@@ -116,7 +116,9 @@ impl NodeBuilder {
                 }
                 // Evidence is for those that lead now or next; others that get it only look at it.
                 Incoming::Report { report, .. }
-                    if feed.watches() && report.node != name && leadership.borrow().position == Position::Following =>
+                    if live_state.wants_reports()
+                        && report.node != name
+                        && leadership.borrow().position == Position::Following =>
                 {
                     true
                 }
@@ -236,14 +238,14 @@ impl NodeBuilder {
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
         };
-        let sources = Sources {
+        let sources = NodeSources {
             node,
             landmarks: self.config.landmarks().into_iter().map(landmark).collect(),
             vitals: self.vitals(),
             members: self.members(),
             counters: self.counters(),
             frames: self.frames(),
-            feed: Arc::clone(&self.feed),
+            live_state: Arc::clone(&self.live_state),
         };
         DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
     }
@@ -297,7 +299,7 @@ mod tests {
     #[test]
     fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
         use ecod::aggregator::Algorithms::{Both, Pace};
-        use ecod::tracks::TracksMode::{Auto, Off, On};
+        use ecod::tracking::TracksMode::{Auto, Off, On};
         let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
         for (algorithms, mode, landmarks, expected) in [
             (Both, Off, vec![], true),

@@ -15,7 +15,7 @@ use schemars::{JsonSchema, Schema};
 use serde::{Deserialize, Serialize};
 
 use super::foxglove;
-use super::viewers::schema_of;
+use super::viewer_schema::schema_of;
 
 /// A channel's schema by its name in the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -17,15 +17,15 @@ use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
-use super::gate::{Gate, Guard};
-use super::pulse::{PULSE, Pulse};
+use super::frontend::{AccessPolicy, BrokerFrontend};
+use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
+use super::publish_throttle::PublishThrottle;
 use super::retained::RetainedMessages;
-use super::throttle::ClientThrottle;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 
 /// An MQTT broker that lives inside the process.
-pub trait Mqtt: Send + fmt::Debug {
+pub trait MqttBroker: Send + fmt::Debug {
     /// Listens on `address`, port 0 for a free one, and returns the bound address; clients may connect at once.
     ///
     /// # Errors
@@ -158,23 +158,37 @@ impl BrokerConfig {
 #[derive(Default)]
 pub struct EmbeddedBroker {
     config: BrokerConfig,
-    guard: Option<Guard>,
+    guard: Option<AccessPolicy>,
     counters: Arc<Counters>,
-    running: Option<Running>,
+    running: Option<RunningBroker>,
 }
 
 #[derive(Debug)]
-struct Running {
+struct RunningBroker {
     address: SocketAddr,
     stop: oneshot::Sender<()>,
     thread: JoinHandle<()>,
     /// Closed when the thread has ended.
     ended: mpsc::Receiver<()>,
-    pulse: Mutex<Pulse>,
+    heartbeat: Mutex<ThreadHeartbeat>,
 }
 
 /// Largest packet of a broker that was not told of a cell's limits: the default maps and their topics.
 const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
+
+/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
+const MAX_TOPIC_LEVELS: usize = 32;
+
+/// Maximum length of a topic or filter in bytes.
+const MAX_TOPIC_BYTES: usize = 512;
+
+/// Maximum subscriptions of one client.
+const MAX_SUBSCRIPTIONS: usize = 256;
+
+/// Whether rmqtt can hold a topic or filter.
+pub(super) fn is_topic_bounded(topic: &str) -> bool {
+    topic.len() <= MAX_TOPIC_BYTES && topic.split('/').count() <= MAX_TOPIC_LEVELS
+}
 
 /// How long connections may take to end when the broker stops; beyond it their thread is left to end by itself.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
@@ -190,7 +204,7 @@ impl EmbeddedBroker {
 
     /// A broker that is not started, behind a gate: clients show certificates, if the guard has any, and strangers are
     /// limited.
-    pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
+    pub fn protected(config: BrokerConfig, guard: AccessPolicy) -> Self {
         let counters = Arc::clone(&guard.counters);
         Self { config, guard: Some(guard), counters, running: None }
     }
@@ -205,11 +219,13 @@ impl EmbeddedBroker {
             .max_packet_size(self.config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
             .max_connections(self.config.max_clients)
             .max_mqueue_len(self.config.max_waiting)
+            .max_topic_levels(MAX_TOPIC_LEVELS)
+            .max_subscriptions(MAX_SUBSCRIPTIONS)
             .handshake_timeout(Duration::from_secs(5))
     }
 }
 
-impl Mqtt for EmbeddedBroker {
+impl MqttBroker for EmbeddedBroker {
     fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
         if let Some(running) = &self.running {
             return Err(BrokerError::Running(running.address));
@@ -218,14 +234,14 @@ impl Mqtt for EmbeddedBroker {
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
         let (ending, ended) = mpsc::channel();
-        let pulse = Pulse::default();
-        let plan = Plan {
+        let heartbeat = ThreadHeartbeat::default();
+        let plan = ThreadSetup {
             address,
             listener: self.listener(address),
             config: self.config.clone(),
             guard: self.guard.clone(),
             counters: Arc::clone(&self.counters),
-            beats: pulse.beats(),
+            beats: heartbeat.beats(),
         };
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
@@ -245,12 +261,12 @@ impl Mqtt for EmbeddedBroker {
                 return Err(error);
             }
         };
-        self.running = Some(Running { address: bound, stop, thread, ended, pulse: Mutex::new(pulse) });
+        self.running = Some(RunningBroker { address: bound, stop, thread, ended, heartbeat: Mutex::new(heartbeat) });
         Ok(bound)
     }
 
     fn stop(&mut self) {
-        let Some(Running { address, stop, thread, ended, .. }) = self.running.take() else { return };
+        let Some(RunningBroker { address, stop, thread, ended, .. }) = self.running.take() else { return };
         let told = stop.send(()).is_ok();
         if ended.recv_timeout(END_TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
             tracing::error!(%address, "broker hangs and is left to itself");
@@ -262,15 +278,15 @@ impl Mqtt for EmbeddedBroker {
     fn health(&self) -> BrokerHealth {
         match &self.running {
             None => BrokerHealth::Stopped,
-            Some(running) if running.thread.is_finished() || running.hangs() => BrokerHealth::Dead,
+            Some(running) if running.thread.is_finished() || running.has_stopped() => BrokerHealth::Dead,
             Some(running) => BrokerHealth::Serving(running.address),
         }
     }
 }
 
-impl Running {
-    fn hangs(&self) -> bool {
-        self.pulse.lock().unwrap_or_else(PoisonError::into_inner).is_lost(clock::now())
+impl RunningBroker {
+    fn has_stopped(&self) -> bool {
+        self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).has_stopped(clock::now())
     }
 }
 
@@ -287,11 +303,11 @@ impl fmt::Debug for EmbeddedBroker {
 }
 
 /// What the broker's thread is to do.
-struct Plan {
+struct ThreadSetup {
     address: SocketAddr,
     listener: Builder,
     config: BrokerConfig,
-    guard: Option<Guard>,
+    guard: Option<AccessPolicy>,
     counters: Arc<Counters>,
     /// Counts on while the thread does not hang.
     beats: Arc<AtomicU64>,
@@ -299,7 +315,7 @@ struct Plan {
 
 /// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made
 /// here.
-fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
+fn serve(plan: ThreadSetup, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
     let (address, beats) = (plan.address, Arc::clone(&plan.beats));
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
@@ -310,7 +326,7 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
         }
     };
     runtime.block_on(async {
-        let (server, gate, bound) = match prepare(plan).await {
+        let (server, frontend, bound) = match prepare(plan).await {
             Ok(prepared) => prepared,
             Err(error) => {
                 let reason = error.root_cause().to_string();
@@ -319,13 +335,13 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
         };
         ready.send(Ok(bound)).unwrap_or_default();
         let admitting = async {
-            match gate {
-                Some(gate) => gate.run().await,
+            match frontend {
+                Some(frontend) => frontend.run().await,
                 None => std::future::pending().await,
             }
         };
         let beating = async {
-            let mut ticks = tokio::time::interval(PULSE);
+            let mut ticks = tokio::time::interval(HEARTBEAT_INTERVAL);
             loop {
                 ticks.tick().await;
                 beats.fetch_add(1, Ordering::Relaxed);
@@ -334,7 +350,7 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
         tokio::select! {
             () = beating => {}
             ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
-            () = admitting => tracing::error!("gate ended by itself"),
+            () = admitting => tracing::error!("frontend ended by itself"),
             _ = stopped => {}
         }
     });
@@ -342,8 +358,8 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
 }
 
 /// Opens the sockets: rmqtt's own is the public one, or behind the gate's.
-async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketAddr)> {
-    let Plan { address, listener, config, guard, counters, .. } = plan;
+async fn prepare(plan: ThreadSetup) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr)> {
+    let ThreadSetup { address, listener, config, guard, counters, .. } = plan;
     let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let listener = match &guard {
         // Without anonymous clients, the hooks are asked about each.
@@ -355,17 +371,17 @@ async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketA
     // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
     let context = ServerContext::new().busy_check_enable(false).build().await;
     *context.extends.retain_mut().await = Box::new(RetainedMessages::new(&config));
-    let (gate, bound) = match &guard {
+    let (frontend, bound) = match &guard {
         Some(guard) => {
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
-            let gate = Gate::new(public, own, guard, &config);
-            gate.permissions(guard).install(&context).await;
-            (Some(gate), bound)
+            let frontend = BrokerFrontend::new(public, own, guard, &config);
+            frontend.permissions(guard).install(&context).await;
+            (Some(frontend), bound)
         }
         None => (None, own),
     };
-    let passes = gate.as_ref().map(Gate::passes).unwrap_or_default();
-    ClientThrottle::new(config.max_messages_hz, passes, counters).install(&context).await;
-    Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), gate, bound))
+    let principals = frontend.as_ref().map(BrokerFrontend::principals).unwrap_or_default();
+    PublishThrottle::new(config.max_messages_hz, principals, counters).install(&context).await;
+    Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), frontend, bound))
 }

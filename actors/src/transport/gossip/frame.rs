@@ -14,14 +14,14 @@ use ecod::names::NodeName;
 use serde::{Deserialize, Serialize};
 
 use super::MAX_PAYLOAD_BYTES;
-use super::key::{Cookie, Seal, SessionId};
+use super::key::{Cookie, FrameCipher, SessionId};
 use super::node_id::NodeId;
 
 /// Bytes before the sealed body.
-pub(crate) const HEAD_BYTES: usize = 32;
+pub(crate) const HEADER_BYTES: usize = 32;
 
 /// Longest frame in bytes.
-pub(crate) const MAX_FRAME_BYTES: usize = HEAD_BYTES + MAX_PAYLOAD_BYTES + SEAL_BYTES;
+pub(crate) const MAX_FRAME_BYTES: usize = HEADER_BYTES + MAX_PAYLOAD_BYTES + SEAL_BYTES;
 
 const SEAL_BYTES: usize = 16;
 const MAGIC: [u8; 2] = [0xec, 0x0d];
@@ -29,7 +29,7 @@ const VERSION: u8 = 1;
 
 /// What a frame holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub(crate) enum FrameKind {
     /// A greeting to whom it may concern, sealed for everybody.
     Hello = 1,
     /// A step of the handshake that establishes a session.
@@ -64,31 +64,31 @@ pub(crate) enum Handshake {
         /// To be returned.
         cookie: Cookie,
         /// Who proves.
-        word: Word,
+        introduction: Introduction,
     },
     /// "I am too."
     Accept {
         /// The prover's cookie.
         echo: Cookie,
         /// Who accepts.
-        word: Word,
+        introduction: Introduction,
     },
 }
 
 /// What two nodes tell each other when they meet.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct Word {
+pub(crate) struct Introduction {
     /// The sender.
     pub(crate) id: NodeId,
     /// Where the sender sees the receiver.
     pub(crate) seen_at: SocketAddr,
     /// What the sender knows of the receiver's name.
-    pub(crate) standing: NameStanding,
+    pub(crate) claim: NameClaim,
 }
 
 /// What is known of a name besides who just proved to bear it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) enum NameStanding {
+pub(crate) enum NameClaim {
     /// Nothing that is in the way.
     Free,
     /// A later life of that name is over: only one after it will be believed.
@@ -106,8 +106,8 @@ pub(crate) struct Hello {
 
 /// The open part of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Head {
-    pub(crate) kind: Kind,
+pub(crate) struct FrameHeader {
+    pub(crate) kind: FrameKind,
     pub(crate) sender: SessionId,
     pub(crate) counter: u64,
 }
@@ -120,13 +120,13 @@ pub(crate) enum HeadError {
     WrongCell,
 }
 
-impl Head {
+impl FrameHeader {
     /// Reads the head of a frame; its body is what follows [`HEAD_BYTES`].
     pub(crate) fn read(frame: &[u8], cell: [u8; 4]) -> Result<Self, HeadError> {
         if frame.len() > MAX_FRAME_BYTES {
             return Err(HeadError::Oversized);
         }
-        let Some((head, _)) = frame.split_first_chunk::<HEAD_BYTES>().filter(|(_, body)| body.len() >= SEAL_BYTES)
+        let Some((head, _)) = frame.split_first_chunk::<HEADER_BYTES>().filter(|(_, body)| body.len() >= SEAL_BYTES)
         else {
             return Err(HeadError::Malformed);
         };
@@ -135,10 +135,10 @@ impl Head {
             return Err(HeadError::Malformed);
         }
         let kind = match kind {
-            1 => Kind::Hello,
-            2 => Kind::Handshake,
-            3 => Kind::Gossip,
-            4 => Kind::Payload,
+            1 => FrameKind::Hello,
+            2 => FrameKind::Handshake,
+            3 => FrameKind::Gossip,
+            4 => FrameKind::Payload,
             _ => return Err(HeadError::Malformed),
         };
         if [*c0, *c1, *c2, *c3] != cell {
@@ -151,15 +151,15 @@ impl Head {
     }
 
     /// Writes a whole frame.
-    pub(crate) fn write(&self, cell: [u8; 4], body: &[u8], seal: &Seal) -> Vec<u8> {
-        let mut frame = Vec::with_capacity(HEAD_BYTES + body.len() + SEAL_BYTES);
+    pub(crate) fn write(&self, cell: [u8; 4], body: &[u8], seal: &FrameCipher) -> Vec<u8> {
+        let mut frame = Vec::with_capacity(HEADER_BYTES + body.len() + SEAL_BYTES);
         frame.extend_from_slice(&MAGIC);
         frame.extend_from_slice(&[VERSION, self.kind as u8]);
         frame.extend_from_slice(&cell);
         frame.extend_from_slice(&self.sender);
         frame.extend_from_slice(&self.counter.to_be_bytes());
         frame.extend_from_slice(body);
-        seal.close(self.counter, &mut frame, HEAD_BYTES);
+        seal.close(self.counter, &mut frame, HEADER_BYTES);
         frame
     }
 }

@@ -11,7 +11,7 @@ use super::config::MembershipConfig;
 pub(crate) type SessionId = [u8; 16];
 
 /// In place of the receiver's session in frames for everybody.
-pub(crate) const EVERYBODY: SessionId = [0; 16];
+pub(crate) const BROADCAST: SessionId = [0; 16];
 
 /// What all nodes of a cell share, and what keys of single frames are derived from.
 pub(crate) struct CellKey {
@@ -77,7 +77,7 @@ impl CellKey {
         let mut secret = [0; 32];
         if !decode_hex(text, &mut secret) && !text.is_empty() {
             let salt = [b"ecod gossip 1 ", cell.as_str().as_bytes()].concat();
-            pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, STRETCHING, &salt, text.as_bytes(), &mut secret);
+            pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, PBKDF2_ROUNDS, &salt, text.as_bytes(), &mut secret);
         }
         let root = hkdf::Salt::new(hkdf::HKDF_SHA256, cell.as_str().as_bytes()).extract(&secret);
         let hash = digest::digest(&digest::SHA256, cell.as_str().as_bytes());
@@ -100,17 +100,17 @@ impl CellKey {
     /// The key of frames from one session to another. With the sender's frame counter as nonce, no two frames share
     /// both.
     #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
-    pub(crate) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> Seal {
+    pub(crate) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> FrameCipher {
         let info: [&[u8]; 3] = [b"ecod frame 1", sender, receiver];
         let key = self.root.expand(&info, &aead::CHACHA20_POLY1305).map(aead::UnboundKey::from);
-        Seal(aead::LessSafeKey::new(key.expect("HKDF gives as much as a cipher's key")))
+        FrameCipher(aead::LessSafeKey::new(key.expect("HKDF gives as much as a cipher's key")))
     }
 }
 
 /// Seals and opens the frames of one direction between two sessions.
-pub(crate) struct Seal(aead::LessSafeKey);
+pub(crate) struct FrameCipher(aead::LessSafeKey);
 
-impl Seal {
+impl FrameCipher {
     /// Encrypts what follows the first `head` bytes of the frame, and authenticates all of it.
     #[expect(clippy::expect_used, reason = "the cipher seals 256 GiB, a datagram has 64 KiB")]
     pub(crate) fn close(&self, counter: u64, frame: &mut Vec<u8>, head: usize) {
@@ -130,18 +130,18 @@ impl Seal {
 }
 
 /// Makes proofs of reachability that need not be remembered: whoever returns one has received it.
-pub(crate) struct CookieJar(hmac::Key);
+pub(crate) struct CookieFactory(hmac::Key);
 
 /// Proof that its bearer received what was sent to it lately.
 pub(crate) type Cookie = [u8; 16];
 
-impl CookieJar {
+impl CookieFactory {
     pub(crate) fn new(secret: &[u8; 32]) -> Self {
         Self(hmac::Key::new(hmac::HMAC_SHA256, secret))
     }
 
     /// The cookie for a session at an address during one slot of time.
-    pub(crate) fn bake(&self, session: &SessionId, address: std::net::SocketAddr, slot: u64) -> Cookie {
+    pub(crate) fn issue(&self, session: &SessionId, address: std::net::SocketAddr, slot: u64) -> Cookie {
         let text = format!("{slot} {address}");
         let tag = hmac::sign(&self.0, &[&session[..], text.as_bytes()].concat());
         tag.as_ref().first_chunk().copied().unwrap_or_default()
@@ -149,7 +149,7 @@ impl CookieJar {
 }
 
 /// Rounds that stretch a passphrase: about 50 ms on a small board's core for the owner, and for every guess.
-const STRETCHING: NonZeroU32 = NonZeroU32::new(100_000).expect("not zero");
+const PBKDF2_ROUNDS: NonZeroU32 = NonZeroU32::new(100_000).expect("not zero");
 
 fn nonce(counter: u64) -> aead::Nonce {
     let [a, b, c, d, e, f, g, h] = counter.to_be_bytes();

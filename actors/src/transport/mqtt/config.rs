@@ -1,14 +1,14 @@
 //! How a node talks MQTT.
 
-use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
+use ecod::leadership::BrokerAddress;
 use ecod::wire::{Encoding, Limits};
 use serde::{Deserialize, Serialize};
 
-use ecod::leadership::BrokerAddress;
+use crate::platform::secret::Secret;
 
 /// Protocol, credentials and limits of the MQTT connections.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -154,51 +154,6 @@ pub enum MqttVersion {
     /// MQTT 5.
     #[serde(rename = "5")]
     V5,
-}
-
-/// Text that shows in no log and no printed configuration.
-#[derive(Clone, PartialEq, Eq, Deserialize)]
-#[serde(try_from = "String")]
-pub struct Secret(String);
-
-/// What is shown in place of a secret.
-const HIDDEN: &str = "***";
-
-/// A secret that is only what is shown in place of one.
-#[derive(Debug, thiserror::Error)]
-#[error("`{HIDDEN}` stands for a secret that was not printed, give the secret itself")]
-pub struct HiddenSecret;
-
-impl TryFrom<String> for Secret {
-    type Error = HiddenSecret;
-
-    fn try_from(text: String) -> Result<Self, HiddenSecret> {
-        if text == HIDDEN { Err(HiddenSecret) } else { Ok(Self(text)) }
-    }
-}
-
-impl Secret {
-    /// Takes the text.
-    pub fn new(text: impl Into<String>) -> Self {
-        Self(text.into())
-    }
-
-    /// The text itself.
-    pub fn reveal(&self) -> &str {
-        &self.0
-    }
-}
-
-impl Serialize for Secret {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(HIDDEN)
-    }
-}
-
-impl fmt::Debug for Secret {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(HIDDEN)
-    }
 }
 
 #[cfg(test)]

@@ -17,11 +17,11 @@ use crate::transport::pki::CredentialsError;
 
 /// How the broker is to treat a message: contract of the topics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Handling {
+pub(crate) enum Retention {
     /// QoS 0, not retained: the next one makes it worthless.
-    Stream,
+    Transient,
     /// QoS 1, retained: latecomers need it.
-    State,
+    Retained,
 }
 
 /// The sending half; never waits.
@@ -44,9 +44,9 @@ pub(crate) enum Packet {
     /// A message on a topic, which may be no UTF-8.
     Message { topic: Bytes, payload: Bytes },
     /// This side's farewell is on its way.
-    Left,
+    Disconnected,
     /// The broker answered a subscription and refused some of its filters, by their place in it, with its reason.
-    Denied(Vec<(usize, String)>),
+    SubscriptionRefused(Vec<(usize, String)>),
     /// Something was sent.
     Sent,
     /// Something came in that only the protocol is concerned with.
@@ -61,9 +61,9 @@ pub(crate) enum ConnectionError {
     #[error("{0}")]
     V5(Box<v5::ConnectionError>),
     #[error("nothing within {0:?}")]
-    Silent(Duration),
+    Timeout(Duration),
     #[error("the broker's certificate is no longer valid: {0}")]
-    Distrusted(rustls::Error),
+    BrokerInvalidated(rustls::Error),
     #[error(transparent)]
     Credentials(#[from] Box<CredentialsError>),
 }
@@ -75,14 +75,14 @@ impl ConnectionError {
         match self {
             Self::V311(error) => matches!(&**error, rumqttc::ConnectionError::Io(io) if refused(io)),
             Self::V5(error) => matches!(&**error, v5::ConnectionError::Io(io) if refused(io)),
-            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
+            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => false,
         }
     }
 
     /// Why the broker took the connection and then refused the node, in its own words, or why this node does not trust
     /// it.
     pub(crate) fn refusal(&self) -> Option<String> {
-        if let Some(reason) = self.mistrust() {
+        if let Some(reason) = self.certificate_error() {
             return Some(reason);
         }
         match self {
@@ -94,17 +94,17 @@ impl ConnectionError {
                 v5::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
                 _ => None,
             },
-            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => None,
+            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => None,
         }
     }
 
     /// What is wrong with one side's certificate.
-    fn mistrust(&self) -> Option<String> {
+    fn certificate_error(&self) -> Option<String> {
         let mut next: Option<&(dyn Error + 'static)> = match self {
             Self::V311(error) => Some(&**error),
             Self::V5(error) => Some(&**error),
-            Self::Distrusted(error) => return Some(error.to_string()),
-            Self::Silent(_) | Self::Credentials(_) => None,
+            Self::BrokerInvalidated(error) => return Some(error.to_string()),
+            Self::Timeout(_) | Self::Credentials(_) => None,
         };
         while let Some(error) = next {
             let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
@@ -134,7 +134,7 @@ impl ConnectionError {
                         | v5::StateError::IncomingPacketTooLarge { .. }
                 )
             ),
-            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
+            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => false,
         }
     }
 }
@@ -147,7 +147,7 @@ pub(crate) struct LastWill {
 }
 
 /// The will's payload of a node with this status.
-pub(crate) fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
+pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Bytes {
     encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
 }
 
@@ -213,8 +213,8 @@ pub(crate) fn open(
 
 impl Client {
     /// Queues a message; false when there is no room or the connection has ended.
-    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, handling: Handling) -> bool {
-        let retain = handling == Handling::State;
+    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
+        let retain = retention == Retention::Retained;
         match self {
             Self::V311(client) => {
                 let qos = if retain { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
@@ -263,7 +263,7 @@ impl Client {
 impl Connection {
     /// Sends and receives until there is something to tell; `patience` bounds the silence.
     pub(crate) async fn next(&mut self, patience: Duration) -> Result<Packet, ConnectionError> {
-        tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Silent(patience)))
+        tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Timeout(patience)))
     }
 
     async fn poll(&mut self) -> Result<Packet, ConnectionError> {
@@ -274,9 +274,11 @@ impl Connection {
                     Packet::Message { topic: publish.topic.into(), payload: publish.payload }
                 }
                 rumqttc::Event::Incoming(rumqttc::Packet::SubAck(answer)) => {
-                    denied(answer.return_codes, |code| matches!(code, rumqttc::SubscribeReasonCode::Success(_)))
+                    refused_filters(answer.return_codes, |code| {
+                        matches!(code, rumqttc::SubscribeReasonCode::Success(_))
+                    })
                 }
-                rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Disconnected,
                 rumqttc::Event::Outgoing(_) => Packet::Sent,
                 rumqttc::Event::Incoming(_) => Packet::Other,
             },
@@ -285,10 +287,10 @@ impl Connection {
                 v5::Event::Incoming(v5::Incoming::Publish(publish)) => {
                     Packet::Message { topic: publish.topic, payload: publish.payload }
                 }
-                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => denied(answer.return_codes, |code| {
+                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => refused_filters(answer.return_codes, |code| {
                     matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
                 }),
-                v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Disconnected,
                 v5::Event::Outgoing(_) => Packet::Sent,
                 v5::Event::Incoming(_) => Packet::Other,
             },
@@ -297,12 +299,12 @@ impl Connection {
 }
 
 /// The filters of a subscription that were refused.
-fn denied<C: std::fmt::Debug>(codes: Vec<C>, granted: impl Fn(&C) -> bool) -> Packet {
+fn refused_filters<C: std::fmt::Debug>(codes: Vec<C>, granted: impl Fn(&C) -> bool) -> Packet {
     let refused: Vec<_> = codes
         .into_iter()
         .enumerate()
         .filter(|(_, code)| !granted(code))
         .map(|(index, code)| (index, format!("{code:?}")))
         .collect();
-    if refused.is_empty() { Packet::Other } else { Packet::Denied(refused) }
+    if refused.is_empty() { Packet::Other } else { Packet::SubscriptionRefused(refused) }
 }

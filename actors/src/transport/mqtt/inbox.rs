@@ -3,6 +3,8 @@
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::links::LinkState;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{
@@ -14,10 +16,8 @@ use uuid::Uuid;
 
 use super::security::SigningKey;
 use crate::platform::clock;
-use crate::platform::throttle::Throttles;
+use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, Event, ShedReason};
-use ecod::leadership::BrokerAddress;
-use ecod::leadership::links::LinkState;
 
 /// A checked message of the cell, or news about a link.
 ///
@@ -85,15 +85,15 @@ pub(crate) struct Inbox {
     signing: Option<SigningKey>,
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
-    places: Arc<Semaphore>,
-    reporters: [Mutex<Throttles<NodeName>>; ReportKind::COUNT],
-    sharers: Mutex<Throttles<NodeName>>,
-    tellers: Mutex<Throttles<NodeName>>,
+    capacity: Arc<Semaphore>,
+    report_throttles: [Mutex<KeyedThrottle<NodeName>>; ReportKind::COUNT],
+    ledger_throttle: Mutex<KeyedThrottle<NodeName>>,
+    status_throttle: Mutex<KeyedThrottle<NodeName>>,
 }
 
 /// What became of a packet, as far as the link has to act on it.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Outcome {
+pub(crate) enum PacketOutcome {
     Done,
     /// The broker took this node for dead; it has to be told otherwise.
     DeclaredOffline,
@@ -108,7 +108,7 @@ impl Inbox {
         (node, run): (NodeName, Uuid),
         topics: Topics,
         (limits, signing): (Limits, Option<SigningKey>),
-        (places, max_report_hz): (usize, u32),
+        (capacity, max_report_hz): (usize, u32),
         counters: Arc<Counters>,
         subscriber: Subscriber,
     ) -> Self {
@@ -120,10 +120,10 @@ impl Inbox {
             signing,
             counters,
             subscriber: RwLock::new(subscriber),
-            places: Arc::new(Semaphore::new(places)),
-            reporters: std::array::from_fn(|_| Mutex::new(Throttles::new(max_report_hz))),
-            sharers: Mutex::new(Throttles::new(max_report_hz)),
-            tellers: Mutex::new(Throttles::new(max_report_hz)),
+            capacity: Arc::new(Semaphore::new(capacity)),
+            report_throttles: std::array::from_fn(|_| Mutex::new(KeyedThrottle::new(max_report_hz))),
+            ledger_throttle: Mutex::new(KeyedThrottle::new(max_report_hz)),
+            status_throttle: Mutex::new(KeyedThrottle::new(max_report_hz)),
         }
     }
 
@@ -132,38 +132,44 @@ impl Inbox {
     }
 
     /// Deals with one packet of a broker; a payload that cannot be used is counted by its reason.
-    pub(crate) fn accept(&self, via: &BrokerAddress, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Outcome {
+    pub(crate) fn accept(
+        &self,
+        via: &BrokerAddress,
+        topic: &[u8],
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> PacketOutcome {
         self.counters.count(Event::Received);
         match self.read(via, topic, payload, received_at) {
             Ok(Read::Message(message)) => {
                 self.deliver(message, received_at);
-                Outcome::Done
+                PacketOutcome::Done
             }
             Ok(Read::Echo) => {
                 self.counters.count(Event::Echo);
-                Outcome::Done
+                PacketOutcome::Done
             }
-            Ok(Read::Cleared | Read::Shed) => Outcome::Done,
-            Ok(Read::OwnDeath) => Outcome::DeclaredOffline,
+            Ok(Read::Cleared | Read::Shed) => PacketOutcome::Done,
+            Ok(Read::OwnDeath) => PacketOutcome::DeclaredOffline,
             Ok(Read::OwnStatus) => {
                 self.counters.count(Event::Echo);
-                Outcome::OwnStatus
+                PacketOutcome::OwnStatus
             }
             Ok(Read::Namesake(run)) => {
                 self.counters.count(Event::NameConflict);
-                Outcome::Namesake(run)
+                PacketOutcome::Namesake(run)
             }
             Err(reason) => {
                 self.counters.reject(reason);
                 tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
-                Outcome::Done
+                PacketOutcome::Done
             }
         }
     }
 
     /// Hands over a message that came from outside; dropped and counted when receivers are too far behind.
     fn deliver(&self, message: Incoming, received_at: Timestamp) {
-        match Arc::clone(&self.places).try_acquire_owned() {
+        match Arc::clone(&self.capacity).try_acquire_owned() {
             Ok(place) => self.hand_over(Delivery { message, received_at, _place: Some(place) }),
             Err(_) => self.counters.count(Event::InboxFull),
         }
@@ -199,7 +205,7 @@ impl Inbox {
             }
             Topic::Ledger(node) if node == self.node => return Ok(Read::Echo),
             Topic::Ledger(node) => {
-                if !self.sharers.lock().unwrap_or_else(PoisonError::into_inner).allow(&node, received_at) {
+                if !self.ledger_throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(&node, received_at) {
                     self.counters.shed(ShedReason::LedgerThrottled, node.as_str());
                     return Ok(Read::Shed);
                 }
@@ -244,12 +250,12 @@ impl Inbox {
         if *node == self.node {
             return Ok(Read::Echo);
         }
-        let mut reporters = self.reporters[kind as usize].lock().unwrap_or_else(PoisonError::into_inner);
-        if !reporters.allow(node, received_at) {
+        let mut report_throttles = self.report_throttles[kind as usize].lock().unwrap_or_else(PoisonError::into_inner);
+        if !report_throttles.allow(node, received_at) {
             self.counters.shed(ShedReason::ReportThrottled, node.as_str());
             return Ok(Read::Shed);
         }
-        drop(reporters);
+        drop(report_throttles);
         let report = Arc::new(decode_report(payload, node, &self.limits)?);
         Ok(Read::Message(Incoming::Report { kind, report }))
     }
@@ -264,7 +270,7 @@ impl Inbox {
         if payload.is_empty() {
             return Ok(Read::Cleared);
         }
-        if !self.tellers.lock().unwrap_or_else(PoisonError::into_inner).allow(node, received_at) {
+        if !self.status_throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(node, received_at) {
             self.counters.shed(ShedReason::StatusThrottled, node.as_str());
             return Ok(Read::Shed);
         }
@@ -363,7 +369,7 @@ mod tests {
         };
         let accept = |at| accept_from("gauss", at);
         for at in 1..=5 {
-            assert_eq!(accept(at), Outcome::Done);
+            assert_eq!(accept(at), PacketOutcome::Done);
         }
         assert_eq!(counters.events(Event::InboxFull), 3);
         assert_eq!(held.lock().unwrap().remove(0).received_at, Timestamp(1));

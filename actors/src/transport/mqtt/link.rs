@@ -3,6 +3,9 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::echo::EchoMonitor;
+use ecod::leadership::links::LinkState;
 use ecod::time::Timestamp;
 use ecod::wire::RejectReason;
 use rand::{RngExt, SeedableRng};
@@ -14,12 +17,8 @@ use uuid::Uuid;
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet};
 use super::hearing::Hearing;
-use super::inbox::{Inbox, Outcome};
+use super::inbox::{Inbox, PacketOutcome};
 use super::security::Security;
-use ecod::leadership::BrokerAddress;
-use ecod::leadership::echo::EchoMonitor;
-use ecod::leadership::links::LinkState;
-
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 
@@ -31,11 +30,11 @@ pub(crate) struct LinkId(pub(crate) u64);
 #[derive(Debug)]
 pub struct LinkEvent {
     pub(crate) link: LinkId,
-    pub(crate) news: LinkNews,
+    pub(crate) change: LinkChange,
 }
 
 #[derive(Debug)]
-pub(crate) enum LinkNews {
+pub(crate) enum LinkChange {
     /// The broker accepted the connection; nothing is subscribed yet.
     Accepted(Client),
     /// The broker published the last will of this living node.
@@ -81,7 +80,8 @@ impl Link {
     pub(crate) fn spawn(id: LinkId, broker: BrokerAddress, setup: Arc<LinkSetup>, report: LinkSink) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
         let (hearing, at) = (Arc::<Hearing>::default(), broker.clone());
-        let task = Task { id, broker: at, setup, report, hearing, told: None, told_oversized: false };
+        let task =
+            Task { id, broker: at, setup, report, hearing, reported_refusal: None, has_reported_oversized: false };
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
         let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
@@ -118,11 +118,11 @@ impl Drop for Link {
 
 /// Waits before the first attempts after a session broke, for the quickest word of whether the broker's process is
 /// gone: a process that ends may still have the port for a moment when its connections break.
-const BREAK_CHECKS: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
+const FIRST_RETRIES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
 
 /// A session shorter than this earns no such attempts, or a broker that ends every session would be tried without
 /// pause.
-const SHORTEST_USE: Duration = Duration::from_millis(200);
+const MIN_SESSION: Duration = Duration::from_millis(200);
 
 struct Task {
     id: LinkId,
@@ -131,8 +131,8 @@ struct Task {
     report: LinkSink,
     hearing: Arc<Hearing>,
     /// What the broker refused, as last told of.
-    told: Option<String>,
-    told_oversized: bool,
+    reported_refusal: Option<String>,
+    has_reported_oversized: bool,
 }
 
 impl Task {
@@ -140,7 +140,7 @@ impl Task {
         // The first answer is waited for half as long: a session that outlived this was in use. One that ends sooner,
         // such as by a retained packet beyond all bounds, must not be tried again at full speed.
         let in_use = 2 * self.setup.config.connect_timeout();
-        let mut checks = BREAK_CHECKS.iter();
+        let mut checks = FIRST_RETRIES.iter();
         loop {
             let begun = Instant::now();
             let error = match self.attempt().await {
@@ -150,24 +150,24 @@ impl Task {
             let state = if error.is_refused() { LinkState::Refused } else { LinkState::Down };
             tracing::debug!(broker = %self.broker, %error, "link lost");
             if let Some(reason) = error.refusal() {
-                self.tell_refusal(format!("{NOT_ADMITTED}: {reason}"));
+                self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }
             if error.is_oversized() {
                 self.setup.counters.reject(RejectReason::TooLarge);
-                if !std::mem::replace(&mut self.told_oversized, true) {
+                if !std::mem::replace(&mut self.has_reported_oversized, true) {
                     let limit = self.setup.config.max_packet_bytes();
                     tracing::warn!(broker = %self.broker, limit, "link lost to a packet that is too large; if it is \
                         retained it comes again and again: remove it, and have the broker limit its messages");
                 }
             }
-            if !self.tell(LinkNews::Lost(state)) {
+            if !self.tell(LinkChange::Lost(state)) {
                 return;
             }
             if begun.elapsed() > in_use {
                 backoff.reset();
             }
-            if begun.elapsed() > SHORTEST_USE {
-                checks = BREAK_CHECKS.iter();
+            if begun.elapsed() > MIN_SESSION {
+                checks = FIRST_RETRIES.iter();
             }
             let wait = checks.next().copied().unwrap_or_else(|| backoff.next_wait());
             tokio::time::sleep(wait).await;
@@ -181,9 +181,9 @@ impl Task {
         };
         tokio::select! {
             ended = self.session(Some(trust.client())) => ended,
-            error = trust.lost() => {
+            error = trust.invalidated() => {
                 self.setup.counters.count(Event::Disconnected);
-                Err(ConnectionError::Distrusted(error))
+                Err(ConnectionError::BrokerInvalidated(error))
             }
         }
     }
@@ -198,8 +198,8 @@ impl Task {
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
         self.hearing.note();
-        self.told.take_if(|told| told.starts_with(NOT_ADMITTED));
-        if !self.tell(LinkNews::Accepted(client)) {
+        self.reported_refusal.take_if(|reported_refusal| reported_refusal.starts_with(NOT_ADMITTED));
+        if !self.tell(LinkChange::Accepted(client)) {
             return Ok(());
         }
         // Pings alone make something come in every keep-alive; longer silence is a connection that hangs. What is sent
@@ -218,52 +218,52 @@ impl Task {
             }
             silent = Duration::ZERO;
             if self.hearing.note() {
-                self.tell(LinkNews::Answered);
+                self.tell(LinkChange::Answered);
             }
             match packet {
                 Packet::Message { topic, payload } => {
                     match inbox.accept(&self.broker, &topic, &payload, clock::now()) {
-                        Outcome::DeclaredOffline => {
-                            self.tell(LinkNews::DeclaredOffline);
+                        PacketOutcome::DeclaredOffline => {
+                            self.tell(LinkChange::DeclaredOffline);
                         }
-                        Outcome::Namesake(run) => {
-                            self.tell(LinkNews::Namesake(run));
+                        PacketOutcome::Namesake(run) => {
+                            self.tell(LinkChange::Namesake(run));
                         }
-                        Outcome::OwnStatus => {
+                        PacketOutcome::OwnStatus => {
                             heard_itself = true;
-                            self.told.take_if(|told| told == NOT_HEARD);
+                            self.reported_refusal.take_if(|reported_refusal| reported_refusal == NOT_HEARD);
                         }
-                        Outcome::Done => {}
+                        PacketOutcome::Done => {}
                     }
                 }
-                Packet::Denied(refused) => {
+                Packet::SubscriptionRefused(refused) => {
                     let name = |(index, reason): (usize, String)| {
                         format!("{} ({reason})", setup.filters.get(index).map_or("?", String::as_str))
                     };
                     let refused: Vec<_> = refused.into_iter().map(name).collect();
-                    self.tell_refusal(format!("subscription refused: {}", refused.join(", ")));
+                    self.report_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
-                Packet::Left => return Ok(()),
+                Packet::Disconnected => return Ok(()),
                 Packet::Accepted | Packet::Sent | Packet::Other => {}
             }
-            if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.told.is_none() {
-                self.tell_refusal(NOT_HEARD.to_owned());
+            if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.reported_refusal.is_none() {
+                self.report_refusal(NOT_HEARD.to_owned());
             }
         }
     }
 
     /// Warns of what the broker refuses, once per change.
-    fn tell_refusal(&mut self, refusal: String) {
-        if self.told.as_ref() != Some(&refusal) {
+    fn report_refusal(&mut self, refusal: String) {
+        if self.reported_refusal.as_ref() != Some(&refusal) {
             tracing::warn!(broker = %self.broker, refusal, "broker refuses this node, check its password, certificate and permissions");
             self.setup.counters.count(Event::BrokerRefused);
-            self.told = Some(refusal);
+            self.reported_refusal = Some(refusal);
         }
     }
 
     /// False when the gateway is gone.
-    fn tell(&self, news: LinkNews) -> bool {
-        (self.report)(LinkEvent { link: self.id, news })
+    fn tell(&self, change: LinkChange) -> bool {
+        (self.report)(LinkEvent { link: self.id, change })
     }
 }
 

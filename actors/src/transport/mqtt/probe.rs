@@ -30,7 +30,7 @@ pub async fn probe(
         }
     }
     if client.disconnect() {
-        while !matches!(connection.next(patience).await, Ok(Packet::Left) | Err(_)) {}
+        while !matches!(connection.next(patience).await, Ok(Packet::Disconnected) | Err(_)) {}
     }
     Ok(())
 }

@@ -16,13 +16,13 @@ use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfi
 pub struct Security {
     /// The node's certificates, for the brokers of the cell.
     pub credentials: Option<Arc<Credentials>>,
-    external: Option<External>,
+    external: Option<ExternalBroker>,
     pub(crate) signing: Option<SigningKey>,
 }
 
 /// A broker that is none of the cell's, and who signed its certificate, if it has one.
 #[derive(Debug, Clone)]
-struct External {
+struct ExternalBroker {
     address: BrokerAddress,
     ca: Option<PathBuf>,
 }
@@ -49,7 +49,7 @@ impl Security {
         (membership, cell): (&MembershipConfig, &NodeName),
     ) -> Result<Self, SecurityError> {
         let credentials = tls.map(|(files, name)| Credentials::load(files, name)).transpose()?.map(Arc::new);
-        let external = mqtt.broker.clone().map(|address| External { address, ca: mqtt.ca.clone() });
+        let external = mqtt.broker.clone().map(|address| ExternalBroker { address, ca: mqtt.ca.clone() });
         let signing = mqtt.sign.then(|| payload_key(membership, cell)).transpose()?;
         let security = Self { credentials, external, signing: signing.map(SigningKey) };
         if let Some(external) = &security.external {
@@ -64,11 +64,11 @@ impl Security {
     /// When the credentials can no longer be used.
     pub fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self.external.as_ref().filter(|external| external.address == *broker) {
-            Some(External { ca: Some(ca), .. }) => {
+            Some(ExternalBroker { ca: Some(ca), .. }) => {
                 let current = self.credentials.as_ref().map(|credentials| credentials.current());
                 external_broker(ca, current.as_deref()).map(Some)
             }
-            Some(External { ca: None, .. }) => Ok(None),
+            Some(ExternalBroker { ca: None, .. }) => Ok(None),
             None => Ok(self.credentials.as_ref().map(BrokerTrust::of_cell)),
         }
     }
@@ -141,7 +141,7 @@ mod tests {
 
     fn key(text: &str, cell: &'static str) -> SigningKey {
         let membership =
-            MembershipConfig { key: Some(crate::transport::mqtt::Secret::new(text)), ..MembershipConfig::default() };
+            MembershipConfig { key: Some(crate::platform::secret::Secret::new(text)), ..MembershipConfig::default() };
         SigningKey(payload_key(&membership, &NodeName::from_static(cell)).unwrap())
     }
 

@@ -17,7 +17,7 @@ pub(crate) const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
 impl SubscriptionRole {
     /// All that the node may subscribe to. Reports come last: wherever they are left out, a level keeps its place, by
     /// which a broker names it.
-    pub(crate) fn levels(self) -> &'static [&'static str] {
+    pub(crate) fn filters(self) -> &'static [&'static str] {
         match self {
             Self::Follower => {
                 &["global_detections", "global_verdicts", "reputations", "nodes/+", "detections/+", "vote_detections/+"]

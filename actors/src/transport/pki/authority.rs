@@ -31,19 +31,19 @@ const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
 #[derive(Debug)]
 pub struct Authority {
     directory: PathBuf,
-    register: Register,
+    register: IssuedCertificates,
 }
 
 /// Every certificate that was issued, in `issued.json`; the revocation list is made from it.
 #[derive(Debug, Serialize, Deserialize)]
-struct Register {
+struct IssuedCertificates {
     cell: NodeName,
     revision: u64,
-    issued: Vec<Issued>,
+    issued: Vec<IssuedCertificate>,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
-struct Issued {
+struct IssuedCertificate {
     node: NodeName,
     serial: String,
     expires_at_us: Timestamp,
@@ -81,7 +81,7 @@ pub enum AuthorityError {
     Name(NodeName),
     /// No valid certificate was issued for the node.
     #[error("{0} has no certificate that could be revoked")]
-    Unknown(NodeName),
+    NotIssued(NodeName),
     /// A key or certificate could not be made.
     #[error("no certificate could be made: {0}")]
     Crypto(String),
@@ -114,7 +114,7 @@ impl Authority {
         let certificate = parameters.self_signed(&key)?;
         let secret = key.serialize_pem();
         write(&directory.join(CA), &certificate.pem())?;
-        let register = Register { cell: cell.clone(), revision: 0, issued: Vec::new() };
+        let register = IssuedCertificates { cell: cell.clone(), revision: 0, issued: Vec::new() };
         let mut authority = Self { directory: directory.into(), register };
         authority.save(&Issuer::from_ca_cert_pem(&certificate.pem(), key)?, now)?;
         // Last: with the key there is a CA, and what is left of an attempt without it gives way to the next.
@@ -169,7 +169,7 @@ impl Authority {
         let issuer = self.issuer()?;
         let certificate = parameters.signed_by(&key, &issuer)?;
         let serial = hex(serial.as_ref());
-        let issued = Issued { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
+        let issued = IssuedCertificate { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
         // Known before it exists, so that nothing can be valid that cannot be revoked.
         self.register.issued.push(issued);
         self.save(&issuer, now)?;
@@ -191,7 +191,7 @@ impl Authority {
             }
         }
         if revoked == 0 {
-            return Err(AuthorityError::Unknown(node.clone()));
+            return Err(AuthorityError::NotIssued(node.clone()));
         }
         self.save(&self.issuer()?, now)?;
         Ok(revoked)
@@ -221,7 +221,7 @@ impl Authority {
     /// Writes the revocation list and then the register.
     fn save(&mut self, issuer: &Issuer<'_, KeyPair>, now: Timestamp) -> Result<(), AuthorityError> {
         self.register.revision += 1;
-        let revoked = |issued: &Issued| {
+        let revoked = |issued: &IssuedCertificate| {
             let serial = SerialNumber::from_slice(&unhex(&issued.serial));
             let revocation_time = time(issued.revoked_at_us?).into();
             let reason_code = Some(RevocationReason::PrivilegeWithdrawn);
@@ -344,10 +344,10 @@ mod tests {
         for _ in 0..2 {
             authority.issue(&edge, Role::Edge, days(1), clock::now()).unwrap();
         }
-        assert!(matches!(authority.revoke(&euclid, clock::now()), Err(AuthorityError::Unknown(_))));
+        assert!(matches!(authority.revoke(&euclid, clock::now()), Err(AuthorityError::NotIssued(_))));
         assert_eq!(authority.revoke(&edge, clock::now()).unwrap(), 2);
         let mut reopened = Authority::open(directory.path()).unwrap();
-        assert!(matches!(reopened.revoke(&edge, clock::now()), Err(AuthorityError::Unknown(_))));
+        assert!(matches!(reopened.revoke(&edge, clock::now()), Err(AuthorityError::NotIssued(_))));
         let observer = NodeName::from_static("edge--top");
         assert!(matches!(reopened.issue(&observer, Role::Cav, days(1), clock::now()), Err(AuthorityError::Name(_))));
     }

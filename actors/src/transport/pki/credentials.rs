@@ -15,29 +15,29 @@ use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::version::TLS13;
 use rustls::{ClientConfig, RootCertStore, ServerConfig};
 
-use super::broker_trust::Shown;
-use super::{BROKER_NAME, BrokerTrust, Identity, TlsConfig};
+use super::broker_trust::RecordingVerifier;
+use super::{BROKER_NAME, BrokerTrust, CertificateSubject, TlsConfig};
 
 /// The certificates of a node, read again when their files change.
 #[derive(Debug)]
 pub struct Credentials {
     files: TlsConfig,
     node: NodeName,
-    kept: Mutex<Kept>,
+    cache: Mutex<CachedCredentials>,
 }
 
 #[derive(Debug)]
-struct Kept {
-    looked_at: Instant,
-    stamps: Vec<Option<(SystemTime, u64)>>,
-    current: Arc<Current>,
+struct CachedCredentials {
+    checked_at: Instant,
+    fingerprints: Vec<Option<(SystemTime, u64)>>,
+    current: Arc<LoadedCredentials>,
 }
 
 /// What the files held when they were read last.
 #[derive(Debug)]
-pub struct Current {
+pub struct LoadedCredentials {
     /// The node's own certificate.
-    pub identity: Identity,
+    pub identity: CertificateSubject,
     /// How the node serves: TLS 1.3, clients show a certificate of the cell, sessions are not resumed, as a resumed one
     /// would not be checked against the revocation list.
     pub server: Arc<ServerConfig>,
@@ -67,7 +67,7 @@ pub enum CredentialsError {
     },
     /// The certificate is another node's.
     #[error("key `tls.certificate`: {path} is for {found}, this node is {node}")]
-    AnothersName {
+    WrongName {
         /// The file.
         path: PathBuf,
         /// Whom it is for.
@@ -81,7 +81,7 @@ pub enum CredentialsError {
 }
 
 /// Least time between two looks at the files.
-const LOOK: Duration = Duration::from_secs(1);
+const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Credentials {
     /// Reads a node's files.
@@ -89,29 +89,29 @@ impl Credentials {
     /// # Errors
     /// [`CredentialsError`] naming the file.
     pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
-        let (stamps, current) = (stamps(files), Arc::new(read(files, node)?));
-        let kept = Mutex::new(Kept { looked_at: Instant::now(), stamps, current });
-        Ok(Self { files: files.clone(), node: node.clone(), kept })
+        let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
+        let cache = Mutex::new(CachedCredentials { checked_at: Instant::now(), fingerprints, current });
+        Ok(Self { files: files.clone(), node: node.clone(), cache })
     }
 
     /// What the files hold now; what they held before if they have become unusable, which is logged.
-    pub fn current(&self) -> Arc<Current> {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        if kept.looked_at.elapsed() >= LOOK {
-            kept.looked_at = Instant::now();
-            let stamps = stamps(&self.files);
-            if stamps != kept.stamps {
-                kept.stamps = stamps;
+    pub fn current(&self) -> Arc<LoadedCredentials> {
+        let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        if cache.checked_at.elapsed() >= RELOAD_INTERVAL {
+            cache.checked_at = Instant::now();
+            let fingerprints = fingerprints(&self.files);
+            if fingerprints != cache.fingerprints {
+                cache.fingerprints = fingerprints;
                 match read(&self.files, &self.node) {
                     Ok(current) => {
                         tracing::info!("certificates read again");
-                        kept.current = Arc::new(current);
+                        cache.current = Arc::new(current);
                     }
                     Err(error) => tracing::warn!(%error, "changed certificates not used"),
                 }
             }
         }
-        Arc::clone(&kept.current)
+        Arc::clone(&cache.current)
     }
 }
 
@@ -121,7 +121,7 @@ impl Credentials {
 ///
 /// # Errors
 /// [`CredentialsError`] naming the file.
-pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, CredentialsError> {
+pub fn external_broker(ca: &Path, own: Option<&LoadedCredentials>) -> Result<BrokerTrust, CredentialsError> {
     let roots = Arc::new(roots("mqtt.ca", ca)?);
     let verifier = server_verifier(Arc::clone(&roots), Vec::new())?;
     let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
@@ -133,7 +133,7 @@ pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, 
     Ok(BrokerTrust::new(&client, verifier, None))
 }
 
-fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError> {
+fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, CredentialsError> {
     let roots = Arc::new(roots("tls.ca", &files.ca)?);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
     let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
@@ -141,10 +141,11 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
     let lists = files.revocation_list.as_deref().map(lists).transpose()?.unwrap_or_default();
     let own =
         certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
-    let identity = Identity::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
-    if !identity.speaks_for(node.as_str()) {
+    let identity =
+        CertificateSubject::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
+    if !identity.may_act_as(node.as_str()) {
         let (path, found) = (files.certificate.clone(), identity.name().clone());
-        return Err(CredentialsError::AnothersName { path, found, node: node.clone() });
+        return Err(CredentialsError::WrongName { path, found, node: node.clone() });
     }
     let clients = client_verifier(&roots, &lists)?;
     let mut server = ServerConfig::builder_with_provider(crypto())
@@ -162,12 +163,15 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
         .with_protocol_versions(&[&TLS13])
         .map_err(unusable)?
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(Shown::new(Arc::clone(&brokers), Some(broker_name.clone()))))
+        .with_custom_certificate_verifier(Arc::new(RecordingVerifier::new(
+            Arc::clone(&brokers),
+            Some(broker_name.clone()),
+        )))
         .with_client_auth_cert(certificates.clone(), key.clone_key())
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
     let (server, client) = (Arc::new(server), Arc::new(client));
-    Ok(Current { identity, server, client, clients, brokers, broker_name, certificates, key })
+    Ok(LoadedCredentials { identity, server, client, clients, brokers, broker_name, certificates, key })
 }
 
 fn client_verifier(
@@ -233,7 +237,7 @@ fn unusable(error: rustls::Error) -> CredentialsError {
 }
 
 /// Time of change and length of each file: enough to tell that it was replaced.
-fn stamps(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
+fn fingerprints(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
     let stamp = |path: &PathBuf| {
         let facts = fs::metadata(path).ok()?;
         Some((facts.modified().ok()?, facts.len()))
@@ -265,10 +269,10 @@ mod tests {
             let error = Credentials::load(&files, &edge).unwrap_err().to_string();
             assert!(error.starts_with("key `tls.revocation_list`: ") && error.contains("copied.pem"), "{error}");
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(RELOAD_INTERVAL);
         assert!(Arc::ptr_eq(&credentials.current(), &before), "still checked against the list before");
         fs::copy(authority.revocation_list(), &list).unwrap();
-        std::thread::sleep(LOOK);
+        std::thread::sleep(RELOAD_INTERVAL);
         assert!(!Arc::ptr_eq(&credentials.current(), &before), "and against the next");
     }
 }

@@ -9,7 +9,7 @@ use super::{EvalArguments, columns, read_output, write_json};
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
 use crate::report::tracks::{tables, without_map};
 
-/// What is written beside what came of locations.
+/// Contents of the file of `--out`.
 #[derive(Serialize)]
 struct Judged {
     tracks: TrackScores,

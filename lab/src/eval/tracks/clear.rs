@@ -21,7 +21,7 @@ pub(super) struct Clear {
     pub(super) distance_sum_m: f64,
 }
 
-/// What a pair that goes on is worth, beside its similarity of at most 1: more than all others of a frame.
+/// Bonus of a pair that goes on, beside its similarity of at most 1: more than all others of a frame.
 const GOES_ON: f64 = 1000.0;
 
 pub(super) fn judge(frames: &[Frame]) -> Clear {

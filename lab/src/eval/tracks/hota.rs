@@ -21,7 +21,7 @@ pub(super) struct Hota {
 /// Thresholds on the similarity, in twentieths.
 const TWENTIETHS: std::ops::RangeInclusive<u32> = 1..=19;
 
-/// How often identities occur, and how much of their lives they share.
+/// Frequency of identities, and the share of their lives that they have in common.
 #[derive(Default)]
 struct Lives {
     truth: HashMap<u32, f64>,
@@ -29,7 +29,7 @@ struct Lives {
     shared: HashMap<(u32, u32), f64>,
 }
 
-/// What one threshold comes to.
+/// Figures at one threshold.
 #[derive(Default)]
 struct AtThreshold {
     similarity_sum: f64,

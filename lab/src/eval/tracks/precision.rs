@@ -55,7 +55,7 @@ pub(super) fn best_f1(frames: &[Frame]) -> Option<BestF1> {
     points.iter().map(f1).reduce(|best, next| if next.f1 > best.f1 { next } else { best })
 }
 
-/// Whether an object that was said took a true one.
+/// True if a reported object took a true one.
 #[derive(Debug, Clone, Copy)]
 struct Verdict<'a> {
     label: &'a Label,

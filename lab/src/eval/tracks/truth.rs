@@ -41,7 +41,7 @@ pub enum TrackTruthError {
     Form {
         /// The path of the value, as `frames[3].objects[0].x_m`.
         place: String,
-        /// What is wrong with it.
+        /// Reason.
         reason: String,
     },
     /// No frame at all.
@@ -76,7 +76,7 @@ enum Id {
 }
 
 impl TrackTruth {
-    /// Whether a truth file is of objects that move, as opposed to locations: its `frames` is a list, empty or of
+    /// True if a truth file is of objects that move, not of locations: its `frames` is a list, empty or of
     /// objects with a time or with objects.
     pub fn is_in(text: &str) -> bool {
         #[derive(Deserialize)]

@@ -31,7 +31,7 @@ impl Sheet {
     /// Room around what the scene holds: for placards and names.
     const PADDING_M: f64 = 3.0 * METRES_PER_INCH;
     /// Least side of the frame.
-    const LEAST_M: f64 = 24.0 * METRES_PER_INCH;
+    const MIN_M: f64 = 24.0 * METRES_PER_INCH;
 
     /// Room to the right of that, for the names of vehicles.
     const NAMES_M: f64 = 3.0 * METRES_PER_INCH;
@@ -42,7 +42,7 @@ impl Sheet {
         let places: Vec<Point2<f64>> = spots.chain(scene.cavs.iter().map(|cav| cav.pose.position)).collect();
         let first = places.first().copied().unwrap_or_default();
         let (low, high) = places.iter().fold((first, first), |(low, high), place| (low.inf(place), high.sup(place)));
-        let lacking = (high - low).map(|side| (Self::LEAST_M / 2.0 - Self::PADDING_M - side / 2.0).max(0.0));
+        let lacking = (high - low).map(|side| (Self::MIN_M / 2.0 - Self::PADDING_M - side / 2.0).max(0.0));
         let room = lacking.add_scalar(Self::PADDING_M);
         let (low, high) = (low - room, high + room + Vector2::new(Self::NAMES_M, 0.0));
         Self { low, high, px_per_m: Self::FRAME_PX / (high - low).max() }
@@ -63,7 +63,7 @@ impl Sheet {
         metres * self.px_per_m
     }
 
-    /// Whether a place lies inside the frame.
+    /// True if a place lies inside the frame.
     pub(super) fn holds(&self, place: &Point2<f64>) -> bool {
         (self.low.x..=self.high.x).contains(&place.x) && (self.low.y..=self.high.y).contains(&place.y)
     }

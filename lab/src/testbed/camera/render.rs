@@ -26,7 +26,7 @@ const CARDBOARD: Light = [92.0, 132.0, 168.0];
 const FLOOR: Light = [104.0, 110.0, 114.0];
 const WALL: Light = [150.0, 158.0, 160.0];
 
-/// What the camera at `pose` has before it, as 8-bit BGR.
+/// View of the camera at `pose`, as 8-bit BGR.
 pub(super) fn still(testbed: &Testbed, cards: &[Card], pose: &Pose) -> Result<Mat, RenderError> {
     let camera = &testbed.camera.intrinsics;
     let faces = cards.iter().map(Face::new).collect::<Result<Vec<_>, _>>()?;
@@ -74,7 +74,7 @@ impl<'a> Face<'a> {
         Ok(Self { card, side: code.width(), modules: code.into_colors() })
     }
 
-    /// Whether ink is printed at a point, in metres to the right of and above the middle of the code.
+    /// True if ink is printed at a point, in metres to the right of and above the middle of the code.
     fn is_ink(&self, right_m: f64, up_m: f64, placard: &Placard) -> bool {
         let module = |from_edge_m: f64| {
             let at = (from_edge_m / placard.qr_width_m * self.side as f64).floor();
@@ -104,7 +104,7 @@ struct Meeting<'a> {
     depth_m: f64,
     right_m: f64,
     front: bool,
-    /// How much of the light falls on this side.
+    /// Share of the light that falls on this side.
     lit: f32,
 }
 

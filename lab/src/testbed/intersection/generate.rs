@@ -18,12 +18,12 @@ use rand_chacha::ChaCha8Rng;
 use super::reports;
 use crate::testbed::{IntersectionRecording, KnownObject};
 
-/// How far objects and vehicles are moved, in metres along each axis.
+/// Greatest shift of objects and vehicles, in metres along each axis.
 const MOVED_M: RangeInclusive<f64> = -0.025..=0.025;
-/// How far vehicles are turned, in radians.
+/// Greatest turn of vehicles, in radians.
 const TURNED_RAD: RangeInclusive<f64> = -0.03..=0.03;
 
-/// What a recording teaches about its detectors.
+/// Statistics of a recording's detectors.
 #[derive(Debug, Clone)]
 pub struct ConfusionModel<'a> {
     recording: &'a IntersectionRecording,
