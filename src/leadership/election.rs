@@ -39,14 +39,13 @@
 //! and 251 ms. A silent leader has to be replaced within 400 ms, a period of 100 ms included, and 251 ms leaves no room
 //! for a lost packet. Moreover the beat carries what a successor needs, its round and its successors, and proves that
 //! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as its
-//! cost per node does not grow with the cell; what it finds enters as [`ElectionInput::PeerAlive`] and [`ElectionInput::PeerDown`]. To
-//! keep a leader's packets few, only its standby gets every beat, its other successors and better nodes that are not fit
-//! every eighth, and everyone else one each `idle_beat_ms`.
+//! cost per node does not grow with the cell; what it finds enters as [`ElectionInput::PeerAlive`] and
+//! [`ElectionInput::PeerDown`]. To keep a leader's packets few, only its standby gets every beat, its other successors and
+//! better nodes that are not fit every eighth, and everyone else one each `idle_beat_ms`.
 
 #![deny(clippy::indexing_slicing)]
 
 mod awake_clock;
-mod config;
 mod following;
 mod handover;
 mod interface;
@@ -61,8 +60,8 @@ use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::SCHEMA_VERSION;
 
+pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
-pub use config::ElectionConfig;
 pub use interface::{ElectionEffect, ElectionInput, Health};
 pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM};
 

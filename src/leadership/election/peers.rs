@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::epoch::Epoch;
-use crate::leadership::election::config::ElectionConfig;
+use crate::leadership::config::ElectionConfig;
 use crate::leadership::election::message::{Candidacy, ElectionMessage};
 use crate::names::NodeName;
 use crate::time::Timestamp;
