@@ -4,6 +4,8 @@ use std::io::{IsTerminal, stderr};
 use std::os::unix::fs::MetadataExt;
 
 use clap::ValueEnum;
+use tracing::level_filters::LevelFilter;
+use tracing_subscriber::filter::{FilterExt, filter_fn};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry};
@@ -26,7 +28,8 @@ pub(super) enum LogFormat {
 const JOURNAL_PREFIX: &str = "ECOD";
 
 /// Starts the log. `runs_on` tells programs that work until they are told to stop, whose logs machines read, from tools.
-/// `RUST_LOG` goes before `level`.
+/// `RUST_LOG` goes before `level`. Spans are not logged: a line has the fields of its event alone, without those of the
+/// actor that wrote it, and a span that nothing else records costs nothing.
 pub(super) fn start(format: LogFormat, runs_on: bool, level: &str) {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let (layer, problem) = match resolved(format, runs_on) {
@@ -37,7 +40,8 @@ pub(super) fn start(format: LogFormat, runs_on: bool, level: &str) {
         LogFormat::Json => (json(), None),
         LogFormat::Text | LogFormat::Auto => (text(), None),
     };
-    tracing_subscriber::registry().with(layer.with_filter(filter)).init();
+    let events = filter_fn(|metadata| metadata.is_event()).with_max_level_hint(LevelFilter::TRACE);
+    tracing_subscriber::registry().with(layer.with_filter(filter.and(events))).init();
     if let Some(error) = problem {
         tracing::warn!(%error, "the journal does not answer, logging to standard error");
     }
@@ -66,13 +70,7 @@ fn text() -> AnyLayer {
 }
 
 fn json() -> AnyLayer {
-    tracing_subscriber::fmt::layer()
-        .json()
-        .flatten_event(true)
-        .with_current_span(false)
-        .with_span_list(false)
-        .with_writer(stderr)
-        .boxed()
+    tracing_subscriber::fmt::layer().json().flatten_event(true).with_writer(stderr).boxed()
 }
 
 fn journal() -> std::io::Result<AnyLayer> {
