@@ -1,3 +1,4 @@
-//! Counters of a node.
+//! Counters of a node, and spans of what it does.
 
 pub mod counters;
+pub mod spans;

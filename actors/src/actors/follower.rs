@@ -30,6 +30,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::leadership::Leadership;
 use crate::observe::recorder::Recording;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::spans::Spans;
 use crate::transport::mqtt::Incoming;
 use age::Age;
 use gate::{Gate, MEMORY, Refusal};
@@ -55,6 +56,8 @@ pub struct FollowerArguments {
     pub fuser: ActorSlot<FuserMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
+    /// The node's spans.
+    pub spans: Spans,
 }
 
 /// Keeps the newest map, verdicts and reputations.
@@ -75,6 +78,7 @@ pub struct FollowerState {
     election: ActorSlot<LeaderElectionMessage>,
     fuser: ActorSlot<FuserMessage>,
     counters: Arc<Counters>,
+    spans: Spans,
 }
 
 impl Actor for Follower {
@@ -119,8 +123,9 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, recording, least_term, term, leadership, election, fuser, counters, .. } =
-            arguments;
+        let FollowerArguments {
+            newest, recording, least_term, term, leadership, election, fuser, counters, spans, ..
+        } = arguments;
         let [maps, verdicts] = [(); 2].map(|()| Gate::new(least_term, Some(term.clone())));
         // They are retained: a node that starts gets them before it can have heard of any term, and perhaps not again.
         let reputations = Gate::new(least_term, None);
@@ -138,6 +143,7 @@ impl FollowerState {
             election,
             fuser,
             counters,
+            spans,
         }
     }
 
@@ -145,6 +151,7 @@ impl FollowerState {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         self.maps.admit(&epoch, map.round, received_at, &self.leadership.borrow())?;
         check(self.map_age.is_fresh(&epoch, map.fused_at_us, received_at))?;
+        let _accept = self.spans.accept("map", &**map, received_at);
         self.counters.count(Event::MapAccepted);
         self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
@@ -159,6 +166,7 @@ impl FollowerState {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
         self.verdicts.admit(&epoch, verdicts.round, received_at, &self.leadership.borrow())?;
         check(self.verdicts_age.is_fresh(&epoch, verdicts.fused_at_us, received_at))?;
+        let _accept = self.spans.accept("verdicts", &**verdicts, received_at);
         self.counters.count(Event::VerdictsAccepted);
         self.recording.verdicts(verdicts, received_at);
         if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
@@ -218,6 +226,7 @@ mod tests {
             election: ActorSlot::default(),
             fuser: ActorSlot::default(),
             counters: Arc::default(),
+            spans: Spans::new(NodeName::from_static("lot"), NodeName::from_static("gauss")),
         };
         FollowerState::new(arguments, None)
     }

@@ -42,6 +42,7 @@ use crate::observe::recorder::Pictures;
 use crate::observe::recorder::Recording;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
+use crate::telemetry::spans::Spans;
 use crate::transport::broker::{BrokerError, EmbeddedBroker, Guard};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
@@ -112,6 +113,10 @@ impl NodeBuilder {
 
     pub(super) fn counters(&self) -> Arc<Counters> {
         Arc::clone(&self.counters)
+    }
+
+    fn spans(&self) -> Spans {
+        Spans::new(self.config.cell.clone(), self.name.clone())
     }
 
     pub(super) fn newest(&self) -> Newest {
@@ -221,7 +226,8 @@ impl NodeBuilder {
             ActorKind::Detector => {
                 let pictures = Pictures::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
-                let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
+                let (counters, spans) = (self.counters(), self.spans());
+                let arguments = crate::node::camera::detector(&self.config, projector, pictures, counters, spans);
                 let arguments = arguments.map_err(in_full)?;
                 slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }

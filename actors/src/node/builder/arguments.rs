@@ -161,6 +161,7 @@ impl NodeBuilder {
             election: self.slots.election.clone(),
             fuser: self.slots.fuser.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 
@@ -198,6 +199,7 @@ impl NodeBuilder {
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 
