@@ -107,7 +107,7 @@ pub fn main() -> ExitCode {
         Some(_) => "warn",
     };
     let runs_on = matches!(&cli.command, None | Some(Command::Record(_)));
-    logging::start(cli.log_format, runs_on, level);
+    let _export = logging::start(cli.log_format, runs_on, level);
     let outcome = match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
