@@ -147,8 +147,8 @@ pub(crate) struct LastWill {
 }
 
 /// The will's payload of a node with this status.
-pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Bytes {
-    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
+pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Vec<u8> {
+    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding)
 }
 
 /// Prepares a connection; the first poll makes it.

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use ecod::time::Timestamp;
 use ecod::wire::RejectReason;
 use rand::{RngExt, SeedableRng};
@@ -13,7 +14,7 @@ use uuid::Uuid;
 
 use super::address::BrokerAddress;
 use super::config::MqttConfig;
-use super::connection::{self, Client, ConnectionError, LastWill, Packet};
+use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
 use super::inbox::{Inbox, LinkState, PacketOutcome};
 use super::security::Security;
 use super::silence::{Hearing, Silence};
@@ -84,6 +85,11 @@ impl Link {
         let task = tokio::spawn(task.run(backoff));
         let (abort, silence) = (task.abort_handle(), Silence::default());
         Self { broker, state: LinkState::Down, client: None, hearing, silence, abort, task: Some(task) }
+    }
+
+    /// Queues a message; false when there is no connection or no room.
+    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
+        self.client.as_ref().is_some_and(|client| client.publish(topic, payload, retention))
     }
 
     /// Notes a message that the broker should pass back to this node, whether or not there was room for it; true when
