@@ -1,4 +1,4 @@
-//! The cell's key and what is derived from it.
+//! The cell's key, and the keys derived from it.
 
 use std::num::NonZeroU32;
 
@@ -10,10 +10,10 @@ use super::config::MembershipConfig;
 /// One run of a node's membership, drawn at random.
 pub(crate) type SessionId = [u8; 16];
 
-/// In place of the receiver's session in frames for everybody.
+/// Receiver in frames for all nodes of the cell.
 pub(crate) const BROADCAST: SessionId = [0; 16];
 
-/// What all nodes of a cell share, and what keys of single frames are derived from.
+/// The secret that all nodes of a cell share. All other keys are derived from it.
 pub(crate) struct CellKey {
     root: hkdf::Prk,
     tag: [u8; 4],
@@ -38,7 +38,7 @@ pub enum KeyError {
     },
 }
 
-/// Whether the key that the configuration names can be used.
+/// Checks that the configured key can be used.
 ///
 /// # Errors
 /// [`KeyError`] when the key file cannot be used.
@@ -55,8 +55,8 @@ pub(crate) fn payload_key(config: &MembershipConfig, cell: &NodeName) -> Result<
 }
 
 impl CellKey {
-    /// Reads the key that the configuration names. Without one, the cell's name is the key, which keeps cells apart and
-    /// nobody out.
+    /// Reads the configured key. Without one the key is derived from the cell's name, which separates cells and gives
+    /// no protection.
     ///
     /// # Errors
     /// [`KeyError`] when the key file cannot be used.
@@ -84,7 +84,7 @@ impl CellKey {
         Self { root, tag: hash.as_ref().first_chunk().copied().unwrap_or_default() }
     }
 
-    /// Signs payloads that go through brokers of others.
+    /// The key that signs payloads sent through external brokers.
     #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
     pub(crate) fn payload_key(&self) -> hmac::Key {
         let info: [&[u8]; 1] = [b"ecod payload 1"];
@@ -92,13 +92,13 @@ impl CellKey {
         key.expect("HKDF gives as much as a hash's length")
     }
 
-    /// Tells frames of other cells; no secret.
+    /// Public tag in every frame that tells cells apart.
     pub(crate) fn tag(&self) -> [u8; 4] {
         self.tag
     }
 
-    /// The key of frames from one session to another. With the sender's frame counter as nonce, no two frames share
-    /// both.
+    /// The cipher of frames from one session to another. The sender's frame counter is the nonce, so that no two frames
+    /// share key and nonce.
     #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
     pub(crate) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> FrameCipher {
         let info: [&[u8]; 3] = [b"ecod frame 1", sender, receiver];
@@ -107,7 +107,7 @@ impl CellKey {
     }
 }
 
-/// Seals and opens the frames of one direction between two sessions.
+/// Encrypts and decrypts the frames of one direction between two sessions.
 pub(crate) struct FrameCipher(aead::LessSafeKey);
 
 impl FrameCipher {
@@ -120,7 +120,7 @@ impl FrameCipher {
         frame.append(&mut body);
     }
 
-    /// The body of a frame, if nothing of it was changed.
+    /// The decrypted body of a frame, if the frame is authentic.
     pub(crate) fn open(&self, counter: u64, head: &[u8], body: &[u8]) -> Option<Vec<u8>> {
         let mut body = body.to_vec();
         let length = self.0.open_in_place(nonce(counter), aead::Aad::from(head), &mut body).ok()?.len();
@@ -129,10 +129,10 @@ impl FrameCipher {
     }
 }
 
-/// Makes proofs of reachability that need not be remembered: whoever returns one has received it.
+/// Issues cookies without storing them, as MACs over address and time.
 pub(crate) struct CookieFactory(hmac::Key);
 
-/// Proof that its bearer received what was sent to it lately.
+/// Proof of reachability: a node that returns a cookie has received it.
 pub(crate) type Cookie = [u8; 16];
 
 impl CookieFactory {
@@ -148,7 +148,7 @@ impl CookieFactory {
     }
 }
 
-/// Rounds that stretch a passphrase: about 50 ms on a small board's core for the owner, and for every guess.
+/// Rounds of PBKDF2 for a passphrase: about 50 ms for each guess on a small board's core.
 const PBKDF2_ROUNDS: NonZeroU32 = NonZeroU32::new(100_000).expect("not zero");
 
 fn nonce(counter: u64) -> aead::Nonce {
