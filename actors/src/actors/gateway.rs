@@ -63,7 +63,6 @@ pub struct GatewayArguments {
 pub struct Gateway;
 
 /// The links and the node's status.
-#[derive(Debug)]
 pub struct GatewayState {
     topics: Topics,
     role: SubscriptionRole,

@@ -1,11 +1,11 @@
 //! The embedded broker: rmqtt on a thread of its own, in a node behind a gate.
 
+use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
-use std::{fmt, io};
 
 use ecod::config::{ConfigError, check_range};
 use rmqtt::context::ServerContext;
@@ -25,7 +25,7 @@ use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 
 /// An MQTT broker that lives inside the process.
-pub trait MqttBroker: Send + fmt::Debug {
+pub trait MqttBroker: Send {
     /// Listens on `address`, port 0 for a free one, and returns the bound address; clients may connect at once.
     ///
     /// # Errors
@@ -219,7 +219,6 @@ impl EmbeddedBroker {
             .max_packet_size(self.config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
             .max_connections(self.config.max_clients)
             .max_mqueue_len(self.config.max_waiting)
-            .max_topic_levels(MAX_TOPIC_LEVELS)
             .max_subscriptions(MAX_SUBSCRIPTIONS)
             .handshake_timeout(Duration::from_secs(5))
     }
@@ -296,12 +295,6 @@ impl Drop for EmbeddedBroker {
     }
 }
 
-impl fmt::Debug for EmbeddedBroker {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("EmbeddedBroker").field("running", &self.running).finish_non_exhaustive()
-    }
-}
-
 /// What the broker's thread is to do.
 struct ThreadSetup {
     address: SocketAddr,
@@ -364,7 +357,7 @@ async fn prepare(plan: ThreadSetup) -> rmqtt::Result<(MqttServer, Option<BrokerF
     let listener = match &guard {
         // Without anonymous clients, the hooks are asked about each.
         Some(_) => listener.laddr(behind).allow_anonymous(false),
-        None => listener,
+        None => listener.max_topic_levels(MAX_TOPIC_LEVELS),
     };
     let listener = listener.bind().and_then(Listener::tcp)?;
     let own = listener.local_addr()?;

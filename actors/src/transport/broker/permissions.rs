@@ -11,7 +11,6 @@
 //! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a
 //! certificate of the cell may read everything. Topics and filters are bounded in length and in levels.
 
-use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
@@ -40,12 +39,6 @@ pub(super) struct Permissions {
     pub(super) limits: Limits,
     pub(super) elected: LeaderCheck,
     pub(super) counters: Arc<Counters>,
-}
-
-impl fmt::Debug for Permissions {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Permissions").finish_non_exhaustive()
-    }
 }
 
 impl Permissions {

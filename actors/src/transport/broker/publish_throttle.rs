@@ -1,6 +1,5 @@
 //! Nobody takes more than a share of the embedded broker, under however many names.
 
-use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use async_trait::async_trait;
@@ -43,11 +42,5 @@ impl Handler for PublishThrottle {
         }
         self.counters.shed(ShedReason::BrokerThrottled, source.as_str());
         (false, Some(HookResult::PublishAclResult(PublishAclResult::rejected(false, None))))
-    }
-}
-
-impl fmt::Debug for PublishThrottle {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("PublishThrottle").finish_non_exhaustive()
     }
 }

@@ -75,7 +75,7 @@ impl CellKey {
     /// Takes 64 hexadecimal digits as they are and stretches any other text.
     pub(crate) fn new(text: &str, cell: &NodeName) -> Self {
         let mut secret = [0; 32];
-        if !decode_hex(text, &mut secret) && !text.is_empty() {
+        if hex::decode_to_slice(text, &mut secret).is_err() && !text.is_empty() {
             let salt = [b"ecod gossip 1 ", cell.as_str().as_bytes()].concat();
             pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, PBKDF2_ROUNDS, &salt, text.as_bytes(), &mut secret);
         }
@@ -156,17 +156,6 @@ fn nonce(counter: u64) -> aead::Nonce {
     aead::Nonce::assume_unique_for_key([0, 0, 0, 0, a, b, c, d, e, f, g, h])
 }
 
-/// Whether the text is exactly the hexadecimal form of as many bytes.
-fn decode_hex(text: &str, bytes: &mut [u8]) -> bool {
-    let digits: Option<Vec<u8>> = text.chars().map(|c| c.to_digit(16).map(|digit| digit as u8)).collect();
-    let Some(digits) = digits.filter(|digits| digits.len() == 2 * bytes.len()) else { return false };
-    let (pairs, _) = digits.as_chunks();
-    for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
-        *byte = high << 4 | low;
-    }
-    true
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -199,10 +188,15 @@ mod tests {
 
     #[test]
     fn sixty_four_digits_are_the_key_itself() {
-        let mut bytes = [0; 32];
-        assert!(decode_hex(&"0aF1".repeat(16), &mut bytes));
-        assert_eq!(bytes[..4], [0x0a, 0xf1, 0x0a, 0xf1]);
-        assert!(!decode_hex(&"0".repeat(63), &mut bytes) && !decode_hex(&"g".repeat(64), &mut bytes));
+        let cell = NodeName::from_static("lot-1");
+        let digits = "0aF1".repeat(16);
+        let mut frame = b"headbody".to_vec();
+        CellKey::new(&digits, &cell).seal(&A, &B).close(1, &mut frame, 4);
+        let root = hkdf::Salt::new(hkdf::HKDF_SHA256, b"lot-1").extract(&[0x0a, 0xf1].repeat(16));
+        assert_eq!(open(&CellKey { root, tag: [0; 4] }, &A, &B, 1, &frame).as_deref(), Some(&b"body"[..]));
+        for other in [&digits[..63], &"g".repeat(64), &digits.to_lowercase()[..62]] {
+            assert_eq!(open(&CellKey::new(other, &cell), &A, &B, 1, &frame), None);
+        }
     }
 
     #[test]

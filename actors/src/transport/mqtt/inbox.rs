@@ -2,7 +2,6 @@
 //!
 //! A payload that cannot be used ends here as a count.
 
-use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use ecod::names::NodeName;
@@ -299,12 +298,6 @@ impl Inbox {
             self.counters.shed(reason, node.as_str());
         }
         is_shed
-    }
-}
-
-impl fmt::Debug for Inbox {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Inbox").field("node", &self.node).finish_non_exhaustive()
     }
 }
 

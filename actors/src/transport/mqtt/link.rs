@@ -49,8 +49,7 @@ pub(crate) enum LinkChange {
 /// Takes the events of links; false once nobody takes them any more.
 pub(crate) type LinkSink = Arc<dyn Fn(LinkEvent) -> bool + Send + Sync>;
 
-/// What all links of a gateway have in common.
-#[derive(Debug)]
+/// Settings and inbox that all links of a gateway share.
 pub(crate) struct LinkSetup {
     pub(crate) client_id: String,
     pub(crate) filters: Vec<String>,

@@ -168,7 +168,7 @@ impl Authority {
         let key = KeyPair::generate()?;
         let issuer = self.issuer()?;
         let certificate = parameters.signed_by(&key, &issuer)?;
-        let serial = hex(serial.as_ref());
+        let serial = hex::encode(serial.as_ref());
         let issued = IssuedCertificate { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
         // Known before it exists, so that nothing can be valid that cannot be revoked.
         self.register.issued.push(issued);
@@ -222,7 +222,7 @@ impl Authority {
     fn save(&mut self, issuer: &Issuer<'_, KeyPair>, now: Timestamp) -> Result<(), AuthorityError> {
         self.register.revision += 1;
         let revoked = |issued: &IssuedCertificate| {
-            let serial = SerialNumber::from_slice(&unhex(&issued.serial));
+            let serial = SerialNumber::from_slice(&hex::decode(&issued.serial).unwrap_or_default());
             let revocation_time = time(issued.revoked_at_us?).into();
             let reason_code = Some(RevocationReason::PrivilegeWithdrawn);
             Some(RevokedCertParams { serial_number: serial, revocation_time, reason_code, invalidity_date: None })
@@ -268,15 +268,6 @@ fn draw_serial() -> Result<SerialNumber, AuthorityError> {
     drawn.map_err(|_| AuthorityError::Crypto("the system gives no random numbers".into()))?;
     bytes[0] = bytes[0] & 0x7f | 0x40;
     Ok(SerialNumber::from_slice(&bytes))
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-fn unhex(text: &str) -> Vec<u8> {
-    let pairs = text.as_bytes().chunks(2);
-    pairs.filter_map(|pair| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok()).collect()
 }
 
 fn read(path: &Path) -> Result<String, AuthorityError> {
