@@ -23,7 +23,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout, timeout
 use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
-use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin, Rate};
+use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
 use super::permissions::{LeaderCheck, Permissions};
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
 use super::{BrokerConfig, connect_packet};
@@ -82,7 +82,7 @@ const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 impl BrokerFrontend {
     /// A gate at the listener, for a broker that listens `behind` it.
     pub(super) fn new(listener: TcpListener, behind: SocketAddr, guard: &AccessPolicy, config: &BrokerConfig) -> Self {
-        let rate = Rate { burst: config.connect_burst, interval: Duration::from_secs(1) / config.connects_per_s };
+        let interval = Duration::from_secs(1) / config.connects_per_s;
         let current = guard.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
         let shared = FrontendState {
             credentials: guard.credentials.clone(),
@@ -93,7 +93,12 @@ impl BrokerFrontend {
             handshake_timeout: Duration::from_millis(config.handshake_timeout_ms),
             counters: Arc::clone(&guard.counters),
         };
-        Self { listener, shared: Arc::new(shared), current, throttle: ConnectionThrottle::new(rate, clock::now()) }
+        Self {
+            listener,
+            shared: Arc::new(shared),
+            current,
+            throttle: ConnectionThrottle::new(config.connect_burst, interval, clock::now()),
+        }
     }
 
     /// What rmqtt has to ask about those who come through this gate.
