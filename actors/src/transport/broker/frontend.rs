@@ -1,12 +1,12 @@
-//! What stands between the network and rmqtt: TLS, limits on strangers, and who is who.
+//! Public side of the embedded broker: TLS, connection limits, and the principal of each client.
 //!
 //! ```text
 //! client ── TCP ──> admission ── TLS ──> CONNECT within time and size ──> loopback ──> rmqtt
-//!                    by source     certificate of the cell                with a pass that says whose it is
+//!                    by source     certificate of the cell                registered with its principal
 //! ```
 //!
-//! rmqtt accepts connections from nobody but a socket of its own, and knows no revocation lists; so it listens on
-//! loopback, on a port that the system draws, and takes only connections for which there is a pass.
+//! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore listens on a free
+//! loopback port, and accepts only connections that the frontend has registered.
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -31,22 +31,22 @@ use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::pki::{CertificateSubject, Credentials, LoadedCredentials};
 
-/// What an embedded broker needs to keep strangers out.
+/// Rules of access to an embedded broker.
 #[derive(Clone)]
 pub struct AccessPolicy {
-    /// The node's certificates; without any, everybody is let in, within limits, and may say anything.
+    /// The node's certificates. Without them every client may log in and publish anything, within limits.
     pub credentials: Option<Arc<Credentials>>,
     /// The cell's topics.
     pub topics: Topics,
-    /// The largest payloads that the cell's nodes take.
+    /// Largest payloads that the cell's nodes accept.
     pub limits: Limits,
-    /// Tells who may speak for all.
+    /// Decides which node may publish maps, verdicts and reputations.
     pub elected: LeaderCheck,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
 
-/// The public side of a broker.
+/// Public side of a broker.
 pub(super) struct BrokerFrontend {
     listener: TcpListener,
     shared: Arc<FrontendState>,
@@ -64,19 +64,19 @@ struct FrontendState {
     counters: Arc<Counters>,
 }
 
-/// Time between two looks at whether certificates have changed.
+/// Time between two checks for changed certificate files.
 const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Time between two checks of those who are connected, for certificates that have expired.
+/// Time between two checks of connected clients for expired certificates.
 const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
 
-/// Pause after the system gave no connection, such as for lack of file descriptors.
+/// Pause after `accept` failed, such as for lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
-/// How long a client may not read at all before it is cut off.
+/// Time after which a client that reads nothing is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(15);
 
-/// How long what is under way to a client that said farewell may take.
+/// Time to deliver the rest to a client that has ended its side.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl BrokerFrontend {
@@ -117,7 +117,7 @@ impl BrokerFrontend {
         self.shared.principals.clone()
     }
 
-    /// Lets clients in; never ends.
+    /// Accepts clients; never ends.
     pub(super) async fn run(self) {
         let mut looks = interval(RELOAD_INTERVAL);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -137,7 +137,7 @@ impl BrokerFrontend {
     }
 
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
-        // Certificates tell even this machine's clients apart.
+        // With certificates even local clients are told apart.
         let is_local = self.current.is_none() && from.ip().to_canonical().is_loopback();
         let origin = if is_local { Origin::Local } else { Origin::Remote(from.ip()) };
         let Some(slot) = self.throttle.admit(origin, clock::now()) else {
@@ -153,7 +153,7 @@ impl BrokerFrontend {
         });
     }
 
-    /// Has all connections checked again when certificates or the list changed, and from time to time.
+    /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
     fn look(&self, checked: &mut Instant) {
         let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) else { return };
         let current = credentials.current();
@@ -164,22 +164,22 @@ impl BrokerFrontend {
     }
 }
 
-/// Why a client was not let in, or not any longer.
+/// Reason for which a client was refused or cut off.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ClientRejection {
-    #[error("left without a word, as nodes do that only look whether a broker is there")]
+    #[error("left without a word, as nodes do that only test the port")]
     Left,
     #[error("no login in time")]
     TimedOut,
-    #[error("no login before many others of its address wanted one")]
+    #[error("no login before many newer connections of its address")]
     Evicted,
     #[error("not trusted: {0}")]
     Untrusted(String),
-    #[error("no MQTT")]
+    #[error("not an MQTT login")]
     Malformed,
-    #[error("most clients are connected")]
+    #[error("as many clients as allowed are connected")]
     Full,
-    #[error("as many clients of this certificate or address are connected as may be")]
+    #[error("as many clients as allowed are connected of this certificate or address")]
     Crowded,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),
@@ -208,7 +208,7 @@ trait Duplex: AsyncRead + AsyncWrite + Send {}
 impl<T: AsyncRead + AsyncWrite + Send> Duplex for T {}
 
 impl FrontendState {
-    /// One client from its first byte to its last.
+    /// Serves one client from its first byte to its last.
     async fn serve(
         &self,
         stream: TcpStream,
@@ -246,7 +246,7 @@ impl FrontendState {
 
         let socket = TcpSocket::new_v4()?;
         socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
-        // Before rmqtt can ask for it, and until the port may be somebody else's.
+        // Registered before rmqtt can ask for it, and until the port may be reused.
         let _pass = self.principals.register(socket.local_addr()?, principal);
         let mut behind = socket.connect(self.behind).await?;
         behind.set_nodelay(true)?;
@@ -271,13 +271,12 @@ async fn secure(
     Ok((Box::pin(stream), certificates))
 }
 
-/// Passes bytes on until either side ends; what was under way to a client that left is given a moment.
+/// Forwards bytes until either side ends. The rest for a client that has left is sent for a moment longer.
 async fn relay(client: Stream, broker: TcpStream) {
     let (mut from_client, mut to_client) = tokio::io::split(client);
     let (mut from_broker, mut to_broker) = broker.into_split();
     let up = async {
         let copied = tokio::io::copy(&mut from_client, &mut to_broker).await;
-        // The broker has to see the end; if it is gone, it has.
         (copied.is_ok(), to_broker.shutdown().await.is_ok())
     };
     let down = async {
@@ -294,7 +293,7 @@ async fn relay(client: Stream, broker: TcpStream) {
     }
 }
 
-/// Waits until the client's certificate is not valid any more, and says why.
+/// Waits until the client's certificate is no longer valid; the result is the reason.
 async fn certificate_invalidated(
     current: Option<watch::Receiver<Arc<LoadedCredentials>>>,
     certificates: &[CertificateDer<'static>],

@@ -1,4 +1,4 @@
-//! Nobody takes more than a share of the embedded broker, under however many names.
+//! Throttle of published messages, by principal rather than by client id.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -12,7 +12,7 @@ use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, ShedReason};
 
-/// Passes on at most so many messages a second of each node, address or client, before anything is done with them.
+/// Hook of rmqtt that drops messages of a node, address or local client above a rate.
 pub(super) struct PublishThrottle {
     sources: Mutex<KeyedThrottle<QuotaKey>>,
     principals: PrincipalRegistry,
@@ -24,7 +24,7 @@ impl PublishThrottle {
         Self { sources: Mutex::new(KeyedThrottle::new(per_second)), principals, counters }
     }
 
-    /// Has rmqtt ask for every message, before anybody is asked for permission.
+    /// Registers the hook for every message, before the permissions.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
         register.add_priority(Type::MessagePublishCheckAcl, 1, Box::new(self)).await;
