@@ -1,4 +1,4 @@
-//! A file that survives crashes: it holds the last state written whole, or the one before, never a mixture.
+//! State files that survive crashes: they hold the last complete state or the one before, never a mixture.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -8,13 +8,13 @@ use ecod::names::NodeName;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// Where one kind of state of a node is kept.
+/// File of one kind of state of a node.
 #[derive(Debug, Clone)]
 pub struct StateFile {
     path: PathBuf,
 }
 
-/// A larger file is not one of ours.
+/// Maximum length of a state file in bytes.
 const MAX_BYTES: u64 = 64 * 1024 * 1024;
 
 impl StateFile {
@@ -23,12 +23,12 @@ impl StateFile {
         Self { path: directory.join(format!("{cell}.{node}.{what}.json")) }
     }
 
-    /// Where the state is.
+    /// The file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What was written last, if it is there, whole and `is_ours`; anything else is set aside with a warning.
+    /// The state written last, if it is complete and `is_ours`. Any other content is set aside with a warning.
     pub fn load<T: DeserializeOwned>(&self, is_ours: impl FnOnce(&T) -> bool) -> Option<T> {
         let mut bytes = Vec::new();
         let read = File::open(&self.path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
@@ -51,10 +51,10 @@ impl StateFile {
         None
     }
 
-    /// Replaces the state; after `Ok` it survives a loss of power.
+    /// Replaces the state. After `Ok` it survives a loss of power.
     ///
     /// # Errors
-    /// When the directory or disk does not take it; the state before is still there then.
+    /// When the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
         let directory = self.path.parent().unwrap_or(Path::new("."));
         fs::create_dir_all(directory)?;

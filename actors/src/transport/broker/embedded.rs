@@ -86,9 +86,8 @@ pub struct BrokerConfig {
     pub max_packet_bytes: Option<u32>,
     /// Maximum clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
     pub max_clients: usize,
-    /// Most clients at a time of one certificate or, without certificates, of one address other than this machine's; default
-    /// 32. A node has one or two, and one for each observer beside it; a cell behind address translation needs as many for
-    /// each node.
+    /// Maximum clients at a time of one certificate, or of one remote address without certificates; default 32. A node
+    /// has one or two, and one for each observer. A cell behind address translation needs as many for each node.
     pub max_clients_each: usize,
     /// Maximum messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
     /// then gets is old. Each of them may be as large as the largest packet.

@@ -143,7 +143,7 @@ impl FrameHeader {
         Ok(Self { kind, sender, counter: u64::from_be_bytes(counter) })
     }
 
-    /// Writes a whole frame.
+    /// Writes a whole frame, sealed.
     pub(crate) fn write(&self, cell: [u8; 4], body: &[u8], seal: &FrameCipher) -> Vec<u8> {
         let mut frame = Vec::with_capacity(HEADER_BYTES + body.len() + SEAL_BYTES);
         frame.extend_from_slice(&MAGIC);

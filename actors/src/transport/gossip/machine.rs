@@ -3,8 +3,8 @@
 //! # Call order
 //!
 //! [`Machine::new`], then [`Machine::receive`] for every datagram, [`Machine::tick`] at [`Machine::next_deadline`], and
-//! the commands at any time; after each, [`Machine::poll`] until nothing is left. A caller that was held up hands in
-//! all datagrams that wait before it ticks; the time for which it was held up does not count.
+//! the commands at any time. After each, [`Machine::poll`] until nothing is left. A caller that was stalled hands in
+//! all datagrams that wait before it ticks; the time of the stall does not count.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;

@@ -1,4 +1,4 @@
-//! The cell's certificate authority: a directory on one machine, which need not be one of the cell.
+//! The cell's certificate authority: a directory on one machine, which need not belong to the cell.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -24,17 +24,17 @@ pub const DEFAULT_DAYS: u32 = 365;
 /// Days for which a CA is valid.
 const CA_DAYS: u32 = 3650;
 
-/// How far a certificate's beginning lies back: clocks of the cell may be behind.
+/// Time by which the validity of a certificate begins in the past, as clocks of the cell may be behind.
 const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
 
-/// The CA of one cell and all that it has issued.
+/// The CA of one cell and its register of certificates.
 #[derive(Debug)]
 pub struct Authority {
     directory: PathBuf,
     register: IssuedCertificates,
 }
 
-/// Every certificate that was issued, in `issued.json`; the revocation list is made from it.
+/// Register of all issued certificates, in `issued.json`. The revocation list is made of it.
 #[derive(Debug, Serialize, Deserialize)]
 struct IssuedCertificates {
     cell: NodeName,
@@ -51,7 +51,7 @@ struct IssuedCertificate {
     revoked_at_us: Option<Timestamp>,
 }
 
-/// Why the authority did not do what it was asked to; what was there before is still there.
+/// An error of the authority; the files before it are still there.
 #[derive(Debug, thiserror::Error)]
 pub enum AuthorityError {
     /// A file could not be read or written.
@@ -59,27 +59,27 @@ pub enum AuthorityError {
     File {
         /// The file.
         path: PathBuf,
-        /// What the operating system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// There is no CA.
+    /// No CA in the directory.
     #[error("{0} has no CA: make one with `ecod-node pki init`")]
     Missing(PathBuf),
-    /// The directory has a CA already, whose certificates would all be worth nothing.
+    /// The directory has a CA already, whose certificates would become invalid.
     #[error("{0} has a CA already; a new one needs an empty directory")]
     Exists(PathBuf),
-    /// The register is not what this program writes.
+    /// The register cannot be read.
     #[error("{path} cannot be understood: {reason}")]
     Register {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The error.
         reason: String,
     },
-    /// Names with the mark belong to observers, and file names have to end somewhere.
+    /// The name contains the mark of observers.
     #[error("{0} cannot have a certificate: names of nodes have no `{OBSERVER_MARK}`")]
     Name(NodeName),
-    /// No valid certificate was issued for the node.
+    /// The node has no valid certificate.
     #[error("{0} has no certificate that could be revoked")]
     NotIssued(NodeName),
     /// A key or certificate could not be made.
@@ -117,7 +117,7 @@ impl Authority {
         let register = IssuedCertificates { cell: cell.clone(), revision: 0, issued: Vec::new() };
         let mut authority = Self { directory: directory.into(), register };
         authority.save(&Issuer::from_ca_cert_pem(&certificate.pem(), key)?, now)?;
-        // Last: with the key there is a CA, and what is left of an attempt without it gives way to the next.
+        // Last: the key makes a CA complete. An attempt that failed before it can be repeated.
         write_secret(&directory.join(CA_KEY), &secret)?;
         Ok(authority)
     }
@@ -170,7 +170,7 @@ impl Authority {
         let certificate = parameters.signed_by(&key, &issuer)?;
         let serial = hex::encode(serial.as_ref());
         let issued = IssuedCertificate { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
-        // Known before it exists, so that nothing can be valid that cannot be revoked.
+        // Registered before it exists, so that every valid certificate can be revoked.
         self.register.issued.push(issued);
         self.save(&issuer, now)?;
         let nodes = self.directory.join(NODES);
@@ -178,7 +178,7 @@ impl Authority {
         write(&nodes.join(format!("{node}.pem")), &certificate.pem())
     }
 
-    /// Revokes all certificates of a node and writes the list anew; tells how many they were.
+    /// Revokes all certificates of a node and rewrites the revocation list; returns their number.
     ///
     /// # Errors
     /// [`AuthorityError`] when there are none or the list cannot be written.
@@ -207,7 +207,7 @@ impl Authority {
         self.directory.join(LIST)
     }
 
-    /// A node's certificate and its key, issued or not.
+    /// Paths of a node's certificate and key, issued or not.
     pub fn files_of(&self, node: &NodeName) -> (PathBuf, PathBuf) {
         let nodes = self.directory.join(NODES);
         (nodes.join(format!("{node}.pem")), nodes.join(format!("{node}.key")))
@@ -261,7 +261,7 @@ fn set_validity(parameters: &mut CertificateParams, now: Timestamp, valid: Durat
     parameters.not_after = time(now + valid).into();
 }
 
-/// 127 random bits: positive, and never the same twice.
+/// A random serial number of 127 bits, which is positive.
 fn draw_serial() -> Result<SerialNumber, AuthorityError> {
     let mut bytes = [0; 16];
     let drawn = SystemRandom::new().fill(&mut bytes);
@@ -282,7 +282,7 @@ fn write_secret(path: &Path, text: &str) -> Result<(), AuthorityError> {
     replace(path, text, 0o600)
 }
 
-/// Writes the file whole or leaves the one before.
+/// Replaces a file atomically.
 fn replace(path: &Path, text: &str, mode: u32) -> Result<(), AuthorityError> {
     let beside = path.with_extension("new");
     let written = || -> io::Result<()> {
