@@ -168,14 +168,8 @@ impl GatewayState {
         let seal = |payload| Bytes::from(security.seal(&status_topic, payload));
         let will = LastWill { topic: status_topic.clone(), payload: seal(offline_payload(&status, encoding)) };
         let status_payload = seal(encode(&status, encoding));
-        let inbox = Inbox::new(
-            (status.node.clone(), status.id),
-            topics.clone(),
-            (mqtt.limits(), security.signing.clone()),
-            (mqtt.inbox, mqtt.max_report_hz),
-            Arc::clone(&counters),
-            subscriber,
-        );
+        let signing = security.signing.clone();
+        let inbox = Inbox::new(&status, topics.clone(), &mqtt, signing, Arc::clone(&counters), subscriber);
         // One client id for each run: a broker ends the old connection before it accepts the new one, so that the last
         // will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());

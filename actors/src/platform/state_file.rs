@@ -1,7 +1,8 @@
 //! State files that survive crashes: they hold the last complete state or the one before, never a mixture.
 
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use ecod::names::NodeName;
@@ -56,15 +57,22 @@ impl StateFile {
     /// # Errors
     /// When the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
-        let directory = self.path.parent().unwrap_or(Path::new("."));
-        fs::create_dir_all(directory)?;
-        let temporary = self.path.with_extension("tmp");
-        let mut file = File::create(&temporary)?;
-        file.write_all(&serde_json::to_vec(state)?)?;
-        file.sync_all()?;
-        fs::rename(&temporary, &self.path)?;
-        File::open(directory)?.sync_all()
+        fs::create_dir_all(self.path.parent().unwrap_or(Path::new(".")))?;
+        replace_file(&self.path, &serde_json::to_vec(state)?, 0o666)
     }
+}
+
+/// Replaces a file atomically, with permissions `mode` less the process's umask. After `Ok` it survives a loss of power.
+///
+/// # Errors
+/// When the directory or disk refuses it; the file before is then still there.
+pub(crate) fn replace_file(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
+    let temporary = path.with_extension("tmp");
+    let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(mode).open(&temporary)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    fs::rename(&temporary, path)?;
+    File::open(path.parent().unwrap_or(Path::new(".")))?.sync_all()
 }
 
 #[cfg(test)]

@@ -14,6 +14,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
 
 use super::address::BrokerAddress;
+use super::config::MqttConfig;
 use super::security::SigningKey;
 use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
@@ -122,23 +123,23 @@ pub(crate) enum PacketOutcome {
 
 impl Inbox {
     pub(crate) fn new(
-        (node, run): (NodeName, Uuid),
+        own: &NodeStatus,
         topics: Topics,
-        (limits, signing): (Limits, Option<SigningKey>),
-        (capacity, max_report_hz): (usize, u32),
+        config: &MqttConfig,
+        signing: Option<SigningKey>,
         counters: Arc<Counters>,
         subscriber: Subscriber,
     ) -> Self {
-        let throttle = || Mutex::new(KeyedThrottle::new(max_report_hz));
+        let throttle = || Mutex::new(KeyedThrottle::new(config.max_report_hz));
         Self {
-            node,
-            run,
+            node: own.node.clone(),
+            run: own.id,
             topics,
-            limits,
+            limits: config.limits(),
             signing,
             counters,
             subscriber: RwLock::new(subscriber),
-            capacity: Arc::new(Semaphore::new(capacity)),
+            capacity: Arc::new(Semaphore::new(config.inbox)),
             report_throttles: std::array::from_fn(|_| throttle()),
             ledger_throttle: throttle(),
             status_throttle: throttle(),
@@ -316,14 +317,10 @@ mod tests {
         counters: &Arc<Counters>,
         receiver: impl Fn(Delivery) + Send + Sync + 'static,
     ) -> Inbox {
-        Inbox::new(
-            (NodeName::from_static("edge"), Uuid::nil()),
-            Topics::new(&NodeName::from_static("lot")),
-            (Limits::default(), None),
-            (capacity, max_report_hz),
-            Arc::clone(counters),
-            Arc::new(receiver),
-        )
+        let own = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
+        let config = MqttConfig { inbox: capacity, max_report_hz, ..MqttConfig::default() };
+        let topics = Topics::new(&NodeName::from_static("lot"));
+        Inbox::new(&own, topics, &config, None, Arc::clone(counters), Arc::new(receiver))
     }
 
     fn broker() -> BrokerAddress {

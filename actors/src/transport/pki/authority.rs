@@ -1,10 +1,8 @@
 //! The cell's certificate authority: a directory on one machine, which need not belong to the cell.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
+use std::{fs, io};
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
@@ -17,6 +15,7 @@ use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 
 use super::{BROKER_NAME, OBSERVER_MARK};
+use crate::platform::state_file::replace_file;
 
 /// Days for which a node's certificate is valid unless told otherwise.
 pub const DEFAULT_DAYS: u32 = 365;
@@ -282,16 +281,8 @@ fn write_secret(path: &Path, text: &str) -> Result<(), AuthorityError> {
     replace(path, text, 0o600)
 }
 
-/// Replaces a file atomically.
 fn replace(path: &Path, text: &str, mode: u32) -> Result<(), AuthorityError> {
-    let beside = path.with_extension("new");
-    let written = || -> io::Result<()> {
-        let mut file: File = OpenOptions::new().write(true).create(true).truncate(true).mode(mode).open(&beside)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()?;
-        fs::rename(&beside, path)
-    };
-    written().map_err(|source| AuthorityError::File { path: path.into(), source })
+    replace_file(path, text.as_bytes(), mode).map_err(|source| AuthorityError::File { path: path.into(), source })
 }
 
 #[cfg(test)]
@@ -317,7 +308,7 @@ mod tests {
     #[test]
     fn a_ca_that_was_left_half_made_can_be_made_again() {
         let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
-        let obstacle = directory.path().join("issued.new");
+        let obstacle = directory.path().join("issued.tmp");
         fs::create_dir(&obstacle).unwrap();
         Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
         fs::remove_dir(&obstacle).unwrap();
