@@ -41,10 +41,11 @@ impl TokenBucket {
     }
 }
 
-/// Token buckets by source: each allows the same number of messages per second, and as many in a burst.
+/// Token buckets by source, all with the same rate.
 #[derive(Debug)]
 pub(crate) struct KeyedThrottle<K> {
-    per_second: u32,
+    burst: u32,
+    interval: Duration,
     sources: BTreeMap<K, TokenBucket>,
 }
 
@@ -52,8 +53,13 @@ pub(crate) struct KeyedThrottle<K> {
 const MAX_SOURCES: usize = 8192;
 
 impl<K: Ord + Clone> KeyedThrottle<K> {
-    pub(crate) fn new(per_second: u32) -> Self {
-        Self { per_second: per_second.max(1), sources: BTreeMap::new() }
+    pub(crate) fn new(burst: u32, interval: Duration) -> Self {
+        Self { burst, interval, sources: BTreeMap::new() }
+    }
+
+    /// As many messages per second as in a burst.
+    pub(crate) fn per_second(count: u32) -> Self {
+        Self::new(count.max(1), Duration::from_secs(1) / count.max(1))
     }
 
     /// Takes a token of a source; false when there is none.
@@ -67,7 +73,7 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
         if self.sources.len() >= MAX_SOURCES {
             return false;
         }
-        let mut throttle = TokenBucket::new(self.per_second, Duration::from_secs(1) / self.per_second, now);
+        let mut throttle = TokenBucket::new(self.burst, self.interval, now);
         let allowed = throttle.allow(now);
         self.sources.insert(source.clone(), throttle);
         allowed
@@ -89,7 +95,7 @@ mod tests {
 
     #[test]
     fn one_source_does_not_use_up_what_another_has() {
-        let mut throttles = KeyedThrottle::new(10);
+        let mut throttles = KeyedThrottle::per_second(10);
         let mut allowed =
             |source, ms: u64| (0..1000).filter(|_| throttles.allow(&source, Timestamp(ms * 1000))).count();
         assert_eq!([allowed("a", 0), allowed("b", 0), allowed("a", 500), allowed("b", 5000)], [10, 10, 5, 10]);
@@ -97,7 +103,7 @@ mod tests {
 
     #[test]
     fn sources_that_rest_make_room() {
-        let mut throttles = KeyedThrottle::new(10);
+        let mut throttles = KeyedThrottle::per_second(10);
         assert!((0..MAX_SOURCES).all(|source| throttles.allow(&source, Timestamp(0))));
         assert!(!throttles.allow(&MAX_SOURCES, Timestamp(0)));
         assert!(throttles.allow(&MAX_SOURCES, Timestamp(1_000_000)));

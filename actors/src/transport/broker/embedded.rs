@@ -19,6 +19,7 @@ use tokio::sync::oneshot;
 use super::BrokerHealth;
 use super::frontend::{AccessPolicy, BrokerFrontend};
 use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
+use super::permissions::Permissions;
 use super::publish_throttle::PublishThrottle;
 use super::retained::RetainedMessages;
 use crate::platform::clock;
@@ -157,7 +158,7 @@ impl BrokerConfig {
 #[derive(Default)]
 pub struct EmbeddedBroker {
     config: BrokerConfig,
-    guard: Option<AccessPolicy>,
+    policy: Option<AccessPolicy>,
     counters: Arc<Counters>,
     running: Option<RunningBroker>,
 }
@@ -198,13 +199,13 @@ const END_TIMEOUT: Duration = Duration::from_millis(1500);
 impl EmbeddedBroker {
     /// A broker without a frontend, not started: every client may log in.
     pub fn new(config: BrokerConfig) -> Self {
-        Self { config, guard: None, counters: Arc::default(), running: None }
+        Self { config, policy: None, counters: Arc::default(), running: None }
     }
 
     /// A broker behind a frontend with an access policy, not started.
-    pub fn protected(config: BrokerConfig, guard: AccessPolicy) -> Self {
-        let counters = Arc::clone(&guard.counters);
-        Self { config, guard: Some(guard), counters, running: None }
+    pub fn protected(config: BrokerConfig, policy: AccessPolicy) -> Self {
+        let counters = Arc::clone(&policy.counters);
+        Self { config, policy: Some(policy), counters, running: None }
     }
 
     fn listener(&self, address: SocketAddr) -> Builder {
@@ -236,7 +237,7 @@ impl MqttBroker for EmbeddedBroker {
             address,
             listener: self.listener(address),
             config: self.config.clone(),
-            guard: self.guard.clone(),
+            policy: self.policy.clone(),
             counters: Arc::clone(&self.counters),
             beats: heartbeat.beats(),
         };
@@ -297,7 +298,7 @@ struct ThreadSetup {
     address: SocketAddr,
     listener: Builder,
     config: BrokerConfig,
-    guard: Option<AccessPolicy>,
+    policy: Option<AccessPolicy>,
     counters: Arc<Counters>,
     /// Counter that the thread increments while it does not hang.
     beats: Arc<AtomicU64>,
@@ -347,9 +348,9 @@ fn serve(plan: ThreadSetup, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>
 
 /// Opens the sockets. rmqtt's own is public without a frontend, and else on loopback.
 async fn prepare(plan: ThreadSetup) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr)> {
-    let ThreadSetup { address, listener, config, guard, counters, .. } = plan;
+    let ThreadSetup { address, listener, config, policy, counters, .. } = plan;
     let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
-    let listener = match &guard {
+    let listener = match &policy {
         // Without anonymous clients, rmqtt asks the hooks about each login.
         Some(_) => listener.laddr(behind).allow_anonymous(false),
         None => listener.max_topic_levels(MAX_TOPIC_LEVELS),
@@ -359,12 +360,12 @@ async fn prepare(plan: ThreadSetup) -> rmqtt::Result<(MqttServer, Option<BrokerF
     // rmqtt's own overload check looks at the whole machine's load, which a vehicle's camera would exceed.
     let context = ServerContext::new().busy_check_enable(false).build().await;
     *context.extends.retain_mut().await = Box::new(RetainedMessages::new(&config));
-    let (frontend, bound) = match &guard {
-        Some(guard) => {
+    let (frontend, bound) = match &policy {
+        Some(policy) => {
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
-            let frontend = BrokerFrontend::new(public, own, guard, &config);
-            frontend.permissions(guard).install(&context).await;
+            let frontend = BrokerFrontend::new(public, own, policy, &config);
+            Permissions { principals: frontend.principals(), policy: policy.clone() }.install(&context).await;
             (Some(frontend), bound)
         }
         None => (None, own),

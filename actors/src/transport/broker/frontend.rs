@@ -24,7 +24,7 @@ use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
 use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
-use super::permissions::{LeaderCheck, Permissions};
+use super::permissions::LeaderCheck;
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
 use super::{BrokerConfig, connect_packet};
 use crate::platform::clock;
@@ -57,6 +57,7 @@ pub(super) struct BrokerFrontend {
 struct FrontendState {
     credentials: Option<Arc<Credentials>>,
     principals: PrincipalRegistry,
+    /// Address of rmqtt's own listener.
     behind: SocketAddr,
     places: Arc<Semaphore>,
     quota: ConnectionQuota,
@@ -80,18 +81,18 @@ const WRITE_TIMEOUT: Duration = Duration::from_secs(15);
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl BrokerFrontend {
-    /// A gate at the listener, for a broker that listens `behind` it.
-    pub(super) fn new(listener: TcpListener, behind: SocketAddr, guard: &AccessPolicy, config: &BrokerConfig) -> Self {
+    /// A frontend on a listener, for a broker that listens at `behind`.
+    pub(super) fn new(listener: TcpListener, behind: SocketAddr, policy: &AccessPolicy, config: &BrokerConfig) -> Self {
         let interval = Duration::from_secs(1) / config.connects_per_s;
-        let current = guard.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
+        let current = policy.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
         let shared = FrontendState {
-            credentials: guard.credentials.clone(),
+            credentials: policy.credentials.clone(),
             principals: PrincipalRegistry::default(),
             behind,
             places: Arc::new(Semaphore::new(config.max_clients)),
             quota: ConnectionQuota::new(config.max_clients_each),
             handshake_timeout: Duration::from_millis(config.handshake_timeout_ms),
-            counters: Arc::clone(&guard.counters),
+            counters: Arc::clone(&policy.counters),
         };
         Self {
             listener,
@@ -101,18 +102,7 @@ impl BrokerFrontend {
         }
     }
 
-    /// What rmqtt has to ask about those who come through this gate.
-    pub(super) fn permissions(&self, guard: &AccessPolicy) -> Permissions {
-        Permissions {
-            principals: self.principals(),
-            topics: guard.topics.clone(),
-            limits: guard.limits,
-            elected: Arc::clone(&guard.elected),
-            counters: Arc::clone(&guard.counters),
-        }
-    }
-
-    /// Whose the connections are that come through this gate.
+    /// Principals of the forwarded connections.
     pub(super) fn principals(&self) -> PrincipalRegistry {
         self.shared.principals.clone()
     }

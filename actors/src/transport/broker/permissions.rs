@@ -16,15 +16,16 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use ecod::names::NodeName;
-use ecod::wire::{Limits, Topic, Topics};
+use ecod::wire::{Limits, Topic};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, SubscribeAclResult, TopicFilter};
 
+use super::AccessPolicy;
 use super::embedded::is_topic_bounded;
 use super::principal::{Principal, PrincipalRegistry};
-use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::counters::Event;
 use crate::transport::mqtt::ENVELOPE_BYTES;
 use crate::transport::pki::CertificateSubject;
 
@@ -35,20 +36,17 @@ pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 #[derive(Clone)]
 pub(super) struct Permissions {
     pub(super) principals: PrincipalRegistry,
-    pub(super) topics: Topics,
-    pub(super) limits: Limits,
-    pub(super) elected: LeaderCheck,
-    pub(super) counters: Arc<Counters>,
+    pub(super) policy: AccessPolicy,
 }
 
 impl Permissions {
     /// Registers the hooks.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
-        register.add(Type::ClientAuthenticate, Box::new(self.clone())).await;
-        register.add(Type::MessagePublishCheckAcl, Box::new(self.clone())).await;
-        register.add(Type::ClientSubscribeCheckAcl, Box::new(self.clone())).await;
-        register.add(Type::ClientUnsubscribe, Box::new(self)).await;
+        use Type::{ClientAuthenticate, ClientSubscribeCheckAcl, ClientUnsubscribe, MessagePublishCheckAcl};
+        for hook in [ClientAuthenticate, MessagePublishCheckAcl, ClientSubscribeCheckAcl, ClientUnsubscribe] {
+            register.add(hook, Box::new(self.clone())).await;
+        }
         register.start().await;
     }
 
@@ -81,14 +79,15 @@ impl Permissions {
         if !is_topic_bounded(topic) {
             return false;
         }
-        let topic = self.topics.parse(topic);
-        let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));
-        bytes <= most + ENVELOPE_BYTES
+        let topic = self.policy.topics.parse(topic);
+        let limits = &self.policy.limits;
+        let limit = topic.as_ref().map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
+        bytes <= limit + ENVELOPE_BYTES
             && (!retain || topic.as_ref().is_some_and(is_state))
             && principal
                 .identity
                 .as_ref()
-                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
+                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.policy.elected)))
     }
 }
 
@@ -99,7 +98,7 @@ impl Handler for Permissions {
             Parameter::ClientAuthenticate(info) => HookResult::AuthResult(if self.allows_login(info) {
                 AuthResult::Allow(false, None)
             } else {
-                self.counters.count(Event::ClientDenied);
+                self.policy.counters.count(Event::ClientDenied);
                 tracing::debug!(client = %info.client_id(), "login refused");
                 AuthResult::NotAuthorized
             }),
@@ -107,18 +106,18 @@ impl Handler for Permissions {
                 HookResult::PublishAclResult(if self.allows_publish(session.id.remote_addr, publish) {
                     PublishAclResult::allow()
                 } else {
-                    self.counters.count(Event::ClientDenied);
+                    self.policy.counters.count(Event::ClientDenied);
                     tracing::debug!(client = %session.id.client_id, topic = %publish.topic, "message refused");
                     PublishAclResult::rejected(false, None)
                 })
             }
             Parameter::ClientSubscribeCheckAcl(_, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
-                self.counters.count(Event::ClientDenied);
+                self.policy.counters.count(Event::ClientDenied);
                 HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
             }
             // An UNSUBACK cannot refuse. Such a filter is never subscribed, so that there is nothing to end.
             Parameter::ClientUnsubscribe(_, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
-                self.counters.count(Event::ClientDenied);
+                self.policy.counters.count(Event::ClientDenied);
                 HookResult::TopicFilter(Some(TopicFilter::default()))
             }
             _ => return (true, None),
@@ -162,7 +161,7 @@ fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
 mod tests {
     use std::time::Duration;
 
-    use ecod::wire::Role;
+    use ecod::wire::{Role, Topics};
 
     use super::*;
     use crate::platform::clock;
@@ -185,13 +184,14 @@ mod tests {
     }
 
     fn permissions() -> Permissions {
-        Permissions {
-            principals: PrincipalRegistry::default(),
+        let policy = AccessPolicy {
+            credentials: None,
             topics: Topics::new(&NodeName::from_static("lot")),
             limits: Limits { payload_bytes: 1000, map_bytes: 5000, ..Limits::default() },
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::default(),
-        }
+        };
+        Permissions { principals: PrincipalRegistry::default(), policy }
     }
 
     #[test]

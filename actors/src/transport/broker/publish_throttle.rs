@@ -21,7 +21,7 @@ pub(super) struct PublishThrottle {
 
 impl PublishThrottle {
     pub(super) fn new(per_second: u32, principals: PrincipalRegistry, counters: Arc<Counters>) -> Self {
-        Self { sources: Mutex::new(KeyedThrottle::new(per_second)), principals, counters }
+        Self { sources: Mutex::new(KeyedThrottle::per_second(per_second)), principals, counters }
     }
 
     /// Registers the hook for every message, before the permissions.

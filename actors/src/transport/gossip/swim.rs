@@ -112,10 +112,8 @@ impl Swim {
             && due.at <= now
             && let Some(Reverse(due)) = self.timers.pop()
         {
-            if let Err(error) = self.foca.handle_timer(due.timer, &mut self.runtime) {
-                tracing::debug!(%error, "gossip timer came to nothing");
-            }
-            self.collect(now);
+            let handled = self.foca.handle_timer(due.timer, &mut self.runtime);
+            self.finish("timer", handled, now);
         }
         if self.renew_at.is_some_and(|at| at <= now) {
             self.renew(now);
@@ -124,10 +122,8 @@ impl Swim {
 
     /// Announces this node to one that was just admitted.
     pub(crate) fn meet(&mut self, peer: NodeId, now: Timestamp) {
-        if let Err(error) = self.foca.announce(peer, &mut self.runtime) {
-            tracing::debug!(%error, "gossip cannot announce");
-        }
-        self.collect(now);
+        let announced = self.foca.announce(peer, &mut self.runtime);
+        self.finish("announce", announced, now);
     }
 
     /// Takes a `life` after that of the node that had this name before.
@@ -142,19 +138,15 @@ impl Swim {
         let mut own = self.own().clone();
         change(&mut own);
         own.life = own.life.saturating_add(1);
-        if let Err(error) = self.foca.change_identity(own, &mut self.runtime) {
-            tracing::debug!(%error, "gossip cannot change identity");
-        }
-        self.collect(now);
+        let changed = self.foca.change_identity(own, &mut self.runtime);
+        self.finish("change of identity", changed, now);
     }
 
     /// Tells the others that this node leaves.
     pub(crate) fn leave(&mut self, now: Timestamp) {
         self.left = true;
-        if let Err(error) = self.foca.leave_cluster(&mut self.runtime) {
-            tracing::debug!(%error, "gossip cannot say goodbye");
-        }
-        self.collect(now);
+        let left = self.foca.leave_cluster(&mut self.runtime);
+        self.finish("leave", left, now);
         self.timers.clear();
         self.renew_at = None;
     }
@@ -163,6 +155,13 @@ impl Swim {
         self.renew_at = None;
         self.renewed_at = Some(now);
         self.change(now, |_| ());
+    }
+
+    fn finish(&mut self, operation: &str, result: Result<(), foca::Error>, now: Timestamp) {
+        if let Err(error) = result {
+            tracing::debug!(%error, operation, "gossip operation failed");
+        }
+        self.collect(now);
     }
 
     fn collect(&mut self, now: Timestamp) {

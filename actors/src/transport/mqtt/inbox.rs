@@ -130,7 +130,7 @@ impl Inbox {
         counters: Arc<Counters>,
         subscriber: Subscriber,
     ) -> Self {
-        let throttle = || Mutex::new(KeyedThrottle::new(config.max_report_hz));
+        let throttle = || Mutex::new(KeyedThrottle::per_second(config.max_report_hz));
         Self {
             node: own.node.clone(),
             run: own.id,
