@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check live-check asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check live-check tracing-check asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -96,6 +96,9 @@ recording-check: setup ## prove that the Python reader of MCAP reads what nodes 
 
 live-check: setup ## record with the feature foxglove, and look on as Foxglove does
 	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test recording
+
+tracing-check: setup ## follow a detection through two nodes, with the feature otel
+	cargo test --locked -p ecod-actors --features otel --test tracing
 
 fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each; TARGETS=payload,... runs those only
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))

@@ -198,7 +198,7 @@ impl Aggregator {
     pub fn refine(&mut self, passes: u32, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let verdicts = self.vote.as_mut()?.refine(passes);
-        Some(self.number_verdicts(epoch, verdicts, now))
+        Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
     /// Judges the incomplete packet of VOTE's `paper` mode in a round of its own, at the end of a recording. `None` if no
@@ -208,12 +208,12 @@ impl Aggregator {
         let by_packets = self.by_packets;
         let vote = self.vote.as_mut().filter(|vote| by_packets && vote.is_packet_begun())?;
         let verdicts = vote.close(now).verdicts;
-        Some(self.number_verdicts(epoch, verdicts, now))
+        Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    fn number_verdicts(&mut self, epoch: Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {
+    fn number_verdicts(&mut self, epoch: &Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {
         let round = self.take_round_number();
-        Verdicts::new(&epoch, round, now, verdicts)
+        Verdicts::new(epoch, round, now, verdicts)
     }
 
     fn take_round_number(&mut self) -> u64 {

@@ -28,13 +28,14 @@ impl ConfigError {
     }
 }
 
-/// Defines a section of the configuration: the default of each field and its range, if any, stand beside its
-/// documentation.
+/// Defines a section of the configuration: the default of each field and its check, if any, stand beside its
+/// documentation. A check is a range, which may name other fields, or a function.
 ///
-/// Generates the struct, its `Default` and `validate`. A range may name other fields.
+/// Generates the struct, its `Default` and `validate`.
 macro_rules! config_section {
     ($(#[$attribute:meta])* pub struct $name:ident {
-        $($(#[$doc:meta])* pub $field:ident: $type:ty = $default:expr $(, in $low:tt to $high:expr)?;)*
+        $($(#[$doc:meta])* pub $field:ident: $type:ty = $default:expr
+            $(, in $low:tt to $high:expr)? $(, checked by $check:expr)?;)*
     }) => {
         $(#[$attribute])*
         #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -58,6 +59,7 @@ macro_rules! config_section {
                 #[allow(unused_variables)]
                 let Self { $($field,)* } = self;
                 $($(crate::config::check_range(stringify!($field), *$field as f64, $low, $high)?;)?)*
+                $($($check($field).map_err(|error| error.within(stringify!($field)))?;)?)*
                 Ok(())
             }
         }

@@ -118,8 +118,8 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         Some(_) => "warn",
     };
     let runs_on = matches!(&cli.command, None | Some(Command::Record(_)));
-    logging::start(cli.log_format, runs_on, level);
-    match cli.command {
+    let _export = logging::start(cli.log_format, runs_on, level);
+    let outcome = match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),

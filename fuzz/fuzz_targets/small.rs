@@ -30,7 +30,7 @@ fuzz_target!(|input: &[u8]| {
             let detections = parse_detections(text).unwrap_or_default();
             assert!(detections.iter().all(|detection| detection.bounding_box.is_valid()));
         }
-        2 => assert!(SIGNING.keeps_shut("ecod/lot-1/detections/euclid", bytes)),
+        2 => assert!(SIGNING.rejects_forgery("ecod/lot-1/detections/euclid", bytes)),
         3 => read_saved(bytes),
         _ => drop((Truth::parse(text), TrackTruth::is_in(text), TrackTruth::parse(text))),
     }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::{ConfigError, check_range, config_section};
 use crate::names::Label;
 
 /// The way to find the distance of a detection.
@@ -82,50 +82,23 @@ impl ObjectSizes {
     }
 }
 
-/// Settings of projection.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ProjectionConfig {
-    /// The way of ranging; default `corners`. `box_height` needs upright objects, `box_width` objects that face the
-    /// camera; `paper` has the published formulas with their errors.
-    pub ranging: Ranging,
-    /// True sizes of objects; default none.
-    pub sizes: ObjectSizes,
-    /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
-    /// detectors 3 and more.
-    pub pixel_sigma_px: f64,
-    /// Standard deviation of the camera's heading in radians; default 0.01.
-    pub heading_sigma_rad: f64,
-    /// Standard deviation of the camera's position in metres, each axis; default 0.005.
-    pub position_sigma_m: f64,
-    /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps covariances away from zero.
-    pub floor_m: f64,
-}
-
-impl Default for ProjectionConfig {
-    fn default() -> Self {
-        Self {
-            ranging: Ranging::default(),
-            sizes: ObjectSizes::default(),
-            pixel_sigma_px: 1.0,
-            heading_sigma_rad: 0.01,
-            position_sigma_m: 0.005,
-            floor_m: 0.005,
-        }
-    }
-}
-
-impl ProjectionConfig {
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// [`ConfigError`] with the first key out of range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        self.sizes.validate().map_err(|e| e.within("sizes"))?;
-        check_range("pixel_sigma_px", self.pixel_sigma_px, 0.0, 1e3)?;
-        check_range("heading_sigma_rad", self.heading_sigma_rad, 0.0, std::f64::consts::PI)?;
-        check_range("position_sigma_m", self.position_sigma_m, 0.0, 1e3)?;
-        check_range("floor_m", self.floor_m, 1e-6, 1e3)
+config_section! {
+    /// Settings of projection.
+    pub struct ProjectionConfig {
+        /// The way of ranging; default `corners`. `box_height` needs upright objects, `box_width` objects that face the
+        /// camera; `paper` has the published formulas with their errors.
+        pub ranging: Ranging = Ranging::default();
+        /// True sizes of objects; default none.
+        pub sizes: ObjectSizes = ObjectSizes::default(), checked by ObjectSizes::validate;
+        /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
+        /// detectors 3 and more.
+        pub pixel_sigma_px: f64 = 1.0, in 0.0 to 1e3;
+        /// Standard deviation of the camera's heading in radians; default 0.01.
+        pub heading_sigma_rad: f64 = 0.01, in 0.0 to std::f64::consts::PI;
+        /// Standard deviation of the camera's position in metres, each axis; default 0.005.
+        pub position_sigma_m: f64 = 0.005, in 0.0 to 1e3;
+        /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps covariances away from zero.
+        pub floor_m: f64 = 0.005, in 1e-6 to 1e3;
     }
 }
 

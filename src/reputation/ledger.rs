@@ -29,12 +29,15 @@ pub struct ReputationLedger {
     pub(super) entries: usize,
 }
 
+/// Counts by vehicle and label.
+type SnapshotLane = BTreeMap<NodeName, BTreeMap<Label, Counts>>;
+
 /// A ledger in its serialised form; snapshots of early versions have no marks.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Snapshot {
-    /// By term, aggregator, vehicle and label.
-    lanes: BTreeMap<u64, BTreeMap<NodeName, BTreeMap<NodeName, BTreeMap<Label, Counts>>>>,
+    /// By term, and by the aggregator that wrote the lane.
+    lanes: BTreeMap<u64, BTreeMap<NodeName, SnapshotLane>>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     marks: Vec<LedgerMark>,
 }

@@ -106,7 +106,7 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
         Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|error| {
             // serde_json has no other way to distinguish 1e999 from a syntax error.
             let overflow = error.to_string().starts_with("number out of range");
-            let not_finite = overflow || (error.is_syntax() && names_no_number(bytes, &error));
+            let not_finite = overflow || (error.is_syntax() && is_at_non_finite_word(bytes, &error));
             if not_finite { RejectReason::NotFinite } else { RejectReason::Malformed }
         }),
         Some(_) => ciborium::from_reader(bytes).map_err(|_| RejectReason::Malformed),
@@ -115,7 +115,7 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
 }
 
 /// Whether the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not finite.
-fn names_no_number(bytes: &[u8], error: &serde_json::Error) -> bool {
+fn is_at_non_finite_word(bytes: &[u8], error: &serde_json::Error) -> bool {
     let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
     // The column is at the first letter of the word or next to it.
     let from = line.get(error.column().saturating_sub(3)..).unwrap_or_default();

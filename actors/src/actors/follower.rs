@@ -29,6 +29,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::LogSender;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::spans::Spans;
 use crate::transport::mqtt::Incoming;
 
 /// What a follower needs at its start.
@@ -50,6 +51,8 @@ pub struct FollowerArguments {
     pub fuser: ActorSlot<FuserMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
+    /// The node's spans.
+    pub spans: Spans,
 }
 
 /// Keeps the newest map, verdicts and reputations.
@@ -66,6 +69,7 @@ pub struct FollowerState {
     election: ActorSlot<LeaderElectionMessage>,
     fuser: ActorSlot<FuserMessage>,
     counters: Arc<Counters>,
+    spans: Spans,
 }
 
 impl Actor for Follower {
@@ -108,13 +112,15 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, recording, saved_term, leadership, election, fuser, counters, .. } = arguments;
+        let FollowerArguments { newest, recording, saved_term, leadership, election, fuser, counters, spans, .. } =
+            arguments;
         let filter = RoundFilter::new(saved_term);
-        Self { newest, filter, log, recording, leadership, election, fuser, counters }
+        Self { newest, filter, log, recording, leadership, election, fuser, counters, spans }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
         let accepted = self.filter.accept_map(map, received_at, &self.leadership.borrow())?;
+        let _accept = self.spans.accept("map", &**map, received_at);
         self.counters.count(Event::MapAccepted);
         if accepted.is_known_term {
             self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
@@ -129,6 +135,7 @@ impl FollowerState {
 
     fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), Refusal> {
         let accepted = self.filter.accept_verdicts(verdicts, received_at, &self.leadership.borrow())?;
+        let _accept = self.spans.accept("verdicts", &**verdicts, received_at);
         self.counters.count(Event::VerdictsAccepted);
         self.recording.verdicts(verdicts, received_at);
         self.tell_election(accepted);

@@ -35,6 +35,7 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::observe::recorder::LogSender;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::spans::{RoundReports, Spans};
 use crate::transport::mqtt::{Delivery, Incoming};
 
 /// What a fuser needs at its start.
@@ -53,6 +54,8 @@ pub struct FuserArguments {
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
+    /// The node's spans.
+    pub spans: Spans,
 }
 
 /// Drives an [`Aggregator`] with the clock and the gateway.
@@ -73,6 +76,9 @@ pub struct FuserState {
     timer: Option<AbortHandle>,
     /// What the aggregator has left out so far and is counted already.
     losses: [u64; 4],
+    spans: Spans,
+    /// Reports of the present round, while their spans are recorded.
+    reports: RoundReports,
 }
 
 impl Actor for Fuser {
@@ -126,7 +132,7 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
-        let FuserArguments { aggregator, intake, newest, recording, gateway, keeper, counters } = arguments;
+        let FuserArguments { aggregator, intake, newest, recording, gateway, keeper, counters, spans } = arguments;
         Self {
             aggregator,
             intake,
@@ -138,6 +144,8 @@ impl FuserState {
             alarm: Timestamp(u64::MAX),
             timer: None,
             losses: [0; 4],
+            spans,
+            reports: RoundReports::default(),
         }
     }
 
@@ -152,7 +160,12 @@ impl FuserState {
         self.recording.report(*kind, report, delivery.received_at);
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
-            Ok(fused) => self.publish(fused, delivery.received_at),
+            Ok(fused) => {
+                if self.aggregator.leads().is_some() {
+                    self.spans.note(report, delivery.received_at, &mut self.reports);
+                }
+                self.publish(fused, delivery.received_at);
+            }
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
                 self.counters.reject(reason);
@@ -168,6 +181,7 @@ impl FuserState {
     }
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
+        self.reports = RoundReports::default();
         self.keeper
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
         if let Some((map, received_at)) = self.last_map.take()
@@ -208,8 +222,10 @@ impl FuserState {
         }
     }
 
-    fn publish(&self, fused: Option<Fused>, now: Timestamp) {
-        let Some(Fused { epoch, round, map, verdicts, evidence, reputations }) = fused else { return };
+    fn publish(&mut self, fused: Option<Fused>, now: Timestamp) {
+        let Some(fused) = fused else { return };
+        let _round = self.spans.round(&fused, &std::mem::take(&mut self.reports)).entered();
+        let Fused { epoch, round, map, verdicts, evidence, reputations } = fused;
         self.recording.round(round, now);
         let has_verdicts = verdicts.is_some();
         if let Some(map) = map {

@@ -100,7 +100,9 @@ impl ProjectorState {
             self.perception.set_pose(pose);
         }
         let found = detections.len();
-        let report = self.perception.report(detections, captured_at);
+        let span = tracing::info_span!("project");
+        let report = span.in_scope(|| self.perception.report(detections, captured_at));
+        drop(span);
         self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
         if self.algorithms.vote() {
             self.publish(ReportKind::VoteDetections, votes(&report));

@@ -43,6 +43,7 @@ use crate::observe::recorder::ImageRecorder;
 use crate::observe::recorder::LogSender;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
+use crate::telemetry::spans::Spans;
 use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
@@ -110,6 +111,10 @@ impl NodeBuilder {
 
     pub(super) fn counters(&self) -> Arc<Counters> {
         Arc::clone(&self.counters)
+    }
+
+    fn spans(&self) -> Spans {
+        Spans::new(self.config.cell.clone(), self.name.clone())
     }
 
     pub(super) fn newest(&self) -> Newest {
@@ -219,7 +224,8 @@ impl NodeBuilder {
             ActorKind::Detector => {
                 let pictures = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
-                let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
+                let (counters, spans) = (self.counters(), self.spans());
+                let arguments = crate::node::camera::detector(&self.config, projector, pictures, counters, spans);
                 let arguments = arguments.map_err(in_full)?;
                 slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }

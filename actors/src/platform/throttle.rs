@@ -1,4 +1,4 @@
-//! Rates that are not exceeded: of one source, or of each of many.
+//! Rate limits: of one source, or of each of many.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ecod::time::Timestamp;
 
-/// Allows a burst, then a steady rate.
+/// Allows a burst, then one per interval.
 #[derive(Debug, Clone)]
 pub(crate) struct TokenBucket {
     tokens: u32,
@@ -20,12 +20,12 @@ impl TokenBucket {
         Self { tokens: burst, burst, interval, refilled_at: now }
     }
 
-    /// Whether a whole burst would be allowed now.
+    /// Whether a whole burst is allowed now.
     pub(crate) fn is_full(&self, now: Timestamp) -> bool {
         now.since(self.refilled_at) >= self.interval * self.burst.saturating_sub(self.tokens)
     }
 
-    /// Whether one more is allowed now.
+    /// Takes a token; false when there is none.
     pub(crate) fn allow(&mut self, now: Timestamp) -> bool {
         let earned = now.since(self.refilled_at).as_micros() / self.interval.as_micros().max(1);
         let earned = u32::try_from(earned).unwrap_or(u32::MAX);
@@ -41,22 +41,28 @@ impl TokenBucket {
     }
 }
 
-/// Allows every source as many messages a second, and as many at once after a second of silence.
+/// Token buckets by source, all with the same rate.
 #[derive(Debug)]
 pub(crate) struct KeyedThrottle<K> {
-    per_second: u32,
+    burst: u32,
+    interval: Duration,
     sources: BTreeMap<K, TokenBucket>,
 }
 
-/// Most sources that are remembered. While as many are busy at a time, further ones are not allowed anything.
+/// Maximum sources with a bucket. While as many are busy, further sources are allowed nothing.
 const MAX_SOURCES: usize = 8192;
 
 impl<K: Ord + Clone> KeyedThrottle<K> {
-    pub(crate) fn new(per_second: u32) -> Self {
-        Self { per_second: per_second.max(1), sources: BTreeMap::new() }
+    pub(crate) fn new(burst: u32, interval: Duration) -> Self {
+        Self { burst, interval, sources: BTreeMap::new() }
     }
 
-    /// Whether the source is allowed one more message now.
+    /// As many messages per second as in a burst.
+    pub(crate) fn per_second(count: u32) -> Self {
+        Self::new(count.max(1), Duration::from_secs(1) / count.max(1))
+    }
+
+    /// Takes a token of a source; false when there is none.
     pub(crate) fn allow(&mut self, source: &K, now: Timestamp) -> bool {
         if let Some(throttle) = self.sources.get_mut(source) {
             return throttle.allow(now);
@@ -67,14 +73,15 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
         if self.sources.len() >= MAX_SOURCES {
             return false;
         }
-        let mut throttle = TokenBucket::new(self.per_second, Duration::from_secs(1) / self.per_second, now);
+        let mut throttle = TokenBucket::new(self.burst, self.interval, now);
         let allowed = throttle.allow(now);
         self.sources.insert(source.clone(), throttle);
         allowed
     }
 }
 
-/// What counts as one source: an IPv4 address, or the network of an IPv6 host, which has 2⁶⁴ addresses to choose from.
+/// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴ addresses to choose
+/// from.
 pub(crate) fn host_network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V4(v4) => IpAddr::V4(v4),
@@ -88,7 +95,7 @@ mod tests {
 
     #[test]
     fn one_source_does_not_use_up_what_another_has() {
-        let mut throttles = KeyedThrottle::new(10);
+        let mut throttles = KeyedThrottle::per_second(10);
         let mut allowed =
             |source, ms: u64| (0..1000).filter(|_| throttles.allow(&source, Timestamp(ms * 1000))).count();
         assert_eq!([allowed("a", 0), allowed("b", 0), allowed("a", 500), allowed("b", 5000)], [10, 10, 5, 10]);
@@ -96,7 +103,7 @@ mod tests {
 
     #[test]
     fn sources_that_rest_make_room() {
-        let mut throttles = KeyedThrottle::new(10);
+        let mut throttles = KeyedThrottle::per_second(10);
         assert!((0..MAX_SOURCES).all(|source| throttles.allow(&source, Timestamp(0))));
         assert!(!throttles.allow(&MAX_SOURCES, Timestamp(0)));
         assert!(throttles.allow(&MAX_SOURCES, Timestamp(1_000_000)));

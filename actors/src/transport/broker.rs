@@ -19,14 +19,13 @@ pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
 pub use frontend::AccessPolicy;
 pub use permissions::LeaderCheck;
 
-/// Whether the broker serves.
+/// State of an embedded broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BrokerHealth {
     /// Not started, or stopped.
     Stopped,
-    /// Accepts clients at this address.
+    /// Serves clients at this address.
     Serving(SocketAddr),
-    /// Was started, but has ended by itself or hangs; a node without its broker must not lead. The actor ends with this
-    /// answer.
+    /// Has ended by itself or hangs. The actor ends with this answer, and the node must not lead meanwhile.
     Dead,
 }

@@ -92,8 +92,8 @@ mod tests {
     fn a_label_that_is_no_longer_believed_gives_way_to_one_that_is() {
         let (car, van) = (Label::from("car"), Label::from("van"));
         let winner = |nats_of_car: f64| {
-            let tally = LabelScores { labels: [(&car, nats_of_car), (&van, 0.3)].into_iter().collect() };
-            tally.winner(Some(&car), 0.5).map(|winner| winner.label.clone())
+            let scores = LabelScores { labels: [(&car, nats_of_car), (&van, 0.3)].into_iter().collect() };
+            scores.winner(Some(&car), 0.5).map(|winner| winner.label.clone())
         };
         assert_eq!(winner(0.1), Some(car.clone()), "van does not lead by 0.5 nats");
         assert_eq!(winner(-0.1), Some(van.clone()));

@@ -31,6 +31,10 @@ fn global_map(Epoch { term, leader }: Epoch, round: u64) -> Arc<GlobalMap> {
     })
 }
 
+fn spans() -> Spans {
+    Spans::new(NodeName::from_static("lot"), NodeName::from_static("gauss"))
+}
+
 fn map(epoch: Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
     let map = global_map(epoch, round);
     FollowerMessage::TakeMap { delivery: Delivery::local(Incoming::Map(map), received_at) }
@@ -51,6 +55,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             election: ActorSlot::default(),
             fuser: fuser.clone(),
             counters: Arc::default(),
+            spans: spans(),
         };
         let (follower, _) = Actor::spawn(None, Follower, arguments).await.unwrap();
         for round in 1..=3 {
@@ -70,6 +75,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             gateway: ActorSlot::default(),
             keeper: ActorSlot::default(),
             counters: Arc::default(),
+            spans: spans(),
         });
         let mut maps = 0;
         while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {

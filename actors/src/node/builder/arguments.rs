@@ -166,6 +166,7 @@ impl NodeBuilder {
             election: self.slots.election.clone(),
             fuser: self.slots.fuser.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 
@@ -201,6 +202,7 @@ impl NodeBuilder {
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 

@@ -1,18 +1,18 @@
-//! The first packet of a client.
+//! The CONNECT packet of a client.
 
 use tokio::io::{AsyncRead, AsyncReadExt};
 
 use super::frontend::ClientRejection;
 
-/// A CONNECT packet as it came.
+/// A CONNECT packet as received.
 #[derive(Debug)]
 pub(super) struct ConnectPacket {
     pub(super) packet: Vec<u8>,
-    /// Whether the client leaves it to the broker to draw its id.
+    /// Whether the client id is empty, so that the broker draws one.
     pub(super) has_generated_id: bool,
 }
 
-/// Largest CONNECT packet: client id, last will, user name and password.
+/// Maximum length of a CONNECT packet in bytes: client id, last will, user name and password.
 const MAX_BYTES: usize = 16 * 1024;
 
 const CONNECT: u8 = 0x10;
@@ -20,7 +20,7 @@ const CONNECT: u8 = 0x10;
 /// The protocol level of MQTT 5, in which properties come before the client id.
 const MQTT_5: u8 = 5;
 
-/// Reads the first packet, which must be CONNECT; rmqtt itself would wait for its first bytes for good.
+/// Reads the first packet, which must be CONNECT. rmqtt itself would wait for its first bytes for ever.
 pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<ConnectPacket, ClientRejection> {
     if stream.read_u8().await? != CONNECT {
         return Err(ClientRejection::Malformed);
@@ -45,7 +45,7 @@ pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Connec
     Ok(ConnectPacket { packet, has_generated_id })
 }
 
-/// The length of the first packet in what a client sent, if all of it is there; only built for the fuzz targets.
+/// Length of the first packet in received bytes, if it is complete. Only built for the fuzz targets.
 #[cfg(fuzzing)]
 pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     use futures_util::FutureExt;
@@ -55,7 +55,7 @@ pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     Some(login.packet.len())
 }
 
-/// The client id in a CONNECT packet without its head; none where rmqtt will find the packet malformed.
+/// The client id in the body of a CONNECT packet; none where rmqtt will find the packet malformed.
 fn client_id(body: &[u8]) -> Option<&[u8]> {
     let (_protocol, rest) = text(body)?;
     // Level, flags and the keep-alive.
@@ -75,7 +75,7 @@ fn client_id(body: &[u8]) -> Option<&[u8]> {
     text(rest).map(|(id, _)| id)
 }
 
-/// Bytes after their length, and the rest.
+/// Splits a length-prefixed text from the rest.
 fn text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let (length, rest) = bytes.split_first_chunk::<2>()?;
     rest.split_at_checked(u16::from_be_bytes(*length).into())

@@ -1,6 +1,6 @@
-//! How many strangers may knock, and how often.
+//! Limits of connections that have not logged in yet.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -11,84 +11,67 @@ use tokio::sync::oneshot;
 use crate::platform::clock;
 use crate::platform::throttle::{TokenBucket, host_network};
 
-/// Limits connections that have not logged in yet, by source address and in all. Where too many wait, the oldest gives
-/// way: whoever means to log in does so at once.
+/// Limits connections without a login, by source address and in total. Where too many wait, the oldest is evicted: an
+/// honest client logs in at once.
 #[derive(Debug, Clone)]
 pub(super) struct ConnectionThrottle(Arc<Mutex<AddressTable>>);
 
 #[derive(Debug)]
 struct AddressTable {
     by_address: HashMap<IpAddr, AddressEntry>,
-    /// For addresses beyond those that are remembered.
+    /// Throttle shared by all addresses beyond [`MAX_ADDRESSES`].
     overflow: TokenBucket,
-    pending: BTreeMap<Number, Pending>,
-    next: Number,
-    pruned: Timestamp,
-    rate: Rate,
-}
-
-/// Counts connections in the order in which they came.
-type Number = u64;
-
-#[derive(Debug)]
-struct Pending {
-    source: IpAddr,
-    /// Dropped with it, which tells the connection.
-    _place: oneshot::Sender<()>,
+    /// Connections without a login by order of arrival: the source, and a sender whose drop evicts the connection.
+    pending: BTreeMap<u64, (IpAddr, oneshot::Sender<()>)>,
+    next_number: u64,
+    pruned_at: Timestamp,
+    /// Connections that an address may make at once, and the time until one more.
+    burst: u32,
+    interval: Duration,
 }
 
 #[derive(Debug)]
 struct AddressEntry {
-    throttle: TokenBucket,
-    pending: BTreeSet<Number>,
-    seen: Timestamp,
-    /// Until when it is remembered that a client of this address was logged in.
+    bucket: TokenBucket,
+    /// End of the time for which a login raises the address's rate.
     privileged_until: Timestamp,
 }
 
-/// A burst, then one for every interval.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Rate {
-    pub(super) burst: u32,
-    pub(super) interval: Duration,
-}
-
-/// Where a connection comes from.
+/// Source of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Origin {
-    /// From an address that has its share.
+    /// A throttled address.
     Remote(IpAddr),
-    /// From this machine, where a whole cell may run, and nothing tells its nodes apart: only those that wait are
-    /// limited.
+    /// This machine, where a whole cell may run and nothing tells its nodes apart. Only waiting connections are limited.
     Local,
 }
 
-/// Most connections of one address, of this machine, and of all, that have not logged in.
+/// Maximum connections without a login: of one address, of this machine, and in total.
 const MAX_PENDING_PER_ADDRESS: usize = 32;
 const MAX_PENDING_LOCAL: usize = 256;
 const MAX_PENDING: usize = 1024;
 
-/// How many times the rate of a stranger an address has from which a client has logged in, and for how long after: a
-/// flood from a node's own address, such as behind address translation, is to leave something for the node.
+/// Factor on the rate of an address from which a client has logged in, and how long it lasts after the last login. A
+/// flood from a node's own address, such as behind address translation, must leave something for the node.
 const PRIVILEGED_FACTOR: u32 = 10;
 const PRIVILEGED_FOR: Duration = Duration::from_secs(3600);
 
-/// Most addresses that are remembered.
-const MAX_SOURCES: usize = 4096;
+/// Maximum addresses with a throttle of their own.
+const MAX_ADDRESSES: usize = 4096;
 
-/// Least time between two looks for addresses to forget: looking at all for every connection would be an attack's aim.
+/// Minimum time between two searches for addresses to forget. A search for every connection would help an attacker.
 const PRUNE_INTERVAL: Duration = Duration::from_secs(1);
 
-/// A connection that was let in to log in; its place is free when dropped.
+/// The place of a connection that may log in; free when dropped.
 #[derive(Debug)]
 pub(super) struct LoginSlot {
     throttle: ConnectionThrottle,
     source: IpAddr,
-    number: Number,
+    number: u64,
     evicted: oneshot::Receiver<()>,
 }
 
-/// A connection that has logged in.
+/// A connection that has logged in. Until its end it keeps its address privileged.
 #[derive(Debug)]
 pub(super) struct LoggedInConnection {
     throttle: ConnectionThrottle,
@@ -96,20 +79,34 @@ pub(super) struct LoggedInConnection {
 }
 
 impl ConnectionThrottle {
-    pub(super) fn new(rate: Rate, now: Timestamp) -> Self {
-        let (by_address, pending) = (HashMap::new(), BTreeMap::new());
-        let overflow = TokenBucket::new(rate.burst, rate.interval, now);
-        Self(Arc::new(Mutex::new(AddressTable { by_address, overflow, pending, next: 0, pruned: now, rate })))
+    /// Allows each address `burst` connections at once, then one per `interval`.
+    pub(super) fn new(burst: u32, interval: Duration, now: Timestamp) -> Self {
+        Self(Arc::new(Mutex::new(AddressTable {
+            by_address: HashMap::new(),
+            overflow: TokenBucket::new(burst, interval, now),
+            pending: BTreeMap::new(),
+            next_number: 0,
+            pruned_at: now,
+            burst,
+            interval,
+        })))
     }
 
-    /// Lets a connection in, or not.
+    /// A place to log in, unless the origin connects too often.
     pub(super) fn admit(&self, from: Origin, now: Timestamp) -> Option<LoginSlot> {
-        let (source, most) = match from {
+        let (source, limit) = match from {
             Origin::Remote(address) => (host_network(address), MAX_PENDING_PER_ADDRESS),
             Origin::Local => (IpAddr::V4(Ipv4Addr::LOCALHOST), MAX_PENDING_LOCAL),
         };
-        let (number, evicted) = self.table().admit(source, from == Origin::Local, most, now)?;
-        Some(LoginSlot { throttle: self.clone(), source, number, evicted })
+        let mut table = self.table();
+        let is_allowed = match table.entry(source, now) {
+            Some(entry) => from == Origin::Local || entry.bucket.allow(now),
+            None => table.overflow.allow(now),
+        };
+        is_allowed.then(|| {
+            let (number, evicted) = table.insert(source, limit);
+            LoginSlot { throttle: self.clone(), source, number, evicted }
+        })
     }
 
     fn table(&self) -> MutexGuard<'_, AddressTable> {
@@ -118,94 +115,56 @@ impl ConnectionThrottle {
 }
 
 impl AddressTable {
-    fn admit(
-        &mut self,
-        source: IpAddr,
-        is_unthrottled: bool,
-        most: usize,
-        now: Timestamp,
-    ) -> Option<(Number, oneshot::Receiver<()>)> {
-        let number = self.next;
-        let allowed = match self.entry(source, now) {
-            Some(entry) => {
-                let allowed = is_unthrottled || entry.throttle.allow(now);
-                let oldest = entry.pending.first().copied().filter(|_| allowed && entry.pending.len() >= most);
-                if allowed {
-                    entry.pending.insert(number);
-                }
-                oldest.inspect(|oldest| self.remove(*oldest));
-                allowed
-            }
-            None => self.overflow.allow(now),
+    /// Adds a waiting connection and evicts the oldest if there are too many, of its source or in total.
+    fn insert(&mut self, source: IpAddr, limit: usize) -> (u64, oneshot::Receiver<()>) {
+        let mut of_source = self.pending.iter().filter(|(_, (other, _))| *other == source).map(|(number, _)| *number);
+        let oldest = match of_source.clone().count() {
+            count if count >= limit => of_source.next(),
+            _ => self.pending.keys().next().copied().filter(|_| self.pending.len() >= MAX_PENDING),
         };
-        if !allowed {
-            return None;
-        }
-        if self.pending.len() >= MAX_PENDING
-            && let Some(oldest) = self.pending.keys().next().copied()
-        {
-            self.remove(oldest);
-        }
-        self.next += 1;
+        oldest.map(|oldest| self.pending.remove(&oldest));
+        let number = self.next_number;
+        self.next_number += 1;
         let (place, evicted) = oneshot::channel();
-        self.pending.insert(number, Pending { source, _place: place });
-        Some((number, evicted))
+        self.pending.insert(number, (source, place));
+        (number, evicted)
     }
 
-    /// What is remembered of an address; nothing when there is no room for one more.
+    /// The entry of an address; none when there is no room for one more.
     fn entry(&mut self, source: IpAddr, now: Timestamp) -> Option<&mut AddressEntry> {
-        let Rate { burst, interval } = self.rate;
-        if self.by_address.len() >= MAX_SOURCES && !self.by_address.contains_key(&source) {
-            // Whose burst is whole again need not be remembered.
-            if now.since(self.pruned) >= PRUNE_INTERVAL {
-                self.pruned = now;
-                let is_rested =
-                    |entry: &AddressEntry| entry.pending.is_empty() && now.since(entry.seen) >= interval * burst;
-                self.by_address.retain(|_, entry| now < entry.privileged_until || !is_rested(entry));
+        if self.by_address.len() >= MAX_ADDRESSES && !self.by_address.contains_key(&source) {
+            if now.since(self.pruned_at) >= PRUNE_INTERVAL {
+                self.pruned_at = now;
+                self.by_address.retain(|_, entry| now < entry.privileged_until || !entry.bucket.is_full(now));
             }
-            if self.by_address.len() >= MAX_SOURCES {
+            if self.by_address.len() >= MAX_ADDRESSES {
                 return None;
             }
         }
-        let throttle = || TokenBucket::new(burst, interval, now);
-        let fresh = || AddressEntry {
-            throttle: throttle(),
-            pending: BTreeSet::new(),
-            seen: now,
-            privileged_until: Timestamp::default(),
-        };
-        let entry = self.by_address.entry(source).or_insert_with(fresh);
-        entry.seen = now;
-        Some(entry)
+        let bucket = || TokenBucket::new(self.burst, self.interval, now);
+        let fresh = || AddressEntry { bucket: bucket(), privileged_until: Timestamp::default() };
+        Some(self.by_address.entry(source).or_insert_with(fresh))
     }
 
-    /// Notes that a client of the address is, or was until now, logged in.
+    /// Raises the rate of an address from which a client is, or was until now, logged in.
     fn note_login(&mut self, source: IpAddr, now: Timestamp) {
-        let Rate { burst, interval } = self.rate;
+        let (burst, interval) = (self.burst.saturating_mul(PRIVILEGED_FACTOR), self.interval / PRIVILEGED_FACTOR);
         let Some(entry) = self.entry(source, now) else { return };
         if now >= entry.privileged_until {
-            entry.throttle =
-                TokenBucket::new(burst.saturating_mul(PRIVILEGED_FACTOR), interval / PRIVILEGED_FACTOR, now);
+            entry.bucket = TokenBucket::new(burst, interval, now);
         }
         entry.privileged_until = now + PRIVILEGED_FOR;
-    }
-
-    fn remove(&mut self, number: Number) {
-        let Some(pending) = self.pending.remove(&number) else { return };
-        if let Some(entry) = self.by_address.get_mut(&pending.source) {
-            entry.pending.remove(&number);
-        }
     }
 }
 
 impl LoginSlot {
-    /// Waits until a newer connection has taken the place of this one.
+    /// Waits until a newer connection has evicted this one.
     pub(super) async fn evicted(&mut self) {
-        // It ends by the sender's end.
+        // The drop of the sender is the signal.
         (&mut self.evicted).await.unwrap_or_default();
     }
 
-    /// Gives the place back: the client has logged in.
+    /// Frees the place: the client has logged in.
     pub(super) fn log_in(self) -> LoggedInConnection {
         self.throttle.table().note_login(self.source, clock::now());
         LoggedInConnection { throttle: self.throttle.clone(), source: self.source }
@@ -214,7 +173,7 @@ impl LoginSlot {
 
 impl Drop for LoginSlot {
     fn drop(&mut self) {
-        self.throttle.table().remove(self.number);
+        self.throttle.table().pending.remove(&self.number);
     }
 }
 
@@ -228,7 +187,9 @@ impl Drop for LoggedInConnection {
 mod tests {
     use super::*;
 
-    const RATE: Rate = Rate { burst: 100, interval: Duration::from_millis(100) };
+    fn throttle(burst: u32, now: Timestamp) -> ConnectionThrottle {
+        ConnectionThrottle::new(burst, Duration::from_millis(100), now)
+    }
 
     fn at(ms: u64) -> Timestamp {
         Timestamp(ms * 1000)
@@ -245,7 +206,7 @@ mod tests {
 
     #[test]
     fn one_address_uses_up_its_own_share_only() {
-        let throttle = ConnectionThrottle::new(Rate { burst: 3, ..RATE }, at(0));
+        let throttle = throttle(3, at(0));
         let admitted = |address, ms| (0..9).filter(|_| throttle.admit(from(address), at(ms)).is_some()).count();
         assert_eq!([admitted("10.0.0.1", 0), admitted("10.0.0.2", 0), admitted("10.0.0.1", 100)], [3, 3, 1]);
         assert_eq!([admitted("fd00::1:1", 0), admitted("fd00::2:2", 0)], [3, 0], "one network");
@@ -254,7 +215,7 @@ mod tests {
 
     #[test]
     fn where_too_many_wait_the_oldest_gives_way_to_the_newest() {
-        let throttle = ConnectionThrottle::new(RATE, at(0));
+        let throttle = throttle(100, at(0));
         let other = throttle.admit(from("10.0.0.2"), at(0)).unwrap();
         let mut held: Vec<_> = (0..40).filter_map(|_| throttle.admit(from("10.0.0.1"), at(0))).collect();
         assert_eq!(evicted(&mut held), (0..40 - MAX_PENDING_PER_ADDRESS).collect::<Vec<_>>());
@@ -268,7 +229,7 @@ mod tests {
 
     #[test]
     fn however_many_addresses_wait_the_oldest_gives_way() {
-        let throttle = ConnectionThrottle::new(RATE, at(0));
+        let throttle = throttle(100, at(0));
         let mut held: Vec<_> = (0..MAX_PENDING as u32 + 10)
             .filter_map(|n| throttle.admit(Origin::Remote(IpAddr::V4(n.into())), at(0)))
             .collect();
@@ -277,7 +238,7 @@ mod tests {
 
     #[test]
     fn an_address_from_which_a_client_has_logged_in_has_more() {
-        let throttle = ConnectionThrottle::new(RATE, clock::now());
+        let throttle = throttle(100, clock::now());
         let flood = |ms: u64| {
             let now = clock::now() + Duration::from_millis(ms);
             (0..10_000).filter(|_| throttle.admit(from("10.0.0.1"), now).is_some()).count()
@@ -292,7 +253,7 @@ mod tests {
 
     #[test]
     fn this_machines_are_not_throttled_but_few_wait() {
-        let throttle = ConnectionThrottle::new(RATE, at(0));
+        let throttle = throttle(100, at(0));
         let mut held: Vec<_> = (0..MAX_PENDING).filter_map(|_| throttle.admit(Origin::Local, at(0))).collect();
         assert_eq!(held.len(), MAX_PENDING);
         assert_eq!(evicted(&mut held).len(), MAX_PENDING - MAX_PENDING_LOCAL);
@@ -300,11 +261,11 @@ mod tests {
 
     #[test]
     fn any_number_of_addresses_costs_bounded_memory() {
-        let throttle = ConnectionThrottle::new(RATE, at(0));
-        for n in 0..2 * MAX_SOURCES as u32 {
+        let throttle = throttle(100, at(0));
+        for n in 0..2 * MAX_ADDRESSES as u32 {
             drop(throttle.admit(Origin::Remote(IpAddr::V4(n.into())), at(0)));
         }
-        assert_eq!(throttle.table().by_address.len(), MAX_SOURCES);
+        assert_eq!(throttle.table().by_address.len(), MAX_ADDRESSES);
         let latest = Origin::Remote(IpAddr::V4(u32::MAX.into()));
         assert!(throttle.admit(latest, at(60_000)).is_some(), "the old are forgotten");
         let sources = throttle.table();

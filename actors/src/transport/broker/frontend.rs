@@ -1,12 +1,12 @@
-//! What stands between the network and rmqtt: TLS, limits on strangers, and who is who.
+//! Public side of the embedded broker: TLS, connection limits, and the principal of each client.
 //!
 //! ```text
 //! client ── TCP ──> admission ── TLS ──> CONNECT within time and size ──> loopback ──> rmqtt
-//!                    by source     certificate of the cell                with a pass that says whose it is
+//!                    by source     certificate of the cell                registered with its principal
 //! ```
 //!
-//! rmqtt accepts connections from nobody but a socket of its own, and knows no revocation lists; so it listens on
-//! loopback, on a port that the system draws, and takes only connections for which there is a pass.
+//! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore listens on a free
+//! loopback port, and accepts only connections that the frontend has registered.
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -23,30 +23,30 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout, timeout
 use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
-use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin, Rate};
-use super::permissions::{LeaderCheck, Permissions};
+use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
+use super::permissions::LeaderCheck;
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
 use super::{BrokerConfig, connect_packet};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::pki::{CertificateSubject, Credentials, LoadedCredentials};
 
-/// What an embedded broker needs to keep strangers out.
+/// Rules of access to an embedded broker.
 #[derive(Clone)]
 pub struct AccessPolicy {
-    /// The node's certificates; without any, everybody is let in, within limits, and may say anything.
+    /// The node's certificates. Without them every client may log in and publish anything, within limits.
     pub credentials: Option<Arc<Credentials>>,
     /// The cell's topics.
     pub topics: Topics,
-    /// The largest payloads that the cell's nodes take.
+    /// Largest payloads that the cell's nodes accept.
     pub limits: Limits,
-    /// Tells who may speak for all.
+    /// Decides which node may publish maps, verdicts and reputations.
     pub elected: LeaderCheck,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
 
-/// The public side of a broker.
+/// Public side of a broker.
 pub(super) struct BrokerFrontend {
     listener: TcpListener,
     shared: Arc<FrontendState>,
@@ -57,6 +57,7 @@ pub(super) struct BrokerFrontend {
 struct FrontendState {
     credentials: Option<Arc<Credentials>>,
     principals: PrincipalRegistry,
+    /// Address of rmqtt's own listener.
     behind: SocketAddr,
     places: Arc<Semaphore>,
     quota: ConnectionQuota,
@@ -64,55 +65,49 @@ struct FrontendState {
     counters: Arc<Counters>,
 }
 
-/// Time between two looks at whether certificates have changed.
+/// Time between two checks for changed certificate files.
 const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Time between two checks of those who are connected, for certificates that have expired.
+/// Time between two checks of connected clients for expired certificates.
 const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
 
-/// Pause after the system gave no connection, such as for lack of file descriptors.
+/// Pause after `accept` failed, such as for lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
-/// How long a client may not read at all before it is cut off.
+/// Time after which a client that reads nothing is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(15);
 
-/// How long what is under way to a client that said farewell may take.
+/// Time to deliver the rest to a client that has ended its side.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl BrokerFrontend {
-    /// A gate at the listener, for a broker that listens `behind` it.
-    pub(super) fn new(listener: TcpListener, behind: SocketAddr, guard: &AccessPolicy, config: &BrokerConfig) -> Self {
-        let rate = Rate { burst: config.connect_burst, interval: Duration::from_secs(1) / config.connects_per_s };
-        let current = guard.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
+    /// A frontend on a listener, for a broker that listens at `behind`.
+    pub(super) fn new(listener: TcpListener, behind: SocketAddr, policy: &AccessPolicy, config: &BrokerConfig) -> Self {
+        let interval = Duration::from_secs(1) / config.connects_per_s;
+        let current = policy.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
         let shared = FrontendState {
-            credentials: guard.credentials.clone(),
+            credentials: policy.credentials.clone(),
             principals: PrincipalRegistry::default(),
             behind,
             places: Arc::new(Semaphore::new(config.max_clients)),
             quota: ConnectionQuota::new(config.max_clients_each),
             handshake_timeout: Duration::from_millis(config.handshake_timeout_ms),
-            counters: Arc::clone(&guard.counters),
+            counters: Arc::clone(&policy.counters),
         };
-        Self { listener, shared: Arc::new(shared), current, throttle: ConnectionThrottle::new(rate, clock::now()) }
-    }
-
-    /// What rmqtt has to ask about those who come through this gate.
-    pub(super) fn permissions(&self, guard: &AccessPolicy) -> Permissions {
-        Permissions {
-            principals: self.principals(),
-            topics: guard.topics.clone(),
-            limits: guard.limits,
-            elected: Arc::clone(&guard.elected),
-            counters: Arc::clone(&guard.counters),
+        Self {
+            listener,
+            shared: Arc::new(shared),
+            current,
+            throttle: ConnectionThrottle::new(config.connect_burst, interval, clock::now()),
         }
     }
 
-    /// Whose the connections are that come through this gate.
+    /// Principals of the forwarded connections.
     pub(super) fn principals(&self) -> PrincipalRegistry {
         self.shared.principals.clone()
     }
 
-    /// Lets clients in; never ends.
+    /// Accepts clients; never ends.
     pub(super) async fn run(self) {
         let mut looks = interval(RELOAD_INTERVAL);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -132,7 +127,7 @@ impl BrokerFrontend {
     }
 
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
-        // Certificates tell even this machine's clients apart.
+        // With certificates even local clients are told apart.
         let is_local = self.current.is_none() && from.ip().to_canonical().is_loopback();
         let origin = if is_local { Origin::Local } else { Origin::Remote(from.ip()) };
         let Some(slot) = self.throttle.admit(origin, clock::now()) else {
@@ -148,7 +143,7 @@ impl BrokerFrontend {
         });
     }
 
-    /// Has all connections checked again when certificates or the list changed, and from time to time.
+    /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
     fn look(&self, checked: &mut Instant) {
         let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) else { return };
         let current = credentials.current();
@@ -159,22 +154,22 @@ impl BrokerFrontend {
     }
 }
 
-/// Why a client was not let in, or not any longer.
+/// Reason for which a client was refused or cut off.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ClientRejection {
-    #[error("left without a word, as nodes do that only look whether a broker is there")]
+    #[error("left without a word, as nodes do that only test the port")]
     Left,
     #[error("no login in time")]
     TimedOut,
-    #[error("no login before many others of its address wanted one")]
+    #[error("no login before many newer connections of its address")]
     Evicted,
     #[error("not trusted: {0}")]
     Untrusted(String),
-    #[error("no MQTT")]
+    #[error("not an MQTT login")]
     Malformed,
-    #[error("most clients are connected")]
+    #[error("as many clients as allowed are connected")]
     Full,
-    #[error("as many clients of this certificate or address are connected as may be")]
+    #[error("as many clients as allowed are connected of this certificate or address")]
     Crowded,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),
@@ -203,7 +198,7 @@ trait Duplex: AsyncRead + AsyncWrite + Send {}
 impl<T: AsyncRead + AsyncWrite + Send> Duplex for T {}
 
 impl FrontendState {
-    /// One client from its first byte to its last.
+    /// Serves one client from its first byte to its last.
     async fn serve(
         &self,
         stream: TcpStream,
@@ -241,7 +236,7 @@ impl FrontendState {
 
         let socket = TcpSocket::new_v4()?;
         socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
-        // Before rmqtt can ask for it, and until the port may be somebody else's.
+        // Registered before rmqtt can ask for it, and until the port may be reused.
         let _pass = self.principals.register(socket.local_addr()?, principal);
         let mut behind = socket.connect(self.behind).await?;
         behind.set_nodelay(true)?;
@@ -266,13 +261,12 @@ async fn secure(
     Ok((Box::pin(stream), certificates))
 }
 
-/// Passes bytes on until either side ends; what was under way to a client that left is given a moment.
+/// Forwards bytes until either side ends. The rest for a client that has left is sent for a moment longer.
 async fn relay(client: Stream, broker: TcpStream) {
     let (mut from_client, mut to_client) = tokio::io::split(client);
     let (mut from_broker, mut to_broker) = broker.into_split();
     let up = async {
         let copied = tokio::io::copy(&mut from_client, &mut to_broker).await;
-        // The broker has to see the end; if it is gone, it has.
         (copied.is_ok(), to_broker.shutdown().await.is_ok())
     };
     let down = async {
@@ -289,7 +283,7 @@ async fn relay(client: Stream, broker: TcpStream) {
     }
 }
 
-/// Waits until the client's certificate is not valid any more, and says why.
+/// Waits until the client's certificate is no longer valid; the result is the reason.
 async fn certificate_invalidated(
     current: Option<watch::Receiver<Arc<LoadedCredentials>>>,
     certificates: &[CertificateDer<'static>],

@@ -1,4 +1,4 @@
-//! Whether the broker's thread still does anything.
+//! Detection of a broker thread that hangs.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -6,37 +6,37 @@ use std::time::Duration;
 
 use ecod::time::Timestamp;
 
-/// The beats of a thread, as seen by whoever asks from time to time.
+/// Heartbeat of a thread, checked from time to time.
 #[derive(Debug, Default)]
 pub(super) struct ThreadHeartbeat {
     beats: Arc<AtomicU64>,
     seen: u64,
-    looked_at: Timestamp,
+    checked_at: Timestamp,
     missed: u32,
 }
 
-/// Time between two beats, and the least between two looks that count.
+/// Time between two beats, and minimum time between two checks that count.
 pub(super) const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(200);
 
-/// A thread hangs after so many looks in a row without a beat, some five seconds. Looks are counted rather than time,
-/// so that nothing is missed while the whole process is stopped.
-const MAX_MISSED_LOOKS: u32 = 25;
+/// Consecutive checks without a beat after which the thread hangs: some five seconds. Checks are counted instead of time,
+/// so that a stop of the whole process does not count.
+const MAX_MISSED_CHECKS: u32 = 25;
 
 impl ThreadHeartbeat {
-    /// What the thread counts up.
+    /// The counter that the thread increments.
     pub(super) fn beats(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.beats)
     }
 
-    /// Looks at the thread; true when it hangs.
+    /// Checks the thread; true when it hangs.
     pub(super) fn has_stopped(&mut self, now: Timestamp) -> bool {
         let beats = self.beats.load(Ordering::Relaxed);
         if beats != self.seen {
-            (self.seen, self.looked_at, self.missed) = (beats, now, 0);
-        } else if now.since(self.looked_at) >= HEARTBEAT_INTERVAL {
-            (self.looked_at, self.missed) = (now, self.missed + 1);
+            (self.seen, self.checked_at, self.missed) = (beats, now, 0);
+        } else if now.since(self.checked_at) >= HEARTBEAT_INTERVAL {
+            (self.checked_at, self.missed) = (now, self.missed + 1);
         }
-        self.missed >= MAX_MISSED_LOOKS
+        self.missed >= MAX_MISSED_CHECKS
     }
 }
 

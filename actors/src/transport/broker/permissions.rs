@@ -1,67 +1,58 @@
-//! Who may say what through the embedded broker: hooks of rmqtt that look at the certificate behind a connection.
+//! Permissions at the embedded broker: hooks of rmqtt that check the principal of a connection.
 //!
-//! | topic | who |
+//! | topic | may publish |
 //! |---|---|
-//! | `detections/N`, `vote_detections/N` | whoever has the certificate of `N` |
+//! | `detections/N`, `vote_detections/N` | the certificate of `N` |
 //! | `ledger/N` | the same, if `N` may lead |
-//! | `nodes/N`, `nodes/N--…` | whoever has the certificate of `N`; observers share it |
-//! | `global_detections`, `global_verdicts`, `reputations` | who is elected; while nobody is, who may lead |
+//! | `nodes/N`, `nodes/N--…` | the certificate of `N`, which its observers share |
+//! | `global_detections`, `global_verdicts`, `reputations` | the leader; without a leader, nodes that may lead |
 //! | anything else | nobody |
 //!
-//! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a
-//! certificate of the cell may read everything. Topics and filters are bounded in length and in levels.
+//! Only statuses and reputations may be retained: other messages are worthless when late. Everyone with a certificate
+//! of the cell may read everything. Topics and filters are bounded in length and in levels.
 
-use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
 use ecod::names::NodeName;
-use ecod::wire::{Limits, Topic, Topics};
+use ecod::wire::{Limits, Topic};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, SubscribeAclResult, TopicFilter};
 
+use super::AccessPolicy;
 use super::embedded::is_topic_bounded;
 use super::principal::{Principal, PrincipalRegistry};
-use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::counters::Event;
 use crate::transport::mqtt::ENVELOPE_BYTES;
 use crate::transport::pki::CertificateSubject;
 
-/// Tells whether a node may speak for all: whether it is the elected one.
+/// Decides whether a node may publish maps, verdicts and reputations.
 pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 
-/// What the hooks need to know.
+/// Hooks of rmqtt that check logins, messages and filters.
 #[derive(Clone)]
 pub(super) struct Permissions {
     pub(super) principals: PrincipalRegistry,
-    pub(super) topics: Topics,
-    pub(super) limits: Limits,
-    pub(super) elected: LeaderCheck,
-    pub(super) counters: Arc<Counters>,
-}
-
-impl fmt::Debug for Permissions {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Permissions").finish_non_exhaustive()
-    }
+    pub(super) policy: AccessPolicy,
 }
 
 impl Permissions {
-    /// Has rmqtt ask before it lets anybody log in or publish.
+    /// Registers the hooks.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
-        register.add(Type::ClientAuthenticate, Box::new(self.clone())).await;
-        register.add(Type::MessagePublishCheckAcl, Box::new(self.clone())).await;
-        register.add(Type::ClientSubscribeCheckAcl, Box::new(self.clone())).await;
-        register.add(Type::ClientUnsubscribe, Box::new(self)).await;
+        use Type::{ClientAuthenticate, ClientSubscribeCheckAcl, ClientUnsubscribe, MessagePublishCheckAcl};
+        for hook in [ClientAuthenticate, MessagePublishCheckAcl, ClientSubscribeCheckAcl, ClientUnsubscribe] {
+            register.add(hook, Box::new(self.clone())).await;
+        }
         register.start().await;
     }
 
     /// Whether the connection may log in under this client id with this last will.
     fn allows_login(&self, info: &ConnectInfo) -> bool {
-        // Without a pass it went past the gate: another process of this machine found the port behind it.
+        // Unregistered: a local process that connected past the frontend.
         let Some(principal) = self.principals.principal(info.id().remote_addr) else { return false };
         let may_say = |will: LastWill<'_>| {
             let (topic, retain, bytes) = match will {
@@ -82,20 +73,21 @@ impl Permissions {
         self.principals.principal(address).is_some_and(allows)
     }
 
-    /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more
-    /// than the topic's receivers take, nor what is not to be retained.
+    /// Whether a principal may publish on a topic. Without certificates every topic is allowed, within its limits of size
+    /// and retention.
     fn allows(&self, principal: &Principal, topic: &str, retain: bool, bytes: usize) -> bool {
         if !is_topic_bounded(topic) {
             return false;
         }
-        let topic = self.topics.parse(topic);
-        let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));
-        bytes <= most + ENVELOPE_BYTES
+        let topic = self.policy.topics.parse(topic);
+        let limits = &self.policy.limits;
+        let limit = topic.as_ref().map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
+        bytes <= limit + ENVELOPE_BYTES
             && (!retain || topic.as_ref().is_some_and(is_state))
             && principal
                 .identity
                 .as_ref()
-                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
+                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.policy.elected)))
     }
 }
 
@@ -106,26 +98,26 @@ impl Handler for Permissions {
             Parameter::ClientAuthenticate(info) => HookResult::AuthResult(if self.allows_login(info) {
                 AuthResult::Allow(false, None)
             } else {
-                self.counters.count(Event::ClientDenied);
-                tracing::debug!(client = %info.client_id(), "login in another's name refused");
+                self.policy.counters.count(Event::ClientDenied);
+                tracing::debug!(client = %info.client_id(), "login refused");
                 AuthResult::NotAuthorized
             }),
             Parameter::MessagePublishCheckAcl(session, publish) => {
                 HookResult::PublishAclResult(if self.allows_publish(session.id.remote_addr, publish) {
                     PublishAclResult::allow()
                 } else {
-                    self.counters.count(Event::ClientDenied);
+                    self.policy.counters.count(Event::ClientDenied);
                     tracing::debug!(client = %session.id.client_id, topic = %publish.topic, "message refused");
                     PublishAclResult::rejected(false, None)
                 })
             }
             Parameter::ClientSubscribeCheckAcl(_, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
-                self.counters.count(Event::ClientDenied);
+                self.policy.counters.count(Event::ClientDenied);
                 HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
             }
-            // An answer to an unsubscription cannot refuse it. The filter cannot be subscribed: nothing is ended.
+            // An UNSUBACK cannot refuse. Such a filter is never subscribed, so that there is nothing to end.
             Parameter::ClientUnsubscribe(_, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
-                self.counters.count(Event::ClientDenied);
+                self.policy.counters.count(Event::ClientDenied);
                 HookResult::TopicFilter(Some(TopicFilter::default()))
             }
             _ => return (true, None),
@@ -134,7 +126,7 @@ impl Handler for Permissions {
     }
 }
 
-/// What receivers take of the topic: nobody but the elected has maps to send.
+/// Largest payload that receivers of the topic accept, in bytes.
 fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     match topic {
         Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) | Topic::Nodes(_) => limits.payload_bytes,
@@ -142,7 +134,7 @@ fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     }
 }
 
-/// Whether the topic's last message is kept for latecomers.
+/// Whether the topic's last message may be retained.
 fn is_state(topic: &Topic) -> bool {
     matches!(topic, Topic::Nodes(_) | Topic::Reputations)
 }
@@ -158,7 +150,8 @@ fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderChe
     }
 }
 
-/// A second connection of one client id ends the first: nobody may take another's. A node's is its name and its run.
+/// Whether a client id is the name and run of this node or of its observer. A connection ends an earlier one with the
+/// same client id, so that foreign ids are refused.
 fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
     let is_run = |text: &str| text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
     client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.may_act_as(name))
@@ -168,7 +161,7 @@ fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
 mod tests {
     use std::time::Duration;
 
-    use ecod::wire::Role;
+    use ecod::wire::{Role, Topics};
 
     use super::*;
     use crate::platform::clock;
@@ -191,13 +184,14 @@ mod tests {
     }
 
     fn permissions() -> Permissions {
-        Permissions {
-            principals: PrincipalRegistry::default(),
+        let policy = AccessPolicy {
+            credentials: None,
             topics: Topics::new(&NodeName::from_static("lot")),
             limits: Limits { payload_bytes: 1000, map_bytes: 5000, ..Limits::default() },
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::default(),
-        }
+        };
+        Permissions { principals: PrincipalRegistry::default(), policy }
     }
 
     #[test]

@@ -1,23 +1,24 @@
-//! Whose a connection is, and what it has in common with others.
+//! The principal behind each connection, and the quotas of principals.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use rmqtt::types::ClientId;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::platform::throttle::host_network;
 use crate::transport::pki::CertificateSubject;
 
-/// Who is at the other end: a node by its certificate, or somebody by an address.
+/// Authenticated party of a connection: a node by its certificate, or else a host by its address.
 #[derive(Debug, Clone)]
 pub(super) struct Principal {
     /// Absent without certificates.
     pub(super) identity: Option<Arc<CertificateSubject>>,
-    /// By what its connections count together; absent for this machine's without certificates, where a whole cell may
-    /// run.
+    /// Key under which its connections and messages count together. Absent for local clients without certificates: a
+    /// whole cell may run on this machine.
     quota_key: Option<Arc<str>>,
-    /// Whether it left it to the broker to draw its client id.
+    /// Whether the broker draws the client id.
     pub(super) has_generated_id: bool,
 }
 
@@ -32,29 +33,29 @@ impl Principal {
     }
 }
 
-/// What a message's share is counted by.
+/// Key under which messages are counted.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum QuotaKey {
     /// The node, or the address.
     Principal(Arc<str>),
-    /// Where neither is told apart, the client.
-    Anonymous(ClientId),
+    /// The client id, for clients without a quota key.
+    Client(ClientId),
 }
 
 impl QuotaKey {
     pub(super) fn as_str(&self) -> &str {
         match self {
             Self::Principal(principal) => principal,
-            Self::Anonymous(client) => client,
+            Self::Client(client) => client,
         }
     }
 }
 
-/// The connections that the gate has let in, by the address from which it passes them on, and whose they are.
+/// Principals of the connections that the frontend forwards, by the frontend's local address.
 #[derive(Debug, Clone, Default)]
 pub(super) struct PrincipalRegistry(Arc<RwLock<HashMap<SocketAddr, Principal>>>);
 
-/// A connection that may talk to rmqtt; not any more when dropped.
+/// Entry of one connection in the registry; removed when dropped.
 pub(super) struct Registration {
     principals: PrincipalRegistry,
     address: SocketAddr,
@@ -70,11 +71,11 @@ impl PrincipalRegistry {
         self.0.read().unwrap_or_else(PoisonError::into_inner).get(&address?).cloned()
     }
 
-    /// By what the messages of a client count.
+    /// Key under which the messages of a client count.
     pub(super) fn quota_key(&self, address: Option<SocketAddr>, client: &ClientId) -> QuotaKey {
         let principals = self.0.read().unwrap_or_else(PoisonError::into_inner);
         let quota_key = address.and_then(|address| principals.get(&address)?.quota_key.clone());
-        quota_key.map_or_else(|| QuotaKey::Anonymous(client.clone()), QuotaKey::Principal)
+        quota_key.map_or_else(|| QuotaKey::Client(client.clone()), QuotaKey::Principal)
     }
 }
 
@@ -84,50 +85,28 @@ impl Drop for Registration {
     }
 }
 
-/// How many connections each has.
-#[derive(Debug, Clone)]
+/// Limit of simultaneous connections of each principal.
+#[derive(Debug)]
 pub(super) struct ConnectionQuota {
     limit: usize,
-    connections: Arc<Mutex<HashMap<Arc<str>, usize>>>,
+    connections: Mutex<HashMap<Arc<str>, Arc<Semaphore>>>,
 }
 
-/// One connection's part of its holder's share; free when dropped.
-#[derive(Debug)]
-pub(super) struct ConnectionPermit(Option<(ConnectionQuota, Arc<str>)>);
+/// The place of one connection, free when dropped. Connections that do not count hold none.
+pub(super) type ConnectionPermit = Option<OwnedSemaphorePermit>;
 
 impl ConnectionQuota {
     pub(super) fn new(limit: usize) -> Self {
-        Self { limit, connections: Arc::default() }
+        Self { limit, connections: Mutex::default() }
     }
 
-    /// A part of the holder's share, if there is one left.
+    /// A place for one more connection of the principal, if there is one left.
     pub(super) fn take(&self, principal: &Principal) -> Option<ConnectionPermit> {
-        let Some(quota_key) = &principal.quota_key else { return Some(ConnectionPermit(None)) };
-        let mut connections = self.connections();
-        let count = connections.entry(Arc::clone(quota_key)).or_default();
-        if *count >= self.limit {
-            return None;
-        }
-        *count += 1;
-        Some(ConnectionPermit(Some((self.clone(), Arc::clone(quota_key)))))
-    }
-
-    fn connections(&self) -> MutexGuard<'_, HashMap<Arc<str>, usize>> {
-        self.connections.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Drop for ConnectionPermit {
-    fn drop(&mut self) {
-        let Some((quota, quota_key)) = self.0.take() else { return };
-        let mut connections = quota.connections();
-        let left = connections.get_mut(&quota_key).map(|count| {
-            *count = count.saturating_sub(1);
-            *count
-        });
-        if left == Some(0) {
-            connections.remove(&quota_key);
-        }
+        let Some(quota_key) = &principal.quota_key else { return Some(None) };
+        let mut connections = self.connections.lock().unwrap_or_else(PoisonError::into_inner);
+        connections.retain(|_, places| places.available_permits() < self.limit);
+        let places = connections.entry(Arc::clone(quota_key)).or_insert_with(|| Arc::new(Semaphore::new(self.limit)));
+        Arc::clone(places).try_acquire_owned().ok().map(Some)
     }
 }
 
@@ -149,7 +128,8 @@ mod tests {
         let here: Vec<_> = (0..100).map_while(|_| take("127.0.0.1")).collect();
         assert_eq!(here.len(), 100);
         drop(held);
-        assert!(take("10.0.0.1").is_some() && quota.connections().is_empty());
+        assert!(take("10.0.0.1").is_some() && take("10.0.0.3").is_some());
+        assert_eq!(quota.connections.lock().unwrap().len(), 1, "who has left is forgotten");
     }
 
     #[test]
@@ -163,6 +143,6 @@ mod tests {
         assert_eq!(quota_key(1), quota_key(2));
         assert_ne!(quota_key(1), quota_key(3));
         assert_ne!(quota_key(4), quota_key(5), "this machine's are told apart by their names");
-        assert_eq!(quota_key(6), QuotaKey::Anonymous("client-6".into()), "and those behind no frontend");
+        assert_eq!(quota_key(6), QuotaKey::Client("client-6".into()), "and those behind no frontend");
     }
 }

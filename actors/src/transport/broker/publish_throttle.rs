@@ -1,6 +1,5 @@
-//! Nobody takes more than a share of the embedded broker, under however many names.
+//! Throttle of published messages, by principal rather than by client id.
 
-use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use async_trait::async_trait;
@@ -13,7 +12,7 @@ use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, ShedReason};
 
-/// Passes on at most so many messages a second of each node, address or client, before anything is done with them.
+/// Hook of rmqtt that drops messages of a node, address or local client above a rate.
 pub(super) struct PublishThrottle {
     sources: Mutex<KeyedThrottle<QuotaKey>>,
     principals: PrincipalRegistry,
@@ -22,10 +21,10 @@ pub(super) struct PublishThrottle {
 
 impl PublishThrottle {
     pub(super) fn new(per_second: u32, principals: PrincipalRegistry, counters: Arc<Counters>) -> Self {
-        Self { sources: Mutex::new(KeyedThrottle::new(per_second)), principals, counters }
+        Self { sources: Mutex::new(KeyedThrottle::per_second(per_second)), principals, counters }
     }
 
-    /// Has rmqtt ask for every message, before anybody is asked for permission.
+    /// Registers the hook for every message, before the permissions.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
         register.add_priority(Type::MessagePublishCheckAcl, 1, Box::new(self)).await;
@@ -43,11 +42,5 @@ impl Handler for PublishThrottle {
         }
         self.counters.shed(ShedReason::BrokerThrottled, source.as_str());
         (false, Some(HookResult::PublishAclResult(PublishAclResult::rejected(false, None))))
-    }
-}
-
-impl fmt::Debug for PublishThrottle {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("PublishThrottle").finish_non_exhaustive()
     }
 }

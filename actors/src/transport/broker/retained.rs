@@ -12,7 +12,7 @@ use super::BrokerConfig;
 use super::embedded::is_topic_bounded;
 use crate::transport::pki::OBSERVER_MARK;
 
-/// A bounded number of retained messages and of their bytes.
+/// Retained messages, bounded in number and in bytes.
 pub(super) struct RetainedMessages {
     storage: DefaultRetainStorage,
     register: Mutex<RetainedIndex>,
@@ -41,8 +41,8 @@ impl RetainStorage for RetainedMessages {
         false
     }
 
-    // `_listener_expiry` is the listener's bound on queued messages; a retained status holds until it is replaced,
-    // unless its publisher says otherwise (MQTT 5).
+    // `_listener_expiry` is for queued messages. A retained status is valid until it is replaced, or until the expiry
+    // that its publisher set (MQTT 5).
     async fn set(&self, topic: &TopicName, message: Retain, _listener_expiry: Option<Duration>) -> rmqtt::Result<()> {
         let properties = message.publish.properties.as_ref();
         let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));
@@ -55,7 +55,7 @@ impl RetainStorage for RetainedMessages {
             self.storage.remove_expired_messages().await;
         }
         if !has_room {
-            // Not for each: whoever fills the store is not to fill the log.
+            // Not for each message: a flood must not fill the log.
             if has_pruned {
                 tracing::warn!(%topic, bytes, "retained messages refused");
             }
@@ -80,13 +80,13 @@ impl RetainStorage for RetainedMessages {
     }
 }
 
-/// Most observers of one certificate whose statuses are kept.
+/// Maximum observers of one certificate whose statuses are retained.
 const MAX_OBSERVERS: usize = 64;
 
-/// Least time between two looks for messages that have expired.
+/// Minimum time between two searches for expired messages.
 const PRUNE_INTERVAL: Duration = Duration::from_secs(1);
 
-/// What is kept, by topic: its bytes and until when, if it expires.
+/// Bytes and expiry of each retained topic.
 #[derive(Debug)]
 struct RetainedIndex {
     kept: BTreeMap<String, (usize, Option<Instant>)>,
@@ -97,7 +97,7 @@ struct RetainedIndex {
 }
 
 impl RetainedIndex {
-    /// Notes a message in the place of its topic's last, if there is room for it.
+    /// Records a message in place of its topic's last; false when there is no room.
     fn keep(&mut self, topic: &str, bytes: usize, until: Option<Instant>, now: Instant) -> bool {
         if !self.has_room(topic, bytes) && self.pruned.is_none_or(|pruned| now.duration_since(pruned) >= PRUNE_INTERVAL)
         {
@@ -124,7 +124,7 @@ impl RetainedIndex {
         self.bytes - before.unwrap_or(&0) + bytes <= self.max_bytes && (before.is_some() || !is_crowded())
     }
 
-    /// How many topics there are of observers that share the certificate of this one.
+    /// Number of topics of observers that share a certificate with this topic's observer.
     fn observers_beside(&self, topic: &str) -> usize {
         let name = topic.rfind('/').map_or(0, |slash| slash + 1);
         let mark = topic.get(name..).and_then(|name| name.find(OBSERVER_MARK));

@@ -1,10 +1,10 @@
-//! The membership without socket and clock: what comes in, and what is to be sent and told.
+//! State machine of the membership: datagrams and time in, datagrams and events out. No socket, no clock.
 //!
 //! # Call order
 //!
 //! [`Machine::new`], then [`Machine::receive`] for every datagram, [`Machine::tick`] at [`Machine::next_deadline`], and
-//! the commands at any time; after each, [`Machine::poll`] until nothing is left. A caller that was held up hands in
-//! all datagrams that wait before it ticks; the time for which it was held up does not count.
+//! the commands at any time. After each, [`Machine::poll`] until nothing is left. A caller that was stalled hands in
+//! all datagrams that wait before it ticks; the time of the stall does not count.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -27,26 +27,26 @@ use super::sessions::{FrameContent, LocalView, Sessions};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
 
-/// What the caller has to do.
+/// An action for the caller.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum GossipOutput {
     /// Send a datagram to a node.
     Send { to: SocketAddr, frame: Vec<u8> },
     /// Send a datagram to the multicast group.
     Multicast { frame: Vec<u8> },
-    /// Tell what was found out.
+    /// Deliver an event.
     Tell(MembershipEvent),
 }
 
-/// What a machine needs at its start.
+/// Arguments of [`GossipMachine::new`].
 pub(crate) struct GossipSetup {
     pub(crate) own: NodeId,
     pub(crate) key: CellKey,
-    /// New and unpredictable with every start.
+    /// Random for each start, and unpredictable.
     pub(crate) session: SessionId,
-    /// The same.
+    /// Secret of the cookies; random for each start.
     pub(crate) secret: [u8; 32],
-    /// For everything that need not be secret.
+    /// Seed of random numbers that need not be secret.
     pub(crate) seed: u64,
     pub(crate) counters: Arc<FrameCounters>,
 }
@@ -60,11 +60,11 @@ pub(crate) struct GossipMachine {
     hello_at: Timestamp,
     hello_count: u64,
     seeds: Vec<SocketAddr>,
-    /// What waits for a session with its addressee.
+    /// Frames that wait for a session with their addressee.
     pending: HashMap<NodeName, PendingFrames>,
-    /// When a name was last reported as taken.
+    /// The name last reported as taken, and when.
     taken: Option<(NodeName, Timestamp)>,
-    /// Whether the node has to learn from others where it is seen.
+    /// Whether the node has to learn its address from others.
     learns_address: bool,
     left: bool,
     rng: ChaCha8Rng,
@@ -99,12 +99,12 @@ impl GossipMachine {
         }
     }
 
-    /// What the caller has to do next.
+    /// The next action for the caller.
     pub(crate) fn poll(&mut self) -> Option<GossipOutput> {
         self.outputs.pop_front()
     }
 
-    /// When [`Self::tick`] is next needed, unless the node has left.
+    /// Time at which [`Self::tick`] is next needed; none after leaving.
     pub(crate) fn next_deadline(&self) -> Option<Timestamp> {
         (!self.left).then(|| self.clock.outside(self.due()))
     }
@@ -114,7 +114,7 @@ impl GossipMachine {
         self.gossip.alive().values().map(|id| self.member(id)).collect()
     }
 
-    /// Takes a datagram.
+    /// Processes a datagram.
     pub(crate) fn receive(&mut self, datagram: &[u8], from: SocketAddr, now: Timestamp) {
         let at = self.advance(now);
         self.counters.count(FrameEvent::Received);
@@ -134,7 +134,7 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
-    /// Carries out what is due.
+    /// Runs the timers that are due.
     pub(crate) fn tick(&mut self, now: Timestamp) {
         let at = self.advance(now);
         if self.left {
@@ -149,8 +149,7 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
-    /// Sends a datagram to a node, once; for a while to one that the gossip has given up as well, which may hear less than
-    /// those who send.
+    /// Sends a datagram to a node, once. A node that the gossip has just declared down is sent to for a while, too.
     pub(crate) fn send(&mut self, to: &NodeName, payload: &[u8], now: Timestamp) {
         let at = self.advance(now);
         let address = self.gossip.alive().get(to).map(|id| id.gossip).or_else(|| self.sessions.heard_at(to, at));
@@ -160,7 +159,7 @@ impl GossipMachine {
         }
     }
 
-    /// Addresses that are greeted besides the multicast group.
+    /// Replaces the addresses that are greeted besides the multicast group.
     pub(crate) fn set_seeds(&mut self, seeds: Vec<SocketAddr>) {
         if self.seeds != seeds {
             self.hello_count = 0;
@@ -169,7 +168,7 @@ impl GossipMachine {
         }
     }
 
-    /// Says goodbye to all; nothing is sent or taken afterwards.
+    /// Tells all nodes that this one leaves. Afterwards nothing is sent or processed.
     pub(crate) fn leave(&mut self, now: Timestamp) {
         let at = self.advance(now);
         if !self.left {
@@ -205,7 +204,7 @@ impl GossipMachine {
         Ok(())
     }
 
-    /// A node has proven that it is there: take what it says of this one, and get to know it.
+    /// Processes the handshake of an admitted node: its knowledge of this node, then its identity.
     fn meet(&mut self, introduction: Introduction, speaks: bool, greeter: bool, at: Timestamp) {
         let Introduction { id, seen_at, claim } = introduction;
         match claim {
@@ -229,7 +228,7 @@ impl GossipMachine {
         }
     }
 
-    /// Sends what the gossip wants to be sent, and tells what it found out.
+    /// Sends SWIM's messages and delivers its events.
     fn flush_swim(&mut self, at: Timestamp) {
         while let Some(rumour) = self.gossip.poll() {
             let event = match rumour {
@@ -251,7 +250,7 @@ impl GossipMachine {
         }
     }
 
-    /// Sends to a node, or keeps a little until there is a session with it.
+    /// Sends to a node, or queues a few frames until there is a session with it.
     fn send_or_queue(&mut self, to: &NodeName, address: SocketAddr, kind: FrameKind, body: &[u8], at: Timestamp) {
         if let Some((to, frame)) = self.sessions.seal(to, kind, body) {
             return self.outputs.push_back(GossipOutput::Send { to, frame });
@@ -276,8 +275,8 @@ impl GossipMachine {
         }
     }
 
-    /// Greets all seeds that do not belong to a living node, so that one that returns hears of the cell before it takes
-    /// itself to be alone, and the group, which in company is greeted less often.
+    /// Greets all seeds that do not belong to a living node, so that a returning seed hears of its cell before it leads
+    /// on its own. Greets the multicast group too, less often once other nodes are alive.
     fn send_hellos(&mut self) {
         let frame = self.sessions.hello(self.gossip.own());
         let known: Vec<_> = self.members().iter().map(|member| member.gossip).collect();
@@ -316,20 +315,20 @@ impl GossipMachine {
     }
 }
 
-/// A timer later than this was stalled; only this much of the delay counts as time.
+/// Delay of a timer above which the process was stalled. Only this much of the delay counts as time.
 const STALL: Duration = Duration::from_millis(40);
 
-/// How long frames wait for a session before they are dropped.
+/// Time for which frames wait for a session before they are dropped.
 const SESSION_TIMEOUT: Duration = Duration::from_millis(200);
 
-/// Most nodes for which frames wait, and most frames for each.
+/// Maximum nodes for which frames wait, and maximum frames of each.
 const MAX_PENDING: usize = 64;
 const MAX_PENDING_FRAMES: usize = 4;
 
-/// How much rarer greetings to the group are in company.
+/// Greetings of seeds for each greeting of the multicast group, once other nodes are alive.
 const MULTICAST_EVERY: u64 = 10;
 
-/// How often the same name is reported as taken.
+/// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);
 
 #[cfg(test)]

@@ -1,48 +1,37 @@
-//! How many answers strangers get.
+//! Throttle of answers to nodes without a session.
 
-use std::collections::HashMap;
 use std::time::Duration;
 
 use ecod::time::Timestamp;
 
 use super::key::SessionId;
-use crate::platform::throttle::TokenBucket;
+use crate::platform::throttle::{KeyedThrottle, TokenBucket};
 
-/// Limits answers to all strangers together and to each session, so that one recorded greeting, sent over and over,
-/// does not use up what is meant for others.
-#[derive(Debug, Clone)]
+/// Limits answers to all unknown nodes together and to each session. One recorded greeting, sent over and over, does
+/// not use up the share of others.
+#[derive(Debug)]
 pub(crate) struct ReplyThrottle {
     all: TokenBucket,
-    answered: HashMap<SessionId, Timestamp>,
+    by_session: KeyedThrottle<SessionId>,
 }
 
 impl ReplyThrottle {
     pub(crate) fn new(now: Timestamp) -> Self {
-        Self { all: TokenBucket::new(REPLY_BURST, REPLY_INTERVAL, now), answered: HashMap::new() }
+        Self {
+            all: TokenBucket::new(REPLY_BURST, REPLY_INTERVAL, now),
+            by_session: KeyedThrottle::new(1, MIN_SESSION_INTERVAL),
+        }
     }
 
-    /// Whether this session may get an answer now.
+    /// Whether this session may be answered now.
     pub(crate) fn allow(&mut self, session: &SessionId, now: Timestamp) -> bool {
-        if self.answered.get(session).is_some_and(|at| now.since(*at) < MIN_SESSION_INTERVAL) {
-            return false;
-        }
-        let allowed = self.all.allow(now);
-        if allowed {
-            if self.answered.len() >= MAX_ANSWERED {
-                self.answered.retain(|_, at| now.since(*at) < MIN_SESSION_INTERVAL);
-            }
-            self.answered.insert(*session, now);
-        }
-        allowed
+        self.by_session.allow(session, now) && self.all.allow(now)
     }
 }
 
-/// Most answers to strangers at once, and time until one more: a cell of 64 that starts together meets unhindered.
+/// Burst of answers, and time until one more. A cell of 64 nodes that start together stays below it.
 const REPLY_BURST: u32 = 256;
 const REPLY_INTERVAL: Duration = Duration::from_millis(10);
 
-/// Least time between two answers to one session.
+/// Minimum time between two answers to one session.
 const MIN_SESSION_INTERVAL: Duration = Duration::from_millis(50);
-
-/// From so many sessions on, those that may be answered again are forgotten; at most [`BURST`] more are not.
-const MAX_ANSWERED: usize = 256;

@@ -1,9 +1,9 @@
-//! With whom this node shares keys, and the handshake that comes before.
+//! Authenticated sessions with other nodes, and the handshake that establishes them. No clock, no socket.
 //!
-//! Nothing in here reads a clock or a socket. A session is one run of a node's membership; frames between two sessions
-//! have keys of their own, so that a frame recorded before either restarted, or meant for another, opens nowhere. The
-//! sender's counter never repeats in a session and the receiver takes each once. A session is admitted only when its
-//! bearer has just returned a cookie baked for it: a recorded handshake admits nobody.
+//! A session is one run of a node's membership. Each pair of sessions has keys of its own: a frame that was recorded
+//! before a restart, or meant for another node, does not decrypt. The sender's counter never repeats in a session, and
+//! the receiver accepts each value once. A node is admitted only when it returns a cookie just issued to its address: a
+//! recorded handshake admits nobody.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -16,7 +16,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::counters::{FrameCounters, FrameEvent};
-use super::frame::{FrameHeader, FrameKind, HEADER_BYTES, Handshake, HeadError, Hello, Introduction, NameClaim};
+use super::frame::{FrameHeader, FrameKind, HEADER_BYTES, Handshake, Hello, Introduction, NameClaim};
 use super::key::{BROADCAST, CellKey, Cookie, CookieFactory, FrameCipher, SessionId};
 use super::node_id::NodeId;
 use super::replay_window::ReplayWindow;
@@ -29,12 +29,12 @@ pub(crate) struct Sessions {
     own: SessionId,
     cookies: CookieFactory,
     everybody: FrameCipher,
-    /// The counter of the last frame sent, to whomever.
+    /// Counter of the last frame sent to any node.
     counter: u64,
     peers: HashMap<SessionId, PeerSession>,
-    /// The session that speaks for a name.
+    /// The session that is accepted for a name.
     session_by_name: HashMap<NodeName, SessionId>,
-    /// Answers to greetings, to challenges, and greetings of strangers.
+    /// Throttles of answers to greetings, of answers to challenges, and of own greetings.
     challenges: ReplyThrottle,
     proofs: ReplyThrottle,
     greetings: TokenBucket,
@@ -51,42 +51,42 @@ struct PeerSession {
     from: FrameCipher,
     window: ReplayWindow,
     heard: Timestamp,
-    /// Since when another session speaks for the name.
+    /// Time since which another session is accepted for the name.
     superseded: Option<Timestamp>,
 }
 
-/// What the gossip knows of a name.
+/// State of a name in the gossip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct KnownMember {
     pub(crate) life: u64,
     pub(crate) alive: bool,
 }
 
-/// This node and what its gossip knows, for a handshake.
+/// This node's identity and its gossip's knowledge, as input of a handshake.
 pub(crate) struct LocalView<'a> {
     pub(crate) own: &'a NodeId,
     pub(crate) known: &'a dyn Fn(&NodeName) -> Option<KnownMember>,
 }
 
-/// What a frame turned out to be.
+/// Content of an authentic frame.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum FrameContent {
-    /// A step of a handshake: this is the answer.
+    /// A step of a handshake, with the answer to send.
     Answer(Vec<u8>),
-    /// A node was admitted; it is told so by the answer, unless it knows.
+    /// A node was admitted. The answer tells it so, unless it knows already.
     Met {
         introduction: Introduction,
         answer: Option<Vec<u8>>,
-        /// Whether its session speaks for its name.
+        /// Whether its session is accepted for its name.
         speaks: bool,
     },
-    /// Words of the gossip protocol.
+    /// A message of the SWIM protocol.
     Gossip { from: NodeName, body: Vec<u8> },
-    /// A datagram of the sender's other parts.
+    /// A datagram of the sender's other actors.
     Payload { from: NodeName, body: Vec<u8> },
-    /// A session that is not established speaks: greet it.
+    /// A frame of a session that is not established: greet its sender.
     Stranger,
-    /// Two running nodes bear this name.
+    /// Two running nodes have this name.
     NameTaken(NodeName),
     /// Nothing that needs an answer.
     Nothing,
@@ -118,36 +118,36 @@ impl Sessions {
         }
     }
 
-    /// A greeting for whoever gets it.
+    /// A greeting frame for any node of the cell.
     pub(crate) fn hello(&mut self, own: &NodeId) -> Vec<u8> {
         let head = self.head(FrameKind::Hello);
         head.write(self.key.tag(), &encode(&Hello { name: own.name.clone() }), &self.everybody)
     }
 
-    /// A frame for whoever speaks for a name, and where it goes.
+    /// A frame for the node of a name, and its address.
     pub(crate) fn seal(&mut self, to: &NodeName, kind: FrameKind, body: &[u8]) -> Option<(SocketAddr, Vec<u8>)> {
         let head = self.head(kind);
         let peer = self.peers.get(self.session_by_name.get(to)?)?;
         Some((peer.address, head.write(self.key.tag(), body, &peer.to)))
     }
 
-    /// Where the speaker for a name is.
+    /// Address of the node of a name.
     pub(crate) fn address(&self, name: &NodeName) -> Option<SocketAddr> {
         Some(self.peers.get(self.session_by_name.get(name)?)?.address)
     }
 
-    /// Where the speaker for a name is, if it was heard lately.
+    /// Address of the node of a name, if it was heard lately.
     pub(crate) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
         let peer = self.peers.get(self.session_by_name.get(name)?)?;
         (now.since(peer.heard) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
     }
 
-    /// Whether a node may be greeted now that was heard of or from.
+    /// Whether a single node may be greeted now.
     pub(crate) fn may_send_hello(&mut self, now: Timestamp) -> bool {
         self.greetings.allow(now) || self.throttled()
     }
 
-    /// Forgets who spoke for a name in an earlier run; whether it did.
+    /// Ends the session of an earlier run of a node; false when there is none.
     pub(crate) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
         let speaker = self.session_by_name.get(name).and_then(|session| self.peers.get_mut(session));
         let Some(peer) = speaker.filter(|peer| peer.run != run) else { return false };
@@ -156,7 +156,7 @@ impl Sessions {
         true
     }
 
-    /// Takes a datagram. An error is junk, and changed nothing.
+    /// Processes a datagram. An error means junk, which changed nothing.
     pub(crate) fn open(
         &mut self,
         frame: &[u8],
@@ -193,10 +193,10 @@ impl Sessions {
         }
     }
 
-    /// A greeting, which all with the key can read, is in another key: said once, as it goes on for ever.
+    /// Warns of a greeting under another key. Once only, as greetings are repeated for ever.
     fn note_other_key(&mut self, kind: FrameKind, from: SocketAddr) {
         if kind == FrameKind::Hello && !std::mem::replace(&mut self.other_key_seen, true) {
-            tracing::warn!(%from, "a node of this cell has another key, or none; it is not heard");
+            tracing::warn!(%from, "a node of this cell has another key, or none; its frames are ignored");
         }
     }
 
@@ -211,7 +211,7 @@ impl Sessions {
         }
     }
 
-    /// Whoever is known, alive and where it was needs no handshake; a greeting proves nothing else.
+    /// Answers a greeting with a challenge. A known living node at its known address needs no handshake.
     fn handle_hello(
         &mut self,
         head: &FrameHeader,
@@ -273,13 +273,13 @@ impl Sessions {
         Ok(FrameContent::Met { introduction, answer, speaks: claim != NameClaim::Taken })
     }
 
-    /// Whether the cookie was given to this session at this address a moment ago.
+    /// Whether the cookie was issued to this session at this address a moment ago.
     fn is_fresh(&self, session: &SessionId, from: SocketAddr, echo: &Cookie, now: Timestamp) -> bool {
         let slot = slot(now);
         [slot, slot.wrapping_sub(1)].iter().any(|slot| self.cookies.issue(session, from, *slot) == *echo)
     }
 
-    /// Remembers a session that has just proven itself, and decides whether it speaks for its name.
+    /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
     fn admit(
         &mut self,
         head: &FrameHeader,
@@ -323,7 +323,7 @@ impl Sessions {
         Ok(claim)
     }
 
-    /// Forgets whom it has not heard for longest, if for long enough, should there be too many.
+    /// Removes the longest idle session when there are too many and it is idle for long enough.
     fn make_room(&mut self, now: Timestamp) -> Result<(), FrameEvent> {
         if self.peers.len() < self.max_peers {
             return Ok(());
@@ -376,27 +376,17 @@ impl Sessions {
     }
 }
 
-impl From<HeadError> for FrameEvent {
-    fn from(error: HeadError) -> Self {
-        match error {
-            HeadError::Oversized => Self::Oversized,
-            HeadError::Malformed => Self::Malformed,
-            HeadError::WrongCell => Self::WrongCell,
-        }
-    }
-}
-
-/// Most greetings of single nodes at once, and time until one more.
+/// Burst of greetings to single nodes, and time until one more.
 const HELLO_BURST: u32 = 256;
 const HELLO_INTERVAL: Duration = Duration::from_millis(10);
 
-/// A session that has been silent for so long gives way to a new one, and is sent to only if the gossip holds it alive.
+/// Idle time after which a session may be replaced. It is then sent to only if the gossip holds the node alive.
 const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// How long frames of a node that was restarted may be under way.
+/// Time for which frames of a node's earlier run may still arrive.
 const MAX_TRANSIT: Duration = Duration::from_millis(500);
 
-/// A cookie is good during its slot of time and the next.
+/// Time slot of a cookie, which is valid in its slot and the next.
 fn slot(now: Timestamp) -> u64 {
     now.micros() / 2_000_000
 }

@@ -1,4 +1,4 @@
-//! SWIM gossip by foca: who is alive. The timers that foca wants are kept here; nothing reads a clock or a socket.
+//! Failure detection by the SWIM protocol of `foca`, with foca's timers. No clock, no socket.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap, VecDeque};
@@ -17,29 +17,29 @@ use super::counters::FrameEvent;
 use super::node_id::NodeId;
 use super::sessions::KnownMember;
 
-/// What the gossip wants done or known.
+/// An action or event of the gossip.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum SwimOutput {
-    /// Send words to a node.
+    /// Send a message to a node.
     Send { to: NodeId, body: Vec<u8> },
-    /// A node is there, or a new run of it.
+    /// A node is alive, or a new run of it.
     Alive(NodeId),
     /// A node does not answer.
     Suspected(NodeName),
-    /// A node is gone.
+    /// A node is down.
     Down(NodeName),
     /// A living node's identity changed.
     Changed(NodeId),
 }
 
-/// This node's part in the gossip.
+/// This node's SWIM instance.
 pub(crate) struct Swim {
     foca: Foca<NodeId, PostcardCodec, ChaCha8Rng, NoCustomBroadcast>,
     runtime: AccumulatingRuntime<NodeId>,
     timers: BinaryHeap<Reverse<ScheduledTimer>>,
     scheduled: u64,
     alive: BTreeMap<NodeName, NodeId>,
-    /// When the node last returned from the dead, and when it will.
+    /// Time of this node's last renewal after it was declared down, and of the next.
     renewed_at: Option<Timestamp>,
     renew_at: Option<Timestamp>,
     left: bool,
@@ -68,12 +68,12 @@ impl Swim {
         }
     }
 
-    /// The next thing to be done or known.
+    /// The next action or event.
     pub(crate) fn poll(&mut self) -> Option<SwimOutput> {
         self.outputs.pop_front()
     }
 
-    /// Who this node is.
+    /// This node's identity.
     pub(crate) fn own(&self) -> &NodeId {
         self.foca.identity()
     }
@@ -83,19 +83,19 @@ impl Swim {
         &self.alive
     }
 
-    /// What is known of a name that is not this node's.
+    /// The state of another node.
     pub(crate) fn known(&self, name: &NodeName) -> Option<KnownMember> {
         let member = self.foca.iter_membership_state().find(|member| member.id().name == *name)?;
         Some(KnownMember { life: member.id().life, alive: member.state() != State::Down })
     }
 
-    /// When [`Self::tick`] is next needed.
+    /// Time at which [`Self::tick`] is next needed.
     pub(crate) fn next_due(&self) -> Option<Timestamp> {
         let timer = self.timers.peek().map(|Reverse(due)| due.at);
         [timer, self.renew_at].into_iter().flatten().min()
     }
 
-    /// Takes words that `from` has sealed.
+    /// Processes a message that `from` has authenticated.
     pub(crate) fn receive(&mut self, from: &NodeName, body: &[u8], now: Timestamp) -> Result<(), FrameEvent> {
         let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, body).map_err(|_| FrameEvent::Malformed)?;
         if header.src.name != *from {
@@ -106,55 +106,47 @@ impl Swim {
         result.map_err(|_| FrameEvent::Malformed)
     }
 
-    /// Carries out what is due.
+    /// Runs the timers that are due.
     pub(crate) fn tick(&mut self, now: Timestamp) {
         while let Some(Reverse(due)) = self.timers.peek()
             && due.at <= now
             && let Some(Reverse(due)) = self.timers.pop()
         {
-            if let Err(error) = self.foca.handle_timer(due.timer, &mut self.runtime) {
-                tracing::debug!(%error, "gossip timer came to nothing");
-            }
-            self.collect(now);
+            let handled = self.foca.handle_timer(due.timer, &mut self.runtime);
+            self.finish("timer", handled, now);
         }
         if self.renew_at.is_some_and(|at| at <= now) {
             self.renew(now);
         }
     }
 
-    /// Introduces this node to one that has just been met.
+    /// Announces this node to one that was just admitted.
     pub(crate) fn meet(&mut self, peer: NodeId, now: Timestamp) {
-        if let Err(error) = self.foca.announce(peer, &mut self.runtime) {
-            tracing::debug!(%error, "gossip cannot announce");
-        }
-        self.collect(now);
+        let announced = self.foca.announce(peer, &mut self.runtime);
+        self.finish("announce", announced, now);
     }
 
-    /// Begins a life after that of whoever had this node's name.
+    /// Takes a `life` after that of the node that had this name before.
     pub(crate) fn start_life_after(&mut self, life: u64, now: Timestamp) {
         if life >= self.own().life {
             self.change(now, |own| own.life = life);
         }
     }
 
-    /// Changes what others are told about this node.
+    /// Changes this node's identity and spreads the change.
     pub(crate) fn change(&mut self, now: Timestamp, change: impl FnOnce(&mut NodeId)) {
         let mut own = self.own().clone();
         change(&mut own);
         own.life = own.life.saturating_add(1);
-        if let Err(error) = self.foca.change_identity(own, &mut self.runtime) {
-            tracing::debug!(%error, "gossip cannot change identity");
-        }
-        self.collect(now);
+        let changed = self.foca.change_identity(own, &mut self.runtime);
+        self.finish("change of identity", changed, now);
     }
 
-    /// Says goodbye.
+    /// Tells the others that this node leaves.
     pub(crate) fn leave(&mut self, now: Timestamp) {
         self.left = true;
-        if let Err(error) = self.foca.leave_cluster(&mut self.runtime) {
-            tracing::debug!(%error, "gossip cannot say goodbye");
-        }
-        self.collect(now);
+        let left = self.foca.leave_cluster(&mut self.runtime);
+        self.finish("leave", left, now);
         self.timers.clear();
         self.renew_at = None;
     }
@@ -163,6 +155,13 @@ impl Swim {
         self.renew_at = None;
         self.renewed_at = Some(now);
         self.change(now, |_| ());
+    }
+
+    fn finish(&mut self, operation: &str, result: Result<(), foca::Error>, now: Timestamp) {
+        if let Err(error) = result {
+            tracing::debug!(%error, operation, "gossip operation failed");
+        }
+        self.collect(now);
     }
 
     fn collect(&mut self, now: Timestamp) {
@@ -202,7 +201,7 @@ impl Swim {
                 }
             }
             OwnedNotification::Defunct if !self.left => {
-                // Others thought this node dead, such as while it was stopped.
+                // Others declared this node down, such as while its process was stopped.
                 let earliest = self.renewed_at.map_or(now, |renewed_at| renewed_at + MIN_RENEW_INTERVAL);
                 if earliest <= now { self.renew(now) } else { self.renew_at = Some(earliest) }
             }
@@ -214,7 +213,7 @@ impl Swim {
     }
 }
 
-/// Least time between two returns from the dead.
+/// Minimum time between two renewals.
 const MIN_RENEW_INTERVAL: Duration = Duration::from_secs(1);
 
 fn settings(config: &MembershipConfig) -> foca::Config {

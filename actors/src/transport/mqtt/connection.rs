@@ -1,4 +1,4 @@
-//! One MQTT connection, 3.1.1 or 5, to one broker; used once and never reconnected, so that nothing old is sent late.
+//! One MQTT connection, 3.1.1 or 5. It is never reconnected, so that no old message is sent late.
 
 use std::error::Error;
 use std::io;
@@ -15,12 +15,12 @@ use rustls::ClientConfig;
 use super::config::{MqttConfig, MqttVersion};
 use crate::transport::pki::CredentialsError;
 
-/// How the broker is to treat a message: contract of the topics.
+/// QoS and retention of a message, as the topics' contract says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Retention {
-    /// QoS 0, not retained: the next one makes it worthless.
+    /// QoS 0, not retained: the next message replaces it.
     Transient,
-    /// QoS 1, retained: latecomers need it.
+    /// QoS 1, retained: new subscribers need it.
     Retained,
 }
 
@@ -37,23 +37,23 @@ pub(crate) enum Connection {
     V5(Box<v5::EventLoop>),
 }
 
-/// What polling a connection yields.
+/// Result of polling a connection.
 pub(crate) enum Packet {
     /// The broker accepted the connection.
     Accepted,
-    /// A message on a topic, which may be no UTF-8.
+    /// A message. Its topic may be invalid UTF-8.
     Message { topic: Bytes, payload: Bytes },
-    /// This side's farewell is on its way.
+    /// DISCONNECT was sent.
     Disconnected,
-    /// The broker answered a subscription and refused some of its filters, by their place in it, with its reason.
+    /// The broker refused filters of a subscription: index of each filter and reason.
     SubscriptionRefused(Vec<(usize, String)>),
-    /// Something was sent.
+    /// A packet was sent.
     Sent,
-    /// Something came in that only the protocol is concerned with.
+    /// Another packet of the protocol arrived.
     Other,
 }
 
-/// Why a connection ended.
+/// Reason for the end of a connection.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ConnectionError {
     #[error("{0}")]
@@ -69,7 +69,7 @@ pub(crate) enum ConnectionError {
 }
 
 impl ConnectionError {
-    /// Whether nothing listens there: the broker's process is gone.
+    /// Whether nothing listens at the address: the broker's process is gone.
     pub(crate) fn is_refused(&self) -> bool {
         let refused = |error: &io::Error| error.kind() == io::ErrorKind::ConnectionRefused;
         match self {
@@ -79,8 +79,7 @@ impl ConnectionError {
         }
     }
 
-    /// Why the broker took the connection and then refused the node, in its own words, or why this node does not trust
-    /// it.
+    /// The broker's reason for refusing the login, or this node's reason for not trusting the broker.
     pub(crate) fn refusal(&self) -> Option<String> {
         if let Some(reason) = self.certificate_error() {
             return Some(reason);
@@ -98,7 +97,7 @@ impl ConnectionError {
         }
     }
 
-    /// What is wrong with one side's certificate.
+    /// The error in one side's certificate.
     fn certificate_error(&self) -> Option<String> {
         let mut next: Option<&(dyn Error + 'static)> = match self {
             Self::V311(error) => Some(&**error),
@@ -118,7 +117,7 @@ impl ConnectionError {
         None
     }
 
-    /// Whether a packet beyond [`MqttConfig::max_packet_bytes`] came in.
+    /// Whether a packet larger than [`MqttConfig::max_packet_bytes`] arrived.
     pub(crate) fn is_oversized(&self) -> bool {
         match self {
             Self::V311(error) => matches!(
@@ -139,19 +138,19 @@ impl ConnectionError {
     }
 }
 
-/// What the broker says about this node when it falls silent.
+/// Message that the broker publishes when this node's connection breaks.
 #[derive(Debug, Clone)]
 pub(crate) struct LastWill {
     pub(crate) topic: String,
     pub(crate) payload: Bytes,
 }
 
-/// The will's payload of a node with this status.
-pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Bytes {
-    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
+/// Payload of the last will of a node with this status.
+pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Vec<u8> {
+    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding)
 }
 
-/// Prepares a connection; the first poll makes it.
+/// Prepares a connection; the first poll connects.
 pub(crate) fn open(
     address: &BrokerAddress,
     client_id: &str,
@@ -165,7 +164,7 @@ pub(crate) fn open(
     network.set_connection_timeout(timeout_s);
     let login = config.user.as_deref().map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
     let port = address.port();
-    // The client library takes the host for the name in the broker's certificate, where brackets are none.
+    // The client library compares the host with the name in the certificate, which has no brackets.
     let host = if tls.is_some() { address.host().trim_matches(['[', ']']) } else { address.host() };
     let transport = tls.map(|tls| Transport::tls_with_config(TlsConfiguration::Rustls(tls)));
     let max_packet_bytes = config.max_packet_bytes();
@@ -243,7 +242,7 @@ impl Client {
         }
     }
 
-    /// Queues the end of subscriptions; false when there is no room for all.
+    /// Queues unsubscriptions; false when there is no room for all.
     pub(crate) fn unsubscribe(&self, filters: &[String]) -> bool {
         filters.iter().all(|filter| match self {
             Self::V311(client) => client.try_unsubscribe(filter).is_ok(),
@@ -251,7 +250,7 @@ impl Client {
         })
     }
 
-    /// Queues the farewell, after which the broker does not publish the last will; false when there is no room.
+    /// Queues DISCONNECT, after which the broker publishes no last will; false when there is no room.
     pub(crate) fn disconnect(&self) -> bool {
         match self {
             Self::V311(client) => client.try_disconnect().is_ok(),
@@ -261,7 +260,7 @@ impl Client {
 }
 
 impl Connection {
-    /// Sends and receives until there is something to tell; `patience` bounds the silence.
+    /// Sends and receives until there is a packet to report, for at most `patience`.
     pub(crate) async fn next(&mut self, patience: Duration) -> Result<Packet, ConnectionError> {
         tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Timeout(patience)))
     }

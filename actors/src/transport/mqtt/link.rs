@@ -1,8 +1,9 @@
-//! The task that keeps one link to one broker: connects, reads, and connects anew.
+//! A link to one broker: its task connects, reads packets, and reconnects.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::echo::EchoMonitor;
 use ecod::leadership::links::LinkState;
@@ -15,18 +16,18 @@ use tokio::task::{AbortHandle, JoinHandle};
 use uuid::Uuid;
 
 use super::config::MqttConfig;
-use super::connection::{self, Client, ConnectionError, LastWill, Packet};
+use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
 use super::hearing::Hearing;
 use super::inbox::{Inbox, PacketOutcome};
 use super::security::Security;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 
-/// Tells links apart, also an old and a new one to the same broker.
+/// Id of a link; a new link to the same broker has another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct LinkId(pub(crate) u64);
 
-/// What a link's task tells the gateway.
+/// A message of a link's task to the gateway.
 #[derive(Debug)]
 pub struct LinkEvent {
     pub(crate) link: LinkId,
@@ -37,25 +38,24 @@ pub struct LinkEvent {
 pub(crate) enum LinkChange {
     /// The broker accepted the connection; nothing is subscribed yet.
     Accepted(Client),
-    /// The broker published the last will of this living node.
+    /// The broker published this node's last will, although it is alive.
     DeclaredOffline,
-    /// Another living run has this node's name.
+    /// Another run with this node's name is alive.
     Namesake(Uuid),
-    /// A broker that seemed stalled has sent something.
+    /// A stalled broker has sent a packet.
     Answered,
     /// Not connected; attempts go on.
     Lost(LinkState),
 }
 
-/// Takes the events of links; false once nobody takes them any more.
+/// Callback for the events of links; false once the gateway has ended.
 pub(crate) type LinkSink = Arc<dyn Fn(LinkEvent) -> bool + Send + Sync>;
 
-/// What all links of a gateway have in common.
-#[derive(Debug)]
+/// Settings and inbox that all links of a gateway share.
 pub(crate) struct LinkSetup {
     pub(crate) client_id: String,
     pub(crate) filters: Vec<String>,
-    /// The will of the next connection.
+    /// Last will of the next connection.
     pub(crate) will: Mutex<LastWill>,
     pub(crate) config: MqttConfig,
     pub(crate) security: Security,
@@ -64,7 +64,7 @@ pub(crate) struct LinkSetup {
     pub(crate) seed: u64,
 }
 
-/// A running link; dropping it cuts the connection, upon which the broker publishes the last will.
+/// A running link. Dropping it cuts the connection, and the broker publishes the last will.
 #[derive(Debug)]
 pub(crate) struct Link {
     pub(crate) broker: BrokerAddress,
@@ -88,8 +88,12 @@ impl Link {
         Self { broker, state: LinkState::Down, client: None, hearing, echo, abort, task: Some(task) }
     }
 
-    /// Notes a message that the broker should pass back to this node, whether or not there was room for it; true when
-    /// the broker seems stalled.
+    /// Queues a message; false when there is no connection or no room.
+    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
+        self.client.as_ref().is_some_and(|client| client.publish(topic, payload, retention))
+    }
+
+    /// Records a message whose echo is expected, even if there was no room to send it; true when the broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
         let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
         if is_stalled {
@@ -98,7 +102,7 @@ impl Link {
         is_stalled
     }
 
-    /// Takes leave of the broker without a last will; what was queued before goes out first, within `patience`.
+    /// Sends the queued messages and DISCONNECT, so that there is no last will, within `patience`.
     pub(crate) async fn leave(mut self, patience: Duration) {
         let said = self.client.as_ref().is_some_and(Client::disconnect);
         if said
@@ -116,12 +120,12 @@ impl Drop for Link {
     }
 }
 
-/// Waits before the first attempts after a session broke, for the quickest word of whether the broker's process is
-/// gone: a process that ends may still have the port for a moment when its connections break.
+/// Waits before the first attempts after a broken session. They find out soon whether the broker's process is gone: it
+/// may hold the port for a moment after its connections broke.
 const FIRST_RETRIES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
 
-/// A session shorter than this earns no such attempts, or a broker that ends every session would be tried without
-/// pause.
+/// Minimum length of a session that is followed by [`FIRST_RETRIES`]. Without it, a broker that ends every session would
+/// be tried without pause.
 const MIN_SESSION: Duration = Duration::from_millis(200);
 
 struct Task {
@@ -130,15 +134,15 @@ struct Task {
     setup: Arc<LinkSetup>,
     report: LinkSink,
     hearing: Arc<Hearing>,
-    /// What the broker refused, as last told of.
+    /// The refusal that was logged last.
     reported_refusal: Option<String>,
     has_reported_oversized: bool,
 }
 
 impl Task {
     async fn run(mut self, mut backoff: Backoff) {
-        // The first answer is waited for half as long: a session that outlived this was in use. One that ends sooner,
-        // such as by a retained packet beyond all bounds, must not be tried again at full speed.
+        // A session that outlived this was in use. One that ends sooner, such as by an oversized retained packet, must
+        // not be tried again at full speed.
         let in_use = 2 * self.setup.config.connect_timeout();
         let mut checks = FIRST_RETRIES.iter();
         loop {
@@ -174,7 +178,7 @@ impl Task {
         }
     }
 
-    /// One connection for as long as the broker's certificate is good.
+    /// One connection, for as long as the broker's certificate is valid.
     async fn attempt(&mut self) -> Result<(), ConnectionError> {
         let Some(trust) = self.setup.security.tls(&self.broker).map_err(Box::new)? else {
             return self.session(None).await;
@@ -188,7 +192,7 @@ impl Task {
         }
     }
 
-    /// One connection from beginning to end; `Ok` after a farewell.
+    /// One connection from CONNECT to its end; `Ok` after DISCONNECT.
     async fn session(&mut self, tls: Option<Arc<ClientConfig>>) -> Result<(), ConnectionError> {
         let setup = Arc::clone(&self.setup);
         let LinkSetup { client_id, will, config, inbox, counters, .. } = &*setup;
@@ -202,8 +206,8 @@ impl Task {
         if !self.tell(LinkChange::Accepted(client)) {
             return Ok(());
         }
-        // Pings alone make something come in every keep-alive; longer silence is a connection that hangs. What is sent
-        // is no sign of life, and a poll that takes longer was held up on this side.
+        // A working connection receives at least the answers to pings. Sent packets are no sign of life. A poll that
+        // takes longer than a keep-alive was stalled on this side.
         let patience = 2 * config.keep_alive();
         let mut silent = Duration::ZERO;
         let accepted = Instant::now();
@@ -252,7 +256,7 @@ impl Task {
         }
     }
 
-    /// Warns of what the broker refuses, once per change.
+    /// Warns of a refusal of the broker, once for each change.
     fn report_refusal(&mut self, refusal: String) {
         if self.reported_refusal.as_ref() != Some(&refusal) {
             tracing::warn!(broker = %self.broker, refusal, "broker refuses this node, check its password, certificate and permissions");
@@ -261,19 +265,19 @@ impl Task {
         }
     }
 
-    /// False when the gateway is gone.
+    /// Sends to the gateway; false when it has ended.
     fn tell(&self, change: LinkChange) -> bool {
         (self.report)(LinkEvent { link: self.id, change })
     }
 }
 
-/// A broker that wants other credentials.
+/// Prefix of refused logins.
 const NOT_ADMITTED: &str = "connection refused";
 
-/// A broker acknowledges what it does not permit; only the missing echo tells.
+/// Refusal that shows only by a missing echo: brokers acknowledge messages that they do not permit.
 const NOT_HEARD: &str = "this node's own status does not come back: publishing or subscribing to it is not permitted";
 
-/// Waits that double with every failure, shortened by up to half at random.
+/// Waits that double with every failure, each shortened by a random part of up to half.
 struct Backoff {
     least: Duration,
     most: Duration,

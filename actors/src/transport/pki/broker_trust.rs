@@ -1,4 +1,4 @@
-//! Trust in a broker for as long as a connection to it lasts, not only in the handshake.
+//! Verification of a broker's certificate for as long as a connection lasts, not only in the handshake.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -10,25 +10,25 @@ use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
 
 use super::{Credentials, LoadedCredentials};
 
-/// How one connection to a broker is made, and whether its certificate is still good.
+/// TLS of one connection to a broker, and the repeated verification of its certificate.
 #[derive(Debug)]
 pub struct BrokerTrust {
     client: Arc<ClientConfig>,
     recorded: Arc<RecordingVerifier>,
     verifier: Arc<WebPkiServerVerifier>,
-    /// Of a broker of the cell: where lists change.
+    /// Source of changed revocation lists, for a broker of the cell.
     reloaded_from: Option<(Arc<Credentials>, Arc<LoadedCredentials>)>,
     checked: Instant,
 }
 
-/// Time between two looks at whether certificates have changed.
+/// Time between two checks for changed files.
 const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Time between two checks of a certificate, for one that has expired.
+/// Time between two verifications of a certificate, which may have expired.
 const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
 
 impl BrokerTrust {
-    /// Trusts whom `verifier` trusts under `name`, or under the name by which it is connected to.
+    /// Trust by a verifier, for a certificate with `name`, or else with the host name of the connection.
     pub(super) fn new(
         client: &ClientConfig,
         verifier: Arc<WebPkiServerVerifier>,
@@ -40,19 +40,19 @@ impl BrokerTrust {
         Self { client: Arc::new(client), recorded, verifier, reloaded_from: None, checked: Instant::now() }
     }
 
-    /// Trusts brokers of the cell, as the node's files say at the time.
+    /// Trust in brokers of the cell, by the present content of the node's files.
     pub fn of_cell(credentials: &Arc<Credentials>) -> Self {
         let current = credentials.current();
         let trust = Self::new(&current.client, Arc::clone(&current.brokers), Some(current.broker_name.clone()));
         Self { reloaded_from: Some((Arc::clone(credentials), current)), ..trust }
     }
 
-    /// How to connect, once.
+    /// TLS configuration for one connection.
     pub fn client(&self) -> Arc<ClientConfig> {
         Arc::clone(&self.client)
     }
 
-    /// Waits until the broker's certificate is not valid any more, and says why.
+    /// Waits until the broker's certificate is no longer valid; the result is the reason.
     pub async fn invalidated(mut self) -> rustls::Error {
         loop {
             tokio::time::sleep(RELOAD_INTERVAL).await;
@@ -78,11 +78,11 @@ impl BrokerTrust {
     }
 }
 
-/// Verifies a broker's certificate and remembers it.
+/// Verifier that records the certificate of the broker.
 #[derive(Debug)]
 pub(super) struct RecordingVerifier {
     verifier: Arc<WebPkiServerVerifier>,
-    /// The name that the certificate must bear; without one that by which the broker is connected to.
+    /// Name that the certificate must have; without it, the host name of the connection.
     name: Option<ServerName<'static>>,
     chain: Mutex<Option<(Vec<CertificateDer<'static>>, ServerName<'static>)>>,
 }

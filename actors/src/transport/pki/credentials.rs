@@ -1,4 +1,4 @@
-//! What one node holds: its certificate, and how it checks those of others.
+//! The certificates of one node, and the verifiers of others' certificates.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ use rustls::{ClientConfig, RootCertStore, ServerConfig};
 use super::broker_trust::RecordingVerifier;
 use super::{BROKER_NAME, BrokerTrust, CertificateSubject, TlsConfig};
 
-/// The certificates of a node, read again when their files change.
+/// Certificates of a node, reloaded when their files change.
 #[derive(Debug)]
 pub struct Credentials {
     files: TlsConfig,
@@ -33,44 +33,44 @@ struct CachedCredentials {
     current: Arc<LoadedCredentials>,
 }
 
-/// What the files held when they were read last.
+/// Content of the files, and the TLS configurations made of it.
 #[derive(Debug)]
 pub struct LoadedCredentials {
     /// The node's own certificate.
     pub identity: CertificateSubject,
-    /// How the node serves: TLS 1.3, clients show a certificate of the cell, sessions are not resumed, as a resumed one
-    /// would not be checked against the revocation list.
+    /// TLS of the node's own broker: version 1.3, client certificates of the cell, no resumption. A resumed session would
+    /// not be checked against the revocation list.
     pub server: Arc<ServerConfig>,
-    /// How the node connects to brokers of the cell.
+    /// TLS of connections to brokers of the cell.
     pub client: Arc<ClientConfig>,
-    /// Checks certificates of clients.
+    /// Verifier of clients' certificates.
     pub clients: Arc<dyn ClientCertVerifier>,
-    /// Checks certificates of brokers of the cell, which bear `broker_name` at whatever address they are.
+    /// Verifier of certificates of the cell's brokers, which have `broker_name` at any address.
     pub(super) brokers: Arc<WebPkiServerVerifier>,
     pub(super) broker_name: ServerName<'static>,
     certificates: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
 }
 
-/// Files that are no credentials of this node.
+/// An error in the files of a node's certificates.
 #[derive(Debug, thiserror::Error)]
 pub enum CredentialsError {
-    /// A file is not there, cannot be read, or is not PEM of the kind that it should be.
+    /// A file cannot be read, or is not PEM of the expected kind.
     #[error("key `{key}`: {path}: {reason}")]
     File {
         /// The configuration key that names the file.
         key: &'static str,
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
-    /// The certificate is another node's.
+    /// The certificate names another node.
     #[error("key `tls.certificate`: {path} is for {found}, this node is {node}")]
     WrongName {
         /// The file.
         path: PathBuf,
-        /// Whom it is for.
+        /// The node that it names.
         found: NodeName,
         /// This node.
         node: NodeName,
@@ -80,7 +80,7 @@ pub enum CredentialsError {
     Unusable(String),
 }
 
-/// Least time between two looks at the files.
+/// Minimum time between two checks of the files.
 const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Credentials {
@@ -94,7 +94,7 @@ impl Credentials {
         Ok(Self { files: files.clone(), node: node.clone(), cache })
     }
 
-    /// What the files hold now; what they held before if they have become unusable, which is logged.
+    /// The present content of the files. While they are unusable, which is logged, the content before.
     pub fn current(&self) -> Arc<LoadedCredentials> {
         let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         if cache.checked_at.elapsed() >= RELOAD_INTERVAL {
@@ -115,9 +115,8 @@ impl Credentials {
     }
 }
 
-/// How a node connects to a broker that is none of the cell's, and goes on trusting it: its certificate must be signed
-/// by one of those in `ca` and bear the name under which it is configured. The node shows its own certificate, if it
-/// has one.
+/// Trust in a broker outside the cell. Its certificate must be signed by a CA in `ca` and have the configured host name.
+/// The node presents its own certificate, if it has one.
 ///
 /// # Errors
 /// [`CredentialsError`] naming the file.
@@ -211,7 +210,7 @@ fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsErr
     Ok(roots)
 }
 
-/// A file without a list in it, such as one half copied, is not a list of nobody.
+/// Reads revocation lists. A file without any, such as one copied by half, is an error and not an empty list.
 fn lists(path: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
     let key = "tls.revocation_list";
     let lists = pem(key, path)?;
@@ -236,7 +235,7 @@ fn unusable(error: rustls::Error) -> CredentialsError {
     CredentialsError::Unusable(error.to_string())
 }
 
-/// Time of change and length of each file: enough to tell that it was replaced.
+/// Modification time and length of each file, which change when it is replaced.
 fn fingerprints(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
     let stamp = |path: &PathBuf| {
         let facts = fs::metadata(path).ok()?;

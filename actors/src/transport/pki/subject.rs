@@ -1,4 +1,4 @@
-//! What a certificate says of its holder.
+//! The node that a certificate names.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use x509_parser::prelude::FromDer;
 
 use super::{BROKER_NAME, OBSERVER_MARK};
 
-/// The holder of a certificate; that the certificate is genuine is for others to check.
+/// The node that a certificate names, and its rights. Its signature is verified elsewhere.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CertificateSubject {
     name: NodeName,
@@ -18,13 +18,13 @@ pub struct CertificateSubject {
     expires: Timestamp,
 }
 
-/// A certificate from which no node can be told.
+/// A certificate that names no node.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidCertificate {
-    /// The bytes are no X.509 certificate.
+    /// Not an X.509 certificate.
     #[error("not an X.509 certificate")]
     Malformed,
-    /// It has not exactly one common name, or one that no node can have.
+    /// Not exactly one common name, or one that is not a node's name.
     #[error("the certificate's common name is not the name of a node")]
     NoName,
 }
@@ -52,18 +52,18 @@ impl CertificateSubject {
         &self.name
     }
 
-    /// Whether the node may have a broker, and so lead.
+    /// Whether the node may serve a broker, and so lead.
     pub fn may_serve(&self) -> bool {
         self.may_serve
     }
 
-    /// Until when the certificate is valid.
+    /// End of the certificate's validity.
     pub fn expires(&self) -> Timestamp {
         self.expires
     }
 
-    /// Whether the holder may have a client of this name: its own, or that of an observer which shares its certificate.
-    /// An observer has a status and nothing else to say: one certificate is one vehicle.
+    /// Whether the node may have a client of this name: its own, or that of an observer which shares its certificate. An
+    /// observer publishes nothing but a status, so that one certificate is one vehicle.
     pub fn may_act_as(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
     }
