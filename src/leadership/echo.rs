@@ -32,7 +32,7 @@ impl EchoMonitor {
 mod tests {
     use super::*;
 
-    /// When the broker is stalled, of messages sent at these milliseconds without an answer.
+    /// Time in ms at which the broker counts as stalled, for messages sent at these milliseconds without an answer.
     fn stalled_at(sent_ms: impl IntoIterator<Item = u64>) -> Option<u64> {
         let mut echo = EchoMonitor::default();
         sent_ms.into_iter().find(|ms| echo.note_sent(7, Timestamp(ms * 1000)))

@@ -1,10 +1,10 @@
-//! Who leads the cell: an election without clocks or sockets.
+//! The election of the cell's leader, without clocks or sockets.
 //!
 //! # Call order
 //!
 //! [`Election::new`] with the persisted term, then, for as long as the node runs: [`Election::handle`] with whatever
 //! happened, [`Election::tick`] at [`Election::next_deadline`]. Both return [`ElectionEffect`]s to be carried out in order.
-//! A caller that was held up handles all messages that wait before it ticks. Equal inputs give equal effects.
+//! A caller that was held up handles all waiting messages before it ticks. Equal inputs give equal effects.
 //!
 //! # Kinds of methods
 //!
@@ -14,22 +14,23 @@
 //!
 //! # States
 //!
-//! *Seeking* (no leader known), *following*, *leading*. See `docs/election.md` for messages, timings and sequences.
+//! *Seeking* (no leader known, `seeking.rs`), *following* (`following.rs`, `liveness.rs`), *leading* (`leading.rs`,
+//! `handover.rs`). See `docs/election.md` for messages, timings and sequences.
 //!
 //! # Invariants
 //!
-//! 1. No two leaderships share an [`Epoch`]: a node uses a term once, written to disk before it leads, and the epoch
-//!    holds its name.
+//! 1. No two leaderships share an [`Epoch`]: a node uses a term once, and the epoch holds its name. The term is handed to
+//!    the disk first; see [`ElectionEffect::Lead`] for a disk that fails.
 //! 2. The epoch that a node follows or leads never goes back while it runs, nor below [`Election::floor`] after a
 //!    restart.
 //! 3. A component whose links all work both ways, left alone, has exactly one leader: the best candidate by role and
 //!    priority, if one is fit.
-//! 4. A leader that is there and fit is replaced by nobody but a better candidate, by handover.
+//! 4. Only a better candidate replaces a leader that is there and fit, by handover.
 //! 5. Time that a node was stalled is no silence of others.
 //! 6. A node whose broker, fuser or gateway is broken does not lead.
 //!
-//! There are no votes and no majority: every side of a split network serves its vehicles. Two leaders meet, and the
-//! higher epoch stays; what each published before is told apart by its epoch.
+//! There are no votes and no majority: every side of a split network serves its vehicles. When two leaders meet, the
+//! higher epoch stays. Epochs tell apart what each of them published before.
 //!
 //! # Why the leader beats by itself
 //!
@@ -38,14 +39,13 @@
 //! and 251 ms. A silent leader has to be replaced within 400 ms, a period of 100 ms included, and 251 ms leaves no room
 //! for a lost packet. Moreover the beat carries what a successor needs, its round and its successors, and proves that
 //! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as its
-//! cost per node does not grow with the cell; what it finds enters as [`ElectionInput::PeerAlive`] and [`ElectionInput::PeerDown`]. To
-//! keep a leader's packets few, only its standby gets every beat, its other successors and better nodes that are not fit
-//! every eighth, and everyone else one each `idle_beat_ms`.
+//! cost per node does not grow with the cell; what it finds enters as [`ElectionInput::PeerAlive`] and
+//! [`ElectionInput::PeerDown`]. To keep a leader's packets few, only its standby gets every beat, its other successors and
+//! better nodes that are not fit every eighth, and everyone else one each `idle_beat_ms`.
 
 #![deny(clippy::indexing_slicing)]
 
 mod awake_clock;
-mod config;
 mod following;
 mod handover;
 mod interface;
@@ -60,8 +60,8 @@ use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::SCHEMA_VERSION;
 
+pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
-pub use config::ElectionConfig;
 pub use interface::{ElectionEffect, ElectionInput, Health};
 pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM};
 
@@ -70,7 +70,7 @@ use liveness::Following;
 use peers::Peers;
 use seeking::{Questions, Seeking};
 
-/// One node's part in the election.
+/// Election as one node takes part in it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Election {
     config: ElectionConfig,
@@ -81,7 +81,7 @@ pub struct Election {
     terms: Terms,
     /// The highest epoch followed or led.
     epoch: Option<Epoch>,
-    /// The highest epoch known to be over.
+    /// Highest epoch known to have ended.
     over: Option<Epoch>,
     /// The last round known.
     round: u64,
@@ -100,19 +100,19 @@ enum State {
     Leading(Leading),
 }
 
-/// The terms that may still be used.
+/// Terms that are known to have been used.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Terms {
-    /// The highest term known to have been used by anyone.
+    /// Highest term that any node is known to have used.
     seen: u64,
-    /// The term found on disk at the start: this node may have used it.
+    /// Term found on disk at the start: this node may have used it.
     found: u64,
-    /// The term on disk.
+    /// Term handed to the disk.
     persisted: u64,
 }
 
 impl Election {
-    /// A node that starts; it listens for `join_ms` before it leads. `persisted_term` is the last
+    /// Election of a node that starts; it listens for `join_ms` before it leads. `persisted_term` is the last
     /// [`ElectionEffect::PersistTerm`] of earlier runs, 0 without any.
     pub fn new(config: ElectionConfig, id: NodeName, persisted_term: u64, now: Timestamp) -> Self {
         let clock = AwakeClock::new(now, std::time::Duration::from_millis(config.stall_ms));
@@ -155,14 +155,14 @@ impl Election {
         self.finish()
     }
 
-    /// Does what time demands; harmless when nothing is due.
+    /// Runs the timers that are due.
     pub fn tick(&mut self, now: Timestamp) -> Vec<ElectionEffect> {
         let now = self.advance(now);
         self.run_timers(now);
         self.finish()
     }
 
-    /// When to call [`Self::tick`] next, on the caller's clock.
+    /// Time of the next call of [`Self::tick`], on the caller's clock.
     pub fn next_deadline(&self) -> Timestamp {
         self.clock.outside(self.deadline())
     }
@@ -177,7 +177,7 @@ impl Election {
         self.epoch.as_ref()
     }
 
-    /// Who leads, as far as this node knows; `None` while it seeks.
+    /// The leader as far as this node knows; `None` while it seeks.
     pub fn leader(&self) -> Option<&NodeName> {
         self.current_epoch().map(|epoch| &epoch.leader)
     }
@@ -187,7 +187,7 @@ impl Election {
         matches!(self.state, State::Leading(_))
     }
 
-    /// Who leads next, as named by the leader.
+    /// The next leader, as named by the leader.
     pub fn standby(&self) -> Option<&NodeName> {
         match &self.state {
             State::Seeking(_) => None,
@@ -199,11 +199,6 @@ impl Election {
     /// The highest term that anyone is known to have used.
     pub fn term(&self) -> u64 {
         self.terms.seen
-    }
-
-    /// The lowest term that a gate should admit after a restart: the highest term known when the node stopped.
-    pub fn floor(&self) -> u64 {
-        self.terms.found.saturating_sub(1)
     }
 
     fn advance(&mut self, now: Timestamp) -> Timestamp {
@@ -231,7 +226,7 @@ impl Election {
     }
 
     fn finish(&mut self) -> Vec<ElectionEffect> {
-        // The next term is on disk before it is needed: taking the lead need not wait for the disk.
+        // The disk gets the next term before it is needed: taking the lead need not wait for it.
         self.persist(self.terms.seen + 1);
         std::mem::take(&mut self.effects)
     }
@@ -298,7 +293,7 @@ impl Election {
         }
     }
 
-    /// Says at once what others would have to find out: that this node leads no more, nor could.
+    /// Tells others at once that this node neither leads nor could lead any more.
     fn leave(&mut self, now: Timestamp) {
         let Health { load_percent, .. } = self.health;
         self.set_health(Health { load_percent, ..Health::default() }, now);

@@ -37,7 +37,7 @@ pub struct LedgerResync {
     /// Whether it is to have everything.
     owes_everything: bool,
     everything_sent_at: Option<Timestamp>,
-    /// What was shared since it was first heard.
+    /// Evidence shared since it was first heard.
     shared: ReputationLedger,
     /// Ticks until what was not shared is sent to it.
     wait: u32,
@@ -196,7 +196,7 @@ impl LedgerResync {
         self.shares(&entries, &marks)
     }
 
-    /// What nobody has shared with the leader, if it is time.
+    /// Evidence that nobody has shared with the leader, if it is time to send it.
     fn take_unshared(&mut self, ledger: &ReputationLedger, leadership: &Leadership) -> Vec<LedgerShare> {
         if self.leads.is_some() {
             return Vec::new();

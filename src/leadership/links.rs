@@ -9,7 +9,7 @@ use crate::leadership::address::BrokerAddress;
 use crate::leadership::timers::LINK_LINGER;
 use crate::time::Timestamp;
 
-/// Which brokers carry a cell's reports and maps.
+/// Brokers that carry a cell's reports and maps.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct DataPlane {
     /// A broker that belongs to no node and is used by all.
@@ -104,7 +104,7 @@ impl Links {
         &self.present
     }
 
-    /// Which brokers carry the data.
+    /// Brokers that carry the data.
     pub fn plane(&self) -> &DataPlane {
         &self.plane
     }

@@ -399,3 +399,6 @@ impl LeadershipNode {
         self.effects.push(Effect::Log { notice });
     }
 }
+
+#[cfg(test)]
+mod tests;

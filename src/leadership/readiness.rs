@@ -9,7 +9,7 @@ use crate::leadership::timers::PART_TIMEOUT;
 use crate::leadership::view::Leadership;
 use crate::time::Timestamp;
 
-/// Whether a node does its work, and the reason.
+/// Readiness of a node, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Readiness {
     /// Whether it does.

@@ -1,4 +1,4 @@
-//! Whose rounds a node accepts: the only place that decides it.
+//! Acceptance of rounds: the only place that decides whose rounds a node accepts.
 //!
 //! # Filters
 //!
@@ -150,7 +150,7 @@ impl RoundFilter {
 
 /// Lowest term that a node accepts after a restart: the highest that it knew when it stopped. It writes the next one to
 /// disk before that is needed.
-pub(super) fn floor(saved_term: u64) -> u64 {
+fn floor(saved_term: u64) -> u64 {
     saved_term.saturating_sub(1)
 }
 

@@ -40,7 +40,7 @@
 
 use std::time::Duration;
 
-use crate::leadership::election::ElectionConfig;
+use crate::leadership::config::ElectionConfig;
 
 /// Maximum age of a round that a node accepts.
 pub const MAX_ROUND_AGE: Duration = Duration::from_secs(1);

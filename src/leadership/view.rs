@@ -1,4 +1,4 @@
-//! The view of leadership that the other parts of a node work with.
+//! The view of leadership that all parts of a node work with.
 
 use serde::Serialize;
 
@@ -6,7 +6,7 @@ use crate::epoch::Epoch;
 use crate::leadership::election::Election;
 use crate::names::NodeName;
 
-/// Who leads, as one node sees it.
+/// The leader and its standby, as one node sees them.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct Leadership {
     /// The node's own place in its cell.

@@ -7,18 +7,20 @@ use std::time::Duration;
 use ecod::epoch::Epoch;
 use ecod::leadership::election::{Election, ElectionConfig};
 use ecod::leadership::health::HealthSample;
+use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{LeadershipNode, NodeSettings};
-use ecod::leadership::round_filter::RoundFilter;
+use ecod::leadership::round_filter::{PublisherFilter, RoundFilter};
 use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::names::NodeName;
+use ecod::reputation::ReputationLedger;
 use ecod::round::{RoundClose, RoundConfig, RoundTrigger};
 use ecod::time::Timestamp;
-use ecod::wire::NodeStatus;
+use ecod::wire::{LedgerShare, NodeStatus};
 use uuid::Uuid;
 
 /// What can happen to a cell.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone)]
 pub(crate) enum Fault {
     /// The process starts, with its disk.
     Start(usize),
@@ -38,79 +40,93 @@ pub(crate) enum Fault {
     Loss(u64),
     /// The node's broker breaks, or works again.
     Broker { node: usize, works: bool },
+    /// The node's fuser closes no rounds, or does again.
+    Fuser { node: usize, works: bool },
+    /// The node's gateway answers nobody, or does again.
+    Gateway { node: usize, works: bool },
 }
 
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+/// Something that is going to happen.
+#[derive(Debug, Clone)]
 pub(crate) enum Event {
+    /// At one node, if this run of it is still there.
+    At {
+        node: usize,
+        life: u64,
+        arrival: Arrival,
+    },
+    /// A process goes on after a pause.
+    Resume {
+        node: usize,
+    },
+    Gossip,
+    Fault(Fault),
+}
+
+/// Something that reaches a running node.
+#[derive(Debug, Clone)]
+pub(crate) enum Arrival {
     Packet {
         from: usize,
-        to: usize,
-        life: u64,
         bytes: Vec<u8>,
     },
-    Map {
-        to: usize,
-        life: u64,
+    /// A map for the node's broker to pass on.
+    Relay {
+        from: usize,
         map: Map,
     },
+    Map {
+        map: Map,
+    },
+    Share {
+        share: Box<LedgerShare>,
+    },
+    /// News of the membership.
     Tell {
-        to: usize,
-        life: u64,
         about: usize,
         about_life: u64,
         is_there: bool,
     },
     /// The gateway tries to connect to a broker.
     Connect {
-        to: usize,
-        life: u64,
         broker: usize,
     },
     /// A connection to a broker broke, and its port refuses.
     Refused {
-        to: usize,
-        life: u64,
         broker: usize,
     },
-    Answered {
-        to: usize,
-        life: u64,
-    },
+    /// The parts answer.
+    Answered,
     Broker {
-        to: usize,
-        life: u64,
         works: bool,
     },
     Timer {
-        to: usize,
-        life: u64,
         armed: u64,
     },
+    /// A round is due.
     Publish {
-        to: usize,
-        life: u64,
         term: u64,
     },
-    Resume {
-        to: usize,
-    },
-    Gossip,
-    Fault(Fault),
+    /// A publication period of reputations has passed.
+    Keep,
 }
 
 /// A published map.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone)]
 pub(crate) struct Map {
     pub(crate) epoch: Epoch,
     pub(crate) round: u64,
     /// Time of its fusion by its publisher's clock.
     pub(crate) fused_at: Timestamp,
+    /// The same by the simulation's, in µs.
+    pub(crate) made_at: u64,
 }
 
 /// A round accepted by a node.
 #[derive(Debug, Clone)]
 pub(crate) struct Accepted {
     pub(crate) at: u64,
+    pub(crate) epoch: Epoch,
     pub(crate) round: u64,
 }
 
@@ -120,6 +136,12 @@ pub(crate) struct Node {
     pub(crate) config: ElectionConfig,
     pub(crate) machine: Option<LeadershipNode>,
     pub(crate) filter: RoundFilter,
+    /// The rule of its broker.
+    pub(crate) publishers: PublisherFilter,
+    pub(crate) resync: LedgerResync,
+    pub(crate) ledger: ReputationLedger,
+    /// The ledger on disk.
+    pub(crate) saved: ReputationLedger,
     /// The leadership as the machine told it.
     pub(crate) leadership: Leadership,
     pub(crate) accepted: Vec<Accepted>,
@@ -133,10 +155,14 @@ pub(crate) struct Node {
     pub(crate) steady_clock: i64,
     pub(crate) armed: u64,
     pub(crate) paused_until: u64,
-    pub(crate) waiting: Vec<Event>,
+    pub(crate) waiting: Vec<Arrival>,
     pub(crate) publishing: Option<(Epoch, u64)>,
     pub(crate) rounds: RoundTrigger,
     pub(crate) broker_works: bool,
+    pub(crate) fuser_works: bool,
+    pub(crate) gateway_works: bool,
+    /// Rounds that the fuser closed before it last stopped or started, and when that was.
+    pub(crate) closed: (u64, u64),
     /// State of the links that the machine wants, by node.
     pub(crate) links: BTreeMap<usize, LinkState>,
     /// Nodes that the membership is about to tell of, and their runs.
@@ -148,11 +174,16 @@ pub(crate) struct Node {
 
 impl Node {
     pub(crate) fn new(index: usize, config: ElectionConfig) -> Self {
+        let name = NodeName::new(format!("n{index:02}")).expect("valid name");
         Self {
-            name: NodeName::new(format!("n{index:02}")).expect("valid name"),
+            resync: LedgerResync::new(name.clone(), TICKS_PER_SNAPSHOT),
+            name,
             config,
             machine: None,
             filter: RoundFilter::new(0),
+            publishers: PublisherFilter::default(),
+            ledger: ReputationLedger::default(),
+            saved: ReputationLedger::default(),
             leadership: Leadership::default(),
             accepted: Vec::new(),
             refused: 0,
@@ -170,6 +201,9 @@ impl Node {
                 Timestamp(0),
             ),
             broker_works: true,
+            fuser_works: true,
+            gateway_works: true,
+            closed: (0, 0),
             links: BTreeMap::new(),
             known: BTreeMap::new(),
             members: BTreeMap::new(),
@@ -183,7 +217,11 @@ impl Node {
         self.started_at = now;
         self.paused_until = 0;
         self.steady_clock = self.clock;
-        self.broker_works = true;
+        (self.broker_works, self.fuser_works, self.gateway_works) = (true, true, true);
+        self.closed = (0, now);
+        self.publishers = PublisherFilter::default();
+        self.resync = LedgerResync::new(self.name.clone(), TICKS_PER_SNAPSHOT);
+        self.ledger.clone_from(&self.saved);
         (self.known, self.members, self.links) = Default::default();
         self.leadership = Leadership::default();
         self.filter = RoundFilter::new(self.persisted);
@@ -192,7 +230,7 @@ impl Node {
             election: self.config.clone(),
             plane: DataPlane { external: None, embedded: true },
             round_period: Duration::from_millis(100),
-            keeps_reputations: false,
+            keeps_reputations: true,
             status,
         };
         let clock = Timestamp(now).shifted(self.clock);
@@ -215,17 +253,27 @@ impl Node {
         self.election().and_then(Election::standby)
     }
 
-    /// Rounds that the fuser has closed by `now`.
+    /// Lets the fuser stop, or close rounds again.
+    pub(crate) fn set_fuser(&mut self, works: bool, now: u64) {
+        (self.closed, self.fuser_works) = ((self.rounds_closed(now), now), works);
+    }
+
+    /// Rounds that the fuser has closed by `now`, published or not.
     pub(crate) fn rounds_closed(&self, now: u64) -> u64 {
-        (now - self.started_at) / 100_000
+        let (closed, since) = self.closed;
+        if self.fuser_works { closed + (now - since) / 100_000 } else { closed }
     }
 
     /// What broker, gateway and fuser answer.
     pub(crate) fn sample(&self) -> HealthSample {
-        let links = self.links.iter().map(|(broker, state)| (address_of(*broker), *state)).collect();
-        HealthSample { broker_serves: self.broker_works, links: Some(links), fuser_runs: true }
+        let links = || self.links.iter().map(|(broker, state)| (address_of(*broker), *state)).collect();
+        let links = self.gateway_works.then(links);
+        HealthSample { broker_serves: self.broker_works, links, fuser_runs: true }
     }
 }
+
+/// Publication periods between two times that a leader shares everything.
+const TICKS_PER_SNAPSHOT: u32 = 4;
 
 /// Where a node's broker listens.
 pub(crate) fn broker_of(index: usize) -> SocketAddr {

@@ -1,21 +1,21 @@
-//! A cell in simulated time: nodes, links that lose, delay, repeat and cut, and a data plane that carries rounds.
+//! A cell in simulated time: nodes, and a network that loses, delays, repeats and cuts.
 //!
 //! Each node runs the machines that a real one does, and carries out their effects as the actors do.
 
-use std::cmp::Reverse;
+use std::cmp::{Ordering, Reverse};
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
 use ecod::epoch::Epoch;
 use ecod::leadership::Position;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
-use ecod::leadership::links::{LinkState, WantedLinks};
+use ecod::leadership::links::LinkState;
 use ecod::leadership::node::{Effect, Input, Member};
 use ecod::names::NodeName;
-use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::wire::{Encoding, GlobalMap, Role, SCHEMA_VERSION};
+use ecod::wire::{Encoding, Role};
 
-use crate::node::{Accepted, Event, Fault, Map, Node, address_of, broker_of};
+use crate::evidence::PUBLISH_PERIOD;
+use crate::node::{Arrival, Event, Fault, Node, address_of, broker_of};
 use crate::random::Random;
 
 /// Microseconds in a millisecond.
@@ -39,11 +39,40 @@ pub(crate) struct World {
     pub(crate) lateness: u64,
     /// What to print when a check fails.
     pub(crate) history: Vec<String>,
+    /// Votes that were settled in each leadership.
+    pub(crate) recorded: BTreeMap<Epoch, u64>,
     cuts: BTreeSet<(usize, usize)>,
-    loss_percent: u64,
-    queue: BinaryHeap<Reverse<(u64, u64, Event)>>,
+    pub(crate) loss_percent: u64,
+    queue: BinaryHeap<Planned>,
     events: u64,
     owners: BTreeMap<Epoch, (usize, u64)>,
+}
+
+/// An event and when it happens; of two at one time the first planned comes first.
+struct Planned {
+    at: u64,
+    number: u64,
+    event: Event,
+}
+
+impl PartialEq for Planned {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Planned {}
+
+impl PartialOrd for Planned {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Planned {
+    fn cmp(&self, other: &Self) -> Ordering {
+        (other.at, other.number).cmp(&(self.at, self.number))
+    }
 }
 
 impl World {
@@ -57,6 +86,7 @@ impl World {
             packets: 0,
             lateness: 2 * MS,
             history: Vec::new(),
+            recorded: BTreeMap::new(),
             cuts: BTreeSet::new(),
             loss_percent: 0,
             queue: BinaryHeap::new(),
@@ -74,10 +104,8 @@ impl World {
 
     pub(crate) fn run_for(&mut self, micros: u64) {
         let end = self.now + micros;
-        while let Some(Reverse((at, _, _))) = self.queue.peek()
-            && *at <= end
-        {
-            let Some(Reverse((at, _, event))) = self.queue.pop() else { break };
+        while self.queue.peek().is_some_and(|next| next.at <= end) {
+            let Some(Planned { at, event, .. }) = self.queue.pop() else { break };
             self.now = at;
             self.happen(event);
         }
@@ -102,76 +130,77 @@ impl World {
 
     fn push(&mut self, after: u64, event: Event) {
         self.events += 1;
-        self.queue.push(Reverse((self.now + after, self.events, event)));
+        self.queue.push(Planned { at: self.now + after, number: self.events, event });
+    }
+
+    /// Lets something reach the present run of a node `after` µs from now.
+    pub(crate) fn push_to(&mut self, node: usize, after: u64, arrival: Arrival) {
+        let life = self.nodes[node].life;
+        self.push(after, Event::At { node, life, arrival });
     }
 
     fn happen(&mut self, event: Event) {
         match event {
             Event::Fault(fault) => self.strike(&fault),
             Event::Gossip => self.gossip(),
-            Event::Resume { to } => {
-                for event in std::mem::take(&mut self.nodes[to].waiting) {
-                    self.reach(to, event);
+            Event::Resume { node } => {
+                for arrival in std::mem::take(&mut self.nodes[node].waiting) {
+                    self.reach(node, arrival);
                 }
-                self.arm(to);
+                self.arm(node);
             }
-            Event::Packet { to, life, .. }
-            | Event::Map { to, life, .. }
-            | Event::Tell { to, life, .. }
-            | Event::Connect { to, life, .. }
-            | Event::Refused { to, life, .. }
-            | Event::Answered { to, life }
-            | Event::Broker { to, life, .. }
-            | Event::Timer { to, life, .. }
-            | Event::Publish { to, life, .. } => {
-                let node = &mut self.nodes[to];
+            Event::At { node: index, life, arrival } => {
+                let node = &mut self.nodes[index];
                 if node.life != life || node.machine.is_none() {
                     return;
                 }
                 if node.paused_until > self.now {
-                    node.waiting.push(event);
+                    node.waiting.push(arrival);
                 } else {
-                    self.reach(to, event);
+                    self.reach(index, arrival);
                 }
             }
         }
     }
 
-    fn reach(&mut self, to: usize, event: Event) {
-        match event {
-            Event::Packet { from, bytes, .. } => {
+    fn reach(&mut self, to: usize, arrival: Arrival) {
+        match arrival {
+            Arrival::Packet { from, bytes } => {
                 let message = ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
                 let from = self.nodes[from].name.clone();
                 self.handle(to, Input::Receive { from, message });
             }
-            Event::Map { map, .. } => self.accept(to, &map),
-            Event::Tell { about, about_life, is_there: true, .. } => {
+            Arrival::Relay { from, map } => self.relay(to, from, &map),
+            Arrival::Map { map } => self.accept(to, &map),
+            Arrival::Share { share } => self.take_share(to, &share),
+            Arrival::Tell { about, about_life, is_there: true } => {
                 self.nodes[to].members.insert(about, about_life);
                 self.handle(to, Input::MemberAlive { member: self.member(about, about_life) });
             }
-            Event::Tell { about, .. } => {
+            Arrival::Tell { about, .. } => {
                 self.nodes[to].members.remove(&about);
                 self.handle(to, Input::MemberDown { name: self.nodes[about].name.clone() });
             }
-            Event::Connect { broker, .. } => self.connect(to, broker),
-            Event::Refused { broker, .. } => {
+            Arrival::Connect { broker } => self.connect(to, broker),
+            Arrival::Refused { broker } => {
                 if self.nodes[to].links.contains_key(&broker) {
                     self.set_link(to, broker, LinkState::Down);
                     self.set_link(to, broker, LinkState::Refused);
                     self.plan_connect(to, broker, 80 * MS);
                 }
             }
-            Event::Answered { .. } => self.handle(to, Input::PartsAnswered { sample: self.nodes[to].sample() }),
-            Event::Broker { works, .. } => {
+            Arrival::Answered => self.handle(to, Input::PartsAnswered { sample: self.nodes[to].sample() }),
+            Arrival::Broker { works } => {
                 self.nodes[to].broker_works = works;
                 if !works && self.nodes[to].links.contains_key(&to) {
                     self.set_link(to, to, LinkState::Down);
                 }
                 self.plan_connect(to, to, 0);
             }
-            Event::Timer { armed, .. } if armed == self.nodes[to].armed => self.handle(to, Input::Wake),
-            Event::Publish { term, .. } => self.publish(to, term),
-            Event::Timer { .. } | Event::Resume { .. } | Event::Gossip | Event::Fault(_) => {}
+            Arrival::Timer { armed } if armed == self.nodes[to].armed => self.handle(to, Input::Wake),
+            Arrival::Timer { .. } => {}
+            Arrival::Publish { term } => self.publish(to, term),
+            Arrival::Keep => self.keep(to),
         }
     }
 
@@ -186,7 +215,7 @@ impl World {
             }
             Fault::Pause { node, micros } => {
                 self.nodes[node].paused_until = self.now + micros;
-                self.push(micros, Event::Resume { to: node });
+                self.push(micros, Event::Resume { node });
             }
             Fault::SetClock { node, micros } => self.nodes[node].clock += micros,
             Fault::Cut { from, to } => {
@@ -194,10 +223,9 @@ impl World {
             }
             Fault::Heal => self.cuts.clear(),
             Fault::Loss(percent) => self.loss_percent = percent,
-            Fault::Broker { node, works } => {
-                let life = self.nodes[node].life;
-                self.push(0, Event::Broker { to: node, life, works });
-            }
+            Fault::Broker { node, works } => self.push_to(node, 0, Arrival::Broker { works }),
+            Fault::Fuser { node, works } => self.nodes[node].set_fuser(works, self.now),
+            Fault::Gateway { node, works } => self.nodes[node].gateway_works = works,
         }
     }
 
@@ -206,6 +234,8 @@ impl World {
             return;
         }
         self.nodes[index].start(self.now);
+        let after = self.random.between(0, PUBLISH_PERIOD);
+        self.push_to(index, after, Arrival::Keep);
         self.handle(index, Input::OwnBroker { address: Some(broker_of(index)) });
         for to in 0..self.nodes.len() {
             if to != index && self.nodes[to].links.contains_key(&index) {
@@ -222,45 +252,11 @@ impl World {
         if seen {
             for to in 0..self.nodes.len() {
                 if self.linked(to, index) && self.nodes[to].links.get(&index) == Some(&LinkState::Up) {
-                    let (life, after) = (self.nodes[to].life, self.random.between(MS, 6 * MS));
-                    self.push(after, Event::Refused { to, life, broker: index });
+                    let after = self.random.between(MS, 6 * MS);
+                    self.push_to(to, after, Arrival::Refused { broker: index });
                 }
             }
         }
-    }
-
-    /// Makes the links what the machine wants.
-    fn set_links(&mut self, index: usize, wanted: &WantedLinks) {
-        let is_wanted = |broker: &usize| wanted.brokers.contains(&address_of(*broker));
-        self.nodes[index].links.retain(|broker, _| is_wanted(broker));
-        for broker in (0..self.nodes.len()).filter(is_wanted) {
-            if !self.nodes[index].links.contains_key(&broker) {
-                self.nodes[index].links.insert(broker, LinkState::Down);
-                self.plan_connect(index, broker, 0);
-            }
-        }
-    }
-
-    fn plan_connect(&mut self, to: usize, broker: usize, pause: u64) {
-        let (life, after) = (self.nodes[to].life, pause + self.random.between(MS, 20 * MS));
-        self.push(after, Event::Connect { to, life, broker });
-    }
-
-    /// Tries to connect, and goes on trying.
-    fn connect(&mut self, to: usize, broker: usize) {
-        let Some(state) = self.nodes[to].links.get(&broker) else { return };
-        let there = &self.nodes[broker];
-        let serves = there.machine.is_some() && there.broker_works && there.paused_until <= self.now;
-        if serves && self.linked(to, broker) {
-            self.set_link(to, broker, LinkState::Up);
-        } else if *state != LinkState::Up {
-            self.plan_connect(to, broker, 80 * MS);
-        }
-    }
-
-    fn set_link(&mut self, to: usize, broker: usize, state: LinkState) {
-        self.nodes[to].links.insert(broker, state);
-        self.handle(to, Input::LinkChanged { broker: address_of(broker), state });
     }
 
     /// What a membership would find out, a while later and node by node.
@@ -276,14 +272,14 @@ impl World {
                 if to == about || !is_news || self.nodes[to].machine.is_none() || self.random.chance(50) {
                     continue;
                 }
-                let (life, after) = (self.nodes[to].life, self.random.between(20 * MS, 300 * MS));
+                let after = self.random.between(20 * MS, 300 * MS);
                 let node = &mut self.nodes[to];
                 if is_there {
                     node.known.insert(about, about_life);
                 } else {
                     node.known.remove(&about);
                 }
-                self.push(after, Event::Tell { to, life, about, about_life, is_there });
+                self.push_to(to, after, Arrival::Tell { about, about_life, is_there });
             }
         }
         self.push(100 * MS, Event::Gossip);
@@ -309,7 +305,7 @@ impl World {
     }
 
     /// Hands in what happened and carries out what comes of it, as the actors do.
-    fn handle(&mut self, index: usize, input: Input) {
+    pub(crate) fn handle(&mut self, index: usize, input: Input) {
         let mut inputs = VecDeque::from([input]);
         while let Some(input) = inputs.pop_front() {
             let now = self.clock_of(index);
@@ -323,7 +319,6 @@ impl World {
 
     /// Does what the machine wants; returns what it is to be told at once.
     fn carry_out(&mut self, index: usize, effect: Effect) -> Option<Input> {
-        let life = self.nodes[index].life;
         match effect {
             Effect::PersistTerm { term } => self.nodes[index].persisted = term,
             Effect::Send { to, message } => self.send(index, &to, &message),
@@ -335,14 +330,20 @@ impl World {
             Effect::Lead { epoch, first_round, first } => {
                 assert!(epoch.term <= self.nodes[index].persisted, "led in a term that is not on disk");
                 assert!(self.nodes[index].leadership.is_leading(), "leads before it is told");
-                let owner = self.owners.insert(epoch.clone(), (index, life));
+                let owner = self.owners.insert(epoch.clone(), (index, self.nodes[index].life));
                 assert_eq!(owner, None, "two leaderships share {epoch}");
                 self.led.push((self.now, epoch.clone()));
                 self.history.push(format!("{:>10} µs {epoch} leads", self.now - START));
+                self.nodes[index].resync.lead(epoch.clone());
                 self.begin_to_publish(index, epoch, first_round, first);
+                self.share_all(index);
             }
             Effect::HoldRound => self.nodes[index].rounds.hold(),
-            Effect::StopPublishing { .. } => self.nodes[index].publishing = None,
+            Effect::StopPublishing { .. } => {
+                self.nodes[index].publishing = None;
+                self.nodes[index].resync.step_down();
+            }
+            Effect::SendSnapshot { .. } => self.share_all(index),
             Effect::SetLinks { links } => self.set_links(index, &links),
             Effect::Look => {
                 let node = &self.nodes[index];
@@ -351,10 +352,11 @@ impl World {
                 return Some(Input::Looked { rounds_closed, load_percent: LOAD, members });
             }
             Effect::AskParts => {
-                let after = self.random.between(MS, 20 * MS);
-                self.push(after, Event::Answered { to: index, life });
+                let answers = self.nodes[index].gateway_works;
+                let after = if answers { self.random.between(MS, 20 * MS) } else { 1000 * MS };
+                self.push_to(index, after, Arrival::Answered);
             }
-            Effect::PublishStatus { .. } | Effect::SendSnapshot { .. } | Effect::Log { .. } => {}
+            Effect::PublishStatus { .. } | Effect::Log { .. } => {}
         }
         None
     }
@@ -366,8 +368,8 @@ impl World {
         let Some(machine) = &node.machine else { return };
         let after = machine.next_deadline().since(now).as_micros() as u64 + late;
         node.armed += 1;
-        let event = Event::Timer { to: index, life: node.life, armed: node.armed };
-        self.push(after, event);
+        let armed = node.armed;
+        self.push_to(index, after, Arrival::Timer { armed });
     }
 
     fn send(&mut self, from: usize, to: &NodeName, message: &ElectionMessage) {
@@ -380,67 +382,8 @@ impl World {
         let bytes = message.encode(Encoding::Cbor);
         let copies = if self.random.chance(self.loss_percent / 4) { 2 } else { 1 };
         for _ in 0..copies {
-            let (life, after) = (self.nodes[to].life, self.random.between(200, 3 * MS));
-            self.push(after, Event::Packet { from, to, life, bytes: bytes.clone() });
-        }
-    }
-
-    fn begin_to_publish(&mut self, index: usize, epoch: Epoch, first_round: u64, first: FirstRound) {
-        let node = &mut self.nodes[index];
-        let term = epoch.term;
-        node.publishing = Some((epoch, first_round));
-        node.rounds.start(first, Timestamp(self.now));
-        self.plan_round(index, term);
-    }
-
-    fn plan_round(&mut self, index: usize, term: u64) {
-        let node = &self.nodes[index];
-        let (life, after) = (node.life, node.rounds.deadline().since(Timestamp(self.now)));
-        self.push(after.as_micros() as u64, Event::Publish { to: index, life, term });
-    }
-
-    fn publish(&mut self, index: usize, term: u64) {
-        let node = &mut self.nodes[index];
-        let Some((epoch, next)) = &mut node.publishing else { return };
-        if epoch.term != term {
-            return;
-        }
-        let map = Map { epoch: epoch.clone(), round: *next, fused_at: Timestamp(self.now).shifted(node.steady_clock) };
-        *next += 1;
-        node.rounds.tick(Timestamp(self.now));
-        self.plan_round(index, term);
-        for to in 0..self.nodes.len() {
-            if to != index && self.linked(index, to) {
-                let retry = if self.random.chance(self.loss_percent) { 30 * MS } else { 0 };
-                let (life, after) = (self.nodes[to].life, retry + self.random.between(300, 3 * MS));
-                self.push(after, Event::Map { to, life, map: map.clone() });
-            }
-        }
-        self.accept(index, &map);
-    }
-
-    fn accept(&mut self, to: usize, map: &Map) {
-        let node = &mut self.nodes[to];
-        let received_at = Timestamp(self.now).shifted(node.steady_clock);
-        let Map { epoch, round, fused_at } = map.clone();
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: epoch.leader,
-            epoch: epoch.term,
-            round,
-            fused_at_us: fused_at,
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-            pose_corrections: Default::default(),
-        };
-        let Ok(accepted) = node.filter.accept_map(&map, received_at, &node.leadership) else {
-            node.refused += 1;
-            return;
-        };
-        node.accepted.push(Accepted { at: self.now, round });
-        if accepted.is_sign_of_life {
-            self.handle(to, Input::RoundAccepted { epoch: accepted.epoch, round });
+            let after = self.random.between(200, 3 * MS);
+            self.push_to(to, after, Arrival::Packet { from, bytes: bytes.clone() });
         }
     }
 }

@@ -1,10 +1,10 @@
-//! A clock that does not run while its node is stalled.
+//! A clock that stands still while its node is stalled.
 
 use std::time::Duration;
 
 use crate::time::Timestamp;
 
-/// Turns the caller's `now` into time during which the node was awake.
+/// Clock of the time during which the node was awake, driven by the `now` of its caller.
 ///
 /// A node that was not scheduled, was suspended, or whose clock was set has not listened meanwhile; time that it did
 /// not listen is no silence of others. So time passes only up to the deadline that was planned plus a tolerance, and
@@ -35,7 +35,7 @@ impl AwakeClock {
         self.inside
     }
 
-    /// When `due` inside will be outside.
+    /// The time outside when it will be `due` inside.
     pub fn outside(&self, due: Timestamp) -> Timestamp {
         self.outside + due.since(self.inside)
     }

@@ -1,4 +1,4 @@
-//! Following a leader: hearing it, doubting it, losing it.
+//! Following a leader: its beats, others' evidence, and its loss.
 
 use std::time::Duration;
 
@@ -27,8 +27,7 @@ impl Election {
         }
     }
 
-    /// Asks whether the leader is there: when just a round is late, for which all followers may be waiting, those who
-    /// know best at first.
+    /// Asks about the leader. While just a round is late, which all followers may miss, those who know best are asked first.
     fn doubt(&mut self, now: Timestamp) {
         let State::Following(following) = &mut self.state else { return };
         let first = following.asked_at.is_none();
@@ -80,7 +79,7 @@ impl Election {
         }
     }
 
-    /// Two leaders met. The higher epoch stays, but a leader without followers never unseats one that has some.
+    /// Decides which of two leaders stays: the higher epoch, but never one without followers before one with some.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else { return };
         let own = leading.epoch.clone();
@@ -127,7 +126,7 @@ impl Election {
         self.send_status(&leader, now);
     }
 
-    /// Follows a leader that is known from others only; its own beat makes it complete.
+    /// Follows a leader that is known from others only; its own beat completes it.
     pub(super) fn adopt(&mut self, epoch: Epoch, heard_at: Timestamp, now: Timestamp) {
         let leader = epoch.leader.clone();
         self.epoch = Some(epoch.clone());
@@ -150,7 +149,7 @@ impl Election {
         self.send_status(&beat.epoch.leader, now);
     }
 
-    /// What any message tells about leadership, whatever it says.
+    /// Learns what any message tells about leadership by its sender's epoch.
     pub(super) fn hear_others(&mut self, message: &ElectionMessage, now: Timestamp) {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
@@ -164,7 +163,7 @@ impl Election {
                         *next > ended && next.leader != message.from && next.leader != self.id && !self.is_over(next)
                     });
                     self.close(ended);
-                    // Whom the leader of old follows, its followers follow on its word: none of them need claim.
+                    // Followers of the old leader follow the one that it follows: none of them need claim.
                     match follows {
                         Some(next) => self.adopt(next, now, now),
                         None => self.lose_leader(now),
@@ -221,7 +220,7 @@ impl Election {
         }
     }
 
-    /// What the membership gave up is only doubted here: it may hear less than the leader's beats and others tell.
+    /// Doubts a leader that the membership gave up: it may hear less than the leader's beats and others tell.
     pub(super) fn peer_down(&mut self, peer: &NodeName, now: Timestamp) {
         if let State::Following(following) = &mut self.state
             && following.epoch.leader == *peer

@@ -1,8 +1,8 @@
-//! Handing the lead to a better candidate, make before break.
+//! Handover of the lead to a better candidate, make before break.
 //!
-//! The old leader publishes until it hears that the new one leads. Right after a round it yields, so that there is
-//! nearly a whole period for the few packets it takes; the new leader goes on with the next round. Should every one of
-//! those packets be lost for a period, the old leader publishes that round too, and yields again after it.
+//! The old leader publishes until it hears that the new one leads. It yields right after a round, so that nearly a whole
+//! period is left for the few packets that this takes. The new leader goes on with the next round. If all of these packets
+//! are lost for a period, the old leader publishes that round too, and yields again after it.
 
 use crate::epoch::Epoch;
 use crate::leadership::election::interface::ElectionEffect;
@@ -35,7 +35,7 @@ impl Election {
         self.drive_handover(now);
     }
 
-    /// Repeats what the challenger has to know, or gives the handover up.
+    /// Repeats offers and yields, or gives the handover up.
     pub(super) fn drive_handover(&mut self, now: Timestamp) {
         let limit = self.config.handover();
         let State::Leading(leading) = &mut self.state else { return };

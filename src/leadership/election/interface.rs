@@ -1,11 +1,11 @@
-//! What goes into the election and what comes out.
+//! Inputs and effects of the election.
 
 use crate::epoch::Epoch;
 use crate::leadership::election::message::ElectionMessage;
 use crate::names::NodeName;
 use crate::round::FirstRound;
 
-/// What happened around the node.
+/// Something that happened around the node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum ElectionInput {
     /// An authenticated message arrived.
@@ -38,20 +38,20 @@ pub enum ElectionInput {
         /// The state of the parts.
         health: Health,
     },
-    /// A round was published by this node, or accepted by its gate.
+    /// A round was published by this node, or accepted by its round filter.
     Round {
         /// The epoch it was published in.
         epoch: Epoch,
         /// The round's number.
         round: u64,
     },
-    /// What [`ElectionEffect::Prepare`] asked for is done.
+    /// The preparation that [`ElectionEffect::Prepare`] asked for is complete.
     Prepared,
     /// The node is about to stop: a leader resigns, a follower tells its leader that it is no candidate any more.
     Leave,
 }
 
-/// Whether the parts that a leader needs work.
+/// State of the parts that a leader needs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct Health {
     /// Clients can connect to the broker.
@@ -71,7 +71,7 @@ impl Health {
     }
 }
 
-/// What the actor must do, in the order given.
+/// Something to be done, in the order given.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum ElectionEffect {
     /// Hand a term to the disk. An [`ElectionEffect::Lead`] in it waits for the disk's answer.
@@ -92,7 +92,7 @@ pub enum ElectionEffect {
         epoch: Epoch,
         /// The number of the next round.
         first_round: u64,
-        /// When it is due.
+        /// Time at which it is due.
         first: FirstRound,
     },
     /// Let the present round last its whole length: the next one is the other's unless it stays away for a whole period.

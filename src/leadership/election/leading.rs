@@ -1,4 +1,4 @@
-//! Leading: beating, naming successors, noticing a better candidate.
+//! Leading: beats, successors, and the search for a better candidate.
 
 use std::time::Duration;
 
@@ -17,11 +17,11 @@ pub(super) struct Leading {
     pub(super) since: Timestamp,
     /// The epoch that this one succeeded.
     pub(super) after: Option<Epoch>,
-    /// Who leads next, the standby first.
+    /// The next leaders, the standby first.
     pub(super) successors: Vec<NodeName>,
     /// The handover under way.
     pub(super) handover: Option<Handover>,
-    /// When to lead on in a higher epoch, as this one is refused by some.
+    /// Time at which to lead on in a higher epoch, as some refuse this one.
     renew_at: Option<Timestamp>,
     beat_at: Timestamp,
     beats: u64,
@@ -66,8 +66,8 @@ impl Election {
         }
     }
 
-    /// One of ours knows a later term, or holds this epoch for over. If that is for want of a newer leader rather than
-    /// because one is just taking over, lead on in a term that nobody can refuse.
+    /// Plans to lead on in a term that nobody can refuse: a follower knows a later term, or believes this epoch to have
+    /// ended. A newer leader that is just taking over is heard before.
     pub(super) fn renew_later(&mut self, now: Timestamp) {
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
@@ -93,7 +93,7 @@ impl Election {
         self.send(to, body, now);
     }
 
-    /// How far apart a peer's beats are. One that is better but not yet fit is to be heard soon when it is.
+    /// Time between two beats to a peer. A better candidate that is not yet fit is to be heard soon when it is.
     fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
         let outranks =
             |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.class() < self.candidacy().class();
@@ -109,7 +109,7 @@ impl Election {
         }
     }
 
-    /// Chooses who leads next, and tells all when that changed.
+    /// Chooses the successors, and tells all when they changed.
     pub(super) fn name_successors(&mut self, now: Timestamp) {
         let State::Leading(leading) = &mut self.state else { return };
         let mut next = self.peers.successors(MAX_SUCCESSORS, now);

@@ -18,7 +18,7 @@
 use std::time::Duration;
 
 use crate::epoch::Epoch;
-use crate::leadership::election::config::ElectionConfig;
+use crate::leadership::config::ElectionConfig;
 use crate::leadership::timers::{REGULAR_GAPS, missing, overdue};
 use crate::names::NodeName;
 use crate::round::EARLY_ROUNDS;

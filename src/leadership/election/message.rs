@@ -1,4 +1,4 @@
-//! What the nodes of a cell say to each other about leadership.
+//! Messages of the election, as they travel between the nodes of a cell.
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
@@ -19,7 +19,7 @@ pub const MAX_MESSAGE_BYTES: usize = 1200;
 
 /// One message; may be lost, repeated, delayed and re-ordered on its way.
 ///
-/// Who sent it must be proven by the transport: the election believes [`Self::from`].
+/// The transport must prove the sender: the election believes [`Self::from`].
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct ElectionMessage {
     /// Major version of the message, [`wire::SCHEMA_VERSION`].
@@ -48,12 +48,12 @@ pub struct ElectionMessage {
     /// Whether the sender lately heard the addressee: links may work one way only.
     #[n(6)]
     pub hears_you: bool,
-    /// What it says.
+    /// Its content.
     #[n(7)]
     pub body: Body,
 }
 
-/// What makes a node a better or worse leader.
+/// A node as a candidate: its rank among possible leaders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Candidacy {
     /// The role it was started with.
@@ -130,7 +130,7 @@ pub enum Body {
     /// "I lead": the leader's sign of life.
     #[n(3)]
     Beat {
-        /// When the addressee gets the next one, in ms.
+        /// Time until the addressee gets the next one, in ms.
         #[n(0)]
         every_ms: u64,
         /// The round published last.
@@ -143,7 +143,7 @@ pub enum Body {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[n(3)]
         after: Option<Epoch>,
-        /// Who leads next, the standby first; at most [`MAX_SUCCESSORS`].
+        /// The next leaders, the standby first; at most [`MAX_SUCCESSORS`].
         #[n(4)]
         successors: Vec<NodeName>,
     },
@@ -242,6 +242,40 @@ mod tests {
             assert!(bytes.len() <= MAX_MESSAGE_BYTES, "{}", bytes.len());
             assert_eq!(ElectionMessage::decode(&bytes), Ok(message.clone()));
         }
+    }
+
+    /// Names in the code may change; what is on the wire may not.
+    #[test]
+    fn the_wire_keeps_its_names() {
+        let epoch = || Epoch::new(4, NodeName::from_static("edge"));
+        for (body, expected) in [
+            (Body::Status { over: Some(epoch()) }, r#"{"status":{"over":{"term":4,"leader":"edge"}}}"#),
+            (Body::Ask { ask: 7 }, r#"{"ask":{"ask":7}}"#),
+            (Body::LeaderEvidence { ask: 7, age_ms: 12 }, r#"{"vouch":{"ask":7,"age_ms":12}}"#),
+            (
+                Body::Beat { every_ms: 50, round: 88, followers: 3, after: None, successors: Vec::new() },
+                r#"{"beat":{"every_ms":50,"round":88,"followers":3,"successors":[]}}"#,
+            ),
+            (Body::Offer, r#""offer""#),
+            (Body::Ready, r#""ready""#),
+            (Body::Yield { last_round: 88 }, r#"{"yield":{"last_round":88}}"#),
+            (
+                Body::Resign { epoch: epoch(), last_round: 88 },
+                r#"{"resign":{"epoch":{"term":4,"leader":"edge"},"last_round":88}}"#,
+            ),
+        ] {
+            let message = ElectionMessage { body, ..beat(4, "edge") };
+            let json = String::from_utf8(message.encode(Encoding::Json)).unwrap();
+            let envelope = concat!(
+                r#"{"schema":1,"from":"edge","run":1732154400000000,"seq":9,"#,
+                r#""standing":{"role":"edge","priority":100,"load":1,"fit":true},"#,
+                r#""term":4,"epoch":{"term":4,"leader":"edge"},"hears_you":true,"body":"#,
+            );
+            assert_eq!(json, format!("{envelope}{expected}}}"));
+        }
+        let compact = ElectionMessage { body: Body::LeaderEvidence { ask: 7, age_ms: 12 }, ..beat(4, "edge") };
+        let compact: String = compact.encode(Encoding::Compact).iter().map(|byte| format!("{byte:02x}")).collect();
+        assert_eq!(compact, "");
     }
 
     #[test]

@@ -1,17 +1,17 @@
-//! What a node knows of the others, and who of them would lead.
+//! The other nodes as this one knows them, and their rank as candidates.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::epoch::Epoch;
-use crate::leadership::election::config::ElectionConfig;
+use crate::leadership::config::ElectionConfig;
 use crate::leadership::election::message::{Candidacy, ElectionMessage};
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::Role;
 
-/// What is worth a handover: edge before auto, then the higher priority.
+/// Rank that is worth a handover: edge before auto, then the higher priority.
 pub(super) type Class = (bool, Reverse<u8>);
 
 impl Candidacy {
@@ -28,18 +28,18 @@ impl Candidacy {
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Peer {
     pub(super) candidacy: Option<Candidacy>,
-    /// The epoch it said to follow or lead.
+    /// Epoch that it follows or leads, by its own message.
     pub(super) epoch: Option<Epoch>,
     /// Whether our last message to it said that we hear it.
     pub(super) told: bool,
     run: u64,
     seq: u64,
     heard_at: Option<Timestamp>,
-    /// Since when it has been heard without a gap, fit, and of one class.
+    /// Time since when it has been heard without a gap, fit, and of one class.
     fit_since: Option<Timestamp>,
-    /// Until when it counts as gone although messages of its may still be on their way.
+    /// Time until which it counts as gone although its messages may still be under way.
     gone_until: Option<Timestamp>,
-    /// When the membership gave it up, if it was not heard since.
+    /// Time at which the membership gave it up, if it was not heard since.
     given_up_at: Option<Timestamp>,
 }
 
@@ -51,7 +51,7 @@ pub(super) struct Peers {
     response_timeout: Duration,
     given_up_timeout: Duration,
     standby_silence: Duration,
-    /// When to look for peers that were given up and not heard since.
+    /// Time of the next look for peers that were given up and not heard since.
     forget_at: Option<Timestamp>,
 }
 
@@ -188,8 +188,8 @@ impl Peers {
             .filter_map(|(name, peer)| Some((name, peer.candidacy?)))
     }
 
-    /// The leader's successors: heard lately and fit, the best first. Who was given up has to have been heard within
-    /// the beats that a standby may miss: the membership may hear less than the election does.
+    /// The leader's successors: heard lately and fit, the best first. The membership may hear less than the election does.
+    /// So a peer that it gave up remains a successor if it was heard within the beats that a standby may miss.
     pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
         let silence = self.standby_silence;
         let given_up = |name: &NodeName| {
@@ -204,10 +204,9 @@ impl Peers {
 
     /// The best peer that has been fit for `stable` and should have the lead of `leader` with `candidacy`.
     ///
-    /// Load never takes the lead from a living leader: leading is load, and moving for it would swing. It is only
-    /// respected: among equals the lesser name is handed the lead unless it is busier, once the leader has led `since`
-    /// long enough to know that nobody better is there. A better one that has stood most of its trial is waited for: the
-    /// lead would move twice.
+    /// Load never takes the lead from a living leader: leading is load, so the lead would swing. Among equals the lesser
+    /// name is handed the lead unless it is busier, once the leader has led `since` long enough to know that nobody better
+    /// is there. Waits for a better candidate that is more than halfway through `stable`; otherwise the lead moves twice.
     pub(super) fn challenger(
         &self,
         (leader, candidacy): (&NodeName, Candidacy),

@@ -15,14 +15,14 @@ use crate::time::Timestamp;
 /// A node that knows of no leader.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Seeking {
-    /// When the first in turn may claim.
+    /// Time at which the first in turn may claim.
     since: Timestamp,
     /// The successors named by the lost leader; others come after them.
     order: Vec<NodeName>,
-    /// When the leader's sign of life was first asked for in vain.
+    /// Time of the first question about the lost leader that nobody answered.
     asked_at: Option<Timestamp>,
     ask_at: Timestamp,
-    /// Word of the lost leader must be newer than this to bring it back.
+    /// Evidence of the lost leader must be newer than this to bring it back.
     pub(super) known_until: Timestamp,
 }
 
@@ -32,7 +32,7 @@ impl Seeking {
     }
 }
 
-/// The questions asked lately, so that an answer can be dated from when it was asked for, not from when it came.
+/// The latest questions. Evidence is dated from the question that it answers, so stale evidence cannot circulate.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Questions {
     count: u64,
@@ -84,7 +84,7 @@ impl Election {
             State::Following(following) => (following.evidence_at() + self.config.beat(), following.asked_at),
             State::Seeking(_) | State::Leading(_) => (now, None),
         };
-        // Whoever is first in turn is heard before everyone has to ask.
+        // The first in turn is heard before everyone has to ask.
         let ask_at = now + self.config.answer_time();
         self.state = State::Seeking(Seeking { known_until, asked_at, ..Seeking::new(since, order, ask_at) });
     }
@@ -105,7 +105,7 @@ impl Election {
         }
     }
 
-    /// Answers who leads and how lately it was heard.
+    /// Answers a question about the leader: how long ago this node heard it.
     pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
         match &self.state {
             State::Leading(_) => self.send_beat(from, now),
@@ -145,7 +145,7 @@ impl Election {
         }
     }
 
-    /// Takes the lead in a term never used, succeeding `after`, and says so to all.
+    /// Takes the lead in an unused term, succeeding `after`, and tells all.
     pub(super) fn lead(&mut self, after: Option<Epoch>, now: Timestamp) {
         let term = self.terms.seen.max(self.terms.found) + 1;
         self.persist(term);
@@ -175,9 +175,9 @@ impl Election {
         self.send_all(&Body::Resign { epoch, last_round: self.round }, now);
     }
 
-    /// When it is this node's turn to claim; `None` when it may not lead.
+    /// Time of this node's turn to claim; `None` when it may not lead.
     ///
-    /// Whoever did not answer when the leader was doubted is as much out of reach as the leader, and waited for no
+    /// A node that did not answer when the leader was doubted is as much out of reach as the leader. It is waited for no
     /// longer than an answer takes.
     fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
         let turn = |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
@@ -186,7 +186,7 @@ impl Election {
         self.candidacy().may_lead().then(|| among_present.map_or(in_order, |at| at.min(in_order)))
     }
 
-    /// How many would claim before this node, of those heard at `since` or later if it is given.
+    /// Number of nodes that would claim before this one, of those heard at `since` or later if it is given.
     ///
     /// The successors come first, in the order in which the lost leader named them: it heard them all, whereas what a
     /// follower knows of others may be as old as their first greeting.

@@ -18,13 +18,13 @@ use crate::wire::{NodeStatus, Role};
 pub struct NodeSettings {
     /// Timings, role and priority.
     pub election: ElectionConfig,
-    /// Which brokers carry the data.
+    /// Brokers that carry the data.
     pub plane: DataPlane,
     /// Longest time between two rounds.
     pub round_period: Duration,
     /// Whether the node keeps reputations, and so waits for evidence before it is handed the lead.
     pub keeps_reputations: bool,
-    /// What the node says about itself; state, epoch, aggregator and fitness follow the election.
+    /// The node's own status; state, epoch, aggregator and fitness follow the election.
     pub status: NodeStatus,
 }
 
@@ -155,7 +155,7 @@ pub enum Effect {
         epoch: Epoch,
         /// Number of the next round.
         first_round: u64,
-        /// When it is due.
+        /// Time at which it is due.
         first: FirstRound,
     },
     /// Let the present round last its whole length: another node is about to lead from the next one on.
@@ -186,7 +186,7 @@ pub enum Effect {
     AskParts,
     /// Write to the log.
     Log {
-        /// What happened.
+        /// The event.
         notice: Notice,
     },
 }

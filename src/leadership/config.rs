@@ -11,7 +11,7 @@ use crate::wire::Role;
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ElectionConfig {
-    /// What the node is meant to do; the `role` of the node, no key of this table. Default `auto`.
+    /// Role for which the node is meant; the `role` of the node, no key of this table. Default `auto`.
     #[serde(skip)]
     pub role: Role,
     /// Preference among nodes of one role, higher leads first. Default 100.
