@@ -119,7 +119,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     };
     let runs_on = matches!(&cli.command, None | Some(Command::Record(_)));
     let _export = logging::start(cli.log_format, runs_on, level);
-    let outcome = match cli.command {
+    match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
