@@ -222,8 +222,8 @@ impl Cell {
             }
             Effect::Look => {
                 let members = (0..nodes).filter(|peer| *peer != index).map(member).collect();
-                let rounds_closed = node.clock.micros() / 100_000;
-                return Some(Input::Looked { rounds_closed, load_percent: 0, members });
+                let rounds_due = node.clock.micros() / 100_000;
+                return Some(Input::Looked { rounds_due, load_percent: 0, members });
             }
             Effect::AskParts => {
                 let links = [(broker(index).into(), LinkState::Up)].into();

@@ -46,7 +46,9 @@ pub(crate) struct Vehicle {
     pub(crate) ledger: ReputationLedger,
     /// The other vehicles.
     pub(crate) members: BTreeMap<NodeName, Member>,
-    rounds_closed: u64,
+    rounds_due: u64,
+    /// Time of the fuser's next timer; it may be early.
+    alarm: Timestamp,
     /// The last map that it accepted.
     pub(crate) map: Option<GlobalMap>,
     /// Votes that it settled in each of its leaderships.
@@ -85,7 +87,8 @@ impl Vehicle {
             aggregator: Aggregator::new_standby(fusion, landmarks, now),
             ledger: ReputationLedger::default(),
             members: BTreeMap::new(),
-            rounds_closed: 0,
+            rounds_due: 0,
+            alarm: now,
             map: None,
             settled: BTreeMap::new(),
             outbox: Vec::new(),
@@ -123,10 +126,14 @@ impl Vehicle {
             let shares = self.resync.tick(&self.ledger, &self.leadership, now);
             self.share(shares);
         }
-        if now >= self.aggregator.deadline() {
-            self.rounds_closed += 1;
+        self.alarm = self.alarm.min(self.aggregator.deadline());
+        if now < self.alarm {
+            return Ok(());
         }
-        self.aggregator.tick(now).map_or(Ok(()), |fused| self.publish(fused, now))
+        self.rounds_due += 1;
+        let fused = self.aggregator.tick(now);
+        self.alarm = self.aggregator.deadline();
+        fused.map_or(Ok(()), |fused| self.publish(fused, now))
     }
 
     pub(crate) fn receive(&mut self, from: &NodeName, payload: &Payload, now: Timestamp) -> anyhow::Result<()> {
@@ -224,7 +231,7 @@ impl Vehicle {
             Effect::SendSnapshot { .. } => self.share(self.resync.snapshot(&self.ledger)),
             Effect::Look => {
                 let members = self.members.values().cloned().collect();
-                return Some(Input::Looked { rounds_closed: self.rounds_closed, load_percent: 0, members });
+                return Some(Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members });
             }
             Effect::AskParts => {
                 let links = [(broker(self.index).into(), LinkState::Up)].into();

@@ -1,6 +1,6 @@
 //! Health of a node's own parts: whether they are fit to lead.
 //!
-//! The parts are looked at every [`HEALTH_PERIOD`]. A look shows at once how many rounds the fuser has closed and how busy
+//! The parts are looked at every [`HEALTH_PERIOD`]. A look shows at once whether the fuser's rounds fall due and how busy
 //! the machine is; broker and gateway answer later. A stop of the whole node is no fault of its parts.
 
 use std::collections::BTreeMap;
@@ -21,8 +21,8 @@ pub struct HealthMonitor {
     /// Time that passed while this node was awake.
     clock: AwakeClock,
     look_at: Timestamp,
-    rounds_closed: u64,
-    round_closed_at: Option<Timestamp>,
+    rounds_due: u64,
+    round_due_at: Option<Timestamp>,
     load_percent: u8,
 }
 
@@ -45,8 +45,8 @@ impl HealthMonitor {
             sample: HealthSample::default(),
             clock: AwakeClock::new(now, LOOK_TOLERANCE),
             look_at: now,
-            rounds_closed: 0,
-            round_closed_at: None,
+            rounds_due: 0,
+            round_due_at: None,
             load_percent: 0,
         }
     }
@@ -104,13 +104,13 @@ impl HealthMonitor {
         self.sample = sample;
     }
 
-    /// Notes a look: the number of rounds closed so far, and the processor load in percent.
-    pub fn note_look(&mut self, rounds_closed: u64, load_percent: u8, now: Timestamp) {
+    /// Notes a look: the number of times so far that a round was due, and the processor load in percent.
+    pub fn note_look(&mut self, rounds_due: u64, load_percent: u8, now: Timestamp) {
         let due = self.clock.now() + HEALTH_PERIOD;
         let now = self.clock.advance(now, due);
-        if rounds_closed != self.rounds_closed {
-            self.rounds_closed = rounds_closed;
-            self.round_closed_at = Some(now);
+        if rounds_due != self.rounds_due {
+            self.rounds_due = rounds_due;
+            self.round_due_at = Some(now);
         }
         self.load_percent = load_percent;
     }
@@ -121,7 +121,7 @@ impl HealthMonitor {
         let external = self.is_up(plane.external.as_ref(), no_other);
         let embedded = plane.embedded && self.sample.broker_serves;
         let timeout = round_timeout(round_period);
-        let closes_rounds = self.round_closed_at.is_some_and(|at| self.clock.now().since(at) < timeout);
+        let closes_rounds = self.round_due_at.is_some_and(|at| self.clock.now().since(at) < timeout);
         Health {
             broker: external || embedded,
             fuser: self.sample.fuser_runs && closes_rounds,

@@ -169,8 +169,8 @@ impl LeadershipNode {
                     preparation.has_evidence = true;
                 }
             }
-            Input::Looked { rounds_closed, load_percent, members } => {
-                self.take_look(rounds_closed, load_percent, members, now);
+            Input::Looked { rounds_due, load_percent, members } => {
+                self.take_look(rounds_due, load_percent, members, now);
             }
             Input::PartsAnswered { sample } => {
                 self.monitor.note_sample(sample);
@@ -286,9 +286,9 @@ impl LeadershipNode {
 
     /// Notes a look. The list of members makes up for events from before the start, and for members that a restarted
     /// membership lost without a word.
-    fn take_look(&mut self, rounds_closed: u64, load_percent: u8, members: Vec<Member>, now: Timestamp) {
+    fn take_look(&mut self, rounds_due: u64, load_percent: u8, members: Vec<Member>, now: Timestamp) {
         if !self.is_vehicle_only {
-            self.monitor.note_look(rounds_closed, load_percent, now);
+            self.monitor.note_look(rounds_due, load_percent, now);
             self.update_health(now);
         }
         for name in self.members.long_missing(&members, now) {

@@ -255,11 +255,11 @@ impl Node {
 
     /// Lets the fuser stop, or close rounds again.
     pub(crate) fn set_fuser(&mut self, works: bool, now: u64) {
-        (self.closed, self.fuser_works) = ((self.rounds_closed(now), now), works);
+        (self.closed, self.fuser_works) = ((self.rounds_due(now), now), works);
     }
 
     /// Rounds that the fuser has closed by `now`, published or not.
-    pub(crate) fn rounds_closed(&self, now: u64) -> u64 {
+    pub(crate) fn rounds_due(&self, now: u64) -> u64 {
         let (closed, since) = self.closed;
         if self.fuser_works { closed + (now - since) / 100_000 } else { closed }
     }

@@ -348,8 +348,8 @@ impl World {
             Effect::Look => {
                 let node = &self.nodes[index];
                 let members = node.members.iter().map(|(about, run)| self.member(*about, *run)).collect();
-                let rounds_closed = node.rounds_closed(self.now);
-                return Some(Input::Looked { rounds_closed, load_percent: LOAD, members });
+                let rounds_due = node.rounds_due(self.now);
+                return Some(Input::Looked { rounds_due, load_percent: LOAD, members });
             }
             Effect::AskParts => {
                 let answers = self.nodes[index].gateway_works;

@@ -104,8 +104,8 @@ pub enum Input {
     },
     /// The answer to [`Effect::Look`], at once.
     Looked {
-        /// Rounds that the fuser has closed so far.
-        rounds_closed: u64,
+        /// Number of times so far that the fuser found its round due: its timer runs.
+        rounds_due: u64,
         /// Processor load of the machine, 0 to 100 %.
         load_percent: u8,
         /// All nodes that the membership knows.

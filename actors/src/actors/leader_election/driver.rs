@@ -137,7 +137,7 @@ impl ElectionDriver {
             }
             Effect::Look => {
                 return Some(Input::Looked {
-                    rounds_closed: self.counters.events(Event::RoundDue),
+                    rounds_due: self.counters.events(Event::RoundDue),
                     load_percent: probe::load_percent().unwrap_or(0),
                     members: self.members.borrow().iter().map(as_seen).collect(),
                 });
