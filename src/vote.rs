@@ -33,11 +33,11 @@ pub use config::{MAX_LABELS, PaperConfig, VoteConfig, VoteMode, WeightedConfig};
 pub use paper::REPUTATION_RANGE;
 pub use visibility::{paper as paper_visibility, weighted as weighted_visibility};
 
-use crate::geometry::Pose;
-use crate::landmark::Landmark;
-use crate::names::{LandmarkId, NodeName};
+use crate::model::geometry::Pose;
+use crate::model::names::{LandmarkId, NodeName};
+use crate::model::time::Timestamp;
+use crate::perception::landmark::Landmark;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict};
 use method::{Method, NewVote};
 
@@ -61,7 +61,7 @@ struct LastReport {
 }
 
 /// Largest step back in time of an overtaken report; a larger one means that the vehicle's clock was set back.
-/// [`crate::window::ReportWindow`] admits reports for as long by default.
+/// [`crate::admission::report_window::ReportWindow`] admits reports for as long by default.
 const MAX_OVERTAKEN: Duration = Duration::from_secs(3);
 /// Silence after which a vehicle may be forgotten for another: unproven vehicles, proven vehicles.
 const RETENTION: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(600)];

@@ -82,7 +82,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 mod tests {
     use std::net::{TcpListener, UdpSocket};
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use ecod::wire::Role;
 
     use super::*;

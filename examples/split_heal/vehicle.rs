@@ -7,8 +7,6 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
-use ecod::epoch::Epoch;
-use ecod::landmark::Landmark;
 use ecod::leadership::Leadership;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
@@ -16,9 +14,11 @@ use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
 use ecod::leadership::round_filter::RoundFilter;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::Landmark;
 use ecod::reputation::ReputationLedger;
-use ecod::time::Timestamp;
 use ecod::wire::{
     Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, ReportKind, Role, decode, decode_report,
     decode_share, encode,

@@ -55,16 +55,15 @@ mod message;
 mod peers;
 mod seeking;
 
-use crate::epoch::Epoch;
-use crate::names::NodeName;
-use crate::time::Timestamp;
-use crate::wire::SCHEMA_VERSION;
-
 pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
 pub use interface::{ElectionEffect, ElectionInput, Health};
 pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM};
 
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+use crate::wire::SCHEMA_VERSION;
 use leading::Leading;
 use liveness::Following;
 use peers::Peers;

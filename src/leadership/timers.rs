@@ -28,7 +28,7 @@
 //! | [`PART_TIMEOUT`] | 2 s and three rounds | above [`ECHO_TIMEOUT`] | a stalled broker is found by its missing echo |
 //! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part as long as two looks |
 //! | [`ECHO_TIMEOUT`] | 800 ms | above [`MIN_UNANSWERED`] rounds | both conditions hold at about the same time |
-//! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::round::CONNECT_TIME`] | a planned handover waits for everybody |
+//! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::aggregator::round::CONNECT_TIME`] | a planned handover waits for everybody |
 //! | [`LEDGER_TIMEOUT`] | 1 s | above [`VEHICLE_CONNECT_TIME`], below `handover` | a lost ledger delays a handover and does not end it |
 //! | [`PREPARATION_STEP`] | 50 ms | below [`VEHICLE_CONNECT_TIME`] | it delays a handover by little |
 //! | [`LATE_WAKE`] | 20 ms | below `stall_ms` | messages are read before lateness stops the clock |
@@ -208,7 +208,7 @@ impl ElectionConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::round::{CONNECT_TIME, RoundConfig};
+    use crate::aggregator::round::{CONNECT_TIME, RoundConfig};
 
     /// Every line of the table above.
     #[test]

@@ -5,9 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::config::{VoteConfig, VoteMode};
 use super::paper::PaperVoting;
 use super::weighted::WeightedVoting;
-use crate::names::{Label, LandmarkId, NodeName};
+use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
 
 /// A vote before it is counted.

@@ -3,12 +3,12 @@
 //! A node publishes on every link that it keeps. Each broker passes on what its rule lets through, to all nodes that are
 //! linked to it: so rounds come twice, late, or from two leaders at once.
 
-use ecod::epoch::Epoch;
+use ecod::aggregator::round::FirstRound;
 use ecod::leadership::links::{LinkState, WantedLinks};
 use ecod::leadership::node::Input;
 use ecod::leadership::timers::{EPOCH_MEMORY, MAX_ROUND_AGE};
-use ecod::round::FirstRound;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, LedgerShare, SCHEMA_VERSION};
 
 use crate::node::{Accepted, Arrival, Map, address_of};

@@ -10,7 +10,7 @@
 
 use std::sync::Arc;
 
-use ecod::detection::Detection;
+use ecod::model::detection::Detection;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::Semaphore;
 use tokio::task::{JoinHandle, spawn_blocking};

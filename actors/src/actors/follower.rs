@@ -17,7 +17,7 @@ use std::sync::Arc;
 use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::{AcceptedRound, Refusal, RoundFilter};
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;

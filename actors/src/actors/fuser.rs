@@ -16,12 +16,12 @@ mod tests;
 
 use std::sync::Arc;
 
+use ecod::aggregator::round::FirstRound;
 use ecod::aggregator::{Aggregator, Command, Fused};
-use ecod::epoch::Epoch;
 use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::replay::JournalEvent;
-use ecod::round::FirstRound;
-use ecod::time::Timestamp;
 use ecod::tracking::TracksLosses;
 use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};

@@ -20,7 +20,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, NodeState, NodeStatus, Payload, Topic, Topics, encode};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tracing::Span;
@@ -113,7 +113,8 @@ impl Actor for Gateway {
             GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
-                publishing().in_scope(|| state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient));
+                publishing()
+                    .in_scope(|| state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient));
                 inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {

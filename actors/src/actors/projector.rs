@@ -13,9 +13,9 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::aggregator::Algorithms;
-use ecod::detection::Detection;
-use ecod::pose_history::PoseHistory;
-use ecod::time::Timestamp;
+use ecod::model::detection::Detection;
+use ecod::model::time::Timestamp;
+use ecod::perception::pose_history::PoseHistory;
 use ecod::wire::ObjectReport;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::JoinSet;

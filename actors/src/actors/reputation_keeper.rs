@@ -16,11 +16,11 @@ mod config;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ecod::epoch::Epoch;
 use ecod::leadership::Leadership;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::timers::DISK_TIMEOUT;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig};
 use ecod::wire::{LedgerShare, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use ecod::camera::Intrinsics;
+use ecod::perception::camera::Intrinsics;
 use opencv::core::{Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector};
 use opencv::{calib3d, imgcodecs, imgproc};
 use serde::{Deserialize, Serialize};

@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use ecod::camera::{Intrinsics, Mount};
 use ecod::config::{ConfigError, check_range};
-use ecod::projection::ProjectionConfig;
-use ecod::view::ViewConfig;
+use ecod::perception::camera::{Intrinsics, Mount};
+use ecod::perception::projection::ProjectionConfig;
+use ecod::perception::view::ViewConfig;
 use serde::{Deserialize, Serialize};
 
 use super::calibrate::{Calibration, CalibrationError};

@@ -1,6 +1,6 @@
 //! Where a square target stands before the camera, from its four corners.
 
-use ecod::camera::Intrinsics;
+use ecod::perception::camera::Intrinsics;
 use nalgebra::{Point2, Point3};
 use opencv::calib3d::{self, SolvePnPMethod};
 use opencv::core::{Mat, MatTraitConstManual, Matx33d, Point2d, Point3d, Vector};
@@ -20,7 +20,7 @@ pub enum CornerPoseError {
 
 /// The middle of a square target in the camera frame, in metres: x right, y down, z along the axis.
 ///
-/// `corners` are undistorted pixels in the order of [`ecod::detection::Detection::corners`]; `side_m` is the length of
+/// `corners` are undistorted pixels in the order of [`ecod::model::detection::Detection::corners`]; `side_m` is the length of
 /// the side between them. Of the two poses that infinitesimal plane-based pose estimation finds (Collins and Bartoli
 /// 2014, OpenCV's `SOLVEPNP_IPPE_SQUARE`), the one with the smaller reprojection error that faces the camera is taken.
 ///

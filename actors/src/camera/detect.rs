@@ -5,7 +5,7 @@ mod config;
 pub mod placard;
 pub mod recorded;
 
-use ecod::detection::Detection;
+use ecod::model::detection::Detection;
 
 pub use config::{CustomDetector, DetectorConfig};
 

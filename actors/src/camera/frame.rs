@@ -1,6 +1,6 @@
 //! A camera image with the time it was taken.
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use opencv::core::Mat;
 
 /// One image of one camera.

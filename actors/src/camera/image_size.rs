@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use ecod::camera::Intrinsics;
-use ecod::detection::Detection;
+use ecod::model::detection::Detection;
+use ecod::perception::camera::Intrinsics;
 use opencv::core::{Mat, MatTraitConst};
 
 /// Width and height in pixels.
@@ -80,7 +80,7 @@ impl fmt::Display for ImageSize {
 
 #[cfg(test)]
 mod tests {
-    use ecod::detection::BoundingBox;
+    use ecod::model::detection::BoundingBox;
     use nalgebra::Point2;
 
     use super::*;

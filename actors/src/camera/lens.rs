@@ -1,7 +1,7 @@
 //! A camera's intrinsics with the distortion of its lens, and the removal of that distortion from detections.
 
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::perception::camera::Intrinsics;
 use nalgebra::Point2;
 use opencv::calib3d;
 use opencv::core::{Mat, Matx33d, Point2d, Vector};

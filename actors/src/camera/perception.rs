@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::sync::Arc;
 
-use ecod::camera::Mount;
-use ecod::detection::Detection;
-use ecod::geometry::Pose;
-use ecod::landmark::{LandmarkGate, LandmarkIndex};
-use ecod::names::NodeName;
-use ecod::projection::{Projection, ProjectionConfig, Ranging};
-use ecod::time::Timestamp;
-use ecod::view::{ViewConfig, landmarks_in_view};
+use ecod::model::detection::Detection;
+use ecod::model::geometry::Pose;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::camera::Mount;
+use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
+use ecod::perception::projection::{Projection, ProjectionConfig, Ranging};
+use ecod::perception::view::{ViewConfig, landmarks_in_view};
 use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
 
@@ -141,9 +141,9 @@ impl Perception {
 
 #[cfg(test)]
 mod tests {
-    use ecod::camera::Intrinsics;
-    use ecod::detection::BoundingBox;
-    use ecod::projection::{ObjectSize, ObjectSizes};
+    use ecod::model::detection::BoundingBox;
+    use ecod::perception::camera::Intrinsics;
+    use ecod::perception::projection::{ObjectSize, ObjectSizes};
 
     use super::*;
 

@@ -3,8 +3,8 @@
 use std::net::SocketAddr;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::geometry::Pose;
-use ecod::time::Timestamp;
+use ecod::model::geometry::Pose;
+use ecod::model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 
 /// The vehicle's pose in the cell's east-north frame; `[pose]` in the configuration file.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 
 use super::Failure;
 use crate::observe::recorder::{LogError, LogReader};

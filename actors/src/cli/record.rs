@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 
 use super::Failure;
 use super::run::{ObserverArguments, run_node};

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 #[cfg(feature = "camera")]
 use ecod::wire::Role;
 use serde::Serialize;

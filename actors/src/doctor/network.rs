@@ -4,7 +4,7 @@ use std::io;
 use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use tokio::time::timeout;
 
 use super::Finding;

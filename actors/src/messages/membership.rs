@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use bytes::Bytes;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ractor::RpcReplyPort;
 
 /// Requests to the membership.

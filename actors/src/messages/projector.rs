@@ -1,8 +1,8 @@
 //! Messages to the actor of this name.
 
-use ecod::detection::Detection;
-use ecod::geometry::Pose;
-use ecod::time::Timestamp;
+use ecod::model::detection::Detection;
+use ecod::model::geometry::Pose;
+use ecod::model::time::Timestamp;
 
 /// What the projector is asked to do.
 #[derive(Debug)]

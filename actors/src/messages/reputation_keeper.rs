@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
 use ecod::reputation::Evidence;
 use ecod::wire::Reputation;
 

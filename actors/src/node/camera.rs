@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::Algorithms;
-use ecod::landmark::LandmarkIndex;
+use ecod::perception::landmark::LandmarkIndex;
 
 use crate::actors::detector::DetectorArguments;
 use crate::camera::image_size::ImageSize;
@@ -30,7 +30,7 @@ pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let gate = config.fusion.pace.gate();
     let vehicle_camera = VehicleCamera {
-        node: config.name.clone().unwrap_or(ecod::names::NodeName::from_static("node")),
+        node: config.name.clone().unwrap_or(ecod::model::names::NodeName::from_static("node")),
         pose: config.pose.pose(),
         mount: camera.mount.into(),
         lens: camera.optics.lens().context("key `camera.optics.calibration`")?,

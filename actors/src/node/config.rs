@@ -9,9 +9,9 @@ use std::path::PathBuf;
 
 use ecod::aggregator::FusionConfig;
 use ecod::config::ConfigError;
-use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::leadership::election::ElectionConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::{Landmark, LandmarkConfig};
 use ecod::wire::Role;
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};

@@ -11,10 +11,10 @@ use std::collections::BTreeMap;
 use std::fmt::Debug;
 use std::path::Path;
 
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::replay::FusedLine;
-use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, ReportKind, Reputations, Verdicts};
 
 pub use page::{drawing, section, table};

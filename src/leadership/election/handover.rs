@@ -4,12 +4,12 @@
 //! period is left for the few packets that this takes. The new leader goes on with the next round. If all of these packets
 //! are lost for a period, the old leader publishes that round too, and yields again after it.
 
-use crate::epoch::Epoch;
 use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::message::{Body, MAX_TERM};
 use crate::leadership::election::{Election, State};
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// A handover as the old leader sees it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

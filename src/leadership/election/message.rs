@@ -4,8 +4,8 @@ use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::epoch::Epoch;
-use crate::names::NodeName;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
 use crate::wire::{self, Encoding, Limits, RejectReason, Role};
 
 /// Most successors that a leader names, the standby first.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use ecod::aggregator::FusionConfig;
 use ecod::leadership::{Leadership, Position};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::SCHEMA_VERSION;
 
 use super::*;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
 use ecod::wire::{LedgerEntry, LedgerMark, Reputation, SCHEMA_VERSION};
 use serde::{Deserialize, Serialize};

@@ -3,7 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 
 use ecod::leadership::Position;
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::LedgerEntry;
 
 use super::*;

@@ -8,7 +8,7 @@ mod labels;
 use std::path::PathBuf;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::detection::{BoundingBox, Detection};
+use ecod::model::detection::{BoundingBox, Detection};
 use opencv::core::{CV_8UC1, CV_8UC3, CV_32F, Mat, Rect, Rect2d, Scalar, Size, Vector};
 use opencv::dnn::{self, Net};
 use opencv::imgproc;

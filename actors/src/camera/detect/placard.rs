@@ -4,8 +4,8 @@
 //! pass, so that no code is read twice and later passes only search for what is still missing.
 
 use ecod::config::{ConfigError, check_range};
-use ecod::detection::{BoundingBox, Detection};
-use ecod::names::{Label, MAX_NAME_BYTES};
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::names::{Label, MAX_NAME_BYTES};
 use nalgebra::Point2;
 use opencv::core::{CV_8UC1, CV_8UC3, Mat, Point, Scalar, Size, Vector};
 use opencv::imgproc;

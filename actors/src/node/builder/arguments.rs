@@ -4,11 +4,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
-use ecod::epoch::Epoch;
-use ecod::landmark::Landmark;
 use ecod::leadership::Position;
 use ecod::leadership::election::ElectionConfig;
 use ecod::leadership::node::{Input, NodeSettings};
+use ecod::model::epoch::Epoch;
+use ecod::perception::landmark::Landmark;
 use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
@@ -287,10 +287,10 @@ impl NodeBuilder {
 
 #[cfg(test)]
 mod tests {
-    use ecod::time::Timestamp;
+    use ecod::model::time::Timestamp;
     use ecod::wire::{GlobalMap, Role, SCHEMA_VERSION};
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use tokio::sync::watch;
 
     use super::*;

@@ -12,7 +12,7 @@ use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use futures_util::stream;
 
 use super::access::{AccessDecision, AccessPolicy, HEADERS};

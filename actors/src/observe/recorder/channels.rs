@@ -6,11 +6,11 @@
 
 use std::collections::BTreeMap;
 
-use ecod::epoch::Epoch;
 use ecod::leadership::{Leadership, Position};
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::replay::JournalEntry;
-use ecod::time::Timestamp;
 use schemars::{JsonSchema, Schema};
 use serde::{Deserialize, Serialize};
 

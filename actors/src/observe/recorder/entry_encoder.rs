@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 
 use base64::prelude::{BASE64_STANDARD, Engine};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::replay::{JournalEntry, JournalEvent};
-use ecod::time::Timestamp;
 use ecod::wire::{ObjectReport, ReportKind, Topic};
 use mcap::McapResult;
 use serde::Serialize;

@@ -6,7 +6,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, McapResult, WriteOptions, Writer};
 
@@ -114,7 +114,7 @@ fn nanoseconds(at: Timestamp) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use uuid::Uuid;
 
     use super::*;

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use ecod::aggregator::FusionConfig;
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use uuid::Uuid;
 
 /// Who wrote a log.

@@ -4,10 +4,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
-use ecod::epoch::Epoch;
 use ecod::leadership::Leadership;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::replay::JournalEvent;
-use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
 
 use crate::telemetry::counters::{CounterSnapshot, Counters, Event};

@@ -204,9 +204,9 @@ mod tests {
     use std::sync::Arc;
     use std::sync::mpsc::sync_channel;
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
+    use ecod::model::time::Timestamp;
     use ecod::replay::JournalEntry;
-    use ecod::time::Timestamp;
     use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
     use uuid::Uuid;
 

@@ -87,8 +87,8 @@ fn counts(reading: &CounterReading) -> impl Iterator<Item = (&str, u64)> {
 
 #[cfg(test)]
 mod tests {
-    use ecod::names::NodeName;
-    use ecod::time::Timestamp;
+    use ecod::model::names::NodeName;
+    use ecod::model::time::Timestamp;
 
     use super::*;
 

@@ -3,7 +3,7 @@
 use std::fmt::{Display, Write};
 
 use chrono::DateTime;
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
 use super::plot::{Axis, Curve, Plot, bars, class};
 use super::series::{distribution, quantile};
@@ -135,12 +135,12 @@ fn reputations(report: &Report) -> String {
         return section("Reputations", "None were published: the cell does not run VOTE, or nobody voted.", "");
     }
     let start = report.first.unwrap_or_default();
-    let curve = |(node, samples): (&ecod::names::NodeName, &super::Samples)| Curve {
+    let curve = |(node, samples): (&ecod::model::names::NodeName, &super::Samples)| Curve {
         name: node.to_string(),
         points: samples.points(start, seconds(report), PARTS),
     };
     let curves: Vec<_> = report.reputations.iter().take(MOST_CURVES).map(curve).collect();
-    let newest = |(node, samples): (&ecod::names::NodeName, &super::Samples)| {
+    let newest = |(node, samples): (&ecod::model::names::NodeName, &super::Samples)| {
         Some(vec![node.to_string(), format!("{:.3}", samples.newest()?)])
     };
     let rows: Vec<_> = report.reputations.iter().filter_map(newest).collect();

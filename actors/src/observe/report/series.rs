@@ -1,6 +1,6 @@
 //! Values over time, and their distribution.
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
 /// Values in the order of time.
 #[derive(Debug, Clone, Default)]

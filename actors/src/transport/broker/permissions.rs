@@ -15,7 +15,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{Limits, Topic};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;

@@ -10,7 +10,7 @@
 
 use std::net::SocketAddr;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use serde::{Deserialize, Serialize};
 
 use super::MAX_PAYLOAD_BYTES;

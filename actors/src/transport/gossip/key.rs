@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU32;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ring::{aead, digest, hkdf, hmac, pbkdf2};
 
 use super::config::MembershipConfig;

@@ -13,8 +13,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::leadership::election::AwakeClock;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::links::LinkState;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{
     GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind, Reputations, Topic,
     Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,

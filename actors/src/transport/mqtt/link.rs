@@ -7,7 +7,7 @@ use bytes::Bytes;
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::echo::EchoMonitor;
 use ecod::leadership::links::LinkState;
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::RejectReason;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

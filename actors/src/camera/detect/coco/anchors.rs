@@ -1,6 +1,6 @@
 //! The boxes that the network corrects, as in TensorFlow's `create_ssd_anchors`.
 
-use ecod::detection::BoundingBox;
+use ecod::model::detection::BoundingBox;
 
 /// Cells a side of each feature map.
 const MAPS: [u16; 6] = [19, 10, 5, 3, 2, 1];
