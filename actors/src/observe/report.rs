@@ -51,7 +51,7 @@ pub struct Report {
     problems: Vec<String>,
     maps: Rounds,
     verdicts: Rounds,
-    reigns: Vec<Reign>,
+    round_runs: Vec<RoundRun>,
     changes: Vec<LeadershipChange>,
     vehicles: BTreeMap<NodeName, Vehicle>,
     entries: u64,
@@ -75,7 +75,7 @@ struct Rounds {
 
 /// A run of rounds by one leader in one term.
 #[derive(Debug, Clone, PartialEq)]
-struct Reign {
+struct RoundRun {
     epoch: Epoch,
     first_at: Timestamp,
     last_at: Timestamp,
@@ -179,7 +179,7 @@ impl Report {
 
     fn map(&mut self, at: Timestamp, map: GlobalMap) {
         self.maps.note(at, map.oldest_capture_us, map.fused_at_us);
-        self.reign(at, Epoch::new(map.epoch, map.aggregator.clone()));
+        self.note_round(at, Epoch::new(map.epoch, map.aggregator.clone()));
         let labelled = map.landmarks.iter().filter(|entry| entry.label.is_some()).map(|entry| &entry.contributors);
         for contributors in labelled.chain(map.objects.iter().map(|object| &object.contributors)) {
             self.entries += 1;
@@ -193,7 +193,7 @@ impl Report {
     fn verdicts(&mut self, at: Timestamp, verdicts: Verdicts) {
         self.verdicts.note(at, None, verdicts.fused_at_us);
         if self.maps.count == 0 {
-            self.reign(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
+            self.note_round(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
         }
         self.round(&FusedLine::Verdicts(verdicts));
     }
@@ -212,10 +212,10 @@ impl Report {
         self.losses.note(self.identity.as_ref().map(|identity| identity.run), reading);
     }
 
-    fn reign(&mut self, at: Timestamp, epoch: Epoch) {
-        match self.reigns.last_mut() {
-            Some(reign) if reign.epoch == epoch => (reign.last_at, reign.rounds) = (at, reign.rounds + 1),
-            _ => self.reigns.push(Reign { epoch, first_at: at, last_at: at, rounds: 1 }),
+    fn note_round(&mut self, at: Timestamp, epoch: Epoch) {
+        match self.round_runs.last_mut() {
+            Some(run) if run.epoch == epoch => (run.last_at, run.rounds) = (at, run.rounds + 1),
+            _ => self.round_runs.push(RoundRun { epoch, first_at: at, last_at: at, rounds: 1 }),
         }
     }
 }

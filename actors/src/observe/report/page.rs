@@ -64,12 +64,12 @@ fn problems(report: &Report) -> String {
 
 fn leadership(report: &Report) -> String {
     let rows: Vec<_> = report
-        .reigns
+        .round_runs
         .iter()
-        .map(|reign| {
-            let lasted = reign.last_at.since(reign.first_at).as_secs_f64();
-            let cells = [reign.epoch.leader.to_string(), reign.epoch.term.to_string(), clock(reign.first_at)];
-            cells.into_iter().chain([format!("{lasted:.1}"), reign.rounds.to_string()]).collect()
+        .map(|run| {
+            let lasted = run.last_at.since(run.first_at).as_secs_f64();
+            let cells = [run.epoch.leader.to_string(), run.epoch.term.to_string(), clock(run.first_at)];
+            cells.into_iter().chain([format!("{lasted:.1}"), run.rounds.to_string()]).collect()
         })
         .collect();
     let changes: Vec<_> = report
@@ -190,8 +190,8 @@ fn drops(report: &Report) -> String {
 
 fn over_time<'a>(report: &Report, title: &'a str, y_label: &'a str, curves: Vec<Curve>) -> Plot<'a> {
     let start = report.first.unwrap_or_default();
-    let marks = report.reigns.iter().skip(1);
-    let marks = marks.map(|reign| (reign.first_at.since(start).as_secs_f64(), reign.epoch.to_string())).collect();
+    let marks = report.round_runs.iter().skip(1);
+    let marks = marks.map(|run| (run.first_at.since(start).as_secs_f64(), run.epoch.to_string())).collect();
     Plot { title, x_label: "s", y_label, curves, marks, x: Axis::Linear(seconds(report)) }
 }
 
