@@ -22,7 +22,7 @@ pub struct Finding {
     /// What was looked at.
     pub check: &'static str,
     /// How it is.
-    pub verdict: Verdict,
+    pub verdict: CheckResult,
     /// What was seen.
     pub seen: String,
     /// What to do about it.
@@ -33,7 +33,7 @@ pub struct Finding {
 /// How something is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Verdict {
+pub enum CheckResult {
     /// As it should be.
     Fine,
     /// The node runs, but not as well as it could.
@@ -44,15 +44,15 @@ pub enum Verdict {
 
 impl Finding {
     fn fine(check: &'static str, seen: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Fine, seen: seen.into(), fix: None }
+        Self { check, verdict: CheckResult::Fine, seen: seen.into(), fix: None }
     }
 
     fn doubtful(check: &'static str, seen: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Doubtful, seen: seen.into(), fix: Some(fix.into()) }
+        Self { check, verdict: CheckResult::Doubtful, seen: seen.into(), fix: Some(fix.into()) }
     }
 
     fn broken(check: &'static str, seen: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { check, verdict: Verdict::Broken, seen: seen.into(), fix: Some(fix.into()) }
+        Self { check, verdict: CheckResult::Broken, seen: seen.into(), fix: Some(fix.into()) }
     }
 }
 
@@ -114,7 +114,7 @@ mod tests {
         config.state_dir = Some(directory.path().into());
         config.record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path().join("a/b")) });
         let findings = examine(&config, Path::new("node.toml")).await;
-        assert!(findings.iter().all(|finding| finding.verdict < Verdict::Broken), "{findings:?}");
+        assert!(findings.iter().all(|finding| finding.verdict < CheckResult::Broken), "{findings:?}");
         assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0, "nothing is left behind");
     }
 
@@ -130,7 +130,7 @@ mod tests {
         let (ca, revocation_list) = (authority.ca(), Some(list));
         config.tls = Some(crate::transport::pki::TlsConfig { ca, certificate, key, revocation_list });
         let finding = finding(&config, "certificates").await;
-        assert_eq!(finding.verdict, Verdict::Broken);
+        assert_eq!(finding.verdict, CheckResult::Broken);
         assert!(finding.seen.contains("revoked.pem") && finding.fix.unwrap().contains("revoked.pem"));
     }
 
@@ -148,7 +148,7 @@ mod tests {
             ("dashboard", page.local_addr().unwrap().port(), "`dashboard.listen`"),
         ] {
             let finding = finding(&config, check).await;
-            assert_eq!(finding.verdict, Verdict::Broken);
+            assert_eq!(finding.verdict, CheckResult::Broken);
             assert!(finding.seen.contains(&port.to_string()) && finding.fix.unwrap().contains(key));
         }
     }
@@ -160,7 +160,7 @@ mod tests {
         let mut config = config();
         config.pose.listen = taken.local_addr().ok();
         let finding = finding(&config, "pose port").await;
-        assert!(finding.verdict == Verdict::Broken && finding.fix.unwrap().contains("`pose.listen`"));
+        assert!(finding.verdict == CheckResult::Broken && finding.fix.unwrap().contains("`pose.listen`"));
     }
 
     #[tokio::test]
@@ -169,7 +169,7 @@ mod tests {
         let _taken = TcpListener::bind(crate::observe::dashboard::DEFAULT_ADDRESS);
         let mut config = config();
         config.dashboard.enabled = true;
-        assert!(finding(&config, "dashboard").await.verdict < Verdict::Broken);
+        assert!(finding(&config, "dashboard").await.verdict < CheckResult::Broken);
         config.dashboard.enabled = false;
         assert!(examine(&config, Path::new("node.toml")).await.iter().all(|finding| finding.check != "dashboard"));
     }
@@ -181,7 +181,7 @@ mod tests {
         let live_port = Some(live.local_addr().unwrap().port());
         let record = Some(RecordConfig { live_port, ..RecordConfig::new(directory.path()) });
         let finding = finding(&NodeConfig { record, ..config() }, "live port").await;
-        assert!(finding.verdict == Verdict::Broken && finding.fix.unwrap().contains("`record.live_port`"));
+        assert!(finding.verdict == CheckResult::Broken && finding.fix.unwrap().contains("`record.live_port`"));
     }
 
     #[tokio::test]
@@ -190,9 +190,9 @@ mod tests {
         config.listen = Some("192.0.2.1:1883".parse().unwrap());
         config.map_log = Some("/no/such/maps".into());
         let port = finding(&config, "broker port").await;
-        assert!(port.verdict == Verdict::Broken && port.fix.unwrap().contains("an address of this machine"));
+        assert!(port.verdict == CheckResult::Broken && port.fix.unwrap().contains("an address of this machine"));
         let log = finding(&config, "map log").await;
-        assert!(log.verdict == Verdict::Broken && log.seen.contains("/no/such"), "{log:?}");
+        assert!(log.verdict == CheckResult::Broken && log.seen.contains("/no/such"), "{log:?}");
     }
 
     #[tokio::test]
@@ -201,7 +201,7 @@ mod tests {
         let mut config = config();
         config.mqtt.broker = Some(address.into());
         let finding = finding(&config, "broker").await;
-        assert_eq!(finding.verdict, Verdict::Broken);
+        assert_eq!(finding.verdict, CheckResult::Broken);
         assert!(finding.seen.contains(&address.to_string()), "{finding:?}");
     }
 
@@ -214,7 +214,7 @@ mod tests {
         let findings = examine(&config, Path::new("node.toml")).await;
         let findings: Vec<_> = findings.into_iter().filter(|finding| finding.check == "seed").collect();
         let verdicts: Vec<_> = findings.iter().map(|finding| finding.verdict).collect();
-        assert_eq!(verdicts, [Verdict::Fine, Verdict::Doubtful, Verdict::Doubtful], "{findings:?}");
+        assert_eq!(verdicts, [CheckResult::Fine, CheckResult::Doubtful, CheckResult::Doubtful], "{findings:?}");
         assert!(findings.iter().zip(&seeds).all(|(finding, seed)| finding.seen.contains(seed)), "{findings:?}");
     }
 
@@ -233,7 +233,7 @@ mod tests {
         let of_service = Path::new("/etc/ecod/node.toml");
         let findings = examine(&config, of_service).await;
         let found: Vec<_> = findings.iter().filter(|finding| finding.check == "service").collect();
-        assert!(found.len() == 1 && found[0].verdict == Verdict::Doubtful, "{findings:?}");
+        assert!(found.len() == 1 && found[0].verdict == CheckResult::Doubtful, "{findings:?}");
         assert!(
             found[0].fix.as_ref().is_some_and(|fix| fix.contains("`record.dir`") && fix.contains("ReadWritePaths"))
         );
@@ -250,14 +250,14 @@ mod tests {
         std::fs::write(&short, "short").unwrap();
         std::fs::write(&file, "").unwrap();
         let mut config = config();
-        assert_eq!(finding(&config, "cell key").await.verdict, Verdict::Doubtful);
+        assert_eq!(finding(&config, "cell key").await.verdict, CheckResult::Doubtful);
         config.membership.key_file = Some(short);
-        assert_eq!(finding(&config, "cell key").await.verdict, Verdict::Broken);
+        assert_eq!(finding(&config, "cell key").await.verdict, CheckResult::Broken);
         config.state_dir = Some(file.join("below"));
         let found = finding(&config, "state directory").await;
-        assert!(found.verdict == Verdict::Broken && found.seen.contains("below"), "{found:?}");
+        assert!(found.verdict == CheckResult::Broken && found.seen.contains("below"), "{found:?}");
         config.record = Some(RecordConfig { min_free_mb: 1_000_000_000, ..RecordConfig::new(directory.path()) });
         let found = finding(&config, "log directory").await;
-        assert!(found.verdict == Verdict::Broken && found.fix.unwrap().contains("min_free_mb"));
+        assert!(found.verdict == CheckResult::Broken && found.fix.unwrap().contains("min_free_mb"));
     }
 }

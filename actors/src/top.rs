@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::Leadership;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{Reputations, Role, Verdicts};
@@ -13,7 +14,6 @@ use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
-use crate::messages::leadership::Leadership;
 use crate::messages::newest::{Received, ReceivedMap};
 use crate::node::NodeHandle;
 use crate::node::config::NodeConfig;
@@ -26,7 +26,7 @@ const HISTORY: usize = 5;
 
 /// What is known of a cell at one moment.
 #[derive(Debug)]
-pub struct View {
+pub struct CellView {
     /// The cell's name.
     pub cell: NodeName,
     /// Age beyond which a round is no longer to be relied on, where rounds come by themselves.
@@ -51,7 +51,7 @@ pub struct View {
     pub scroll: usize,
 }
 
-impl View {
+impl CellView {
     /// What `node` knows of the cell of this configuration; `before` hands on the history.
     pub fn of(node: &NodeHandle, config: &NodeConfig, before: Option<Self>, now: Timestamp) -> Self {
         let (history, scroll) = before.map(|before| (before.history, before.scroll)).unwrap_or_default();
@@ -89,7 +89,7 @@ impl View {
 }
 
 /// Draws the cell; scrolls back what was scrolled beyond the end.
-pub fn draw(frame: &mut Frame<'_>, view: &mut View) {
+pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
     let [head, places, below, foot] =
         Layout::vertical([Constraint::Length(4), Constraint::Min(5), Constraint::Length(9), Constraint::Length(1)])
             .areas(frame.area());
@@ -102,7 +102,7 @@ pub fn draw(frame: &mut Frame<'_>, view: &mut View) {
     frame.render_widget(Line::from(" q quits, arrow keys scroll").dim(), foot);
 }
 
-fn summary(view: &View) -> Paragraph<'_> {
+fn summary(view: &CellView) -> Paragraph<'_> {
     let leader = match (view.leadership.leader(), &view.leadership.epoch) {
         (Some(leader), Some(epoch)) => {
             let since = view.history.back().filter(|(newest, _)| newest == epoch);
@@ -126,7 +126,7 @@ fn summary(view: &View) -> Paragraph<'_> {
 }
 
 /// What is where, as far as it finds room in a box of so many lines.
-fn landmarks(view: &mut View, height: u16) -> Table<'static> {
+fn landmarks(view: &mut CellView, height: u16) -> Table<'static> {
     // The frame and the head take three.
     let room = usize::from(height.saturating_sub(3)).max(1);
     let rows = places(view);
@@ -141,7 +141,7 @@ fn landmarks(view: &mut View, height: u16) -> Table<'static> {
     Table::new(rows.into_iter().skip(first).take(room), widths).header(head).block(Block::bordered().title(title))
 }
 
-fn places(view: &View) -> Vec<Row<'static>> {
+fn places(view: &CellView) -> Vec<Row<'static>> {
     let verdicts = view.verdicts.as_ref().map(|received| &received.message.verdicts);
     let verdict = |id: &str| verdicts?.iter().find(|verdict| verdict.landmark == *id);
     let mut rows = Vec::new();
@@ -184,7 +184,7 @@ fn places(view: &View) -> Vec<Row<'static>> {
     rows
 }
 
-fn vehicles(view: &View) -> Table<'_> {
+fn vehicles(view: &CellView) -> Table<'_> {
     let reputations = view.reputations.as_ref().map(|received| &received.message.reputations);
     let trusted = |node: &NodeName| {
         reputations
@@ -215,7 +215,7 @@ fn vehicles(view: &View) -> Table<'_> {
     Table::new(rows, widths).header(head).block(Block::bordered().title(title))
 }
 
-fn counted(view: &View) -> Table<'_> {
+fn counted(view: &CellView) -> Table<'_> {
     const SHOWN: [&str; 5] = ["inbox_full", "publish_refused", "disconnected", "connect_failed", "record_dropped"];
     let events = view.counters.events.iter().filter(|(name, _)| SHOWN.contains(name));
     let counts = events.chain(&view.counters.rejects).chain(&view.counters.shed).filter(|(_, times)| **times > 0);
@@ -240,19 +240,19 @@ fn span(time: Duration) -> String {
 mod tests {
     use std::sync::Arc;
 
+    use ecod::leadership::Position;
     use ecod::wire::{GlobalMap, LandmarkState, SCHEMA_VERSION};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
     use super::*;
-    use crate::messages::leadership::Position;
     use crate::telemetry::counters::{Counters, ShedReason};
 
     fn name(text: &str) -> NodeName {
         NodeName::new(text).unwrap()
     }
 
-    fn view(now: Timestamp) -> View {
+    fn view(now: Timestamp) -> CellView {
         let entry = LandmarkState {
             id: "slot-0".into(),
             label: Some("car".into()),
@@ -277,11 +277,16 @@ mod tests {
         }))
         .unwrap();
         let epoch = Epoch::new(4, name("euclid"));
-        let mut view = View {
+        let mut view = CellView {
             cell: name("lot-1"),
             patience: Some(Duration::from_secs(3)),
             now,
-            leadership: Leadership { position: Position::Following, epoch: Some(epoch), standby: Some(name("gauss")) },
+            leadership: Leadership {
+                position: Position::Following,
+                term: epoch.term,
+                epoch: Some(epoch),
+                standby: Some(name("gauss")),
+            },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
             members: vec![Member {
                 name: name("gauss"),
@@ -300,7 +305,7 @@ mod tests {
         view
     }
 
-    fn shown(view: &mut View, width: u16, height: u16) -> String {
+    fn shown(view: &mut CellView, width: u16, height: u16) -> String {
         let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
         terminal.draw(|frame| draw(frame, view)).unwrap();
         terminal.backend().to_string()
@@ -332,9 +337,9 @@ mod tests {
     fn an_old_round_is_not_passed_off_as_fresh() {
         assert!(shown(&mut view(Timestamp(10_000_000)), 100, 30).contains("newest round 3000 ms old"));
         assert!(shown(&mut view(Timestamp(12_000_000)), 100, 30).contains("STALE: no round for 5 s"));
-        let mut by_packets = View { patience: None, ..view(Timestamp(12_000_000)) };
+        let mut by_packets = CellView { patience: None, ..view(Timestamp(12_000_000)) };
         assert!(shown(&mut by_packets, 100, 30).contains("newest round 5000 ms old"));
-        let mut alone = View { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
+        let mut alone = CellView { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
         let text = shown(&mut alone, 100, 30);
         assert!(text.contains("nobody leads") && text.contains("no round yet"), "{text}");
     }
@@ -349,7 +354,7 @@ mod tests {
         let history = [(Epoch::new(3, name("edge")), Timestamp(0))].into();
         for (now_us, freshness) in [(7_200_000, "newest round 300 ms old"), (12_000_000, "STALE: no round for 5 s")] {
             let (verdicts, history) = (verdicts.clone(), VecDeque::clone(&history));
-            let mut voting = View { map: None, verdicts, history, ..view(Timestamp(now_us)) };
+            let mut voting = CellView { map: None, verdicts, history, ..view(Timestamp(now_us)) };
             voting.remember();
             let text = shown(&mut voting, 100, 30);
             assert!(text.contains(freshness) && text.contains("before: edge@3"), "{text}");
@@ -362,7 +367,7 @@ mod tests {
         for vehicle in ["euclid", "gauss"] {
             counters.shed(ShedReason::ReportReplaced, vehicle);
         }
-        let text = shown(&mut View { counters: counters.snapshot(), ..view(Timestamp(7_200_000)) }, 100, 30);
+        let text = shown(&mut CellView { counters: counters.snapshot(), ..view(Timestamp(7_200_000)) }, 100, 30);
         assert!(text.contains(" lost here ") && text.contains("report replaced"), "{text}");
     }
 

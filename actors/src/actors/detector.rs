@@ -21,8 +21,9 @@ use crate::camera::image_size::{ImageSize, SizeMismatch};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
-use crate::observe::recorder::Pictures;
+use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::spans::Spans;
 
 /// What a detector needs at its start.
 pub struct DetectorArguments {
@@ -37,9 +38,11 @@ pub struct DetectorArguments {
     /// Gets the detections.
     pub projector: ActorSlot<ProjectorMessage>,
     /// Gets the frames that were looked at, to record some.
-    pub pictures: Option<Pictures>,
+    pub pictures: Option<ImageRecorder>,
     /// The node's counters.
     pub counters: Arc<Counters>,
+    /// The node's spans.
+    pub spans: Spans,
 }
 
 /// Looks at the latest frame, again and again.
@@ -56,7 +59,7 @@ pub struct DetectorState {
     /// Whether the last frame could not be looked at: the first in a row is told of.
     failing: bool,
     projector: ActorSlot<ProjectorMessage>,
-    pictures: Option<Pictures>,
+    pictures: Option<ImageRecorder>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
 }
@@ -71,9 +74,9 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, optics, projector, pictures, counters } = arguments;
+        let DetectorArguments { open, capture, detect, optics, projector, pictures, counters, spans } = arguments;
         let capture = Capture::start(open, capture)?;
-        let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters)));
+        let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters), spans));
         let detect = Some(detect);
         Ok(DetectorState { detect, optics, mismatch: None, failing: false, projector, pictures, counters, pump })
     }
@@ -88,8 +91,10 @@ impl Actor for Detector {
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let mut pictures = state.pictures.take();
+        let span = tracing::info_span!("detect");
         let (detect, pictures, outcome) = spawn_blocking(move || {
-            let outcome = detect.detect(&frame);
+            let outcome = span.in_scope(|| detect.detect(&frame));
+            drop(span);
             if let Some(pictures) = &mut pictures {
                 pictures.offer(&frame);
             }
@@ -140,7 +145,7 @@ impl Drop for DetectorState {
 }
 
 /// Hands over the latest frame whenever the detector is ready, until the source or the detector ends.
-async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>) {
+async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>, spans: Spans) {
     let turns = Arc::new(Semaphore::new(1));
     let mut status = capture.status();
     let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
@@ -162,7 +167,8 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
             }
         };
         let Some(frame) = frame else { return };
-        if detector.cast(DetectorMessage::Look { frame, turn }).is_err() {
+        let span = spans.frame(frame.captured_at);
+        if span.in_scope(|| detector.cast(DetectorMessage::Look { frame, turn })).is_err() {
             return;
         }
     }

@@ -23,6 +23,7 @@ use bytes::Bytes;
 use ecod::names::NodeName;
 use ecod::wire::{Encoding, NodeState, NodeStatus, Payload, Topic, Topics, encode};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tracing::Span;
 use uuid::Uuid;
 
 pub use ecod::wire::ReportKind;
@@ -112,16 +113,16 @@ impl Actor for Gateway {
             GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
-                state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient);
+                publishing().in_scope(|| state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient));
                 inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {
-                state.publish(&Topic::GlobalDetections, &*map, Retention::Transient);
+                publishing().in_scope(|| state.publish(&Topic::GlobalDetections, &*map, Retention::Transient));
                 links_first().await;
                 inbox.deliver_local(Incoming::Map(map));
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
-                state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient);
+                publishing().in_scope(|| state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient));
                 links_first().await;
                 inbox.deliver_local(Incoming::Verdicts(verdicts));
             }
@@ -151,6 +152,11 @@ impl Actor for Gateway {
         }
         Ok(())
     }
+}
+
+/// Encoding and handing to the links, as part of a frame's or a round's way.
+fn publishing() -> Span {
+    tracing::info_span!("publish")
 }
 
 /// Lets the links' tasks send the message before this node's own actors process it.

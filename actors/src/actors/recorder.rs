@@ -1,7 +1,7 @@
 //! The actor that records what its node takes, and from which its aggregator can be run again.
 //!
 //! ```text
-//! Fuser, Follower, Gateway's subscriber ── Recording ──> bounded queue ──> writer thread ──> DIR/<node>-<time>.mcap
+//! Fuser, Follower, Gateway's subscriber ── LogSender ──> bounded queue ──> writer thread ──> DIR/<node>-<time>.mcap
 //! Recorder ── leadership, counters ───────────┘
 //! ```
 //!
@@ -15,14 +15,14 @@ use std::sync::mpsc::sync_channel;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use ecod::leadership::Leadership;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
-use crate::messages::leadership::Leadership;
 use crate::messages::recorder::RecorderMessage;
-use crate::observe::recorder::recording::Item;
+use crate::observe::recorder::log_sender::LogItem;
 use crate::observe::recorder::writer::LogWriter;
-use crate::observe::recorder::{Identity, RecordConfig, Recording};
+use crate::observe::recorder::{LogIdentity, LogSender, RecordConfig};
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 
@@ -31,9 +31,9 @@ pub struct RecorderArguments {
     /// What is recorded, and where.
     pub config: RecordConfig,
     /// Who records.
-    pub identity: Identity,
+    pub identity: LogIdentity,
     /// Where the node's parts hand over.
-    pub recording: Recording,
+    pub recording: LogSender,
     /// Who leads.
     pub leadership: watch::Receiver<Leadership>,
     /// The node's counters.
@@ -46,7 +46,7 @@ pub struct Recorder;
 
 /// The writer and what is watched.
 pub struct RecorderState {
-    recording: Recording,
+    recording: LogSender,
     leadership: watch::Receiver<Leadership>,
     counters: Arc<Counters>,
     writer: Option<JoinHandle<()>>,
@@ -85,8 +85,8 @@ impl Actor for Recorder {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let item = match message {
-            RecorderMessage::NoteLeadership => Item::Leadership(state.leadership.borrow().clone()),
-            RecorderMessage::Tick => Item::Counters(state.counters.snapshot()),
+            RecorderMessage::NoteLeadership => LogItem::Leadership(state.leadership.borrow().clone()),
+            RecorderMessage::Tick => LogItem::Counters(state.counters.snapshot()),
         };
         state.recording.put(clock::now(), item);
         if state.writer.as_ref().is_some_and(JoinHandle::is_finished) { Err("the writer ended".into()) } else { Ok(()) }

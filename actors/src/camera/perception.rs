@@ -7,7 +7,7 @@ use std::sync::Arc;
 use ecod::camera::Mount;
 use ecod::detection::Detection;
 use ecod::geometry::Pose;
-use ecod::landmark::{Gate, LandmarkIndex};
+use ecod::landmark::{LandmarkGate, LandmarkIndex};
 use ecod::names::NodeName;
 use ecod::projection::{Projection, ProjectionConfig, Ranging};
 use ecod::time::Timestamp;
@@ -20,7 +20,7 @@ use crate::camera::lens::Lens;
 
 /// Where a vehicle's camera is and what it knows of its world.
 #[derive(Debug, Clone)]
-pub struct Vantage {
+pub struct VehicleCamera {
     /// The vehicle's name.
     pub node: NodeName,
     /// The vehicle's pose.
@@ -36,20 +36,20 @@ pub struct Vantage {
 /// Makes the reports of one vehicle.
 #[derive(Debug, Clone)]
 pub struct Perception {
-    vantage: Vantage,
+    vehicle_camera: VehicleCamera,
     camera: Pose,
     projection: Projection,
     view: ViewConfig,
-    gate: Gate,
+    gate: LandmarkGate,
     seq: u64,
-    left_out: LeftOut,
+    discarded: DiscardCounts,
 }
 
 /// Detections left out by reason.
 #[derive(Debug, Clone, Default)]
-struct LeftOut(BTreeMap<&'static str, u64>);
+struct DiscardCounts(BTreeMap<&'static str, u64>);
 
-impl LeftOut {
+impl DiscardCounts {
     /// Counts one, and tells of the first for each reason.
     fn count(&mut self, reason: &'static str, error: &dyn Display) {
         let times = self.0.entry(reason).or_default();
@@ -64,52 +64,57 @@ impl LeftOut {
 impl Perception {
     /// A vehicle that has not reported yet; the configurations are taken as valid. `gate` bounds which known location
     /// an object is taken for.
-    pub fn new(vantage: Vantage, projection: ProjectionConfig, view: ViewConfig, gate: Gate) -> Self {
-        let camera = vantage.mount.camera_pose(&vantage.pose);
-        let projection = Projection::new(projection, vantage.lens.intrinsics);
-        Self { vantage, camera, projection, view, gate, seq: 0, left_out: LeftOut::default() }
+    pub fn new(
+        vehicle_camera: VehicleCamera,
+        projection: ProjectionConfig,
+        view: ViewConfig,
+        gate: LandmarkGate,
+    ) -> Self {
+        let camera = vehicle_camera.mount.camera_pose(&vehicle_camera.pose);
+        let projection = Projection::new(projection, vehicle_camera.lens.intrinsics);
+        Self { vehicle_camera, camera, projection, view, gate, seq: 0, discarded: DiscardCounts::default() }
     }
 
     /// Tells where the vehicle is from now on.
     pub fn set_pose(&mut self, pose: Pose) {
-        self.vantage.pose = pose;
-        self.camera = self.vantage.mount.camera_pose(&pose);
+        self.vehicle_camera.pose = pose;
+        self.camera = self.vehicle_camera.mount.camera_pose(&pose);
     }
 
     /// The report of one frame. A detection that has no position is left out and counted.
     pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
-        detections.retain(|detection| match self.projection.check_whole(detection) {
+        detections.retain(|detection| match self.projection.check_unclipped(detection) {
             Ok(()) => true,
             Err(error) => {
-                self.left_out.count(error.as_str(), &error);
+                self.discarded.count(error.as_str(), &error);
                 false
             }
         });
-        if let Err(error) = self.vantage.lens.undistort(&mut detections) {
+        if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
             tracing::warn!(%error, "distortion not removed");
         }
         let objects: Vec<_> = detections.iter().filter_map(|detection| self.place(detection)).collect();
-        let landmarks = self.vantage.landmarks.landmarks();
-        let (lens, sizes) = (&self.vantage.lens, &self.projection.config().sizes);
+        let landmarks = self.vehicle_camera.landmarks.landmarks();
+        let (lens, sizes) = (&self.vehicle_camera.lens, &self.projection.config().sizes);
         let seen = landmarks_in_view(landmarks, &self.camera, &lens.intrinsics, &objects, sizes, &self.view);
         self.seq += 1;
         ObjectReport {
             pose: Some(self.camera.into()),
             objects,
             seen: Some(seen),
-            ..ObjectReport::new(self.vantage.node.clone(), self.seq, captured_at)
+            ..ObjectReport::new(self.vehicle_camera.node.clone(), self.seq, captured_at)
         }
     }
 
     /// Detections left out by reason since the start.
-    pub fn left_out(&self) -> &BTreeMap<&'static str, u64> {
-        &self.left_out.0
+    pub fn discarded(&self) -> &BTreeMap<&'static str, u64> {
+        &self.discarded.0
     }
 
     fn place(&mut self, detection: &Detection) -> Option<PerceivedObject> {
         let corners = detection.corners.filter(|_| self.projection.config().ranging == Ranging::Corners);
         let side_m = self.projection.config().sizes.of(&detection.label).map(|size| size.width_m);
-        let target = corners.zip(side_m).map(|(c, side)| locate_target(&c, side, &self.vantage.lens.intrinsics));
+        let target = corners.zip(side_m).map(|(c, side)| locate_target(&c, side, &self.vehicle_camera.lens.intrinsics));
         let target = match target.transpose() {
             Ok(target) => target,
             Err(error) => {
@@ -118,15 +123,15 @@ impl Perception {
             }
         };
         let placed = self.projection.place(detection, target.as_ref(), &self.camera);
-        let placed = placed.map_err(|error| self.left_out.count(error.as_str(), &error)).ok()?;
+        let placed = placed.map_err(|error| self.discarded.count(error.as_str(), &error)).ok()?;
         // One object that nobody would take must not cost the others of its report.
-        placed.validate().map_err(|reason| self.left_out.count(reason.as_str(), &reason)).ok()?;
+        placed.validate().map_err(|reason| self.discarded.count(reason.as_str(), &reason)).ok()?;
         Some(self.at_landmark(placed))
     }
 
     /// Names the known location that the object is taken for.
     fn at_landmark(&self, object: PerceivedObject) -> PerceivedObject {
-        let landmarks = &self.vantage.landmarks;
+        let landmarks = &self.vehicle_camera.landmarks;
         let point = Point2::new(object.x_m, object.y_m);
         let best = object.covariance().and_then(|c| landmarks.best(&object.label, &point, &c, &self.gate));
         let landmark = best.map(|best| landmarks.landmarks()[best.landmark].id.clone());
@@ -145,7 +150,7 @@ mod tests {
     #[test]
     fn an_object_that_nobody_would_take_does_not_cost_the_others() {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
-        let vantage = Vantage {
+        let vehicle_camera = VehicleCamera {
             node: NodeName::from_static("euclid"),
             pose: Pose::new(0.0, 0.0, 0.0),
             mount: Mount { forward_m: 0.0, left_m: 0.0, pan_rad: 0.0 },
@@ -154,8 +159,8 @@ mod tests {
         };
         let sizes = ObjectSizes { default: Some(ObjectSize::square(0.5)), ..ObjectSizes::default() };
         let projection = ProjectionConfig { ranging: Ranging::BoxHeight, sizes, ..ProjectionConfig::default() };
-        let gate = Gate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
-        let mut perception = Perception::new(vantage, projection, ViewConfig::default(), gate);
+        let gate = LandmarkGate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
+        let mut perception = Perception::new(vehicle_camera, projection, ViewConfig::default(), gate);
         let seen = |label: &str, confidence: f64, y_max: f64| Detection {
             label: label.into(),
             confidence,
@@ -166,7 +171,7 @@ mod tests {
             vec![seen("", 0.9, 240.0), seen("cup", f64::NAN, 240.0), seen("cup", 0.9, 480.0), seen("car", 0.9, 240.0)];
         let report = perception.report(found, Timestamp(1));
         assert_eq!(report.objects.iter().map(|object| &*object.label).collect::<Vec<_>>(), ["car"]);
-        let left_out: Vec<_> = perception.left_out().iter().map(|(reason, times)| (*reason, *times)).collect();
-        assert_eq!(left_out, [("clipped", 1), ("invalid_label", 1), ("not_finite", 1)]);
+        let discarded: Vec<_> = perception.discarded().iter().map(|(reason, times)| (*reason, *times)).collect();
+        assert_eq!(discarded, [("clipped", 1), ("invalid_label", 1), ("not_finite", 1)]);
     }
 }

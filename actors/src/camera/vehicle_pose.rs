@@ -42,7 +42,7 @@ impl PoseConfig {
 
 /// A pose as told; unknown fields are left alone.
 #[derive(Debug, Deserialize)]
-struct Fix {
+struct PoseFix {
     x_m: f64,
     y_m: f64,
     heading_rad: f64,
@@ -62,7 +62,7 @@ const WORLD_M: f64 = 1e8;
 /// # Errors
 /// What is wrong with it, in words.
 pub fn read_pose(datagram: &[u8], now: Timestamp) -> Result<(Timestamp, Pose), String> {
-    let fix: Fix = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
+    let fix: PoseFix = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
     let within = |value: f64, most: f64| value.abs() <= most;
     if !within(fix.x_m, WORLD_M) || !within(fix.y_m, WORLD_M) || !within(fix.heading_rad, 1e3) {
         return Err(format!("{fix:?} is not in this world"));

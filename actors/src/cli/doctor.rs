@@ -8,7 +8,7 @@ use anyhow::Context;
 use clap::Args;
 
 use super::{Failure, print};
-use crate::doctor::{Finding, Verdict, examine};
+use crate::doctor::{CheckResult, Finding, examine};
 use crate::node::config::NodeConfig;
 
 /// Flags of `doctor`.
@@ -35,7 +35,7 @@ pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
     } else {
         print(&findings.iter().map(line).collect::<String>())?;
     }
-    match findings.iter().filter(|finding| finding.verdict == Verdict::Broken).count() {
+    match findings.iter().filter(|finding| finding.verdict == CheckResult::Broken).count() {
         0 => Ok(()),
         broken => Err(anyhow::anyhow!("{broken} of {} checks failed", findings.len()).into()),
     }
@@ -43,9 +43,9 @@ pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
 
 fn line(Finding { check, verdict, seen, fix }: &Finding) -> String {
     let sign = match verdict {
-        Verdict::Fine => "ok  ",
-        Verdict::Doubtful => "warn",
-        Verdict::Broken => "FAIL",
+        CheckResult::Fine => "ok  ",
+        CheckResult::Doubtful => "warn",
+        CheckResult::Broken => "FAIL",
     };
     let fix = fix.as_ref().map_or_else(String::new, |fix| format!("  -> {fix}"));
     format!("{sign}  {check:<16}  {}{fix}\n", seen.replace('\n', " "))

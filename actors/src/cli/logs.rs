@@ -26,7 +26,7 @@ pub(super) struct Logs {
 }
 
 /// A file, and what its beginning says.
-struct LogFile {
+struct LogInput {
     path: PathBuf,
     node: Option<NodeName>,
     unusable: Option<LogError>,
@@ -41,10 +41,10 @@ impl Logs {
                 let found =
                     crate::observe::recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
                 for path in found.map_err(Failure::usage)? {
-                    logs.push(LogFile::look_into(path)?);
+                    logs.push(LogInput::look_into(path)?);
                 }
             } else if LogReader::recognises(input).map_err(Failure::usage)? {
-                logs.push(LogFile::look_into(input.clone())?);
+                logs.push(LogInput::look_into(input.clone())?);
             } else {
                 return Err(Failure::usage(anyhow!("{} is not a log", input.display())));
             }
@@ -62,7 +62,7 @@ impl Logs {
     }
 }
 
-impl LogFile {
+impl LogInput {
     fn look_into(path: PathBuf) -> Result<Self, Failure> {
         let mut log = LogReader::open(&path).map_err(Failure::usage)?;
         let unusable = match log.next() {
@@ -75,7 +75,7 @@ impl LogFile {
 }
 
 /// Those of the node that is asked for; files that do not say whose they are go with the only one.
-fn one_node(mut logs: Vec<LogFile>, node: Option<&NodeName>) -> Result<Vec<LogFile>, Failure> {
+fn one_node(mut logs: Vec<LogInput>, node: Option<&NodeName>) -> Result<Vec<LogInput>, Failure> {
     let nodes: BTreeSet<_> = logs.iter().filter_map(|log| log.node.clone()).collect();
     let names = || nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(", ");
     match node {

@@ -27,7 +27,7 @@ pub(super) enum PkiCommand {
 #[derive(Debug, Args)]
 pub(super) struct InitArguments {
     #[command(flatten)]
-    place: Place,
+    place: AuthorityDir,
     /// Name of the cell
     #[arg(long)]
     cell: NodeName,
@@ -37,7 +37,7 @@ pub(super) struct InitArguments {
 #[derive(Debug, Args)]
 pub(super) struct IssueArguments {
     #[command(flatten)]
-    place: Place,
+    place: AuthorityDir,
     /// Name of the node
     node: NodeName,
     /// What the node is meant to do: with `cav` it cannot have a broker, and so never lead
@@ -52,13 +52,13 @@ pub(super) struct IssueArguments {
 #[derive(Debug, Args)]
 pub(super) struct RevokeArguments {
     #[command(flatten)]
-    place: Place,
+    place: AuthorityDir,
     /// Name of the node
     node: NodeName,
 }
 
 #[derive(Debug, Args)]
-struct Place {
+struct AuthorityDir {
     /// Directory of the CA; whoever can read its `ca.key` can make certificates
     #[arg(long, value_name = "DIR", default_value = "pki")]
     dir: PathBuf,

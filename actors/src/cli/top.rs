@@ -12,7 +12,7 @@ use super::run::ObserverArguments;
 use crate::node::config::NodeConfig;
 use crate::node::{self, NodeHandle};
 use crate::platform::clock;
-use crate::top::{View, draw};
+use crate::top::{CellView, draw};
 
 /// Flags of `top`.
 #[derive(Debug, Args)]
@@ -42,7 +42,7 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
 }
 
 fn show(terminal: &mut ratatui::DefaultTerminal, node: &NodeHandle, config: &NodeConfig) -> std::io::Result<()> {
-    let mut view = View::of(node, config, None, clock::now());
+    let mut view = CellView::of(node, config, None, clock::now());
     loop {
         terminal.draw(|frame| draw(frame, &mut view))?;
         if event::poll(PERIOD)?
@@ -61,6 +61,6 @@ fn show(terminal: &mut ratatui::DefaultTerminal, node: &NodeHandle, config: &Nod
                 _ => view.scroll,
             };
         }
-        view = View::of(node, config, Some(view), clock::now());
+        view = CellView::of(node, config, Some(view), clock::now());
     }
 }

@@ -8,9 +8,10 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 /// A message and when it came.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Received<T> {
     /// When it came, by this node's clock.
+    #[serde(rename = "received_at_us")]
     pub received_at: Timestamp,
     /// The message.
     pub message: Arc<T>,

@@ -9,12 +9,13 @@ use ecod::landmark::LandmarkIndex;
 
 use crate::actors::detector::DetectorArguments;
 use crate::camera::image_size::ImageSize;
-use crate::camera::perception::{Perception, Vantage};
+use crate::camera::perception::{Perception, VehicleCamera};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::config::NodeConfig;
-use crate::observe::recorder::Pictures;
+use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::Counters;
+use crate::telemetry::spans::Spans;
 
 /// A node without a camera was asked for what only a camera gives.
 #[derive(Debug, thiserror::Error)]
@@ -28,14 +29,14 @@ pub struct NoCamera;
 pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let gate = config.fusion.pace.gate();
-    let vantage = Vantage {
+    let vehicle_camera = VehicleCamera {
         node: config.name.clone().unwrap_or(ecod::names::NodeName::from_static("node")),
         pose: config.pose.pose(),
         mount: camera.mount.into(),
         lens: camera.optics.lens().context("key `camera.optics.calibration`")?,
         landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),
     };
-    Ok(Perception::new(vantage, camera.projection.clone(), camera.view.clone(), gate))
+    Ok(Perception::new(vehicle_camera, camera.projection.clone(), camera.view.clone(), gate))
 }
 
 /// The algorithms that the camera's reports are for. Without known locations there is nothing to vote on.
@@ -54,8 +55,9 @@ pub fn algorithms(config: &NodeConfig) -> Algorithms {
 pub fn detector(
     config: &NodeConfig,
     projector: ActorSlot<ProjectorMessage>,
-    pictures: Option<Pictures>,
+    pictures: Option<ImageRecorder>,
     counters: Arc<Counters>,
+    spans: Spans,
 ) -> anyhow::Result<DetectorArguments> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let source = camera.source.clone();
@@ -70,5 +72,6 @@ pub fn detector(
         projector,
         pictures,
         counters,
+        spans,
     })
 }

@@ -1,22 +1,22 @@
-//! The page, API, metrics and health of a node by HTTP.
+//! Page, API, metrics and health of a node over HTTP.
 
 pub(crate) mod access;
 pub(crate) mod assets;
 pub(crate) mod config;
-pub(crate) mod feed;
+pub(crate) mod connection_limit;
 pub(crate) mod history;
-pub(crate) mod latency;
+pub(crate) mod live_state;
+pub(crate) mod map_latency;
 pub(crate) mod metrics;
-pub(crate) mod observer;
-pub(crate) mod paced;
-pub(crate) mod picture;
-pub(crate) mod places;
-pub(crate) mod process;
+pub(crate) mod node_monitor;
+pub(crate) mod node_sources;
+pub(crate) mod process_metrics;
+pub(crate) mod response_cache;
 pub(crate) mod routes;
 pub(crate) mod server;
-pub(crate) mod sources;
+pub(crate) mod snapshot;
+
 pub use assets::paths as page_paths;
 pub use config::{DEFAULT_ADDRESS, DashboardConfig};
-pub use feed::{Feed, MAX_SHOWN, Sighting};
-pub use picture::{LandmarkFacts, NodeFacts};
-pub use sources::Sources;
+pub use live_state::{LatestReport, LiveState, MAX_SHOWN};
+pub use node_sources::{LandmarkFacts, NodeFacts, NodeSources};

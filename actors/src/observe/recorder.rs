@@ -1,25 +1,25 @@
 //! Logs of a node in MCAP: written, read, drawn.
 
+#[cfg(feature = "camera")]
+pub(crate) mod camera_images;
 pub(crate) mod channels;
 pub(crate) mod config;
 pub(crate) mod disk;
+pub(crate) mod entry_encoder;
 pub(crate) mod foxglove;
-pub(crate) mod identity;
 #[cfg(feature = "foxglove")]
-pub(crate) mod live;
+pub(crate) mod live_server;
 pub(crate) mod log_file;
-#[cfg(feature = "camera")]
-pub(crate) mod pictures;
+pub(crate) mod log_identity;
+pub(crate) mod log_sender;
 pub(crate) mod reader;
-pub(crate) mod recording;
-pub(crate) mod scribe;
-pub(crate) mod viewers;
+pub(crate) mod viewer_schema;
 pub(crate) mod writer;
+#[cfg(feature = "camera")]
+pub use camera_images::ImageRecorder;
 pub use channels::{CounterReading, LeadershipChange, SchemaName};
 pub use config::RecordConfig;
 pub use disk::{EXTENSION, files, free_bytes};
-pub use identity::{Identity, IdentityError};
-#[cfg(feature = "camera")]
-pub use pictures::Pictures;
+pub use log_identity::{LogIdentity, LogIdentityError};
+pub use log_sender::LogSender;
 pub use reader::{LogError, LogEvent, LogMessage, LogReader};
-pub use recording::Recording;

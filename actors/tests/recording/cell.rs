@@ -13,7 +13,7 @@ use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role, WirePose};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::observe::recorder::{Identity, LogEvent, LogMessage, LogReader, RecordConfig, SchemaName, files};
+use ecod_actors::observe::recorder::{LogEvent, LogIdentity, LogMessage, LogReader, RecordConfig, SchemaName, files};
 use ecod_actors::platform::clock;
 use tempfile::TempDir;
 use tokio::runtime::{Builder, Runtime};
@@ -194,7 +194,7 @@ fn report(node: &str, seq: u64, vehicle: usize) -> ObjectReport {
 
 /// All files of a log.
 pub(crate) struct Log {
-    pub(crate) identity: Option<Identity>,
+    pub(crate) identity: Option<LogIdentity>,
     pub(crate) messages: Vec<LogMessage>,
     pub(crate) problems: Vec<String>,
 }

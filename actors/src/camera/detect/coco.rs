@@ -29,7 +29,7 @@ pub struct CocoConfig {
     pub threshold: f64,
     /// Overlap (intersection over union) from which two boxes of one class are the same object; default 0.5.
     pub max_overlap: f64,
-    /// Whether to look at four overlapping quarters of the image besides the whole; default false. Finds objects of
+    /// Whether to run_network at four overlapping quarters of the image besides the whole; default false. Finds objects of
     /// half the size and takes five times as long.
     pub tiling: bool,
 }
@@ -109,12 +109,12 @@ impl CocoDetector {
         let net = dnn::read_net_from_onnx_buffer(&weights).map_err(|e| unusable(e.message))?;
         let mut detector = Self { config, net, anchors: anchors::all() };
         let black = Mat::new_rows_cols_with_default(INPUT_PX, INPUT_PX, CV_8UC3, Scalar::all(0.0));
-        black.and_then(|image| detector.look(&image)).map_err(|e| unusable(e.message))?;
+        black.and_then(|image| detector.run_network(&image)).map_err(|e| unusable(e.message))?;
         Ok(detector)
     }
 
     /// Runs the network on one image; boxes are shares of its sides.
-    fn look(&mut self, image: &Mat) -> opencv::Result<Vec<Candidate>> {
+    fn run_network(&mut self, image: &Mat) -> opencv::Result<Vec<ScoredBox>> {
         let (scale, middle) = (1.0 / 127.5, Scalar::all(127.5));
         let blob = dnn::blob_from_image(image, scale, Size::new(INPUT_PX, INPUT_PX), middle, true, false, CV_32F)?;
         self.net.set_input_def(&blob)?;
@@ -133,14 +133,14 @@ impl CocoDetector {
             .filter_map(|((anchor, offsets), scores)| {
                 let (class, score) = best_class(scores)?;
                 let bounds = anchor.decode(offsets);
-                (f64::from(score) >= self.config.threshold).then_some(Candidate { class, score, bounds })
+                (f64::from(score) >= self.config.threshold).then_some(ScoredBox { class, score, bounds })
             })
             .collect())
     }
 
-    fn look_everywhere(&mut self, image: &Mat) -> opencv::Result<Vec<Candidate>> {
+    fn run_on_image(&mut self, image: &Mat) -> opencv::Result<Vec<ScoredBox>> {
         let (width, height) = (f64::from(image.cols()), f64::from(image.rows()));
-        let mut found = self.look(image)?;
+        let mut found = self.run_network(image)?;
         for candidate in &mut found {
             candidate.bounds = placed(&candidate.bounds, 0.0, 0.0, width, height);
         }
@@ -151,9 +151,9 @@ impl CocoDetector {
                 let y = if lower { height - tile_height } else { 0.0 };
                 let area = Rect::new(x as i32, y as i32, tile_width as i32, tile_height as i32);
                 let tile = Mat::roi(image, area)?.try_clone()?;
-                let whole = self.look(&tile)?.into_iter().filter(|c| !is_cut(&c.bounds, right, lower));
+                let whole = self.run_network(&tile)?.into_iter().filter(|c| !is_cut(&c.bounds, right, lower));
                 found
-                    .extend(whole.map(|c| Candidate { bounds: placed(&c.bounds, x, y, tile_width, tile_height), ..c }));
+                    .extend(whole.map(|c| ScoredBox { bounds: placed(&c.bounds, x, y, tile_width, tile_height), ..c }));
             }
         }
         found.retain_mut(|candidate| {
@@ -166,10 +166,10 @@ impl CocoDetector {
     }
 
     /// The best box of every object, class by class.
-    fn suppress(&self, candidates: &[Candidate]) -> opencv::Result<Vec<Detection>> {
+    fn suppress(&self, candidates: &[ScoredBox]) -> opencv::Result<Vec<Detection>> {
         let mut detections = Vec::new();
         for (class, label) in labels::all() {
-            let of_class: Vec<&Candidate> = candidates.iter().filter(|c| c.class == class).collect();
+            let of_class: Vec<&ScoredBox> = candidates.iter().filter(|c| c.class == class).collect();
             let boxes: Vector<Rect2d> = of_class
                 .iter()
                 .map(|c| Rect2d::new(c.bounds.x_min, c.bounds.y_min, c.bounds.width(), c.bounds.height()))
@@ -196,12 +196,12 @@ impl Detect for CocoDetector {
         let failed = |step| move |source| DetectError::OpenCv { step, source };
         let candidates = match image.typ() {
             _ if image.empty() => return Err(unusable("no pixels".into())),
-            CV_8UC3 => self.look_everywhere(image),
+            CV_8UC3 => self.run_on_image(image),
             CV_8UC1 => {
                 let mut colour = Mat::default();
                 imgproc::cvt_color_def(image, &mut colour, imgproc::COLOR_GRAY2BGR)
                     .map_err(failed("gray to colour"))?;
-                self.look_everywhere(&colour)
+                self.run_on_image(&colour)
             }
             other => return Err(unusable(format!("pixels of opencv type {other}"))),
         };
@@ -211,7 +211,7 @@ impl Detect for CocoDetector {
 
 /// What one anchor sees.
 #[derive(Debug, Clone, Copy)]
-struct Candidate {
+struct ScoredBox {
     class: usize,
     score: f32,
     bounds: BoundingBox,

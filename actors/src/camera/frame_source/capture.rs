@@ -101,7 +101,7 @@ impl Capture {
         let slot = Arc::new(LatestSlot::default());
         let (status_sender, status) = watch::channel(CaptureStatus::default());
         let (events, inbox) = mpsc::sync_channel(1);
-        let keeper = Keeper {
+        let keeper = CaptureLoop {
             open,
             config,
             slot: Arc::clone(&slot),
@@ -109,7 +109,7 @@ impl Capture {
             events: events.clone(),
             inbox,
             opening: Arc::default(),
-            left_behind: Vec::new(),
+            abandoned: Vec::new(),
             captured: 0,
             unusable: Arc::default(),
             failures: Arc::default(),
@@ -180,7 +180,7 @@ pub fn wait_for_readers(patience: Duration) {
 }
 
 /// Blocked readers from which on no new one is started.
-const MAX_LEFT_BEHIND: usize = 4;
+const MAX_ABANDONED: usize = 4;
 
 enum Event {
     /// From the reader of the given opening.
@@ -194,7 +194,7 @@ enum Outcome {
     Stopped,
 }
 
-struct Keeper {
+struct CaptureLoop {
     open: Opener,
     config: CaptureConfig,
     slot: Arc<LatestSlot<Frame>>,
@@ -203,13 +203,13 @@ struct Keeper {
     inbox: Receiver<Event>,
     /// The opening whose reader is listened to.
     opening: Arc<AtomicU64>,
-    left_behind: Vec<JoinHandle<()>>,
+    abandoned: Vec<JoinHandle<()>>,
     captured: u64,
     unusable: Arc<AtomicU64>,
     failures: Arc<AtomicU64>,
 }
 
-impl Keeper {
+impl CaptureLoop {
     fn run(mut self) {
         let mut failures = 0;
         loop {
@@ -241,8 +241,8 @@ impl Keeper {
     /// Opens the source and passes its frames on.
     fn read_until_failure(&mut self) -> Outcome {
         let stall_timeout = Duration::from_secs_f64(self.config.stall_timeout_s);
-        self.left_behind.retain(|reader| !reader.is_finished());
-        if self.left_behind.len() >= MAX_LEFT_BEHIND {
+        self.abandoned.retain(|reader| !reader.is_finished());
+        if self.abandoned.len() >= MAX_ABANDONED {
             return Outcome::Failed(FrameError::Stalled(stall_timeout));
         }
         let opening = self.opening.load(Ordering::SeqCst);
@@ -254,7 +254,7 @@ impl Keeper {
             reader.run(&open);
         };
         match thread::Builder::new().name("camera".into()).spawn(read) {
-            Ok(reader) => self.left_behind.push(reader),
+            Ok(reader) => self.abandoned.push(reader),
             Err(e) => return Outcome::Failed(FrameError::Open { origin: "a thread".into(), reason: e.to_string() }),
         }
         let mut deadline = Instant::now() + stall_timeout;

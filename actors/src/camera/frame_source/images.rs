@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use opencv::core::MatTraitConst;
 use opencv::imgcodecs;
 
-use super::{FrameError, FrameSource, Pace};
+use super::{FrameError, FramePacer, FrameSource};
 use crate::camera::frame::Frame;
 use crate::platform::clock;
 
@@ -16,7 +16,7 @@ pub(super) struct ImageSequence {
     origin: String,
     files: Vec<PathBuf>,
     looping: bool,
-    pace: Pace,
+    pace: FramePacer,
     /// Files looked at, also those that were no images.
     next: u64,
 }
@@ -34,7 +34,7 @@ impl ImageSequence {
         if files.is_empty() {
             return Err(failed("no images there".into()));
         }
-        Ok(Self { origin, files, looping, pace: Pace::new(fps), next: 0 })
+        Ok(Self { origin, files, looping, pace: FramePacer::new(fps), next: 0 })
     }
 }
 

@@ -8,7 +8,7 @@ use opencv::core::{Mat, Vector};
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
 
-use super::{FrameError, FrameSource, Pace};
+use super::{FrameError, FramePacer, FrameSource};
 use crate::camera::frame::Frame;
 use crate::platform::clock;
 
@@ -25,7 +25,7 @@ pub(super) struct Video {
 
 /// What a file has beyond a live source.
 struct Playback {
-    pace: Pace,
+    pace: FramePacer,
     looping: bool,
 }
 
@@ -74,7 +74,7 @@ impl Video {
         readable(path, &origin)?;
         let mut video = Self::live(origin, || VideoCapture::from_file(path, videoio::CAP_ANY))?;
         let fps = video.capture.get(videoio::CAP_PROP_FPS).ok().filter(|fps| fps.is_finite() && *fps > 0.0);
-        video.playback = Some(Playback { pace: Pace::new(fps.unwrap_or(FALLBACK_FPS)), looping });
+        video.playback = Some(Playback { pace: FramePacer::new(fps.unwrap_or(FALLBACK_FPS)), looping });
         Ok(video)
     }
 

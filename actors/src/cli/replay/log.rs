@@ -7,21 +7,21 @@ use std::sync::Arc;
 
 use anyhow::anyhow;
 use ecod::landmark::Landmark;
-use ecod::replay::{FusedLine, JournalEntry, Replay, ReplayConfig, Rerun};
+use ecod::replay::{FusedLine, JournalEntry, JournalReplay, Replay, ReplayConfig};
 use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
 
 use super::{Failure, report, write_all};
-use crate::observe::recorder::{Identity, LogError, LogEvent, LogMessage, LogReader, SchemaName};
+use crate::observe::recorder::{LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName};
 
 /// What was live was within the limits of its node; here they only bound memory.
 const LIMITS: Limits = Limits { payload_bytes: 1 << 28, map_bytes: 1 << 28, objects: usize::MAX };
 
 /// The machine that runs the reports again.
-enum Machine {
+enum ReplayEngine {
     /// Nothing has been read that says which.
     Undecided,
     /// The aggregator's journal.
-    Journal(Box<Rerun>),
+    Journal(Box<JournalReplay>),
     /// Reports by their time of receipt.
     Reports(Box<Replay>),
 }
@@ -31,14 +31,14 @@ pub(super) struct LogReplay<'a> {
     /// Replaces the configuration in the log.
     cell: Option<&'a ReplayConfig>,
     passes: Option<u32>,
-    identity: Option<Identity>,
-    machine: Machine,
+    identity: Option<LogIdentity>,
+    machine: ReplayEngine,
     unreadable: BTreeMap<RejectReason, u64>,
 }
 
 impl<'a> LogReplay<'a> {
     pub(super) fn new(cell: Option<&'a ReplayConfig>, passes: Option<u32>) -> Self {
-        Self { cell, passes, identity: None, machine: Machine::Undecided, unreadable: BTreeMap::new() }
+        Self { cell, passes, identity: None, machine: ReplayEngine::Undecided, unreadable: BTreeMap::new() }
     }
 
     /// Reads the files and writes what comes of them; what cannot be used is told of and left out.
@@ -72,7 +72,7 @@ impl<'a> LogReplay<'a> {
         }
     }
 
-    fn meet(&mut self, identity: Identity, file: &Path) -> Result<Vec<FusedLine>, Failure> {
+    fn meet(&mut self, identity: LogIdentity, file: &Path) -> Result<Vec<FusedLine>, Failure> {
         let known = self.identity.take();
         if let Some(known) = &known
             && known.node != identity.node
@@ -90,12 +90,12 @@ impl<'a> LogReplay<'a> {
         let is_as_before = (&known.fusion, &known.landmarks) == (&identity.fusion, &identity.landmarks);
         let config = self.config();
         match &mut self.machine {
-            Machine::Journal(rerun) => rerun.restart(config.fusion, config.landmarks),
-            Machine::Reports(replay) if self.cell.is_none() && !is_as_before => {
+            ReplayEngine::Journal(rerun) => rerun.restart(config.fusion, config.landmarks),
+            ReplayEngine::Reports(replay) if self.cell.is_none() && !is_as_before => {
                 eprintln!("{file} is of a run under another configuration: from there on reports are fused anew");
                 return Ok(end(std::mem::replace(&mut **replay, Replay::new(config))));
             }
-            Machine::Reports(_) | Machine::Undecided => {}
+            ReplayEngine::Reports(_) | ReplayEngine::Undecided => {}
         }
         Ok(Vec::new())
     }
@@ -106,13 +106,13 @@ impl<'a> LogReplay<'a> {
                 let Ok(entry) = serde_json::from_slice::<JournalEntry>(&message.json) else {
                     return self.reject(RejectReason::Malformed);
                 };
-                self.rerun().map(|rerun| rerun.entry(&entry)).unwrap_or_default()
+                self.journal_replay().map(|rerun| rerun.entry(&entry)).unwrap_or_default()
             }
             SchemaName::ObjectReport => match read_report(message) {
                 Ok((kind, report)) => match self.machine() {
-                    Machine::Journal(rerun) => rerun.report(kind, &Arc::new(report), message.at),
-                    Machine::Reports(replay) => replay.report(kind, report, message.at),
-                    Machine::Undecided => Vec::new(),
+                    ReplayEngine::Journal(rerun) => rerun.report(kind, &Arc::new(report), message.at),
+                    ReplayEngine::Reports(replay) => replay.report(kind, report, message.at),
+                    ReplayEngine::Undecided => Vec::new(),
                 },
                 Err(reason) => self.reject(reason),
             },
@@ -126,17 +126,17 @@ impl<'a> LogReplay<'a> {
     }
 
     /// A journal precedes the reports that it is about.
-    fn rerun(&mut self) -> Option<&mut Rerun> {
-        if matches!(self.machine, Machine::Undecided) {
+    fn journal_replay(&mut self) -> Option<&mut JournalReplay> {
+        if matches!(self.machine, ReplayEngine::Undecided) {
             let ReplayConfig { fusion, landmarks, .. } = self.config();
-            self.machine = Machine::Journal(Box::new(Rerun::new(fusion, landmarks)));
+            self.machine = ReplayEngine::Journal(Box::new(JournalReplay::new(fusion, landmarks)));
         }
-        if let Machine::Journal(rerun) = &mut self.machine { Some(rerun) } else { None }
+        if let ReplayEngine::Journal(rerun) = &mut self.machine { Some(rerun) } else { None }
     }
 
-    fn machine(&mut self) -> &mut Machine {
-        if matches!(self.machine, Machine::Undecided) {
-            self.machine = Machine::Reports(Box::new(Replay::new(self.config())));
+    fn machine(&mut self) -> &mut ReplayEngine {
+        if matches!(self.machine, ReplayEngine::Undecided) {
+            self.machine = ReplayEngine::Reports(Box::new(Replay::new(self.config())));
         }
         &mut self.machine
     }
@@ -161,11 +161,11 @@ impl<'a> LogReplay<'a> {
             eprintln!("rejected {reason} {messages}");
         }
         match self.machine {
-            Machine::Undecided => eprintln!("there is no report and no journal in the log"),
-            Machine::Reports(replay) => {
+            ReplayEngine::Undecided => eprintln!("there is no report and no journal in the log"),
+            ReplayEngine::Reports(replay) => {
                 write_all(sink, &end(*replay), output)?;
             }
-            Machine::Journal(rerun) => say(&rerun),
+            ReplayEngine::Journal(rerun) => say(&rerun),
         }
         Ok(())
     }
@@ -177,7 +177,7 @@ pub fn rounds_of_log(file: &Path) -> Vec<FusedLine> {
     let mut replay = LogReplay::new(None, None);
     let Ok(log) = LogReader::open(file) else { return Vec::new() };
     let mut rounds: Vec<_> = log.flatten().map_while(|event| replay.event(event, file).ok()).flatten().collect();
-    if let Machine::Reports(machine) = replay.machine {
+    if let ReplayEngine::Reports(machine) = replay.machine {
         rounds.extend(machine.finish().0);
     }
     rounds
@@ -190,7 +190,7 @@ fn end(replay: Replay) -> Vec<FusedLine> {
     lines
 }
 
-fn say(rerun: &Rerun) {
+fn say(rerun: &JournalReplay) {
     let summary = rerun.summary();
     let used = summary.reports - summary.rejected.values().sum::<u64>();
     eprintln!("{} reports, {used} used, {} written", summary.reports, summary.written);

@@ -4,9 +4,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
-use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
 use ecod::landmark::Landmark;
+use ecod::leadership::Position;
+use ecod::leadership::election::ElectionConfig;
+use ecod::leadership::node::{Input, NodeSettings};
 use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
@@ -22,13 +24,13 @@ use crate::actors::reputation_keeper::ReputationKeeperArguments;
 use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
-use crate::messages::leadership::Position;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::ActorSlots;
 use crate::node::config::NodeConfig;
-use crate::observe::dashboard::{LandmarkFacts, NodeFacts, Sources};
+use crate::node::slots::ActorKind;
+use crate::observe::dashboard::{LandmarkFacts, NodeFacts, NodeSources};
 use crate::observe::readiness::{Vitals, patience};
-use crate::observe::recorder::Identity;
+use crate::observe::recorder::LogIdentity;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
@@ -80,11 +82,11 @@ impl NodeBuilder {
     }
 
     /// The identity of the node's log; `record.name` stands for the node's name where it is set.
-    fn log_identity(&self) -> Identity {
+    fn log_identity(&self) -> LogIdentity {
         let NodeConfig { cell, fusion, landmarks, record, .. } = &self.config;
         let named = record.as_ref().and_then(|record| record.name.clone());
         let node = named.unwrap_or_else(|| self.name.clone());
-        Identity::new(node, self.run, cell.clone(), fusion.clone(), landmarks.clone())
+        LogIdentity::new(node, self.run, cell.clone(), fusion.clone(), landmarks.clone())
     }
 
     pub(super) fn recorder_arguments(&self) -> Option<RecorderArguments> {
@@ -101,12 +103,12 @@ impl NodeBuilder {
     /// order in which they are fused.
     fn subscriber(&self) -> Subscriber {
         let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
-        let (name, feed, leadership) = (self.name.clone(), Arc::clone(&self.feed), self.leadership());
+        let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
         let (intake, counters) = (self.intake.clone(), self.counters());
         Arc::new(move |delivery| {
             let at = delivery.received_at;
-            feed.note(&delivery.message, at);
+            live_state.update(&delivery.message, at);
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
                     recording.report(*kind, report, at);
@@ -114,7 +116,9 @@ impl NodeBuilder {
                 }
                 // Evidence is for those that lead now or next; others that get it only look at it.
                 Incoming::Report { report, .. }
-                    if feed.watches() && report.node != name && leadership.borrow().position == Position::Following =>
+                    if live_state.wants_reports()
+                        && report.node != name
+                        && leadership.borrow().position == Position::Following =>
                 {
                     true
                 }
@@ -135,12 +139,14 @@ impl NodeBuilder {
                 }
                 Incoming::Ledger(share) => {
                     recording.share(share, at);
-                    election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
+                    let input = Input::EvidenceReceived { from: share.node.clone() };
+                    election.send(LeaderElectionMessage::Note { input });
                     keeper.send(ReputationKeeperMessage::Merge { delivery })
                 }
                 Incoming::Link { broker, state } => {
                     recording.link(broker, *state, at);
-                    election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
+                    let input = Input::LinkChanged { broker: broker.clone(), state: *state };
+                    election.send(LeaderElectionMessage::Note { input })
                 }
                 Incoming::Status { status, .. } => {
                     recording.status(status, at);
@@ -155,12 +161,12 @@ impl NodeBuilder {
             newest: self.newest.clone(),
             log: self.config.map_log.clone(),
             recording: self.recording.clone(),
-            least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
-            term: self.term.subscribe(),
+            saved_term: saved_term(self.state_file("term").as_ref()),
             leadership: self.leadership(),
             election: self.slots.election.clone(),
             fuser: self.slots.fuser.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 
@@ -175,7 +181,6 @@ impl NodeBuilder {
             newest: self.newest.reputations.subscribe(),
             members: self.members(),
             leadership: self.leadership(),
-            term: self.term.subscribe(),
             gateway: self.slots.gateway.clone(),
             fuser: self.slots.fuser.clone(),
             counters: self.counters(),
@@ -186,34 +191,36 @@ impl NodeBuilder {
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
         let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
-        let mut aggregator = Aggregator::standby(fusion, landmarks, now);
+        let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
         self.recording.journal(now, JournalEvent::Start { ledger });
         FuserArguments {
             aggregator,
-            term: self.term.subscribe(),
             recording: self.recording.clone(),
             intake: self.intake.clone(),
             newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
         let ActorSlots { membership, gateway, fuser, keeper, broker, .. } = self.slots.clone();
         LeaderElectionArguments {
-            config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+            settings: NodeSettings {
+                election: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+                plane: self.config.data_plane(),
+                round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
+                keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
+                status: self.status(),
+            },
             term_file: self.state_file("term"),
-            round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
-            plane: self.config.data_plane(),
-            status: self.status(),
             own_broker: self.broker_address(),
             members: self.members(),
             parts: Parts { membership, gateway, fuser, keeper, broker },
             leadership: self.leadership.clone(),
-            term: self.term.clone(),
             counters: self.counters(),
         }
     }
@@ -233,14 +240,14 @@ impl NodeBuilder {
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
         };
-        let sources = Sources {
+        let sources = NodeSources {
             node,
             landmarks: self.config.landmarks().into_iter().map(landmark).collect(),
             vitals: self.vitals(),
             members: self.members(),
             counters: self.counters(),
             frames: self.frames(),
-            feed: Arc::clone(&self.feed),
+            live_state: Arc::clone(&self.live_state),
         };
         DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
     }
@@ -294,7 +301,7 @@ mod tests {
     #[test]
     fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
         use ecod::aggregator::Algorithms::{Both, Pace};
-        use ecod::tracks::TracksMode::{Auto, Off, On};
+        use ecod::tracking::TracksMode::{Auto, Off, On};
         let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
         for (algorithms, mode, landmarks, expected) in [
             (Both, Off, vec![], true),

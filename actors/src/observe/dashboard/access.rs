@@ -1,46 +1,46 @@
-//! Who may look: the token, the host name that a browser used, and the headers that keep a page to itself.
+//! Access to the dashboard: the token, the host name of a request, and the security headers of every answer.
 
 use std::net::{IpAddr, SocketAddr};
 
 use axum::http::header::{self, AUTHORIZATION, COOKIE, HOST};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Uri};
+use base64::prelude::{BASE64_URL_SAFE_NO_PAD, Engine};
 use ecod::names::NodeName;
-use ring::{digest, hmac};
+use ring::hmac;
 
 use crate::platform::secret::Secret;
 
-/// Judges requests.
+/// Decides which requests are answered.
 #[derive(Debug)]
-pub(crate) struct Access {
+pub(crate) struct AccessPolicy {
     loopback: bool,
     token: Option<Token>,
 }
 
 #[derive(Debug)]
 struct Token {
-    /// The digest is compared, so that the time taken says nothing of the token, not even its length.
+    /// Signatures are compared in constant time, so that timing reveals neither the token nor its length.
     key: hmac::Key,
     cookie_name: String,
-    cookie: String,
 }
 
-/// How a request stands.
+/// The decision about a request.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
-    /// It may see everything.
+pub(crate) enum AccessDecision {
+    /// The request is answered.
     Allowed,
-    /// It brought the token in its address: it gets a cookie, and the token leaves the address.
+    /// The address holds the token: the answer sets a cookie and removes the token from the address.
     SignIn,
-    /// It has no token, or a wrong one.
+    /// The token is missing or wrong.
     Unauthorized,
-    /// It names a host that is not this machine, as a page does that made a browser look up its own name again.
+    /// The host is not this machine. A foreign page sends this after DNS rebinding.
     ForeignHost,
 }
 
-/// What is signed to make a cookie of a token.
+/// The message whose signature with the token is the cookie.
 const COOKIE_MESSAGE: &[u8] = b"ecod dashboard cookie";
 
-/// Sent with every answer.
+/// Headers of every answer.
 pub(crate) const HEADERS: [(HeaderName, HeaderValue); 5] = [
     (
         header::CONTENT_SECURITY_POLICY,
@@ -55,36 +55,35 @@ pub(crate) const HEADERS: [(HeaderName, HeaderValue); 5] = [
     (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
 ];
 
-impl Access {
+impl AccessPolicy {
     /// Access to the page of a node that listens on `address`.
     pub(crate) fn new(token: Option<&Secret>, address: SocketAddr, node: &NodeName) -> Self {
-        let token = token.map(|token| {
-            let key = hmac::Key::new(hmac::HMAC_SHA256, token.reveal().as_bytes());
-            let cookie = hex(hmac::sign(&key, COOKIE_MESSAGE).as_ref());
-            // Cookies are shared between the ports of a host, but not between names.
-            Token { key, cookie_name: format!("ecod-{node}"), cookie }
-        });
+        // Cookies are shared between the ports of a host, but not between names.
+        let token =
+            token.map(|token| Token { key: key(token.reveal().as_bytes()), cookie_name: format!("ecod-{node}") });
         Self { loopback: address.ip().is_loopback(), token }
     }
 
-    /// Whether the request may be answered.
-    pub(crate) fn judge(&self, uri: &Uri, headers: &HeaderMap) -> Verdict {
+    /// The decision about a request.
+    pub(crate) fn decide(&self, uri: &Uri, headers: &HeaderMap) -> AccessDecision {
         if self.loopback && !headers.get(HOST).is_some_and(is_this_machine) {
-            return Verdict::ForeignHost;
+            return AccessDecision::ForeignHost;
         }
-        let Some(token) = &self.token else { return Verdict::Allowed };
+        let Some(token) = &self.token else { return AccessDecision::Allowed };
         if token.is_in_headers(headers) {
-            return Verdict::Allowed;
+            return AccessDecision::Allowed;
         }
-        match token_in(uri) {
-            Some(given) if token.is(given.as_bytes()) => Verdict::SignIn,
-            _ => Verdict::Unauthorized,
+        // The configuration allows no character in a token that an address would escape.
+        match uri.query().and_then(|query| query.split('&').find_map(|pair| pair.strip_prefix("token="))) {
+            Some(given) if token.is(given.as_bytes()) => AccessDecision::SignIn,
+            _ => AccessDecision::Unauthorized,
         }
     }
 
-    /// The cookie of whoever knows the token; a browser also shows it when a link of elsewhere leads here.
+    /// The cookie of a signed-in browser, which it also sends after following a link from another site.
     pub(crate) fn cookie(&self) -> Option<HeaderValue> {
-        let Token { cookie_name, cookie, .. } = self.token.as_ref()?;
+        let Token { key, cookie_name } = self.token.as_ref()?;
+        let cookie = BASE64_URL_SAFE_NO_PAD.encode(hmac::sign(key, COOKIE_MESSAGE));
         HeaderValue::from_str(&format!("{cookie_name}={cookie}; Path=/; HttpOnly; SameSite=Lax")).ok()
     }
 }
@@ -96,32 +95,25 @@ impl Token {
             return true;
         }
         let cookies = headers.get_all(COOKIE).into_iter().filter_map(|value| value.to_str().ok());
-        let mut named = cookies.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
-        named.any(|(name, value)| name == self.cookie_name && equal(value.as_bytes(), self.cookie.as_bytes()))
+        let mut pairs = cookies.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
+        pairs.any(|(name, value)| name == self.cookie_name && self.is_signature(value))
     }
 
     fn is(&self, given: &[u8]) -> bool {
-        let key = hmac::Key::new(hmac::HMAC_SHA256, given);
-        hmac::verify(&self.key, COOKIE_MESSAGE, hmac::sign(&key, COOKIE_MESSAGE).as_ref()).is_ok()
+        hmac::verify(&self.key, COOKIE_MESSAGE, hmac::sign(&key(given), COOKIE_MESSAGE).as_ref()).is_ok()
+    }
+
+    fn is_signature(&self, cookie: &str) -> bool {
+        let signature = BASE64_URL_SAFE_NO_PAD.decode(cookie);
+        signature.is_ok_and(|signature| hmac::verify(&self.key, COOKIE_MESSAGE, &signature).is_ok())
     }
 }
 
-/// Whether both are the same, in a time that does not depend on where they differ.
-fn equal(a: &[u8], b: &[u8]) -> bool {
-    let key = hmac::Key::new(hmac::HMAC_SHA256, digest::digest(&digest::SHA256, b).as_ref());
-    hmac::verify(&key, a, hmac::sign(&key, b).as_ref()).is_ok()
+fn key(token: &[u8]) -> hmac::Key {
+    hmac::Key::new(hmac::HMAC_SHA256, token)
 }
 
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// The token in an address; it is made of characters that stand for themselves there.
-fn token_in(uri: &Uri) -> Option<&str> {
-    uri.query()?.split('&').find_map(|pair| pair.strip_prefix("token="))
-}
-
-/// Whether a `Host` header names loopback, on whatever port: a tunnel may end on another.
+/// Whether a `Host` header names loopback. Any port is allowed, since a tunnel may end on another.
 fn is_this_machine(host: &HeaderValue) -> bool {
     let Ok(host) = host.to_str() else { return false };
     let name = match host.rsplit_once(':') {
@@ -136,45 +128,45 @@ fn is_this_machine(host: &HeaderValue) -> bool {
 mod tests {
     use super::*;
 
-    fn access(listen: &str, token: Option<&str>) -> Access {
+    fn access(listen: &str, token: Option<&str>) -> AccessPolicy {
         let token = token.map(Secret::new);
-        Access::new(token.as_ref(), listen.parse().unwrap(), &NodeName::from_static("edge"))
+        AccessPolicy::new(token.as_ref(), listen.parse().unwrap(), &NodeName::from_static("edge"))
     }
 
-    fn judge(access: &Access, uri: &str, headers: &[(HeaderName, &str)]) -> Verdict {
+    fn decide(access: &AccessPolicy, uri: &str, headers: &[(HeaderName, &str)]) -> AccessDecision {
         let headers = headers.iter().map(|(name, value)| (name.clone(), HeaderValue::from_str(value).unwrap()));
-        access.judge(&uri.parse().unwrap(), &headers.collect())
+        access.decide(&uri.parse().unwrap(), &headers.collect())
     }
 
     #[test]
     fn on_loopback_only_names_of_this_machine_are_answered() {
         let access = access("127.0.0.1:8080", None);
         for host in ["localhost:8080", "LOCALHOST", "127.0.0.1:9", "127.1.2.3", "[::1]:8080", "[::1]"] {
-            assert_eq!(judge(&access, "/", &[(HOST, host)]), Verdict::Allowed, "{host}");
+            assert_eq!(decide(&access, "/", &[(HOST, host)]), AccessDecision::Allowed, "{host}");
         }
         for host in ["evil.example:8080", "127.0.0.1.evil.example", "localhost.evil.example", "10.0.0.2", "", "::1:"] {
-            assert_eq!(judge(&access, "/", &[(HOST, host)]), Verdict::ForeignHost, "{host}");
+            assert_eq!(decide(&access, "/", &[(HOST, host)]), AccessDecision::ForeignHost, "{host}");
         }
-        assert_eq!(judge(&access, "/", &[]), Verdict::ForeignHost);
+        assert_eq!(decide(&access, "/", &[]), AccessDecision::ForeignHost);
     }
 
     #[test]
     fn a_token_comes_by_header_cookie_or_once_by_address() {
         let access = access("0.0.0.0:8080", Some("correct-horse"));
-        let with = |uri: &str, header: Option<(HeaderName, &str)>| judge(&access, uri, header.as_slice());
-        assert_eq!(with("/", None), Verdict::Unauthorized);
-        assert_eq!(with("/?token=correct-horse", None), Verdict::SignIn);
-        assert_eq!(with("/?a=b&token=correct-horse", None), Verdict::SignIn);
-        assert_eq!(with("/?token=correct-hors", None), Verdict::Unauthorized);
-        assert_eq!(with("/", Some((AUTHORIZATION, "Bearer correct-horse"))), Verdict::Allowed);
+        let with = |uri: &str, header: Option<(HeaderName, &str)>| decide(&access, uri, header.as_slice());
+        assert_eq!(with("/", None), AccessDecision::Unauthorized);
+        assert_eq!(with("/?token=correct-horse", None), AccessDecision::SignIn);
+        assert_eq!(with("/?a=b&token=correct-horse", None), AccessDecision::SignIn);
+        assert_eq!(with("/?token=correct-hors", None), AccessDecision::Unauthorized);
+        assert_eq!(with("/", Some((AUTHORIZATION, "Bearer correct-horse"))), AccessDecision::Allowed);
         for wrong in ["Bearer wrong", "Bearer ", "correct-horse", "Basic correct-horse"] {
-            assert_eq!(with("/", Some((AUTHORIZATION, wrong))), Verdict::Unauthorized, "{wrong}");
+            assert_eq!(with("/", Some((AUTHORIZATION, wrong))), AccessDecision::Unauthorized, "{wrong}");
         }
         let cookie = access.cookie().unwrap();
         let cookie = cookie.to_str().unwrap();
         assert!(cookie.contains("HttpOnly") && !cookie.contains("correct-horse"), "{cookie}");
         let pair = cookie.split(';').next().unwrap();
-        assert_eq!(with("/", Some((COOKIE, &format!("a=b; {pair}")))), Verdict::Allowed);
-        assert_eq!(with("/", Some((COOKIE, &pair[..pair.len() - 1]))), Verdict::Unauthorized);
+        assert_eq!(with("/", Some((COOKIE, &format!("a=b; {pair}")))), AccessDecision::Allowed);
+        assert_eq!(with("/", Some((COOKIE, &pair[..pair.len() - 1]))), AccessDecision::Unauthorized);
     }
 }

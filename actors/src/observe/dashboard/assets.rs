@@ -1,4 +1,4 @@
-//! The page's files, part of the program.
+//! Files of the page, compiled into the program.
 
 /// A file of the page.
 #[derive(Debug, Clone, Copy)]
@@ -29,7 +29,7 @@ const fn asset(path: &'static str, content_type: &'static str, content: &'static
     Asset { path, content_type, content }
 }
 
-/// The paths of all of the page's files, the page itself first.
+/// Paths of all files of the page, the page itself first.
 pub fn paths() -> impl Iterator<Item = &'static str> {
     ASSETS.iter().map(|asset| asset.path)
 }

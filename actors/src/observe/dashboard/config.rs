@@ -1,4 +1,4 @@
-//! Where the dashboard listens and who may look.
+//! Configuration of the dashboard: address, token and limits.
 
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
@@ -11,29 +11,28 @@ use crate::platform::secret::Secret;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DashboardConfig {
-    /// Whether the page is served; default true. Without, nothing listens, and metrics and health are not there either.
+    /// Whether page, metrics and health are served. Default true.
     pub enabled: bool,
-    /// Where the page is served, port 0 for a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a free
-    /// port if that is taken, as by another node of the machine. An address that other machines reach needs a token.
+    /// Address and port of the page; port 0 takes a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a
+    /// free port if that is in use. An address that other machines reach needs a token.
     pub listen: Option<SocketAddr>,
-    /// What who looks has to know, at least 12 characters that stand for themselves in an address. Default none, which
-    /// only a loopback address allows. Give it as `ECOD_DASHBOARD__TOKEN` rather than in a file that others read.
+    /// Secret that gives access, at least 12 characters that an address need not escape. Default none, which only a
+    /// loopback address allows. Prefer `ECOD_DASHBOARD__TOKEN` to a file that others can read.
     pub token: Option<Secret>,
-    /// Most pictures of the cell a second that browsers get; default 10. Less costs less, more shows more of a fast
-    /// cell.
+    /// Maximum snapshots a second for each browser. Default 10. Trade-off: more show a fast cell better, fewer cost less.
     pub max_rate_hz: f64,
-    /// Most connections at a time; default 64. A browser's tab takes one for as long as it is looked at, and others for
-    /// a moment; half of them at most are for live pictures.
+    /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others briefly; at most
+    /// half of them carry live snapshots.
     pub max_connections: usize,
 }
 
-/// Where the page is served if nothing else is said and nobody else is there.
+/// Default address of the page.
 pub const DEFAULT_ADDRESS: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::LOCALHOST, 8080));
 
-/// The shortest token.
+/// Minimum length of a token.
 const MIN_TOKEN_BYTES: usize = 12;
 
-/// What a browser changes or cuts off in `/?token=…`, beside what is no visible ASCII.
+/// Visible ASCII characters that a browser escapes or cuts off in `/?token=…`.
 const NOT_IN_TOKENS: [char; 7] = ['"', '#', '%', '&', '\'', '<', '>'];
 
 impl Default for DashboardConfig {
@@ -43,7 +42,7 @@ impl Default for DashboardConfig {
 }
 
 impl DashboardConfig {
-    /// Checks every value and that strangers stay outside.
+    /// Checks every value, and that an address that others reach has a token.
     ///
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
@@ -52,7 +51,7 @@ impl DashboardConfig {
         check_range("max_connections", self.max_connections as f64, 4.0, 4096.0)?;
         match (&self.token, self.listen) {
             (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => {
-                Err(ConfigError::new("token", "a short text", format!("at least {MIN_TOKEN_BYTES} characters")))
+                Err(ConfigError::new("token", "a shorter text", format!("at least {MIN_TOKEN_BYTES} characters")))
             }
             (Some(token), _)
                 if !token.reveal().chars().all(|c| c.is_ascii_graphic() && !NOT_IN_TOKENS.contains(&c)) =>

@@ -1,125 +1,122 @@
-//! What the node saw over time: who led, how late the maps came, how far vehicles were trusted.
+//! Terms of leadership, map latencies and reputations over time.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::Reputations;
 use serde::Serialize;
 
-use super::picture::json;
-use crate::messages::leadership::{Leadership, Position};
+use super::snapshot::json;
 
-/// A span of time in which one node led, as this node saw it.
+/// One leader's time in the lead, as this node saw it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(crate) struct Reign {
+pub(crate) struct LeaderTerm {
     /// The leader.
     pub leader: NodeName,
     /// Its term.
     pub epoch: u64,
-    /// When this node took it for the leader.
+    /// Time at which this node began to follow it.
     pub from_us: Timestamp,
-    /// When it no longer did; absent while it does.
+    /// Time at which this node stopped; absent while it follows.
     pub until_us: Option<Timestamp>,
-    /// Milliseconds from the last round accepted before to the first of this leader; absent for the first leader, or
-    /// until then.
+    /// Milliseconds between the last round accepted before and this leader's first; absent until both are known.
     pub gap_ms: Option<u64>,
 }
 
-/// What one span of [`SAMPLE_PERIOD`] came to.
+/// Statistics of one [`SAMPLE_PERIOD`].
 #[derive(Debug, Serialize)]
 struct Sample<'a> {
-    /// When the span ended.
+    /// End of the period.
     at_us: Timestamp,
-    /// Rounds accepted in it.
+    /// Rounds accepted.
     rounds: u32,
-    /// Milliseconds from the oldest capture in a map to its receipt, median; absent without such a map.
+    /// Median milliseconds from the oldest capture in a map to its receipt; absent without such a map.
     latency_p50_ms: Option<f64>,
-    /// The same, largest.
+    /// Maximum of the same.
     latency_max_ms: Option<f64>,
-    /// Reputation of every vehicle shown.
+    /// Reputation of each vehicle shown.
     reputations: BTreeMap<&'a NodeName, f64>,
 }
 
-/// Leaders and samples, the oldest first.
+/// Leader terms and samples, oldest first.
 #[derive(Debug, Default)]
 pub(crate) struct History {
-    /// Who led.
-    pub reigns: VecDeque<Reign>,
-    /// When spans ended and, as JSON, how they went: it is written once and not for every browser that asks.
+    /// The latest terms.
+    pub terms: VecDeque<LeaderTerm>,
+    /// End of each period and its sample as JSON, which is encoded once for all browsers.
     samples: VecDeque<(Timestamp, Vec<u8>)>,
-    /// How often the leader changed since the node started.
+    /// Changes of the leader since the node started.
     pub failovers: u64,
     last_round: Option<(Epoch, Timestamp)>,
-    /// The gap before the last epoch's first round, which may be known before its reign is.
+    /// Gap before the last epoch's first round. The round may arrive before the election names the leader.
     last_gap: Option<(Epoch, u64)>,
     latencies_ms: Vec<f64>,
     rounds: u32,
 }
 
-/// How often a sample is taken.
+/// Time between two samples.
 pub(crate) const SAMPLE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Most samples kept: ten minutes.
+/// Maximum number of samples: ten minutes.
 pub(crate) const MAX_SAMPLES: usize = 300;
 
-/// Most reigns kept.
-pub(crate) const MAX_REIGNS: usize = 32;
+/// Maximum number of terms.
+pub(crate) const MAX_TERMS: usize = 32;
 
-/// Most vehicles in a sample.
+/// Maximum number of vehicles in a sample.
 pub(crate) const MAX_VEHICLES: usize = 64;
 
-/// Most latencies of one span that are looked at.
+/// Maximum number of latencies per sample.
 const MAX_LATENCIES: usize = 256;
 
 impl History {
-    /// All of it as JSON, but for samples up to a time, for whoever has those.
+    /// The whole history as JSON, with the samples after `time` only.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
         let samples: Vec<_> = self.samples.iter().filter(|(at, _)| *at > time).map(|(_, sample)| &**sample).collect();
-        let (reigns, samples, failovers) = (json(&self.reigns), samples.join(&b','), json(&self.failovers));
+        let (terms, samples, failovers) = (json(&self.terms), samples.join(&b','), json(&self.failovers));
         let parts: [&[u8]; 7] =
-            [b"{\"reigns\":", &reigns, b",\"samples\":[", &samples, b"],\"failovers\":", &failovers, b"}"];
+            [b"{\"reigns\":", &terms, b",\"samples\":[", &samples, b"],\"failovers\":", &failovers, b"}"];
         parts.concat()
     }
 
-    /// Notes who leads now.
-    pub(crate) fn note_leadership(&mut self, leadership: &Leadership, now: Timestamp) {
+    /// Takes the present leadership.
+    pub(crate) fn add_leadership(&mut self, leadership: &Leadership, now: Timestamp) {
         let present = leadership.epoch.as_ref().filter(|_| leadership.position != Position::Seeking);
-        if let Some(open) = self.reigns.back_mut().filter(|reign| reign.until_us.is_none()) {
+        if let Some(open) = self.terms.back_mut().filter(|term| term.until_us.is_none()) {
             if present.is_some_and(|epoch| *epoch == Epoch::new(open.epoch, open.leader.clone())) {
                 return;
             }
             open.until_us = Some(now);
         }
         let Some(epoch) = present else { return };
-        let changed = self.reigns.back().is_some_and(|last| last.leader != epoch.leader);
-        self.failovers += u64::from(changed);
+        self.failovers += u64::from(self.terms.back().is_some_and(|last| last.leader != epoch.leader));
         let gap_ms = self.last_gap.as_ref().filter(|(of, _)| of == epoch).map(|(_, gap)| *gap);
         let (leader, epoch) = (epoch.leader.clone(), epoch.term);
-        push(&mut self.reigns, Reign { leader, epoch, from_us: now, until_us: None, gap_ms }, MAX_REIGNS);
+        push(&mut self.terms, LeaderTerm { leader, epoch, from_us: now, until_us: None, gap_ms }, MAX_TERMS);
     }
 
-    /// Notes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
-    pub(crate) fn note_round(&mut self, epoch: &Epoch, captured_at: Option<Timestamp>, received_at: Timestamp) {
+    /// Takes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
+    pub(crate) fn add_round(&mut self, epoch: &Epoch, captured_at: Option<Timestamp>, received_at: Timestamp) {
         self.rounds = self.rounds.saturating_add(1);
-        let latency = captured_at.map(|captured_at| received_at.since(captured_at));
         if self.latencies_ms.len() < MAX_LATENCIES {
-            self.latencies_ms.extend(latency.map(|latency| latency.as_secs_f64() * 1e3));
+            self.latencies_ms.extend(captured_at.map(|captured_at| received_at.since(captured_at).as_secs_f64() * 1e3));
         }
         let before = self.last_round.replace((epoch.clone(), received_at));
         let Some((last, last_at)) = before.filter(|(last, _)| last != epoch) else { return };
         let gap_ms = u64::try_from(received_at.since(last_at).as_millis()).unwrap_or(u64::MAX);
-        let of_this = |reign: &&mut Reign| reign.leader == epoch.leader && reign.epoch == epoch.term;
-        if let Some(reign) = self.reigns.iter_mut().rev().find(of_this) {
-            reign.gap_ms.get_or_insert(gap_ms);
+        let of_epoch = |term: &&mut LeaderTerm| term.leader == epoch.leader && term.epoch == epoch.term;
+        if let Some(term) = self.terms.iter_mut().rev().find(of_epoch) {
+            term.gap_ms.get_or_insert(gap_ms);
         }
         self.last_gap = Some((epoch.clone(), gap_ms));
-        tracing::debug!(%last, %epoch, gap_ms, "rounds of another leader");
+        tracing::debug!(%last, %epoch, gap_ms, "first round of another leader");
     }
 
-    /// Closes a span.
+    /// Ends a sample period.
     pub(crate) fn sample(&mut self, reputations: Option<&Reputations>, now: Timestamp) {
         let mut latencies = std::mem::take(&mut self.latencies_ms);
         latencies.sort_by(f64::total_cmp);
@@ -135,11 +132,12 @@ impl History {
     }
 }
 
-fn push<T>(kept: &mut VecDeque<T>, item: T, most: usize) {
-    if kept.len() >= most {
-        kept.pop_front();
+/// Appends an item, and drops the oldest beyond `max`.
+fn push<T>(items: &mut VecDeque<T>, item: T, max: usize) {
+    if items.len() >= max {
+        items.pop_front();
     }
-    kept.push_back(item);
+    items.push_back(item);
 }
 
 #[cfg(test)]
@@ -148,7 +146,7 @@ mod tests {
 
     fn led_by(leader: &'static str, term: u64) -> Leadership {
         let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
-        Leadership { position: Position::Following, epoch, standby: None }
+        Leadership { position: Position::Following, epoch, standby: None, term }
     }
 
     fn seconds(n: u64) -> Timestamp {
@@ -156,51 +154,51 @@ mod tests {
     }
 
     #[test]
-    fn a_failover_ends_one_reign_and_begins_another_with_its_gap() {
+    fn a_failover_ends_one_term_and_begins_another_with_its_gap() {
         let mut history = History::default();
         let epoch = |leader, term| Epoch::new(term, NodeName::from_static(leader));
-        history.note_leadership(&led_by("edge", 3), seconds(1));
-        history.note_round(&epoch("edge", 3), None, seconds(9));
-        history.note_leadership(&led_by("edge", 3), seconds(9));
+        history.add_leadership(&led_by("edge", 3), seconds(1));
+        history.add_round(&epoch("edge", 3), None, seconds(9));
+        history.add_leadership(&led_by("edge", 3), seconds(9));
         let seeking = Leadership { position: Position::Seeking, ..led_by("edge", 3) };
-        history.note_leadership(&seeking, seconds(10));
-        history.note_leadership(&led_by("euclid", 4), seconds(11));
-        history.note_round(&epoch("euclid", 4), None, seconds(12));
-        history.note_round(&epoch("euclid", 4), None, seconds(14));
-        history.note_round(&epoch("gauss", 5), None, seconds(15));
-        history.note_leadership(&led_by("gauss", 5), seconds(16));
-        let reign = |leader, epoch, from, until: Option<u64>, gap_ms| {
+        history.add_leadership(&seeking, seconds(10));
+        history.add_leadership(&led_by("euclid", 4), seconds(11));
+        history.add_round(&epoch("euclid", 4), None, seconds(12));
+        history.add_round(&epoch("euclid", 4), None, seconds(14));
+        history.add_round(&epoch("gauss", 5), None, seconds(15));
+        history.add_leadership(&led_by("gauss", 5), seconds(16));
+        let term = |leader, epoch, from, until: Option<u64>, gap_ms| {
             let leader = NodeName::from_static(leader);
-            Reign { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
+            LeaderTerm { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
         };
-        let (first, second) = (reign("edge", 3, 1, Some(10), None), reign("euclid", 4, 11, Some(16), Some(3000)));
-        assert_eq!(history.reigns, [first, second, reign("gauss", 5, 16, None, Some(1000))]);
+        let (first, second) = (term("edge", 3, 1, Some(10), None), term("euclid", 4, 11, Some(16), Some(3000)));
+        assert_eq!(history.terms, [first, second, term("gauss", 5, 16, None, Some(1000))]);
         assert_eq!(history.failovers, 2);
     }
 
     #[test]
     fn a_leader_that_is_found_again_is_no_failover() {
         let mut history = History::default();
-        history.note_leadership(&led_by("edge", 3), seconds(1));
-        history.note_leadership(&Leadership::default(), seconds(2));
-        history.note_leadership(&led_by("edge", 4), seconds(3));
-        assert_eq!((history.reigns.len(), history.failovers), (2, 0));
+        history.add_leadership(&led_by("edge", 3), seconds(1));
+        history.add_leadership(&Leadership::default(), seconds(2));
+        history.add_leadership(&led_by("edge", 4), seconds(3));
+        assert_eq!((history.terms.len(), history.failovers), (2, 0));
     }
 
     #[test]
     fn a_long_run_is_kept_in_bounds() {
         let mut history = History::default();
         for n in 0..1000 {
-            history.note_leadership(&led_by(if n % 2 == 0 { "edge" } else { "euclid" }, n), seconds(n));
+            history.add_leadership(&led_by(if n % 2 == 0 { "edge" } else { "euclid" }, n), seconds(n));
             let epoch = Epoch::new(n, NodeName::from_static("edge"));
-            (0..1000).for_each(|_| history.note_round(&epoch, Some(seconds(n)), seconds(n)));
+            (0..1000).for_each(|_| history.add_round(&epoch, Some(seconds(n)), seconds(n)));
             assert!(history.latencies_ms.len() <= MAX_LATENCIES);
             history.sample(None, seconds(n));
         }
-        assert_eq!((history.reigns.len(), history.samples.len()), (MAX_REIGNS, MAX_SAMPLES));
+        assert_eq!((history.terms.len(), history.samples.len()), (MAX_TERMS, MAX_SAMPLES));
         let told: serde_json::Value = serde_json::from_slice(&history.json_since(seconds(997))).unwrap();
         let told = told["samples"].as_array().unwrap();
-        assert_eq!(told.len(), 2, "those that a browser has are left out");
+        assert_eq!(told.len(), 2, "samples that the browser has are not sent again");
         assert_eq!((&told[1]["at_us"], &told[1]["rounds"]), (&999_000_000.into(), &1000.into()));
     }
 }

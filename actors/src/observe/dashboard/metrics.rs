@@ -1,10 +1,12 @@
-//! The node for Prometheus, in the OpenMetrics text format.
+//! Metrics of the node for Prometheus, in the OpenMetrics text format.
 //!
-//! Everything is read when it is asked for; nothing is kept for it but counters that the node has anyway. Labels have
-//! few values: reasons and states are fixed sets, vehicles are the first [`MAX_VEHICLES`] by name.
+//! All values are read on request; only counters that the node has anyway are kept. The number of label values is
+//! bounded: reasons and states are fixed sets, vehicles are the first [`MAX_VEHICLES`] by name.
 
 use std::fmt;
+use std::sync::atomic::AtomicU64;
 
+use ecod::leadership::Position;
 use ecod::wire::ReportKind;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
@@ -12,156 +14,140 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::{Registry, Unit};
 
-use super::feed::kind_label;
 use super::history::MAX_VEHICLES;
-use super::observer::{Observer, age_s};
-use super::process;
-use crate::messages::leadership::Position;
+use super::live_state::kind_label;
+use super::node_monitor::NodeMonitor;
+use super::process_metrics;
+use crate::platform::clock;
 use crate::telemetry::counters::{Event, OTHERS, Shed, ShedReason};
 use crate::transport::mqtt::LinkState;
 
-/// The content type of [`metrics`].
+/// Content type of [`metrics`].
 pub(crate) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 type Labels = Vec<(&'static str, String)>;
-type Float = Gauge<f64, std::sync::atomic::AtomicU64>;
+type FloatGauge = Gauge<f64, AtomicU64>;
 
 /// All metrics as text.
 ///
 /// # Errors
-/// Never with text; the encoder writes to what may refuse.
-pub(crate) fn metrics(observer: &Observer) -> Result<String, fmt::Error> {
+/// Never for text; the encoder's writer may fail.
+pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod");
-    node(&mut registry, observer);
-    election(&mut registry, observer);
-    rounds(&mut registry, observer);
-    traffic(&mut registry, observer);
-    reputations(&mut registry, observer);
-    let mut own = Registry::default();
-    process::register(&mut own, observer.sources().node.started_at_us);
+    node(&mut registry, monitor);
+    election(&mut registry, monitor);
+    rounds(&mut registry, monitor);
+    traffic(&mut registry, monitor);
+    reputations(&mut registry, monitor);
+    let mut process = Registry::default();
+    process_metrics::register(&mut process, monitor.sources.node.started_at_us);
     let mut text = String::new();
     encode(&mut text, &registry)?;
-    // One text has one end.
+    // A text has one end mark only.
     text.truncate(text.trim_end_matches("# EOF\n").len());
-    encode(&mut text, &own)?;
+    encode(&mut text, &process)?;
     Ok(text)
 }
 
-fn node(registry: &mut Registry, observer: &Observer) {
-    let facts = &observer.sources().node;
-    let role = format!("{:?}", facts.role).to_lowercase();
-    let labels = [("node", facts.name.to_string()), ("cell", facts.cell.to_string()), ("role", role)];
-    let info = family(registry, "node_info", "Name, cell, role and version of the node; always 1.");
-    set(&info, [labels.as_slice(), &[("version", facts.version.to_owned())]].concat(), 1);
-    let ready = "Whether the node follows a live aggregator, or leads with a working broker.";
-    gauge(registry, "ready", ready, i64::from(observer.readiness().ready));
-    gauge(registry, "members", "Nodes of the cell that answer, this one included.", {
-        count(observer.sources().members.borrow().len() + 1)
-    });
-    let (probe, viewers) = (observer.probe(), observer.viewers());
-    let serves = "Whether the node's embedded broker serves; 0 too on a node without one.";
+fn node(registry: &mut Registry, monitor: &NodeMonitor) {
+    let (sources, probe) = (&monitor.sources, monitor.probe());
+    let facts = &sources.node;
+    let labels = vec![
+        ("node", facts.name.to_string()),
+        ("cell", facts.cell.to_string()),
+        ("role", format!("{:?}", facts.role).to_lowercase()),
+        ("version", facts.version.to_owned()),
+    ];
+    gauges(registry, "node_info", "Name, cell, role and version of the node; always 1", [(labels, 1)]);
+    let ready = "Whether the node follows a live aggregator, or leads with a working broker";
+    gauge(registry, "ready", ready, i64::from(monitor.readiness().ready));
+    let members = count(sources.members.borrow().len() + 1);
+    gauge(registry, "members", "Nodes of the cell that answer, this one included", members);
+    let serves = "Whether the node's embedded broker serves; 0 also on a node without one";
     gauge(registry, "broker_up", serves, i64::from(probe.broker_serves));
-    let up = |state: LinkState| state == LinkState::Up;
-    let links = family(registry, "mqtt_links", "Links to brokers by state.");
-    for (label, wanted) in [("up", true), ("down", false)] {
-        let number = probe.links.iter().flatten().filter(|(_, state)| up(**state) == wanted).count();
-        set(&links, [("state", label.to_owned())], count(number));
-    }
-    gauge(registry, "dashboard_viewers", "Browsers that get live pictures.", count(viewers));
+    let links = [("up", true), ("down", false)].map(|(label, wanted)| {
+        let states = probe.links.iter().flat_map(|links| links.values());
+        (state(label), count(states.filter(|state| (**state == LinkState::Up) == wanted).count()))
+    });
+    gauges(registry, "mqtt_links", "Links to brokers by state", links);
+    gauge(registry, "dashboard_viewers", "Browsers that receive live snapshots", count(monitor.viewers()));
 }
 
-fn election(registry: &mut Registry, observer: &Observer) {
-    let leadership = observer.sources().vitals.leadership.borrow().clone();
-    let states = family(registry, "election_state", "What the node has to do with the lead; 1 for the present state.");
-    for (label, position) in [
+fn election(registry: &mut Registry, monitor: &NodeMonitor) {
+    let leadership = monitor.sources.vitals.leadership.borrow().clone();
+    let positions = [
         ("seeking", Position::Seeking),
         ("following", Position::Following),
         ("standing_by", Position::StandingBy),
         ("leading", Position::Leading),
-    ] {
-        set(&states, [("state", label.to_owned())], i64::from(leadership.position == position));
-    }
+    ];
+    let states = positions.map(|(label, position)| (state(label), i64::from(leadership.position == position)));
+    gauges(registry, "election_state", "Position of the node in its cell; 1 for the present one", states);
     let term = leadership.epoch.as_ref().map_or(0, |epoch| i64::try_from(epoch.term).unwrap_or(i64::MAX));
-    gauge(registry, "election_epoch", "Highest term of leadership known.", term);
+    gauge(registry, "election_epoch", "Highest term of leadership known", term);
     let failovers = Counter::<u64>::default();
-    failovers.inc_by(observer.failovers());
+    failovers.inc_by(monitor.failovers());
     registry.register("election_failovers", "Changes of the leader seen since the node started", failovers);
 }
 
-fn rounds(registry: &mut Registry, observer: &Observer) {
-    let (sources, latencies) = (observer.sources(), observer.latencies());
+fn rounds(registry: &mut Registry, monitor: &NodeMonitor) {
+    let (newest, latency) = (&monitor.sources.vitals.newest, &monitor.map_latency);
     for (name, help, histogram) in [
-        ("map_capture_to_fused", "From the oldest capture in a map to its fusion", &latencies.capture_to_fused),
-        ("map_fused_to_received", "From a map's fusion to its receipt", &latencies.fused_to_received),
-        ("map_capture_to_received", "From the oldest capture in a map to its receipt", &latencies.capture_to_received),
+        ("map_capture_to_fused", "From the oldest capture in a map to its fusion", &latency.capture_to_fused),
+        ("map_fused_to_received", "From a map's fusion to its receipt", &latency.fused_to_received),
+        ("map_capture_to_received", "From the oldest capture in a map to its receipt", &latency.capture_to_received),
     ] {
         registry.register_with_unit(name, help, Unit::Seconds, histogram.clone());
     }
-    let newest = sources.vitals.newest.map.borrow().clone();
-    let verdicts = sources.vitals.newest.verdicts.borrow().clone();
-    if let Some(newest) = &newest {
-        gauge(registry, "map_landmarks", "Known locations in the newest map.", count(newest.map.landmarks.len()));
-        gauge(registry, "map_objects", "Objects in the newest map beside known locations.", {
-            count(newest.map.objects.len())
-        });
+    let map = newest.map.borrow().clone();
+    if let Some(newest) = &map {
+        gauge(registry, "map_landmarks", "Known locations in the newest map", count(newest.map.landmarks.len()));
+        let objects = "Objects in the newest map beside known locations";
+        gauge(registry, "map_objects", objects, count(newest.map.objects.len()));
     }
-    let ages = Family::<Labels, Float>::default();
-    registry.register_with_unit(
-        "newest_round_age",
-        "Time since the newest map or verdicts",
-        Unit::Seconds,
-        ages.clone(),
-    );
-    let came = [("map", newest.map(|map| map.received_at)), ("verdicts", verdicts.map(|newest| newest.received_at))];
-    for (label, received_at) in came {
+    let ages = Family::<Labels, FloatGauge>::default();
+    let help = "Time since the newest map or verdicts";
+    registry.register_with_unit("newest_round_age", help, Unit::Seconds, ages.clone());
+    let verdicts_at = newest.verdicts.borrow().as_ref().map(|newest| newest.received_at);
+    for (label, received_at) in [("map", map.map(|newest| newest.received_at)), ("verdicts", verdicts_at)] {
         if let Some(received_at) = received_at {
-            ages.get_or_create(&vec![("kind", label.to_owned())]).set(age_s(received_at));
+            ages.get_or_create(&kind(label)).set(clock::now().since(received_at).as_secs_f64());
         }
     }
 }
 
-fn traffic(registry: &mut Registry, observer: &Observer) {
-    let sources = observer.sources();
+fn traffic(registry: &mut Registry, monitor: &NodeMonitor) {
+    let sources = &monitor.sources;
     let snapshot = sources.counters.snapshot();
-    let accepted = counters(registry, "rounds_accepted", "Maps, verdicts and reputations newer than all before");
-    for (kind, event) in [
+    let accepted = [
         ("map", Event::MapAccepted),
         ("verdicts", Event::VerdictsAccepted),
         ("reputations", Event::ReputationsAccepted),
-    ] {
-        add(&accepted, [("kind", kind.to_owned())], sources.counters.events(event));
-    }
-    let reports = counters(registry, "reports_received", "Vehicles' reports, also those that were not used");
-    for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
-        add(&reports, [("kind", kind_label(kind).to_owned())], sources.feed.reports(kind));
-    }
-    let rejected = counters(registry, "payloads_rejected", "Payloads that were not used, by reason");
-    for (reason, number) in snapshot.rejects {
-        add(&rejected, [("reason", reason.to_owned())], number);
-    }
-    let shed = counters(registry, "shed", "Messages left out under overload, by reason and source; bounded");
-    // A rate needs a series that is there before it matters.
-    for reason in ShedReason::ALL {
-        add(&shed, [("reason", reason.as_str().to_owned()), ("source", OTHERS.to_owned())], 0);
-    }
-    for Shed { reason, source, times } in sources.counters.all_shed() {
-        add(&shed, [("reason", reason.as_str().to_owned()), ("source", source)], times);
-    }
-    let events = counters(registry, "events", "What the node counts, by kind");
-    for (event, number) in snapshot.events {
-        add(&events, [("event", event.to_owned())], number);
-    }
-    let frames = counters(registry, "gossip_frames", "Datagrams between nodes, by what became of them");
-    for (event, number) in sources.frames.snapshot() {
-        add(&frames, [("event", event.to_owned())], number);
-    }
+    ];
+    let accepted = accepted.map(|(label, event)| (kind(label), sources.counters.events(event)));
+    counters(registry, "rounds_accepted", "Maps, verdicts and reputations newer than all before", accepted);
+    let reports = [ReportKind::Detections, ReportKind::VoteDetections]
+        .map(|report| (kind(kind_label(report)), sources.live_state.reports(report)));
+    counters(registry, "reports_received", "Vehicles' reports, used or not", reports);
+    let rejected = snapshot.rejects.iter().map(|(reason, times)| (vec![("reason", (*reason).to_owned())], *times));
+    counters(registry, "payloads_rejected", "Payloads that were not used, by reason", rejected);
+    // Rates need a series that exists before its first increase.
+    let zeros = ShedReason::ALL.iter().map(|&reason| Shed { reason, source: OTHERS.to_owned(), times: 0 });
+    let shed = zeros.chain(sources.counters.all_shed()).map(|Shed { reason, source, times }| {
+        (vec![("reason", reason.as_str().to_owned()), ("source", source)], times)
+    });
+    counters(registry, "shed", "Messages discarded under overload, by reason and source; bounded", shed);
+    let event = |(event, times): (&&str, &u64)| (vec![("event", (*event).to_owned())], *times);
+    counters(registry, "events", "Counted events by kind", snapshot.events.iter().map(event));
+    let frames = sources.frames.snapshot();
+    counters(registry, "gossip_frames", "Datagrams between nodes, by outcome", frames.iter().map(event));
 }
 
-fn reputations(registry: &mut Registry, observer: &Observer) {
-    let Some(newest) = observer.sources().vitals.newest.reputations.borrow().clone() else { return };
+fn reputations(registry: &mut Registry, monitor: &NodeMonitor) {
+    let Some(newest) = monitor.sources.vitals.newest.reputations.borrow().clone() else { return };
     let vehicles = &newest.message.reputations;
-    gauge(registry, "reputation_vehicles", "Vehicles that have a reputation.", count(vehicles.len()));
-    let scores = Family::<Labels, Float>::default();
+    gauge(registry, "reputation_vehicles", "Vehicles that have a reputation", count(vehicles.len()));
+    let scores = Family::<Labels, FloatGauge>::default();
     let help = "Weight of a vehicle's votes; the first vehicles by name only";
     registry.register("reputation_score_ratio", help, scores.clone());
     for (vehicle, reputation) in vehicles.iter().take(MAX_VEHICLES) {
@@ -172,27 +158,31 @@ fn reputations(registry: &mut Registry, observer: &Observer) {
 fn gauge(registry: &mut Registry, name: &str, help: &str, value: i64) {
     let gauge = Gauge::<i64>::default();
     gauge.set(value);
-    registry.register(name, help.trim_end_matches('.'), gauge);
+    registry.register(name, help, gauge);
 }
 
-fn family(registry: &mut Registry, name: &str, help: &str) -> Family<Labels, Gauge> {
-    let family = Family::default();
-    registry.register(name, help.trim_end_matches('.'), Family::clone(&family));
-    family
+fn gauges(registry: &mut Registry, name: &str, help: &str, values: impl IntoIterator<Item = (Labels, i64)>) {
+    let family = Family::<Labels, Gauge>::default();
+    for (labels, value) in values {
+        family.get_or_create(&labels).set(value);
+    }
+    registry.register(name, help, family);
 }
 
-fn set(family: &Family<Labels, Gauge>, labels: impl Into<Labels>, value: i64) {
-    family.get_or_create(&labels.into()).set(value);
+fn counters(registry: &mut Registry, name: &str, help: &str, values: impl IntoIterator<Item = (Labels, u64)>) {
+    let family = Family::<Labels, Counter>::default();
+    for (labels, times) in values {
+        family.get_or_create(&labels).inc_by(times);
+    }
+    registry.register(name, help, family);
 }
 
-fn counters(registry: &mut Registry, name: &str, help: &str) -> Family<Labels, Counter> {
-    let family = Family::default();
-    registry.register(name, help, Family::clone(&family));
-    family
+fn state(label: &str) -> Labels {
+    vec![("state", label.to_owned())]
 }
 
-fn add(family: &Family<Labels, Counter>, labels: impl Into<Labels>, number: u64) {
-    family.get_or_create(&labels.into()).inc_by(number);
+fn kind(label: &str) -> Labels {
+    vec![("kind", label.to_owned())]
 }
 
 fn count(number: usize) -> i64 {

@@ -1,4 +1,4 @@
-//! What is answered to which request.
+//! HTTP routes of the page, the API, metrics and health.
 
 use std::convert::Infallible;
 use std::fmt;
@@ -15,107 +15,108 @@ use axum::{Json, Router};
 use ecod::time::Timestamp;
 use futures_util::stream;
 
-use super::access::{Access, HEADERS, Verdict};
+use super::access::{AccessDecision, AccessPolicy, HEADERS};
 use super::assets::Asset;
+use super::connection_limit::ConnectionSlot;
 use super::metrics;
-use super::observer::Observer;
-use super::paced::Paced;
-use super::picture::json;
-use super::places::Place;
+use super::node_monitor::NodeMonitor;
+use super::response_cache::ResponseCache;
+use super::snapshot::json;
 use crate::platform::clock;
 use crate::platform::throttle::TokenBucket;
 use crate::telemetry::counters::Event;
 
-/// What requests are answered with.
-#[derive(Debug, Clone)]
-pub(crate) struct Site {
-    observer: Arc<Observer>,
-    access: Arc<Access>,
-    answers: Arc<Mutex<TokenBucket>>,
-    /// Apart, so that whoever may not look takes nothing from those who may.
-    refusals: Arc<Mutex<TokenBucket>>,
-    metrics: Arc<Paced<Result<Bytes, fmt::Error>>>,
+/// State of all routes.
+#[derive(Debug)]
+pub(crate) struct HttpApi {
+    monitor: Arc<NodeMonitor>,
+    access: AccessPolicy,
+    answers: Mutex<TokenBucket>,
+    /// Separate, so that requests without access leave the rate of those with access alone.
+    refusals: Mutex<TokenBucket>,
+    metrics: ResponseCache<Result<Bytes, fmt::Error>>,
     landmarks: Bytes,
     max_viewers: usize,
 }
 
-/// Most requests at once, and time until one more: some tabs open together unhindered, a loop of requests is stopped.
+/// Burst of requests: some tabs open together unhindered.
 const BURST: u32 = 512;
-const STEADY: Duration = Duration::from_millis(5);
 
-/// Least time between two readings of all metrics.
-const METRICS_PAUSE: Duration = Duration::from_millis(100);
+/// Time between further requests after a burst.
+const REQUEST_INTERVAL: Duration = Duration::from_millis(5);
 
-const JSON: &str = "application/json";
+/// Minimum age of the metrics before they are read again.
+const METRICS_MIN_AGE: Duration = Duration::from_millis(100);
 
-impl Site {
-    /// Half of the connections at most are for live pictures.
-    pub(crate) fn new(observer: Arc<Observer>, access: Access, max_connections: usize) -> Self {
-        let throttle = || Arc::new(Mutex::new(TokenBucket::new(BURST, STEADY, clock::now())));
+impl HttpApi {
+    /// At most half of the connections carry live snapshots.
+    pub(crate) fn new(monitor: Arc<NodeMonitor>, access: AccessPolicy, max_connections: usize) -> Self {
+        let throttle = || Mutex::new(TokenBucket::new(BURST, REQUEST_INTERVAL, clock::now()));
         Self {
-            access: Arc::new(access),
+            access,
             answers: throttle(),
             refusals: throttle(),
-            metrics: Arc::new(Paced::new(METRICS_PAUSE)),
-            landmarks: json(&observer.sources().landmarks).into(),
+            metrics: ResponseCache::new(METRICS_MIN_AGE),
+            landmarks: json(&monitor.sources.landmarks).into(),
             max_viewers: max_connections / 2,
-            observer,
+            monitor,
         }
     }
 
-    /// All paths. Health is answered to everybody, as it is asked for by machines that hold no secrets.
+    /// All routes. Health needs no token, as the machines that ask hold no secrets.
     pub(crate) fn router(self) -> Router {
+        let api = Arc::new(self);
         let guarded = Router::new()
             .route("/metrics", get(show_metrics))
-            .route("/api/picture", get(show_picture))
+            .route("/api/picture", get(show_snapshot))
             .route("/api/history", get(show_history))
             .route("/api/landmarks", get(show_landmarks))
             .route("/api/events", get(show_events))
             .fallback(show_asset)
-            .layer(middleware::from_fn_with_state(self.clone(), guard));
+            .layer(middleware::from_fn_with_state(Arc::clone(&api), guard));
         Router::new()
             .route("/healthz", get(|| async { "ok\n" }))
             .route("/readyz", get(show_readiness))
             .merge(guarded)
             .layer(middleware::map_response(with_headers))
-            .with_state(self)
+            .with_state(api)
     }
 
     fn count(&self, event: Event) {
-        self.observer.sources().counters.count(event);
+        self.monitor.sources.counters.count(event);
     }
 }
 
-/// Lets through what may pass, and as much of it as may.
-async fn guard(State(site): State<Site>, request: Request, next: Next) -> Response {
-    let verdict = site.access.judge(request.uri(), request.headers());
-    let is_allowed = matches!(verdict, Verdict::Allowed | Verdict::SignIn);
-    let throttle = if is_allowed { &site.answers } else { &site.refusals };
+type Api = State<Arc<HttpApi>>;
+
+/// Checks access and rate of a request.
+async fn guard(State(api): Api, request: Request, next: Next) -> Response {
+    let decision = api.access.decide(request.uri(), request.headers());
+    let is_allowed = matches!(decision, AccessDecision::Allowed | AccessDecision::SignIn);
+    let throttle = if is_allowed { &api.answers } else { &api.refusals };
     if !throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(clock::now()) {
-        site.count(Event::BrowserThrottled);
+        api.count(Event::BrowserThrottled);
         return (StatusCode::TOO_MANY_REQUESTS, [(header::RETRY_AFTER, "1")], "too many requests\n").into_response();
     }
-    if is_allowed && let Some(place) = request.extensions().get::<Arc<Place>>() {
-        place.keep();
+    if !is_allowed {
+        api.count(Event::BrowserRefused);
+    } else if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
+        slot.keep();
     }
-    match verdict {
-        Verdict::Allowed => next.run(request).await,
-        Verdict::SignIn => {
+    match decision {
+        AccessDecision::Allowed => next.run(request).await,
+        AccessDecision::SignIn => {
             let location = HeaderValue::from_str(request.uri().path()).unwrap_or(HeaderValue::from_static("/"));
             let mut answer = (StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response();
-            if let Some(cookie) = site.access.cookie() {
-                answer.headers_mut().insert(header::SET_COOKIE, cookie);
-            }
+            answer.headers_mut().extend(api.access.cookie().map(|cookie| (header::SET_COOKIE, cookie)));
             answer
         }
-        Verdict::Unauthorized => {
-            site.count(Event::BrowserRefused);
-            let ask = [(header::WWW_AUTHENTICATE, "Bearer")];
-            (StatusCode::UNAUTHORIZED, ask, "open this page with ?token=… or send Authorization: Bearer …\n")
-                .into_response()
+        AccessDecision::Unauthorized => {
+            let challenge = [(header::WWW_AUTHENTICATE, "Bearer")];
+            let text = "open this page with ?token=… or send Authorization: Bearer …\n";
+            (StatusCode::UNAUTHORIZED, challenge, text).into_response()
         }
-        Verdict::ForeignHost => {
-            site.count(Event::BrowserRefused);
+        AccessDecision::ForeignHost => {
             (StatusCode::MISDIRECTED_REQUEST, "this page is served on loopback only\n").into_response()
         }
     }
@@ -128,63 +129,67 @@ async fn with_headers(mut answer: Response) -> Response {
     answer
 }
 
-async fn show_readiness(State(site): State<Site>) -> Response {
-    let readiness = site.observer.readiness();
+async fn show_readiness(State(api): Api) -> Response {
+    let readiness = api.monitor.readiness();
     let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     (status, Json(readiness)).into_response()
 }
 
-async fn show_metrics(State(site): State<Site>) -> Response {
-    match site.metrics.get(|| metrics::metrics(&site.observer).map(Bytes::from)).value {
-        Ok(text) => ([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response(),
+async fn show_metrics(State(api): Api) -> Response {
+    match api.metrics.get(|| metrics::metrics(&api.monitor).map(Bytes::from)).value {
+        Ok(text) => typed(metrics::CONTENT_TYPE, text),
         Err(error) => {
-            tracing::warn!(%error, "metrics not written");
+            tracing::warn!(%error, "cannot write metrics");
             StatusCode::INTERNAL_SERVER_ERROR.into_response()
         }
     }
 }
 
-async fn show_picture(State(site): State<Site>) -> Response {
-    ([(header::CONTENT_TYPE, JSON)], site.observer.json()).into_response()
+async fn show_snapshot(State(api): Api) -> Response {
+    typed(JSON, api.monitor.json())
 }
 
-/// All of the history, or with `?since=` only later samples.
-async fn show_history(State(site): State<Site>, uri: Uri) -> Response {
+/// The history, with the samples after `?since=` only.
+async fn show_history(State(api): Api, uri: Uri) -> Response {
     let since = uri.query().and_then(|query| query.strip_prefix("since=")).and_then(|time| time.parse().ok());
-    let history = site.observer.history_since(Timestamp(since.unwrap_or(0)));
-    ([(header::CONTENT_TYPE, JSON)], history).into_response()
+    typed(JSON, api.monitor.history_since(Timestamp(since.unwrap_or(0))))
 }
 
-async fn show_landmarks(State(site): State<Site>) -> Response {
-    ([(header::CONTENT_TYPE, JSON)], site.landmarks).into_response()
+async fn show_landmarks(State(api): Api) -> Response {
+    typed(JSON, api.landmarks.clone())
 }
 
-/// Pictures as they are made. Each browser has the latest and what fits into its socket; what it is too slow for, it
-/// never gets.
-async fn show_events(State(site): State<Site>) -> Response {
-    if site.observer.viewers() >= site.max_viewers {
-        site.count(Event::BrowserRefused);
+/// Snapshots as they are taken. A browser that is too slow for one gets the next.
+async fn show_events(State(api): Api) -> Response {
+    if api.monitor.viewers() >= api.max_viewers {
+        api.count(Event::BrowserRefused);
         return (StatusCode::SERVICE_UNAVAILABLE, "too many browsers\n").into_response();
     }
-    let mut pictures = site.observer.pictures();
-    pictures.mark_unchanged();
-    let first = Some(site.observer.event());
-    let events = stream::unfold((pictures, first), |(mut pictures, mut first)| async move {
+    let mut snapshots = api.monitor.snapshots();
+    snapshots.mark_unchanged();
+    let first = Some(api.monitor.event());
+    let events = stream::unfold((snapshots, first), |(mut snapshots, mut first)| async move {
         let event = match first.take() {
             Some(event) => event,
             None => {
-                pictures.changed().await.ok()?;
-                pictures.borrow_and_update().clone()
+                snapshots.changed().await.ok()?;
+                snapshots.borrow_and_update().clone()
             }
         };
-        Some((Ok::<Bytes, Infallible>(event), (pictures, first)))
+        Some((Ok::<Bytes, Infallible>(event), (snapshots, first)))
     });
-    ([(header::CONTENT_TYPE, "text/event-stream")], Body::from_stream(events)).into_response()
+    typed("text/event-stream", Body::from_stream(events))
 }
 
-async fn show_asset(request: Request) -> Response {
-    match Asset::find(request.uri().path()) {
-        Some(Asset { content_type, content, .. }) => ([(header::CONTENT_TYPE, content_type)], content).into_response(),
+async fn show_asset(uri: Uri) -> Response {
+    match Asset::find(uri.path()) {
+        Some(asset) => typed(asset.content_type, asset.content),
         None => (StatusCode::NOT_FOUND, "nothing here\n").into_response(),
     }
+}
+
+const JSON: &str = "application/json";
+
+fn typed(content_type: &'static str, content: impl Into<Body>) -> Response {
+    ([(header::CONTENT_TYPE, content_type)], content.into()).into_response()
 }

@@ -1,4 +1,4 @@
-//! The listener, on a thread of its own: whatever browsers do, the cell's threads do not notice.
+//! HTTP listener on a thread of its own, so that browsers cannot delay the cell.
 
 use std::io;
 use std::net::SocketAddr;
@@ -17,41 +17,44 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{oneshot, watch};
 use tokio_io_timeout::TimeoutStream;
 
-use super::access::Access;
+use super::access::AccessPolicy;
 use super::config::{DEFAULT_ADDRESS, DashboardConfig};
-use super::observer::Observer;
-use super::places::{Admitted, Place, Places};
-use super::routes::Site;
+use super::connection_limit::{Admitted, ConnectionLimit, ConnectionSlot};
+use super::node_monitor::NodeMonitor;
+use super::routes::HttpApi;
 use crate::telemetry::counters::Event;
 
-/// A running server; dropping it stops it.
+/// A running HTTP server; stops when dropped.
 #[derive(Debug)]
-pub(crate) struct Server {
+pub struct Server {
     stop: Option<oneshot::Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// First and longest wait before an address that was not free is tried again.
+/// First and longest wait before an address in use is tried again.
 const RETRY_MIN: Duration = Duration::from_millis(500);
 const RETRY_MAX: Duration = Duration::from_secs(10);
 
-/// How long a browser may take for its request.
+/// Wait after a connection could not be accepted, most likely for want of file descriptors.
+const ACCEPT_RETRY: Duration = Duration::from_millis(100);
+
+/// Maximum time for the head of a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How long a browser may read nothing of what it asked for.
+/// Maximum time in which a browser reads nothing of an answer.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Most bytes that wait for one browser, beside what its socket holds.
+/// Maximum bytes that wait for one browser, beside its socket's buffer.
 const MAX_BUFFER_BYTES: usize = 64 * 1024;
 
 impl Server {
-    /// Starts the thread; `bound` gets the address as soon as it is listened on.
+    /// Starts the thread; `bound` receives the address once the server listens.
     ///
     /// # Errors
     /// When the operating system gives no thread.
     pub(crate) fn start(
         config: DashboardConfig,
-        observer: Arc<Observer>,
+        monitor: Arc<NodeMonitor>,
         bound: watch::Sender<Option<SocketAddr>>,
     ) -> io::Result<Self> {
         let (stop, stopped) = oneshot::channel();
@@ -59,9 +62,9 @@ impl Server {
         let thread = std::thread::Builder::new().name("dashboard".into()).spawn(move || {
             runtime.block_on(async {
                 tokio::select! {
-                    () = observer.run() => {}
-                    () = serve(&config, &observer, &bound) => {}
-                    // The sender is dropped too when its owner is.
+                    () = monitor.run() => {}
+                    () = serve(&config, &monitor, &bound) => {}
+                    // Ends when the sender is dropped, too.
                     _ = stopped => {}
                 }
             });
@@ -70,7 +73,7 @@ impl Server {
         Ok(Self { stop: Some(stop), thread: Some(thread) })
     }
 
-    /// Whether the thread has ended by itself.
+    /// Whether the thread ended by itself.
     pub(crate) fn has_ended(&self) -> bool {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
@@ -80,62 +83,60 @@ impl Drop for Server {
     fn drop(&mut self) {
         drop(self.stop.take());
         if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
-            tracing::warn!("the dashboard's thread panicked");
+            tracing::warn!("dashboard thread panicked");
         }
     }
 }
 
-async fn serve(config: &DashboardConfig, observer: &Arc<Observer>, bound: &watch::Sender<Option<SocketAddr>>) {
-    // A run before this one may have been given a port, which browsers now know.
+async fn serve(config: &DashboardConfig, monitor: &Arc<NodeMonitor>, bound: &watch::Sender<Option<SocketAddr>>) {
+    // Browsers may know the port of an earlier run.
     let wanted = bound.borrow().or(config.listen);
     let listener = match wanted {
-        Some(address) => listen(address, observer).await,
-        None => listen_anywhere(observer).await,
+        Some(address) => listen(address, monitor).await,
+        None => listen_anywhere(monitor).await,
     };
     let Ok(address) = listener.local_addr() else { return };
-    let node = &observer.sources().node.name;
-    let access = Access::new(config.token.as_ref(), address, node);
+    let access = AccessPolicy::new(config.token.as_ref(), address, &monitor.sources.node.name);
     tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
     bound.send_replace(Some(address));
-    let router = Site::new(Arc::clone(observer), access, config.max_connections).router();
-    let places = Places::new(config.max_connections);
+    let router = HttpApi::new(Arc::clone(monitor), access, config.max_connections).router();
+    let limit = ConnectionLimit::new(config.max_connections);
     loop {
         let (stream, from) = match listener.accept().await {
             Ok(accepted) => accepted,
             Err(error) => {
-                // Out of file descriptors, most likely: some may be free soon.
                 tracing::debug!(%error, "no connection accepted");
-                tokio::time::sleep(Duration::from_millis(100)).await;
+                tokio::time::sleep(ACCEPT_RETRY).await;
                 continue;
             }
         };
-        let admitted = places.admit(from.ip());
+        let admitted = limit.admit(from.ip());
         if admitted.as_ref().is_none_or(|admitted| admitted.displaces) {
-            observer.sources().counters.count(Event::BrowserRefused);
+            monitor.sources.counters.count(Event::BrowserRefused);
         }
-        let Some(Admitted { place, displaced, .. }) = admitted else { continue };
+        let Some(Admitted { slot, displaced, .. }) = admitted else { continue };
         let router = router.clone();
         tokio::spawn(async move {
             tokio::select! {
-                answered = answer(stream, Arc::new(place), router) => if let Err(error) = answered {
-                    tracing::debug!(%error, "connection of a browser ended");
+                answered = answer(stream, Arc::new(slot), router) => if let Err(error) = answered {
+                    tracing::debug!(%error, "connection of a browser failed");
                 },
-                _ = displaced => tracing::debug!(%from, "connection of a browser gave way to another"),
+                _ = displaced => tracing::debug!(%from, "connection of a browser displaced by another"),
             }
         });
     }
 }
 
-/// Answers one request. What keeps its connection between two requests would take a place for nothing.
-async fn answer(stream: TcpStream, place: Arc<Place>, router: Router) -> hyper::Result<()> {
+/// Answers one request and closes the connection: an idle one would occupy a slot.
+async fn answer(stream: TcpStream, slot: Arc<ConnectionSlot>, router: Router) -> hyper::Result<()> {
     if let Err(error) = stream.set_nodelay(true) {
-        tracing::debug!(%error, "small packets may wait");
+        tracing::debug!(%error, "cannot set TCP_NODELAY, small packets may be delayed");
     }
     let mut stream = TimeoutStream::new(stream);
     stream.set_write_timeout(Some(WRITE_TIMEOUT));
     let routed = TowerToHyperService::new(router);
     let service = service_fn(|mut request: Request<Incoming>| {
-        request.extensions_mut().insert(Arc::clone(&place));
+        request.extensions_mut().insert(Arc::clone(&slot));
         routed.call(request)
     });
     http1::Builder::new()
@@ -147,19 +148,19 @@ async fn answer(stream: TcpStream, place: Arc<Place>, router: Router) -> hyper::
         .await
 }
 
-/// Listens at the default address or, as other nodes of the machine do it too, on a free port of loopback.
-async fn listen_anywhere(observer: &Observer) -> TcpListener {
+/// Listens at the default address or, if another node of the machine does, on a free port of loopback.
+async fn listen_anywhere(monitor: &NodeMonitor) -> TcpListener {
     match TcpListener::bind(DEFAULT_ADDRESS).await {
         Ok(listener) => listener,
         Err(error) => {
             tracing::info!(address = %DEFAULT_ADDRESS, %error, "dashboard takes a free port, key `dashboard.listen` is not set");
-            listen(SocketAddr::new(DEFAULT_ADDRESS.ip(), 0), observer).await
+            listen(SocketAddr::new(DEFAULT_ADDRESS.ip(), 0), monitor).await
         }
     }
 }
 
 /// Listens as soon as the address is free.
-async fn listen(address: SocketAddr, observer: &Observer) -> TcpListener {
+async fn listen(address: SocketAddr, monitor: &NodeMonitor) -> TcpListener {
     let mut wait = RETRY_MIN;
     loop {
         match TcpListener::bind(address).await {
@@ -168,7 +169,7 @@ async fn listen(address: SocketAddr, observer: &Observer) -> TcpListener {
                 if wait == RETRY_MIN {
                     tracing::warn!(%address, %error, "dashboard cannot listen, key `dashboard.listen`; trying again");
                 }
-                observer.sources().counters.count(Event::DashboardNotBound);
+                monitor.sources.counters.count(Event::DashboardNotBound);
             }
         }
         tokio::time::sleep(wait).await;

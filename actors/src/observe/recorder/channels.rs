@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::replay::JournalEntry;
 use ecod::time::Timestamp;
@@ -14,8 +15,7 @@ use schemars::{JsonSchema, Schema};
 use serde::{Deserialize, Serialize};
 
 use super::foxglove;
-use super::viewers::schema_of;
-use crate::messages::leadership::{Leadership, Position};
+use super::viewer_schema::schema_of;
 
 /// A channel's schema by its name in the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

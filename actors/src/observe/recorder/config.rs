@@ -34,7 +34,7 @@ pub struct RecordConfig {
     /// Whether a node that never leads takes all reports of its cell to record them; default false. A node that may
     /// lead takes them anyway.
     pub reports: bool,
-    /// Pictures of the camera a second, as JPEG; default 0, none. Each has some 50 to 100 kB at 640x480.
+    /// ImageRecorder of the camera a second, as JPEG; default 0, none. Each has some 50 to 100 kB at 640x480.
     pub camera_hz: f64,
     /// Port on 127.0.0.1 where Foxglove and Lichtblick see live what is recorded; default none. 8765 is what they ask
     /// for, 0 a free one.

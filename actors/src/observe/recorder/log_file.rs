@@ -11,8 +11,8 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, McapResult, WriteOptions, Writer};
 
 use super::channels::SchemaName;
-use super::identity::Identity;
-use super::scribe::{Message, Sink};
+use super::entry_encoder::{EncodedMessage, MessageSink};
+use super::log_identity::LogIdentity;
 
 /// A file being written; what was written up to the last [`LogFile::flush`] survives the process.
 pub(crate) struct LogFile {
@@ -31,11 +31,11 @@ struct Channel {
 
 impl LogFile {
     /// Begins a file that tells who writes it; where that fails, there is none.
-    pub(crate) fn begin(path: &Path, file: File, identity: &Identity) -> McapResult<Self> {
+    pub(crate) fn begin(path: &Path, file: File, identity: &LogIdentity) -> McapResult<Self> {
         Self::introduce(path.into(), file, identity).inspect_err(|_| remove(path))
     }
 
-    fn introduce(path: PathBuf, file: File, identity: &Identity) -> McapResult<Self> {
+    fn introduce(path: PathBuf, file: File, identity: &LogIdentity) -> McapResult<Self> {
         let options = WriteOptions::new()
             .profile("")
             .library(concat!("ecod-node ", env!("CARGO_PKG_VERSION")))
@@ -43,7 +43,7 @@ impl LogFile {
             .compression_level(1)
             .compression_threads(0);
         let mut writer = options.create(BufWriter::with_capacity(1 << 16, file))?;
-        writer.write_metadata(&Metadata { name: Identity::RECORD.into(), metadata: identity.to_map() })?;
+        writer.write_metadata(&Metadata { name: LogIdentity::RECORD.into(), metadata: identity.to_map() })?;
         writer.flush()?;
         Ok(Self { writer, path, holds: false, opened: Instant::now(), channels: HashMap::new() })
     }
@@ -85,9 +85,9 @@ fn remove(path: &Path) {
     }
 }
 
-impl Sink for LogFile {
-    fn put(&mut self, message: Message<'_>) -> McapResult<()> {
-        let Message { schema, topic, at, made_at, json } = message;
+impl MessageSink for LogFile {
+    fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()> {
+        let EncodedMessage { schema, topic, at, made_at, json } = message;
         let key = (schema, topic.to_owned());
         if !self.channels.contains_key(&key) {
             let text = schema.json_schema().to_value().to_string();
@@ -124,7 +124,7 @@ mod tests {
     fn a_file_that_holds_nothing_is_not_left_behind() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("cav.mcap");
-        let identity = Identity::new(
+        let identity = LogIdentity::new(
             NodeName::from_static("cav"),
             Uuid::nil(),
             NodeName::from_static("lot-1"),
@@ -133,7 +133,7 @@ mod tests {
         );
         let json = br#"{"at_us":0,"event":{"missing":{"entries":1}}}"#;
         let (at, made_at) = (Timestamp(0), Timestamp(0));
-        let message = Message { schema: SchemaName::JournalEntry, topic: "node/journal", at, made_at, json };
+        let message = EncodedMessage { schema: SchemaName::JournalEntry, topic: "node/journal", at, made_at, json };
 
         File::create_new(&path).unwrap();
         let refusing = File::open(&path).unwrap();

@@ -12,7 +12,7 @@ use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 use super::channels::SchemaName;
-use super::identity::{Identity, IdentityError};
+use super::log_identity::{LogIdentity, LogIdentityError};
 
 /// How a file of this kind begins.
 const MAGIC: &[u8] = b"\x89MCAP0\r\n";
@@ -24,7 +24,7 @@ const MAX_RECORD_BYTES: usize = 1 << 28;
 #[derive(Debug, Clone, PartialEq)]
 pub enum LogEvent {
     /// Who wrote it, at its beginning.
-    Identity(Box<Identity>),
+    Identity(Box<LogIdentity>),
     /// A message.
     Message(LogMessage),
 }
@@ -68,7 +68,7 @@ pub enum LogError {
         source: McapError,
     },
     /// A later version of the program wrote it.
-    #[error("{path} has version {found} of the log, this program knows {known}", known = Identity::VERSION)]
+    #[error("{path} has version {found} of the log, this program knows {known}", known = LogIdentity::VERSION)]
     Newer {
         /// The file.
         path: PathBuf,
@@ -81,7 +81,7 @@ pub enum LogError {
         /// The file.
         path: PathBuf,
         /// Why.
-        source: IdentityError,
+        source: LogIdentityError,
     },
 }
 
@@ -183,7 +183,9 @@ impl LogReader {
 
     fn take(&mut self, record: Record<'static>) -> Option<Result<LogEvent, LogError>> {
         match record {
-            Record::Metadata(metadata) if metadata.name == Identity::RECORD => Some(self.identity(&metadata.metadata)),
+            Record::Metadata(metadata) if metadata.name == LogIdentity::RECORD => {
+                Some(self.identity(&metadata.metadata))
+            }
             Record::Schema { header, .. } => {
                 self.schemas.insert(header.id, header.name);
                 None
@@ -209,10 +211,10 @@ impl LogReader {
 
     fn identity(&mut self, map: &BTreeMap<String, String>) -> Result<LogEvent, LogError> {
         let path = self.path.clone();
-        self.node = Identity::node_in(map);
-        match Identity::version_in(map) {
-            Some(found) if found > Identity::VERSION => Err(LogError::Newer { path, found }),
-            _ => match Identity::from_map(map) {
+        self.node = LogIdentity::node_in(map);
+        match LogIdentity::version_in(map) {
+            Some(found) if found > LogIdentity::VERSION => Err(LogError::Newer { path, found }),
+            _ => match LogIdentity::from_map(map) {
                 Ok(identity) => Ok(LogEvent::Identity(Box::new(identity))),
                 Err(source) => Err(LogError::Identity { path, source }),
             },

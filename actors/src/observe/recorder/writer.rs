@@ -9,12 +9,12 @@ use mcap::{McapError, McapResult};
 
 use super::config::RecordConfig;
 use super::disk;
-use super::identity::Identity;
+use super::entry_encoder::EntryEncoder;
 #[cfg(feature = "foxglove")]
-use super::live::Live;
+use super::live_server::LiveServer;
 use super::log_file::LogFile;
-use super::recording::{Entry, Item, Recording, Standing};
-use super::scribe::Scribe;
+use super::log_identity::LogIdentity;
+use super::log_sender::{AggregatorState, LogEntry, LogItem, LogSender};
 use crate::telemetry::counters::Event;
 
 /// How often the log is made safe from the end of the process.
@@ -26,12 +26,12 @@ const RETRY_AFTER: Duration = Duration::from_secs(5);
 /// Takes entries from the queue to the disk.
 pub(crate) struct LogWriter {
     config: RecordConfig,
-    identity: Identity,
-    recording: Recording,
-    scribe: Scribe,
+    identity: LogIdentity,
+    recording: LogSender,
+    encoder: EntryEncoder,
     file: Option<LogFile>,
     #[cfg(feature = "foxglove")]
-    live: Option<Live>,
+    live: Option<LiveServer>,
     pending: Pending,
     flush_due: Instant,
     retry_at: Option<Instant>,
@@ -48,16 +48,16 @@ struct Pending {
 }
 
 impl LogWriter {
-    pub(crate) fn new(config: RecordConfig, identity: Identity, recording: Recording) -> Self {
+    pub(crate) fn new(config: RecordConfig, identity: LogIdentity, recording: LogSender) -> Self {
         let flush_due = Instant::now() + FLUSH_PERIOD;
-        let scribe = Scribe::new(identity.node.clone(), config.drawable);
+        let encoder = EntryEncoder::new(identity.node.clone(), config.drawable);
         #[cfg(feature = "foxglove")]
-        let live = config.live_port.map(|port| Live::new(port, identity.node.clone()));
+        let live = config.live_port.map(|port| LiveServer::new(port, identity.node.clone()));
         Self {
             config,
             identity,
             recording,
-            scribe,
+            encoder,
             file: None,
             #[cfg(feature = "foxglove")]
             live,
@@ -69,7 +69,7 @@ impl LogWriter {
     }
 
     /// Writes until nobody can send any more.
-    pub(crate) fn run(mut self, queue: &Receiver<Entry>) {
+    pub(crate) fn run(mut self, queue: &Receiver<LogEntry>) {
         loop {
             match queue.recv_timeout(self.flush_due.saturating_duration_since(Instant::now())) {
                 Ok(entry) => self.take(&entry),
@@ -87,7 +87,7 @@ impl LogWriter {
         }
     }
 
-    fn take(&mut self, entry: &Entry) {
+    fn take(&mut self, entry: &LogEntry) {
         #[cfg(feature = "foxglove")]
         if let Some(live) = &mut self.live {
             live.show(entry);
@@ -104,15 +104,15 @@ impl LogWriter {
         self.pending.of_journal += of_journal + missing;
         let told = match missing {
             0 => Ok(()),
-            entries => self.scribe.journal(entry.at, &JournalEvent::Missing { entries }, file),
+            entries => self.encoder.journal(entry.at, &JournalEvent::Missing { entries }, file),
         };
-        if let Err(error) = told.and_then(|()| self.scribe.write(entry, file)) {
+        if let Err(error) = told.and_then(|()| self.encoder.write(entry, file)) {
             self.failed(&error);
         }
     }
 
     /// Begins the next file if there is none, unless the last attempt has just failed.
-    fn open(&mut self, entry: &Entry) {
+    fn open(&mut self, entry: &LogEntry) {
         if self.file.is_some() || self.retry_at.is_some_and(|at| Instant::now() < at) {
             return;
         }
@@ -126,7 +126,7 @@ impl LogWriter {
         }
     }
 
-    fn begin(&mut self, entry: &Entry) -> McapResult<LogFile> {
+    fn begin(&mut self, entry: &LogEntry) -> McapResult<LogFile> {
         let (dir, node) = (&self.config.dir, &self.identity.node);
         std::fs::create_dir_all(dir)?;
         // First, as it may make the room that there must be; what cannot be deleted does not end the log.
@@ -135,23 +135,25 @@ impl LogWriter {
         }
         let (path, file) = disk::create(dir, node, entry.at, self.config.min_free_bytes())?;
         let mut file = LogFile::begin(&path, file, &self.identity)?;
-        let Standing { runs, leads, next_round } = self.recording.standing().clone();
-        if runs && !matches!(entry.item, Item::Journal(JournalEvent::Start { .. })) {
-            self.scribe.journal(entry.at, &JournalEvent::Continue { leads, next_round }, &mut file)?;
+        let AggregatorState { runs, leads, next_round } = self.recording.aggregator_state().clone();
+        if runs && !matches!(entry.item, LogItem::Journal(JournalEvent::Start { .. })) {
+            self.encoder.journal(entry.at, &JournalEvent::Continue { leads, next_round }, &mut file)?;
         }
         Ok(file)
     }
 
     /// Keeps up with the aggregator, for files that begin in the middle of its run.
-    fn follow(&self, item: &Item) {
-        let mut standing = self.recording.standing();
+    fn follow(&self, item: &LogItem) {
+        let mut aggregator_state = self.recording.aggregator_state();
         match item {
-            Item::Journal(JournalEvent::Start { .. }) => *standing = Standing { runs: true, ..Standing::default() },
-            Item::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
-                (standing.leads, standing.next_round) = (Some(epoch.clone()), *first_round);
+            LogItem::Journal(JournalEvent::Start { .. }) => {
+                *aggregator_state = AggregatorState { runs: true, ..AggregatorState::default() }
             }
-            Item::Journal(JournalEvent::Command(Command::StandBy)) => standing.leads = None,
-            Item::Round(round) => standing.next_round = round.saturating_add(1),
+            LogItem::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
+                (aggregator_state.leads, aggregator_state.next_round) = (Some(epoch.clone()), *first_round);
+            }
+            LogItem::Journal(JournalEvent::Command(Command::StepDown)) => aggregator_state.leads = None,
+            LogItem::Round(round) => aggregator_state.next_round = round.saturating_add(1),
             _ => {}
         }
     }
@@ -217,16 +219,16 @@ mod tests {
 
     fn writer(config: RecordConfig, counters: &Arc<Counters>) -> LogWriter {
         let identity =
-            Identity::new(NODE, Uuid::nil(), NodeName::from_static("lot-1"), FusionConfig::default(), Vec::new());
-        LogWriter::new(config, identity, Recording::new(Arc::clone(counters)))
+            LogIdentity::new(NODE, Uuid::nil(), NodeName::from_static("lot-1"), FusionConfig::default(), Vec::new());
+        LogWriter::new(config, identity, LogSender::new(Arc::clone(counters)))
     }
 
     fn in_directory(directory: &Path) -> RecordConfig {
         RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory) }
     }
 
-    fn second(seconds: u64, item: Item) -> Entry {
-        Entry { at: Timestamp(seconds * 1_000_000), item }
+    fn second(seconds: u64, item: LogItem) -> LogEntry {
+        LogEntry { at: Timestamp(seconds * 1_000_000), item }
     }
 
     fn messages(path: &Path) -> Vec<LogMessage> {
@@ -259,7 +261,7 @@ mod tests {
             ..RecordConfig::new(directory.path())
         };
         let counters = Arc::new(Counters::default());
-        let entry = second(100, Item::Counters(counters.snapshot()));
+        let entry = second(100, LogItem::Counters(counters.snapshot()));
         let all = kept();
         writer(config(1_000_000_000), &counters).take(&entry);
         assert_eq!(counters.events(Event::RecordFailed), 1);
@@ -278,7 +280,7 @@ mod tests {
     fn a_disk_that_fills_up_while_a_file_is_written_ends_the_file_in_order() {
         let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
         let mut writer = writer(in_directory(directory.path()), &counters);
-        let entry = |seconds: u64| second(seconds, Item::Counters(counters.snapshot()));
+        let entry = |seconds: u64| second(seconds, LogItem::Counters(counters.snapshot()));
         writer.take(&entry(1));
         writer.flush();
         assert_eq!(counters.events(Event::RecordFailed), 0);
@@ -303,7 +305,7 @@ mod tests {
         let path = format!("/proc/self/fd/{}", memory.as_raw_fd());
         let disk = memory.try_clone().unwrap();
         writer.file = Some(LogFile::begin(Path::new(&path), memory, &writer.identity).unwrap());
-        let tick = |seconds| second(seconds, Item::Journal(JournalEvent::Command(Command::Tick)));
+        let tick = |seconds| second(seconds, LogItem::Journal(JournalEvent::Command(Command::Tick)));
         writer.take(&tick(1));
         assert_eq!(counts(), [0, 0], "it is not on the disk yet");
         writer.flush();
@@ -312,7 +314,7 @@ mod tests {
         fcntl_add_seals(&disk, SealFlags::GROW).unwrap();
         writer.recording.lost(1, 1);
         writer.take(&tick(2));
-        writer.take(&second(3, Item::Counters(counters.snapshot())));
+        writer.take(&second(3, LogItem::Counters(counters.snapshot())));
         writer.take(&tick(4));
         writer.flush();
         assert_eq!(counts(), [1, 4]);
@@ -338,7 +340,7 @@ mod tests {
         assert_eq!(round.at, Timestamp(99_000_000));
         writer.take(&round);
         assert!(files(directory.path()).unwrap().is_empty());
-        writer.take(&second(100, Item::Journal(JournalEvent::Command(Command::Tick))));
+        writer.take(&second(100, LogItem::Journal(JournalEvent::Command(Command::Tick))));
         writer.flush();
         let path = &files(directory.path()).unwrap()[0];
         assert_eq!(path.file_name().unwrap(), "cav-19700101T000140Z-000.mcap");

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::election::Clock;
+use ecod::leadership::election::AwakeClock;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use rand::{RngExt, SeedableRng};
@@ -55,7 +55,7 @@ pub(crate) struct GossipSetup {
 pub(crate) struct GossipMachine {
     sessions: Sessions,
     gossip: Swim,
-    clock: Clock,
+    clock: AwakeClock,
     hello: Duration,
     hello_at: Timestamp,
     hello_count: u64,
@@ -80,7 +80,7 @@ struct PendingFrames {
 impl GossipMachine {
     pub(crate) fn new(setup: GossipSetup, config: &MembershipConfig, now: Timestamp) -> Self {
         let GossipSetup { own, key, session, secret, seed, counters } = setup;
-        let clock = Clock::new(now, STALL);
+        let clock = AwakeClock::new(now, STALL);
         Self {
             learns_address: own.gossip.ip().is_unspecified(),
             sessions: Sessions::new(key, session, &secret, config.max_peers, Arc::clone(&counters), now),

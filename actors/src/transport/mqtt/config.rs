@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
+use ecod::leadership::BrokerAddress;
 use ecod::wire::{Encoding, Limits};
 use serde::{Deserialize, Serialize};
 
-use super::address::BrokerAddress;
 use crate::platform::secret::Secret;
 
 /// Protocol, credentials and limits of the MQTT connections.

@@ -6,12 +6,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::leadership::BrokerAddress;
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
 use rumqttc::v5::mqttbytes::QoS as QoS5;
 use rumqttc::{QoS as QoS4, TlsConfiguration, Transport, v5};
 use rustls::ClientConfig;
 
-use super::address::BrokerAddress;
 use super::config::{MqttConfig, MqttVersion};
 use crate::transport::pki::CredentialsError;
 

@@ -4,6 +4,8 @@
 
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::links::LinkState;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{
@@ -13,7 +15,6 @@ use ecod::wire::{
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
 
-use super::address::BrokerAddress;
 use super::config::MqttConfig;
 use super::security::SigningKey;
 use crate::platform::clock;
@@ -55,19 +56,6 @@ pub enum Incoming {
         /// The new state.
         state: LinkState,
     },
-}
-
-/// State of a link.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LinkState {
-    /// Connected, subscribed, status published.
-    Up,
-    /// Connected, but this node's own messages do not come back: the broker hangs, or its answers are lost.
-    Stalled,
-    /// Not connected; attempts go on.
-    Down,
-    /// Not connected and nothing listens there: the broker's process is gone. Attempts go on.
-    Refused,
 }
 
 /// A message on its way to a receiver. It occupies a place in the inbox until it is dropped: keep it until it is processed.

@@ -4,6 +4,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::echo::EchoMonitor;
+use ecod::leadership::links::LinkState;
 use ecod::time::Timestamp;
 use ecod::wire::RejectReason;
 use rand::{RngExt, SeedableRng};
@@ -12,12 +15,11 @@ use rustls::ClientConfig;
 use tokio::task::{AbortHandle, JoinHandle};
 use uuid::Uuid;
 
-use super::address::BrokerAddress;
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
-use super::inbox::{Inbox, LinkState, PacketOutcome};
+use super::hearing::Hearing;
+use super::inbox::{Inbox, PacketOutcome};
 use super::security::Security;
-use super::silence::{Hearing, Silence};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 
@@ -69,7 +71,7 @@ pub(crate) struct Link {
     pub(crate) state: LinkState,
     pub(crate) client: Option<Client>,
     hearing: Arc<Hearing>,
-    silence: Silence,
+    echo: EchoMonitor,
     task: Option<JoinHandle<()>>,
     abort: AbortHandle,
 }
@@ -82,8 +84,8 @@ impl Link {
             LinkTask { id, broker: at, setup, report, hearing, reported_refusal: None, has_reported_oversized: false };
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
-        let (abort, silence) = (task.abort_handle(), Silence::default());
-        Self { broker, state: LinkState::Down, client: None, hearing, silence, abort, task: Some(task) }
+        let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
+        Self { broker, state: LinkState::Down, client: None, hearing, echo, abort, task: Some(task) }
     }
 
     /// Queues a message; false when there is no connection or no room.
@@ -93,7 +95,7 @@ impl Link {
 
     /// Records a message whose echo is expected, even if there was no room to send it; true when the broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
-        let is_stalled = self.silence.note_sent(self.hearing.packets(), now);
+        let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
         if is_stalled {
             self.hearing.miss();
         }

@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use ecod::leadership::BrokerAddress;
 use ecod::names::NodeName;
 use ring::hmac;
 
-use super::address::BrokerAddress;
 use super::config::MqttConfig;
 use crate::transport::gossip::{KeyError, MembershipConfig, payload_key};
 use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker};
@@ -59,7 +59,10 @@ impl Security {
     }
 
     /// TLS for one connection to a broker; `None` for plaintext.
-    pub(crate) fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
+    ///
+    /// # Errors
+    /// When the credentials can no longer be used.
+    pub fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self.external.as_ref().filter(|external| external.address == *broker) {
             Some(ExternalBroker { ca: Some(ca), .. }) => {
                 let current = self.credentials.as_ref().map(|credentials| credentials.current());
@@ -71,7 +74,7 @@ impl Security {
     }
 
     /// The payload as sent on a topic: in a signed envelope where the cell signs.
-    pub(crate) fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
+    pub fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
         match &self.signing {
             Some(key) => key.sign(topic, &payload),
             None => payload,
@@ -87,7 +90,7 @@ impl Security {
     }
 
     /// Bytes that a signature adds to a payload.
-    pub(crate) fn envelope_bytes(&self) -> usize {
+    pub fn envelope_bytes(&self) -> usize {
         if self.signing.is_some() { ENVELOPE_BYTES } else { 0 }
     }
 }

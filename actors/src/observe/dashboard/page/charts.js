@@ -1,11 +1,11 @@
-// Small line charts: time to the right, the newest at the edge.
+// Small line charts over time, newest values at the right edge.
 
 import { clock, keyed, set, svg, text } from "./dom.js";
 
 const SPAN_US = 600e6;
 const PAD = { left: 34, right: 8, top: 8, bottom: 18 };
 
-/// Draws lines of [time, value | null] pairs; `names` leaves room for them at the right.
+/// Draws lines of [time, value | null] pairs; `names` reserves room for names at the right.
 export function chart(frame, { lines, now, floor = 0, ceiling = null, names = false, unit = "", label }) {
   const picture = frame.firstElementChild ?? frame.appendChild(svg("svg", { role: "img" }));
   const { width, height } = frame.getBoundingClientRect();
@@ -50,7 +50,7 @@ function axis() {
   return g;
 }
 
-/// A gap in the values is a gap in the line.
+/// Path of a line; null values are gaps.
 function trace(points, x, y) {
   let pen = "M";
   let path = "";
@@ -64,7 +64,7 @@ function trace(points, x, y) {
   return path;
 }
 
-/// Names beside the ends of their lines, apart from each other; those that find no room are in the table.
+/// Names beside the ends of their lines, without overlap; the table has those without room.
 function spread(lines, y, height) {
   const named = lines.filter((line) => line.points.at(-1)?.[1] != null).map((line) => ({ ...line, y: y(line.points.at(-1)[1]) }));
   named.sort((a, b) => a.y - b.y);
@@ -75,7 +75,7 @@ function spread(lines, y, height) {
   return shown;
 }
 
-/// The next number that reads well.
+/// The next round number.
 function nice(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return [1, 2, 4, 5, 10, 20].find((step) => step * power >= value * 1.02) * power;

@@ -1,4 +1,4 @@
-// Elements and rows that are changed only where something changed.
+// DOM helpers that change only what differs.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -20,7 +20,7 @@ export function text(element, value) {
   if (element.textContent !== value) element.textContent = value;
 }
 
-/// Makes the children of `parent` be those of `items`, in their order; an element lives as long as its key.
+/// Updates the children of `parent` to match `items`, in order; an element lives as long as its key.
 export function keyed(parent, items, key, create, update) {
   const old = (parent.kept ??= new Map());
   const kept = new Map();
@@ -61,7 +61,7 @@ function swatch() {
 
 export const n = (value) => ({ text: String(value), class: "n" });
 
-/// A span of time in seconds, as people say it.
+/// A time span in seconds, in a readable unit.
 export function span(seconds) {
   if (seconds < 0) return "0 s";
   if (seconds < 10) return `${seconds.toFixed(1)} s`;
@@ -71,7 +71,7 @@ export function span(seconds) {
   return `${Math.round(seconds / 86400)} d`;
 }
 
-/// How long ago something was; what is fresh does not flicker.
+/// Age in seconds as text; below one second it is "now", so that it does not flicker.
 export const ago = (seconds) => (seconds < 1 ? "now" : `${span(seconds)} ago`);
 
 export const milliseconds = (ms) => (ms < 10 ? ms.toFixed(1) : ms < 10000 ? Math.round(ms) : (ms / 1000).toFixed(0) + "k") + " ms";

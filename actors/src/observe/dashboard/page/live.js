@@ -1,8 +1,8 @@
-// The connection to the node: pictures as they come, history now and then, and word of when nothing comes.
+// Connection to the node: live snapshots, polled history, and detection of a lost connection.
 
-/// A longer silence means that the connection is lost: the node sends at least one picture a second.
+/// Silence after which the connection counts as lost: the node sends at least one snapshot a second.
 const SILENCE_MS = 3000;
-/// How often history is asked for, and pictures where they do not come by themselves.
+/// Polling period of the history, and of snapshots where the node sends none.
 const HISTORY_MS = 2000;
 
 export class Live {
@@ -10,11 +10,11 @@ export class Live {
   history = { reigns: [], samples: [], failovers: 0 };
   landmarks = [];
   refused = false;
-  /// Whether the node has no room for another live page; it is then asked now and then.
+  /// Whether the node has no room for another live page, so that this one polls.
   crowded = false;
   #source = null;
   #heard = 0;
-  /// Whether the node is to tell its whole history: it may be another run.
+  /// Whether to fetch the whole history, as after a restart of the node.
   #afresh = false;
 
   constructor(onPicture, onHistory) {
@@ -27,17 +27,17 @@ export class Live {
     this.#refresh();
   }
 
-  /// Whether pictures come.
+  /// Whether snapshots arrive.
   get connected() {
     return performance.now() - this.#heard < SILENCE_MS + (this.crowded ? HISTORY_MS : 0);
   }
 
-  /// The node's time now, in microseconds, as far as the last picture tells.
+  /// The node's present time in microseconds, from the last snapshot.
   get now() {
     return this.picture ? this.picture.now_us + (performance.now() - this.#heard) * 1000 : 0;
   }
 
-  /// A page that nobody looks at takes no connection.
+  /// A hidden page keeps no connection.
   #follow() {
     if (document.hidden) return this.#close();
     if (this.#source) return;
@@ -57,7 +57,7 @@ export class Live {
     this.onPicture();
   }
 
-  /// Whether the browser gave up: the node answered, but not with pictures.
+  /// Whether the browser gave up: the node answered without snapshots.
   get #closed() {
     return this.#source?.readyState === EventSource.CLOSED;
   }
@@ -73,7 +73,7 @@ export class Live {
     this.#source = null;
   }
 
-  /// A browser does not notice every lost connection.
+  /// Reconnects after a long silence, since a browser does not notice every lost connection.
   #check() {
     const silent = performance.now() - this.#heard > 2 * SILENCE_MS;
     if (!document.hidden && silent && this.picture && Math.random() < 0.1) {
@@ -95,7 +95,7 @@ export class Live {
       this.#close();
       this.#follow();
     }
-    // What is known is shown until there is other: the node may end before it has told.
+    // The old history stays until the new one arrives: the node may end before that.
     const known = this.#afresh ? [] : this.history.samples;
     const since = known.at(-1)?.at_us ?? 0;
     const news = await this.#get(`/api/history?since=${since}`);

@@ -1,4 +1,4 @@
-// From pictures to the page. The map follows every picture; text changes four times a second, so that it can be read.
+// Draws snapshots. The map follows every snapshot; text changes four times a second, so that it can be read.
 
 import { chart } from "./charts.js";
 import { byId, span, text } from "./dom.js";
@@ -8,7 +8,7 @@ import * as tables from "./tables.js";
 
 const TEXT_MS = 250;
 let [queued, textAt, told] = [false, 0, {}];
-/// Why a part of the page could not be drawn.
+/// Errors by part of the page.
 const faults = {};
 
 const live = new Live(draw, () => attempt("history", drawHistory));
@@ -33,7 +33,7 @@ function draw() {
   });
 }
 
-/// What cannot be drawn is said, in place of a state that looks well.
+/// Keeps an error, so that the page shows it instead of a healthy state.
 function attempt(part, drawing) {
   try {
     drawing();
@@ -52,7 +52,7 @@ function drawPicture() {
   textAt = performance.now();
 }
 
-/// What of the picture is on the map, joined with where places are and what colours vehicles have.
+/// Scene of the map: the snapshot joined with known locations and vehicle colours.
 function arrange(picture, landmarks, now) {
   const colour = colours(picture.vehicles.map((vehicle) => vehicle.report.node).concat(Object.keys(picture.reputations?.message.reputations ?? {})));
   const known = new Map(landmarks.map((landmark) => [landmark.id, landmark]));
@@ -96,37 +96,37 @@ function drawText(picture, scene) {
   tables.verdicts(picture.verdicts, now);
   tables.vehicles(scene.vehicles, now);
   tables.reputations(picture.reputations, scene.colour);
-  tables.reigns(live.history, now);
+  tables.leaders(live.history, now);
   tables.nodes(picture);
   tables.drops(picture);
   text(byId("about"), `ECOD ${picture.node.version}, role ${picture.node.role}, up ${span((now - picture.node.started_at_us) / 1e6)}`);
 }
 
-/// Whether what is shown is true now, in colour and in words.
+/// Shows whether the page is up to date.
 function drawState() {
   const { picture } = live;
   const fault = Object.values(faults).find(Boolean);
   const [look, words] = !picture ? (live.refused ? ["stale", "Sign in"] : ["waiting", "Connecting"])
     : !live.connected ? ["stale", "Connection lost"]
-    : fault ? ["stale", "Not drawn"]
+    : fault ? ["stale", "Cannot draw"]
     : picture.readiness.ready ? ["live", `Live, ${picture.readiness.reason}`] : ["unready", sentence(picture.readiness.reason)];
   byId("state").className = `state ${look}`;
   text(byId("state-text"), words);
-  // Beside the words and not among them: a screen reader would say every second.
+  // Apart from the words: a screen reader would repeat it every second.
   text(byId("state-age"), picture && !live.connected ? `${Math.round((live.now - picture.now_us) / 1e6)} s old` : "");
   const stale = picture !== null && (!live.connected || fault !== undefined || !picture.readiness.ready);
   document.body.classList.toggle("stale-data", stale);
   const notice = live.refused ? "This page needs the node's token: open it with ?token= and the token."
-    : picture && !live.connected ? "The node does not answer. What is shown is what it said last."
-    : fault ? `This browser cannot draw what the node says (${fault.message}). The same is at /api/picture.`
-    : stale ? `What is shown may be out of date: ${picture.readiness.reason}.`
-    : live.crowded ? "The node has no room for another live page: this one follows every two seconds." : "";
+    : picture && !live.connected ? "The node does not answer. This page shows its last data."
+    : fault ? `This browser cannot draw the data of the node (${fault.message}). The same data is at /api/picture.`
+    : stale ? `This page may be out of date: ${picture.readiness.reason}.`
+    : live.crowded ? "The node has no room for another live page: this one updates every two seconds." : "";
   text(byId("notice"), notice);
   byId("notice").hidden = notice === "";
   announce(picture);
 }
 
-/// Says changes of the leader aloud; the state beside it is said by itself.
+/// Announces changes of the leader to screen readers; they read the state by themselves.
 function announce(picture) {
   const leader = picture?.leadership.leader;
   if (leader && told.leader && leader !== told.leader) text(byId("announcer"), `${leader} leads now, in place of ${told.leader}`);

@@ -1,20 +1,20 @@
-// The bird's-eye view: world metres to screen pixels, signs of constant size, labels that do not cover each other.
+// Bird's-eye view: world metres to screen pixels, symbols of constant size, labels that do not overlap.
 
 import { ago, byId, keyed, set, span, svg, text } from "./dom.js";
 
-/// Where the error ellipse of a plane normal distribution holds 95 %: the square root of its χ² quantile.
+/// Standard deviations of the 95 % error ellipse in two dimensions: the square root of the χ² quantile.
 const SIGMAS_95 = 2.4477;
-/// More places or objects than this are only in the table.
+/// Maximum number of drawn places, and of objects; the table has all.
 const MAX_DRAWN = 2000;
-/// Vehicles that have not reported, and objects that nobody has seen for so long are pale and say how long.
+/// Age in seconds from which silent vehicles and unseen objects are drawn pale with their age.
 const OLD_S = 2;
 const MARGIN_PX = 56;
-/// Pixels to a metre at most, before anybody zooms.
+/// Maximum pixels per metre without zoom.
 const MAX_SCALE = 4000;
-/// The map is fitted anew when half of it has been enough for so long.
+/// Time for which half of the map must have been enough before it is fitted again.
 const ROOMY_MS = 5000;
 
-/// Colours by name, in the order of the alphabet.
+/// Colours by name, in alphabetical order.
 export const colours = (names) => new Map([...new Set(names)].sort().map((name, index) => [name, index % 8]));
 
 export class BirdsEye {
@@ -72,8 +72,8 @@ export class BirdsEye {
     return Object.assign(at, { scale });
   }
 
-  /// The bounds grow at once and shrink late, so that the map stands still while vehicles come and go, and a position
-  /// that was wrong is got over. Once moved or zoomed by hand it stands still until Fit.
+  /// Bounds grow at once and shrink late, so that the map stays steady while vehicles come and go, and recovers from a
+  /// wrong position. Moved or zoomed by hand, the map keeps its bounds until Fit.
   #takeIn(scene, box) {
     const moved = this.#zoom !== 1 || this.#shift.some((shift) => shift !== 0);
     if (this.#bounds && moved) return;
@@ -192,7 +192,7 @@ export class BirdsEye {
     this.redraw();
   }
 
-  /// A finger scrolls the page until the map is zoomed, and then moves the map.
+  /// Touch scrolls the page until the map is zoomed, then moves the map.
   #drag() {
     let last = null;
     this.#picture.addEventListener("pointerdown", (event) => {
@@ -216,8 +216,8 @@ export class BirdsEye {
   }
 }
 
-/// Where the places, objects and vehicles are: west, south, east, north. What a vehicle detected, which is placed less
-/// surely, counts where there is little else.
+/// Bounds of places, objects and vehicles: west, south, east, north. Raw detections, which are less certain, count only
+/// where there is little else.
 function bounds({ places, objects, vehicles }) {
   const sure = [...places, ...objects, ...vehicles.map((v) => v.pose)].filter(Boolean);
   const points = sure.length > 1 ? sure : [...sure, ...vehicles.flatMap((v) => v.objects)];
@@ -226,20 +226,20 @@ function bounds({ places, objects, vehicles }) {
 
 const union = (a, b) => [Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.max(a[2], b[2]), Math.max(a[3], b[3])];
 
-/// Pixels to a metre with which the bounds fill the box.
+/// Pixels per metre with which the bounds fill the box.
 function fitting([left, bottom, right, top], box) {
   const fill = (pixels, metres) => (pixels - 2 * MARGIN_PX) / Math.max(metres, 1e-3);
   return Math.min(fill(box.width, right - left), fill(box.height, top - bottom), MAX_SCALE);
 }
 
-/// Half axes in metres and the direction of the longer, of the ellipse that holds 95 %.
+/// Half axes of the 95 % ellipse in metres, and the direction of the longer one.
 function ellipse([xx, xy, yy]) {
   const mean = (xx + yy) / 2;
   const spread = Math.hypot((xx - yy) / 2, xy);
   return { a: SIGMAS_95 * Math.sqrt(mean + spread), b: SIGMAS_95 * Math.sqrt(Math.max(mean - spread, 0)), turn: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
-/// The field of view, as far as the vehicle sees anything; without word of it, what it saw.
+/// Field of view of a vehicle; estimated from its detections if it reports none.
 function wedge(vehicle, at) {
   const { pose, view, objects, seen } = vehicle;
   const rays = [...objects, ...seen].map((p) => [Math.hypot(p.x_m - pose.x_m, p.y_m - pose.y_m), turn(Math.atan2(p.y_m - pose.y_m, p.x_m - pose.x_m) - pose.heading_rad)]);
@@ -251,18 +251,18 @@ function wedge(vehicle, at) {
   return `M${x} ${y}L${point(-half)}A${r} ${r} 0 ${half > Math.PI / 2 ? 1 : 0} 0 ${point(half)}Z`;
 }
 
-/// A name, with how long ago if that is long.
+/// A name, with its age if that is high.
 const aged = (name, age) => (age > OLD_S ? `${name}, ${span(age)}` : name);
 
 const turn = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
-/// The map in a sentence, for those who do not see it.
+/// Description of the map for screen readers.
 function describe({ places, objects, vehicles }) {
   const labelled = places.filter((place) => place.label).length;
   return `Map of ${places.length} places, ${labelled} with a label, ${objects.length} other objects and ${vehicles.length} vehicles`;
 }
 
-/// Puts labels beside their signs where they cover no other label; one that finds no room is left out.
+/// Places labels beside their symbols without overlap; a label without room is omitted.
 class Labels {
   placed = [];
   #taken = [];

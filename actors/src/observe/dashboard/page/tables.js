@@ -1,4 +1,4 @@
-// Everything on the page that is text.
+// Tables and tiles of the page.
 
 import { ago, byId, clock, milliseconds, n, rows, span, text } from "./dom.js";
 
@@ -20,9 +20,9 @@ export function tiles({ leadership, map, verdicts }, now, perSecond) {
   const { leader, epoch, since_us, standby, position, failovers } = leadership;
   text(byId("leader"), leader ?? "nobody");
   const mine = { leading: ", this node", standing_by: "", following: "", seeking: "" }[position];
-  text(byId("leader-more"), leader ? `epoch ${epoch}${mine}, for ${since_us ? span((now - since_us) / 1e6) : "–"}` : "no leader known");
+  text(byId("leader-more"), leader ? `term ${epoch}${mine}, for ${since_us ? span((now - since_us) / 1e6) : "–"}` : "no leader known");
   text(byId("standby"), standby ?? "–");
-  text(byId("standby-more"), position === "standing_by" ? "this node leads next" : standby ? "leads if the leader fails" : "nobody named");
+  text(byId("standby-more"), position === "standing_by" ? "this node leads next" : standby ? "leads if the leader fails" : "none named");
   const newest = map ?? verdicts;
   text(byId("round"), newest ? String(newest.message.round) : "–");
   text(byId("round-more"), newest ? `${ago((now - newest.received_at_us) / 1e6)}${perSecond === null ? "" : `, ${perSecond.toFixed(1)} a second`}` : "none yet");
@@ -35,7 +35,7 @@ export function latency(samples) {
   const middle = last.map((sample) => sample.latency_p50_ms).sort((a, b) => a - b)[last.length >> 1];
   const most = Math.max(...last.map((sample) => sample.latency_max_ms));
   text(byId("latency"), last.length ? milliseconds(middle) : "–");
-  text(byId("latency-more"), last.length ? `median of 10 s, at most ${milliseconds(most)}` : "no capture in 10 s");
+  text(byId("latency-more"), last.length ? `median of 10 s, at most ${milliseconds(most)}` : "no map in 10 s");
 }
 
 export function places(scene) {
@@ -82,12 +82,11 @@ export function reputations(received, colour) {
   byId("reputation-chart").hidden = all.length === 0;
 }
 
-export function reigns({ reigns }, now) {
-  const latest = [...reigns].reverse();
-  fill("reigns", latest, (reign) => `${reign.leader} ${reign.epoch} ${reign.from_us}`, (reign) => [
-    reign.leader, n(reign.epoch), clock(reign.from_us),
-    reign.until_us ? span((reign.until_us - reign.from_us) / 1e6) : { text: `${span((now - reign.from_us) / 1e6)}, leads`, class: "" },
-    n(reign.gap_ms === null ? "–" : milliseconds(reign.gap_ms)),
+export function leaders({ reigns: terms }, now) {
+  fill("reigns", [...terms].reverse(), (term) => `${term.leader} ${term.epoch} ${term.from_us}`, (term) => [
+    term.leader, n(term.epoch), clock(term.from_us),
+    term.until_us ? span((term.until_us - term.from_us) / 1e6) : { text: `${span((now - term.from_us) / 1e6)}, still leads`, class: "" },
+    n(term.gap_ms === null ? "–" : milliseconds(term.gap_ms)),
   ]);
 }
 
@@ -95,28 +94,28 @@ export function nodes({ nodes, node, leadership }) {
   const states = { following: "follows", aggregating: "leads", offline: "offline" };
   rows(byId("nodes"), nodes, (entry) => entry.name, (entry) => {
     const leads = entry.name === leadership.leader;
-    const state = !entry.alive ? "gone" : leads ? "leads" : entry.name === leadership.standby ? "stands by" : entry.state === "aggregating" ? "follows" : states[entry.state] ?? "there";
+    const state = !entry.alive ? "offline" : leads ? "leads" : entry.name === leadership.standby ? "stands by" : entry.state === "aggregating" ? "follows" : states[entry.state] ?? "online";
     const unfit = entry.alive && entry.fit === false ? ", not fit to lead" : "";
     return [
       entry.name + (entry.name === node.name ? " (this)" : ""), entry.role,
       { text: state + unfit, class: entry.alive ? (unfit ? "warn" : "") : "bad" }, { text: entry.version ?? "–", class: "dim" },
     ];
   });
-  text(byId("nodes-count"), `${nodes.filter((entry) => entry.alive).length} of ${nodes.length} there`);
+  text(byId("nodes-count"), `${nodes.filter((entry) => entry.alive).length} of ${nodes.length} online`);
 }
 
-/// Copies of what was taken, as come by a second broker, are not left out.
+/// Reject reason of copies that arrive through a second broker; these are no loss.
 const COPIES = "out_of_order";
 
-/// What counts as left out, beside payloads that were rejected, in words.
+/// Events that mean a loss or a failure, in plain words.
 const DROPS = {
-  publish_refused: "not sent: link down or full", publish_too_large: "not sent: too large", inbox_full: "dropped: node too far behind",
+  publish_refused: "not sent: link down or queue full", publish_too_large: "not sent: too large", inbox_full: "dropped: node overloaded",
   name_conflict: "another node has this name", disconnected: "link lost", connect_failed: "link not established", broker_refused: "refused by a broker",
-  client_throttled: "client kept out: connects too often", client_timed_out: "client kept out: no login in time", client_untrusted: "client kept out: no valid certificate",
-  client_malformed: "client kept out: no login", clients_full: "client kept out: no room", client_denied: "client may not do or say that", client_expelled: "client cut off: certificate revoked or expired",
-  record_failed: "log not written", record_dropped: "not in the log",
-  vote_ignored: "vote for nothing", report_late: "too late for tracks", object_refused: "no room for tracks", reputations_not_saved: "reputations not saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
-  detection_unplaced: "detection not placed", pose_rejected: "pose not taken", frame_without_pose: "frame without a pose", browser_refused: "browser refused", browser_throttled: "browser slowed down", dashboard_not_bound: "page's address not free",
+  client_throttled: "client refused: connects too often", client_timed_out: "client refused: login too late", client_untrusted: "client refused: no valid certificate",
+  client_malformed: "client refused: malformed login", clients_full: "client refused: broker full", client_denied: "client request denied: no permission", client_expelled: "client disconnected: certificate revoked or expired",
+  record_failed: "log cannot be written", record_dropped: "entry missing in the log",
+  vote_ignored: "vote ignored: no usable location", report_late: "report too late for tracking", object_refused: "new object not tracked: too many", reputations_not_saved: "reputations cannot be saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
+  detection_unplaced: "detection without a position", pose_rejected: "pose rejected", frame_without_pose: "frame without a pose", browser_refused: "browser refused", browser_throttled: "browser refused: too many requests", dashboard_not_bound: "page address already in use",
 };
 
 const earlier = new Map();
@@ -132,7 +131,7 @@ export function drops({ counters, now_us }) {
   });
 }
 
-/// How much a counter rose in the last ten seconds or so.
+/// Increase of a counter in the last ten seconds.
 function recent(reason, count, now) {
   const kept = (earlier.get(reason) ?? [[now, count]]).filter(([, value]) => value <= count);
   if (kept.length === 0 || now - kept.at(-1)[0] > 1e6) kept.push([now, count]);

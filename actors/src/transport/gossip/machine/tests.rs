@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::Ipv4Addr;
 
-use ecod::election::ElectionConfig;
+use ecod::leadership::election::ElectionConfig;
 use ecod::wire::Role;
 use proptest::prelude::*;
 

@@ -1,0 +1,195 @@
+//! Latest message of each node, as it passes through this one.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind};
+use serde::Serialize;
+
+use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
+
+/// Latest report and status of each node. The links' tasks write, the dashboard reads; neither waits for the other.
+#[derive(Debug, Default)]
+pub struct LiveState {
+    reports: [AtomicU64; ReportKind::COUNT],
+    wants_reports: AtomicBool,
+    latest: Mutex<Latest>,
+}
+
+#[derive(Debug, Default)]
+struct Latest {
+    reports: BTreeMap<(NodeName, ReportKind), LatestReport>,
+    statuses: BTreeMap<NodeName, ReportedStatus>,
+}
+
+/// A node's latest status.
+#[derive(Debug, Clone)]
+pub(crate) struct ReportedStatus {
+    /// The status, or the node's last will.
+    pub status: Arc<NodeStatus>,
+    /// Brokers that passed it on and whose links still hold.
+    pub via: BTreeSet<BrokerAddress>,
+    at: Timestamp,
+}
+
+/// A vehicle's latest report of a kind.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LatestReport {
+    /// Algorithm that the report is for.
+    pub kind: ReportKind,
+    /// Time of receipt by this node's clock.
+    #[serde(rename = "received_at_us")]
+    pub received_at: Timestamp,
+    /// The report.
+    pub report: Arc<ObjectReport>,
+}
+
+/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or long silent nodes.
+pub const MAX_SHOWN: usize = 256;
+
+/// Silence after which a vehicle may be replaced by another.
+const SILENCE: Duration = Duration::from_secs(10);
+
+impl LiveState {
+    /// Takes a message that this node received or published.
+    pub fn update(&self, message: &Incoming, received_at: Timestamp) {
+        let mut latest = self.latest();
+        match message {
+            Incoming::Report { kind, report } => {
+                self.reports[*kind as usize].fetch_add(1, Relaxed);
+                let entry = LatestReport { kind: *kind, received_at, report: Arc::clone(report) };
+                insert(&mut latest.reports, (report.node.clone(), *kind), entry, |all| {
+                    let (key, oldest) = all.iter().min_by_key(|(_, old)| old.received_at)?;
+                    (received_at.since(oldest.received_at) > SILENCE).then(|| key.clone())
+                });
+            }
+            Incoming::Status { status, via: broker } => {
+                let mut via = latest.statuses.remove(&status.node).map(|before| before.via).unwrap_or_default();
+                via.insert(broker.clone());
+                let entry = ReportedStatus { status: Arc::clone(status), via, at: received_at };
+                insert(&mut latest.statuses, status.node.clone(), entry, |all| {
+                    let rank = |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
+                    all.iter().min_by_key(|(_, entry)| rank(entry)).map(|(name, _)| name.clone())
+                });
+            }
+            Incoming::Link { broker, state: LinkState::Down | LinkState::Refused } => {
+                for entry in latest.statuses.values_mut() {
+                    entry.via.remove(broker);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Number of reports of this kind so far.
+    pub fn reports(&self, kind: ReportKind) -> u64 {
+        self.reports[kind as usize].load(Relaxed)
+    }
+
+    /// Whether this node receives reports only to show them.
+    pub fn wants_reports(&self) -> bool {
+        self.wants_reports.load(Relaxed)
+    }
+
+    pub(crate) fn set_wants_reports(&self, wanted: bool) {
+        self.wants_reports.store(wanted, Relaxed);
+    }
+
+    /// Latest reports received at or after a time, by vehicle and kind. Drops older ones.
+    pub(crate) fn reports_since(&self, time: Timestamp) -> Vec<LatestReport> {
+        let mut latest = self.latest();
+        latest.reports.retain(|_, entry| entry.received_at >= time);
+        latest.reports.values().cloned().collect()
+    }
+
+    /// Latest status of each node.
+    pub(crate) fn statuses(&self) -> BTreeMap<NodeName, ReportedStatus> {
+        self.latest().statuses.clone()
+    }
+
+    fn latest(&self) -> MutexGuard<'_, Latest> {
+        self.latest.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Inserts a value. A full map first drops the key that `evict` names, or else keeps what it has.
+fn insert<K: Ord, T>(map: &mut BTreeMap<K, T>, key: K, value: T, evict: impl FnOnce(&BTreeMap<K, T>) -> Option<K>) {
+    if map.len() >= MAX_SHOWN
+        && !map.contains_key(&key)
+        && let Some(evicted) = evict(map)
+    {
+        map.remove(&evicted);
+    }
+    if map.len() < MAX_SHOWN || map.contains_key(&key) {
+        map.insert(key, value);
+    }
+}
+
+/// First level of the topic of this kind of report.
+pub(crate) fn kind_label(kind: ReportKind) -> &'static str {
+    match kind {
+        ReportKind::Detections => "detections",
+        ReportKind::VoteDetections => "vote_detections",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::wire::Role;
+    use uuid::Uuid;
+
+    use super::*;
+
+    fn report(node: &str, seq: u64) -> Incoming {
+        let report = ObjectReport::new(NodeName::new(node).unwrap(), seq, Timestamp(seq));
+        Incoming::Report { kind: ReportKind::Detections, report: Arc::new(report) }
+    }
+
+    fn broker(address: &str) -> BrokerAddress {
+        address.parse().unwrap()
+    }
+
+    #[test]
+    fn the_latest_report_is_kept_and_strangers_find_no_room() {
+        let live_state = LiveState::default();
+        for seq in 1..=3 {
+            live_state.update(&report("euclid", seq), Timestamp(seq));
+        }
+        for stranger in 0..2 * MAX_SHOWN {
+            live_state.update(&report(&format!("stranger-{stranger}"), 9), Timestamp(2));
+        }
+        live_state.update(&report("euclid", 4), Timestamp(4));
+        assert_eq!(live_state.reports_since(Timestamp(0)).len(), MAX_SHOWN);
+        let fresh = live_state.reports_since(Timestamp(4));
+        assert_eq!(fresh.iter().map(|s| (s.report.node.as_str(), s.report.seq)).collect::<Vec<_>>(), [("euclid", 4)]);
+        assert_eq!(live_state.reports(ReportKind::Detections), 4 + 2 * MAX_SHOWN as u64);
+        live_state.update(&report("gauss", 1), Timestamp(5));
+        assert_eq!(live_state.reports_since(Timestamp(5)).len(), 1, "there is room when old ones are forgotten");
+    }
+
+    #[test]
+    fn nodes_that_left_and_vehicles_that_fell_silent_give_way() {
+        let live_state = LiveState::default();
+        let status = |node: String, state| {
+            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
+            Incoming::Status { status: Arc::new(NodeStatus { state, ..starting }), via: broker("10.0.0.2:1883") }
+        };
+        for n in 0..MAX_SHOWN {
+            let state = if n % 2 == 0 { NodeState::Following } else { NodeState::Offline };
+            live_state.update(&status(format!("node-{n}"), state), Timestamp(n as u64));
+            live_state.update(&report(&format!("node-{n}"), 1), Timestamp(n as u64));
+        }
+        let later = Timestamp(0) + SILENCE * 2;
+        live_state.update(&status("late".into(), NodeState::Following), later);
+        live_state.update(&report("late", 1), later);
+        let statuses = live_state.statuses();
+        let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
+        assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
+        assert_eq!((statuses.len(), live_state.reports_since(later).len()), (MAX_SHOWN, 1));
+    }
+}

@@ -1,0 +1,251 @@
+//! Observation of the node: its history, its health, and the snapshots that browsers get.
+
+use std::collections::BTreeSet;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use bytes::Bytes;
+use ecod::epoch::Epoch;
+use ecod::leadership::Position;
+use ecod::leadership::readiness::Readiness;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use tokio::sync::watch;
+use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
+
+use super::history::{History, SAMPLE_PERIOD};
+use super::map_latency::MapLatency;
+use super::node_sources::NodeSources;
+use super::response_cache::{CachedResponse, ResponseCache};
+use super::snapshot::{API_VERSION, LeadershipFacts, Snapshot, json, nodes};
+use crate::messages::gateway::GatewayMessage;
+use crate::messages::newest::Received;
+use crate::observe::readiness::Probe;
+use crate::platform::clock;
+
+/// Source of all answers to browsers.
+#[derive(Debug)]
+pub(crate) struct NodeMonitor {
+    /// Inputs from the node.
+    pub(crate) sources: NodeSources,
+    /// Latency of all maps so far.
+    pub(crate) map_latency: MapLatency,
+    snapshots: watch::Sender<Bytes>,
+    observed: Mutex<Observed>,
+    /// The latest snapshot as a server-sent event.
+    event: ResponseCache<Bytes>,
+}
+
+#[derive(Debug, Default)]
+struct Observed {
+    history: History,
+    probe: Probe,
+    /// Nodes that answer, or answered and still have a status at a broker.
+    met: BTreeSet<NodeName>,
+}
+
+/// Time between two probes of gateway and broker.
+const PROBE_PERIOD: Duration = Duration::from_millis(500);
+
+/// Maximum time between two snapshots: browsers take a longer silence for a lost connection.
+const HEARTBEAT: Duration = Duration::from_secs(1);
+
+/// Frame of a server-sent event around the JSON of a snapshot.
+const EVENT_HEAD: &[u8] = b"event: picture\ndata: ";
+const EVENT_END: &[u8] = b"\n\n";
+
+/// Age of a vehicle's last report beyond which the vehicle is no longer shown.
+const MAX_REPORT_AGE: Duration = Duration::from_secs(30);
+
+impl NodeMonitor {
+    pub(crate) fn new(sources: NodeSources, max_rate_hz: f64) -> Self {
+        Self {
+            sources,
+            map_latency: MapLatency::default(),
+            snapshots: watch::Sender::new(Bytes::new()),
+            observed: Mutex::default(),
+            event: ResponseCache::new(Duration::from_secs_f64(1.0 / max_rate_hz)),
+        }
+    }
+
+    /// The history as JSON, with the samples after `time` only.
+    pub(crate) fn history_since(&self, time: Timestamp) -> Vec<u8> {
+        self.observed().history.json_since(time)
+    }
+
+    /// Changes of the leader since the node started.
+    pub(crate) fn failovers(&self) -> u64 {
+        self.observed().history.failovers
+    }
+
+    /// Latest answers of gateway and broker.
+    pub(crate) fn probe(&self) -> Probe {
+        self.observed().probe.clone()
+    }
+
+    /// Latest snapshot as a server-sent event, updated while any such receiver exists.
+    pub(crate) fn snapshots(&self) -> watch::Receiver<Bytes> {
+        self.snapshots.subscribe()
+    }
+
+    /// Number of browsers that receive snapshots.
+    pub(crate) fn viewers(&self) -> usize {
+        self.snapshots.receiver_count()
+    }
+
+    /// Whether the node is ready.
+    pub(crate) fn readiness(&self) -> Readiness {
+        self.sources.vitals.readiness(&self.observed().probe)
+    }
+
+    /// The latest snapshot as a server-sent event, taken anew once it expired.
+    pub(crate) fn event(&self) -> Bytes {
+        self.cached_event().value
+    }
+
+    /// The latest snapshot as JSON.
+    pub(crate) fn json(&self) -> Bytes {
+        let event = self.event();
+        event.slice(EVENT_HEAD.len()..event.len() - EVENT_END.len())
+    }
+
+    /// Observes the node; never ends.
+    pub(crate) async fn run(&self) {
+        tokio::join!(self.follow_changes(), self.poll_probes());
+    }
+
+    fn cached_event(&self) -> CachedResponse<Bytes> {
+        self.event.get(|| [EVENT_HEAD, &json(&self.snapshot()), EVENT_END].concat().into())
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        let (sources, now, readiness) = (&self.sources, clock::now(), self.readiness());
+        let newest = &sources.vitals.newest;
+        let map = newest.map.borrow().clone();
+        let observed = self.observed();
+        let Observed { history, probe, met } = &*observed;
+        let since = history.terms.back().filter(|term| term.until_us.is_none()).map(|term| term.from_us);
+        let links = probe
+            .links
+            .iter()
+            .flatten()
+            .map(|(broker, state)| (broker.to_string(), format!("{state:?}").to_lowercase()));
+        Snapshot {
+            schema: API_VERSION,
+            now_us: now,
+            node: sources.node.clone(),
+            readiness,
+            leadership: LeadershipFacts::new(&sources.vitals.leadership.borrow(), since, history.failovers),
+            map: map.map(|newest| Received { received_at: newest.received_at, message: newest.map }),
+            verdicts: newest.verdicts.borrow().clone(),
+            reputations: newest.reputations.borrow().clone(),
+            vehicles: sources.live_state.reports_since(now - MAX_REPORT_AGE),
+            nodes: nodes(sources, met, probe.links.as_ref()),
+            links: links.collect(),
+            counters: sources.counters.snapshot(),
+        }
+    }
+
+    async fn follow_changes(&self) {
+        let mut leadership = self.sources.vitals.leadership.clone();
+        let mut maps = self.sources.vitals.newest.map.subscribe();
+        let mut verdicts = self.sources.vitals.newest.verdicts.subscribe();
+        let mut members = self.sources.members.clone();
+        let mut samples = ticks(SAMPLE_PERIOD);
+        let (mut next_snapshot, mut changed, mut sent_at) = (Instant::now(), true, Instant::now());
+        self.take_leadership();
+        self.take_members();
+        loop {
+            let due = if changed { next_snapshot } else { (sent_at + HEARTBEAT).max(next_snapshot) };
+            tokio::select! {
+                Ok(()) = leadership.changed() => {
+                    self.take_leadership();
+                    self.request_reports();
+                    changed = true;
+                }
+                Ok(()) = maps.changed() => {
+                    self.take_map();
+                    changed = true;
+                }
+                Ok(()) = verdicts.changed() => {
+                    self.take_verdicts();
+                    changed = true;
+                }
+                Ok(()) = members.changed() => {
+                    self.take_members();
+                    changed = true;
+                }
+                _ = samples.tick() => self.sample(),
+                () = tokio::time::sleep_until(due), if self.viewers() > 0 => {
+                    let event = self.cached_event();
+                    self.snapshots.send_replace(event.value);
+                    (next_snapshot, sent_at, changed) = (event.expires_at, Instant::now(), false);
+                }
+            }
+        }
+    }
+
+    /// Probes gateway and broker. A part that does not answer delays nothing else.
+    async fn poll_probes(&self) {
+        let mut probes = ticks(PROBE_PERIOD);
+        loop {
+            probes.tick().await;
+            let probe = self.sources.vitals.probe().await;
+            self.observed().probe = probe;
+            self.request_reports();
+        }
+    }
+
+    fn take_leadership(&self) {
+        let leadership = self.sources.vitals.leadership.borrow().clone();
+        self.observed().history.add_leadership(&leadership, clock::now());
+    }
+
+    fn take_members(&self) {
+        let statuses = self.sources.live_state.statuses();
+        let mut observed = self.observed();
+        observed.met.retain(|name| statuses.contains_key(name));
+        observed.met.extend(self.sources.members.borrow().iter().map(|member| member.name.clone()));
+    }
+
+    fn take_map(&self) {
+        let Some(newest) = self.sources.vitals.newest.map.borrow().clone() else { return };
+        let epoch = Epoch::new(newest.map.epoch, newest.map.aggregator.clone());
+        self.map_latency.observe(newest.map.oldest_capture_us, newest.map.fused_at_us, newest.received_at);
+        self.observed().history.add_round(&epoch, newest.map.oldest_capture_us, newest.received_at);
+    }
+
+    /// In a cell without maps, verdicts count as the round.
+    fn take_verdicts(&self) {
+        let Some(newest) = self.sources.vitals.newest.verdicts.borrow().clone() else { return };
+        let map_at = self.sources.vitals.newest.map.borrow().as_ref().map(|map| map.received_at);
+        if map_at.is_none_or(|map_at| newest.received_at.since(map_at) > HEARTBEAT) {
+            let epoch = Epoch::new(newest.message.epoch, newest.message.aggregator.clone());
+            self.observed().history.add_round(&epoch, None, newest.received_at);
+        }
+    }
+
+    fn sample(&self) {
+        let reputations = self.sources.vitals.newest.reputations.borrow().clone();
+        self.observed().history.sample(reputations.as_ref().map(|newest| &*newest.message), clock::now());
+    }
+
+    /// Has a node that only follows receive the vehicles' reports while a browser shows them.
+    fn request_reports(&self) {
+        let wanted = self.viewers() > 0 && self.sources.vitals.leadership.borrow().position == Position::Following;
+        if wanted || self.sources.live_state.wants_reports() {
+            self.sources.live_state.set_wants_reports(wanted);
+            self.sources.vitals.gateway.send(GatewayMessage::WatchReports { wanted });
+        }
+    }
+
+    fn observed(&self) -> MutexGuard<'_, Observed> {
+        self.observed.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn ticks(period: Duration) -> Interval {
+    let mut ticks = interval(period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
+}

@@ -1,0 +1,63 @@
+//! Inputs of the dashboard. Reading them never makes another part of the node wait.
+
+use std::sync::Arc;
+
+use ecod::names::{LandmarkId, NodeName};
+use ecod::time::Timestamp;
+use ecod::wire::Role;
+use serde::Serialize;
+use tokio::sync::watch;
+
+use super::live_state::LiveState;
+use crate::observe::readiness::Vitals;
+use crate::telemetry::counters::Counters;
+use crate::transport::gossip::{FrameCounters, Member};
+
+/// Everything that the dashboard reads from its node.
+#[derive(Debug, Clone)]
+pub struct NodeSources {
+    /// The node.
+    pub node: NodeFacts,
+    /// Known locations of the cell.
+    pub landmarks: Vec<LandmarkFacts>,
+    /// Newest messages, leadership, links and broker.
+    pub vitals: Vitals,
+    /// The other nodes.
+    pub members: watch::Receiver<Vec<Member>>,
+    /// Counters of the node.
+    pub counters: Arc<Counters>,
+    /// Counters of its gossip.
+    pub frames: Arc<FrameCounters>,
+    /// Latest reports and statuses.
+    pub live_state: Arc<LiveState>,
+}
+
+/// Facts that stay the same while a node runs.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct NodeFacts {
+    /// Name of the node.
+    pub name: NodeName,
+    /// Name of its cell.
+    pub cell: NodeName,
+    /// Its role.
+    pub role: Role,
+    /// Version of the software.
+    pub version: &'static str,
+    /// Time of start.
+    pub started_at_us: Timestamp,
+    /// Maximum time between two rounds of a live aggregator, in seconds.
+    pub round_period_s: f64,
+}
+
+/// A known location.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LandmarkFacts {
+    /// Name of the location.
+    pub id: LandmarkId,
+    /// East in metres.
+    pub x_m: f64,
+    /// North in metres.
+    pub y_m: f64,
+    /// Direction that it faces, in radians counter-clockwise from east.
+    pub facing_rad: Option<f64>,
+}

@@ -1,0 +1,210 @@
+//! Everything that the page shows of a cell, as one JSON object.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use ecod::leadership::readiness::Readiness;
+use ecod::leadership::{Leadership, Position};
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
+use serde::Serialize;
+
+use super::live_state::{LatestReport, MAX_SHOWN, ReportedStatus};
+use super::node_sources::{NodeFacts, NodeSources};
+use crate::messages::newest::Received;
+use crate::telemetry::counters::CounterSnapshot;
+use crate::transport::gossip::Member;
+use crate::transport::mqtt::{BrokerAddress, LinkState};
+
+/// State of the link to each broker.
+pub(crate) type Links = BTreeMap<BrokerAddress, LinkState>;
+
+/// Version of [`Snapshot`] and of the other answers of the API.
+pub(crate) const API_VERSION: u32 = 1;
+
+/// A node's knowledge of its cell at one moment. Times are Unix microseconds by the node's clock, except in messages.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Snapshot {
+    /// [`API_VERSION`].
+    pub schema: u32,
+    /// Time of the snapshot.
+    pub now_us: Timestamp,
+    /// This node.
+    pub node: NodeFacts,
+    /// Whether this node is ready.
+    pub readiness: Readiness,
+    /// The leader, its standby and this node's position.
+    pub leadership: LeadershipFacts,
+    /// Newest map accepted.
+    pub map: Option<Received<GlobalMap>>,
+    /// Newest verdicts accepted.
+    pub verdicts: Option<Received<Verdicts>>,
+    /// Newest reputations accepted.
+    pub reputations: Option<Received<Reputations>>,
+    /// Latest report of each vehicle and kind.
+    pub vehicles: Vec<LatestReport>,
+    /// All nodes, this one included.
+    pub nodes: Vec<NodeEntry>,
+    /// State of the link to each broker: `up`, `stalled`, `down` or `refused`.
+    pub links: BTreeMap<String, String>,
+    /// Counters of failures and losses, by reason.
+    pub counters: CounterSnapshot,
+}
+
+/// The leadership of the cell, for a browser.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct LeadershipFacts {
+    /// This node's position.
+    pub position: Position,
+    /// The leader; absent while the node seeks one.
+    pub leader: Option<NodeName>,
+    /// Highest term known.
+    pub epoch: Option<u64>,
+    /// The node that leads next.
+    pub standby: Option<NodeName>,
+    /// Time at which this node began to follow the leader.
+    pub since_us: Option<Timestamp>,
+    /// Changes of the leader since the node started.
+    pub failovers: u64,
+}
+
+/// A node of the cell.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct NodeEntry {
+    /// Name of the node.
+    pub name: NodeName,
+    /// Its role.
+    pub role: Role,
+    /// Whether it answers. A node that never answered is alive while a linked broker reports its status.
+    pub alive: bool,
+    /// State that it reported.
+    pub state: Option<NodeState>,
+    /// Whether it reported that it could lead.
+    pub fit: Option<bool>,
+    /// Version of its software.
+    pub version: Option<String>,
+}
+
+impl LeadershipFacts {
+    pub(crate) fn new(leadership: &Leadership, since_us: Option<Timestamp>, failovers: u64) -> Self {
+        Self {
+            position: leadership.position,
+            leader: leadership.leader().cloned(),
+            epoch: leadership.epoch.as_ref().map(|epoch| epoch.term),
+            standby: leadership.standby.clone(),
+            since_us: since_us.filter(|_| leadership.leader().is_some()),
+            failovers,
+        }
+    }
+}
+
+/// A value as JSON; truncated where it cannot be encoded, which is logged.
+pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
+    let mut text = Vec::new();
+    if let Err(error) = serde_json::to_writer(&mut text, value) {
+        tracing::warn!(%error, "answer to a browser truncated");
+    }
+    text
+}
+
+/// This node and the others by name. `met` holds the nodes that have ever answered; `links` is absent if unknown.
+pub(crate) fn nodes(sources: &NodeSources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
+    let own = &sources.node;
+    let leading = sources.vitals.leadership.borrow().is_leading();
+    let mut nodes = others(&sources.members.borrow(), sources.live_state.statuses(), met, links);
+    nodes.retain(|node| node.name != own.name);
+    nodes.push(NodeEntry {
+        name: own.name.clone(),
+        role: own.role,
+        alive: true,
+        state: Some(if leading { NodeState::Aggregating } else { NodeState::Following }),
+        fit: None,
+        version: Some(own.version.to_owned()),
+    });
+    nodes.sort_by(|a, b| a.name.cmp(&b.name));
+    nodes
+}
+
+/// Members are alive while they answer. Of nodes that never answered, the status from a linked broker counts.
+fn others(
+    members: &[Member],
+    mut statuses: BTreeMap<NodeName, ReportedStatus>,
+    met: &BTreeSet<NodeName>,
+    links: Option<&Links>,
+) -> Vec<NodeEntry> {
+    let entry = |name: &NodeName, role, alive, status: Option<&NodeStatus>| NodeEntry {
+        name: name.clone(),
+        role,
+        alive,
+        state: status.map(|status| status.state),
+        fit: status.and_then(|status| status.fit),
+        version: status.map(|status| status.version.clone()),
+    };
+    let (shown, further) = members.split_at(members.len().min(MAX_SHOWN));
+    let mut nodes = Vec::new();
+    for Member { name, role, .. } in shown {
+        let reported = statuses.remove(name);
+        nodes.push(entry(name, *role, true, reported.as_ref().map(|reported| &*reported.status)));
+    }
+    let is_linked = |broker: &BrokerAddress| {
+        links.is_none_or(|links| matches!(links.get(broker), Some(LinkState::Up | LinkState::Stalled)))
+    };
+    for ReportedStatus { status, via, .. } in statuses.values() {
+        let name = &status.node;
+        let is_online = status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_linked);
+        let alive = is_online || further.iter().any(|member| member.name == *name);
+        nodes.push(entry(name, status.role, alive, Some(status)));
+    }
+    nodes
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use uuid::Uuid;
+
+    use super::*;
+    use crate::observe::dashboard::LiveState;
+    use crate::transport::mqtt::Incoming;
+
+    #[test]
+    fn who_no_longer_answers_or_is_only_known_from_a_lost_broker_is_gone() {
+        let name = NodeName::from_static;
+        let (edge, euclid): (BrokerAddress, BrokerAddress) =
+            ("10.0.0.2:1883".parse().unwrap(), "10.0.0.3:1883".parse().unwrap());
+        let member = Member {
+            name: name("euclid"),
+            run: 0,
+            gossip: "10.0.0.3:17884".parse().unwrap(),
+            broker: None,
+            role: Role::Auto,
+        };
+        let live_state = LiveState::default();
+        let say = |node, via: &BrokerAddress| {
+            let status = NodeStatus::starting(name(node), Uuid::nil(), Role::Cav, "0.1.0");
+            live_state.update(&Incoming::Status { status: Arc::new(status), via: via.clone() }, Timestamp(1));
+        };
+        for node in ["edge", "euclid", "plain"] {
+            say(node, &edge);
+        }
+        say("both", &edge);
+        say("both", &euclid);
+        let alive = |members: &[Member], links: &Links| {
+            let met = [name("edge"), name("euclid")].into();
+            let nodes = others(members, live_state.statuses(), &met, Some(links));
+            nodes.into_iter().filter(|node| node.alive).map(|node| node.name.to_string()).collect::<Vec<_>>()
+        };
+        let up = [(edge.clone(), LinkState::Up), (euclid.clone(), LinkState::Up)].into();
+        assert_eq!(alive(std::slice::from_ref(&member), &up), ["euclid", "both", "plain"], "the edge does not answer");
+        let left = [(euclid.clone(), LinkState::Up)].into();
+        assert_eq!(alive(std::slice::from_ref(&member), &left), ["euclid", "both"], "the link was given up");
+        live_state.update(&Incoming::Link { broker: edge, state: LinkState::Refused }, Timestamp(2));
+        assert_eq!(
+            alive(&[member], &up),
+            ["euclid", "both"],
+            "what a broker said before it was lost is not its word now"
+        );
+        assert_eq!(alive(&[], &up), ["both"]);
+    }
+}
