@@ -113,7 +113,8 @@ impl Actor for Gateway {
             GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
-                publishing().in_scope(|| state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient));
+                publishing()
+                    .in_scope(|| state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient));
                 inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {

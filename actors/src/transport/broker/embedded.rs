@@ -17,9 +17,9 @@ use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
-use super::frontend::{AccessPolicy, BrokerFrontend};
+use super::frontend::BrokerFrontend;
 use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
-use super::permissions::Permissions;
+use super::permissions::{AccessPolicy, MAX_TOPIC_LEVELS, Permissions};
 use super::publish_throttle::PublishThrottle;
 use super::retained::RetainedMessages;
 use crate::platform::clock;
@@ -174,19 +174,8 @@ struct RunningBroker {
 /// Largest packet in bytes without a configured limit: the default maps and their topics.
 const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
 
-/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
-const MAX_TOPIC_LEVELS: usize = 32;
-
-/// Maximum length of a topic or filter in bytes.
-const MAX_TOPIC_BYTES: usize = 512;
-
 /// Maximum subscriptions of one client.
 const MAX_SUBSCRIPTIONS: usize = 256;
-
-/// Whether rmqtt can hold a topic or filter.
-pub(super) fn is_topic_bounded(topic: &str) -> bool {
-    topic.len() <= MAX_TOPIC_BYTES && topic.split('/').count() <= MAX_TOPIC_LEVELS
-}
 
 /// Time for connections to end when the broker stops. Afterwards their tasks are abandoned.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);

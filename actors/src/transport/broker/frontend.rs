@@ -14,7 +14,6 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::wire::{Limits, Topics};
 use rustls::pki_types::{CertificateDer, UnixTime};
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
@@ -24,27 +23,12 @@ use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
 use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
-use super::permissions::LeaderCheck;
+use super::permissions::AccessPolicy;
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
 use super::{BrokerConfig, connect_packet};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::pki::{CertificateSubject, Credentials, LoadedCredentials};
-
-/// Rules of access to an embedded broker.
-#[derive(Clone)]
-pub struct AccessPolicy {
-    /// The node's certificates. Without them every client may log in and publish anything, within limits.
-    pub credentials: Option<Arc<Credentials>>,
-    /// The cell's topics.
-    pub topics: Topics,
-    /// Largest payloads that the cell's nodes accept.
-    pub limits: Limits,
-    /// Decides which node may publish maps, verdicts and reputations.
-    pub elected: LeaderCheck,
-    /// The node's counters.
-    pub counters: Arc<Counters>,
-}
 
 /// Public side of a broker.
 pub(super) struct BrokerFrontend {

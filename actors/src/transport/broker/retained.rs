@@ -9,7 +9,7 @@ use rmqtt::types::{Retain, TopicFilter, TopicName};
 use tokio::sync::Mutex;
 
 use super::BrokerConfig;
-use super::embedded::is_topic_bounded;
+use super::permissions::is_topic_bounded;
 use crate::transport::pki::OBSERVER_MARK;
 
 /// Retained messages, bounded in number and in bytes.
