@@ -23,7 +23,7 @@ use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameKind, Introduction, NameClaim};
 use super::key::{CellKey, SessionId};
 use super::node_id::NodeId;
-use super::sessions::{FrameContent, LocalView, Sessions};
+use super::sessions::{Arrival, FrameContent, Sessions};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
 
@@ -122,8 +122,8 @@ impl GossipMachine {
             return;
         }
         let gossip = &self.gossip;
-        let view = LocalView { own: gossip.own(), known: &|name| gossip.known(name) };
-        let taken = match self.sessions.open(datagram, from, at, &view) {
+        let arrival = Arrival { from, now: at, own: gossip.own(), known: &|name| gossip.known(name) };
+        let taken = match self.sessions.open(datagram, &arrival) {
             Ok(opened) => self.take(opened, from, at, now),
             Err(reason) => Err(reason),
         };
