@@ -28,7 +28,7 @@ use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::leadership::Leadership;
-use crate::observe::recorder::LogSender;
+use crate::observe::recorder::{LogItem, LogSender};
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::Incoming;
 use age::Age;
@@ -150,7 +150,7 @@ impl FollowerState {
         self.election.send(LeaderElectionMessage::NoteRound { epoch, round: map.round });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         self.write(&received);
-        self.recording.map(map, received_at);
+        self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
         Ok(())
     }
@@ -160,7 +160,7 @@ impl FollowerState {
         self.verdicts.admit(&epoch, verdicts.round, received_at, &self.leadership.borrow())?;
         check(self.verdicts_age.is_fresh(&epoch, verdicts.fused_at_us, received_at))?;
         self.counters.count(Event::VerdictsAccepted);
-        self.recording.verdicts(verdicts, received_at);
+        self.recording.send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
         if self.newest.map.borrow().as_ref().is_none_or(|map| received_at.since(map.received_at) >= MEMORY) {
             self.election.send(LeaderElectionMessage::NoteRound { epoch, round: verdicts.round });
         }
@@ -173,7 +173,7 @@ impl FollowerState {
         let epoch = Epoch::new(reputations.epoch, aggregator);
         self.reputations.admit(&epoch, reputations.round, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::ReputationsAccepted);
-        self.recording.reputations(reputations, received_at);
+        self.recording.send(received_at, LogItem::Reputations(Arc::clone(reputations)));
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
         Ok(())
     }

@@ -88,7 +88,7 @@ impl Actor for Recorder {
             RecorderMessage::NoteLeadership => LogItem::Leadership(state.leadership.borrow().clone()),
             RecorderMessage::Tick => LogItem::Counters(state.counters.snapshot()),
         };
-        state.recording.put(clock::now(), item);
+        state.recording.send(clock::now(), item);
         if state.writer.as_ref().is_some_and(JoinHandle::is_finished) { Err("the writer ended".into()) } else { Ok(()) }
     }
 

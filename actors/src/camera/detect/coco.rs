@@ -29,7 +29,7 @@ pub struct CocoConfig {
     pub threshold: f64,
     /// Overlap (intersection over union) from which two boxes of one class are the same object; default 0.5.
     pub max_overlap: f64,
-    /// Whether to run_network at four overlapping quarters of the image besides the whole; default false. Finds objects of
+    /// Whether to also search four overlapping quarters of the image. Default false. Finds objects of
     /// half the size and takes five times as long.
     pub tiling: bool,
 }

@@ -28,7 +28,7 @@ use crate::node::ActorSlots;
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::{LandmarkFacts, NodeFacts, NodeSources};
 use crate::observe::readiness::{Vitals, patience};
-use crate::observe::recorder::LogIdentity;
+use crate::observe::recorder::{LogIdentity, LogItem};
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
@@ -109,7 +109,7 @@ impl NodeBuilder {
             live_state.update(&delivery.message, at);
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
-                    recording.report(*kind, report, at);
+                    recording.send(at, LogItem::Report(*kind, Arc::clone(report)));
                     true
                 }
                 // Evidence is for those that lead now or next; others that get it only look at it.
@@ -132,20 +132,20 @@ impl NodeBuilder {
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
                 Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
                 Incoming::Ledger(share) if !fuses => {
-                    recording.share(share, at);
+                    recording.send(at, LogItem::Share(Arc::clone(share)));
                     true
                 }
                 Incoming::Ledger(share) => {
-                    recording.share(share, at);
+                    recording.send(at, LogItem::Share(Arc::clone(share)));
                     election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
                     keeper.send(ReputationKeeperMessage::Merge { delivery })
                 }
                 Incoming::Link { broker, state } => {
-                    recording.link(broker, *state, at);
+                    recording.send(at, LogItem::Link(broker.clone(), *state));
                     election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
                 }
                 Incoming::Status { status, .. } => {
-                    recording.status(status, at);
+                    recording.send(at, LogItem::Status(Arc::clone(status)));
                     election.send(LeaderElectionMessage::TakeStatus { delivery })
                 }
             };
@@ -190,7 +190,7 @@ impl NodeBuilder {
         let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
         let mut aggregator = Aggregator::standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
-        self.recording.journal(now, JournalEvent::Start { ledger });
+        self.recording.send(now, LogItem::Journal(JournalEvent::Start { ledger }));
         FuserArguments {
             aggregator,
             term: self.term.subscribe(),
