@@ -1,4 +1,4 @@
-//! The command line of `ecod-node`.
+//! Command line of `ecod-node`.
 
 mod bench;
 #[cfg(feature = "camera")]
@@ -35,67 +35,82 @@ use serde::Serialize;
 
 #[cfg(fuzzing)]
 pub use replay::rounds_of_log;
-pub use run::RunArguments;
 
 use logging::LogFormat;
+use run::RunArguments;
 
-/// Camera vehicles that see together: run a node of a cell, or one of the commands.
+/// Cooperative perception of camera vehicles: run a node of a cell, or one of the commands
 #[derive(Debug, Parser)]
-#[command(name = "ecod-node", version, args_conflicts_with_subcommands = true, arg_required_else_help = true)]
+#[command(
+    name = "ecod-node",
+    version,
+    args_conflicts_with_subcommands = true,
+    arg_required_else_help = true,
+    after_long_help = logging::HELP
+)]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
     #[command(flatten)]
     run: RunArguments,
-    /// Form of the log; RUST_LOG sets what is in it
-    #[arg(long, global = true, value_enum, value_name = "FORM", default_value_t)]
+    /// Format of log lines: auto, text, json or journal; `ecod-node --help` explains them
+    #[arg(
+        long,
+        global = true,
+        value_enum,
+        value_name = "FORM",
+        default_value_t,
+        help_heading = "Logging",
+        hide_short_help = true,
+        hide_possible_values = true
+    )]
     log_format: LogFormat,
 }
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Run a whole cell on this machine, as separate processes, and print what it saw
+    /// Run a whole cell on this machine as separate processes, and print its map
     #[cfg(feature = "camera")]
     Demo(demo::DemoArguments),
-    /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
+    /// Run recorded scenes in virtual time: rendered parking lots, or detections at an intersection
     #[cfg(feature = "camera")]
     Testbed(testbed::TestbedArguments),
-    /// Measure a live cell under simulated vehicles: latency beside the bare broker, capacity, costs
+    /// Measure a live cell with simulated vehicles: latency, capacity and cost
     Bench(bench::BenchArguments),
-    /// Look whether a node can run here: camera, broker, ports, key, clock, disk; say what to fix
+    /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
     Doctor(doctor::DoctorArguments),
-    /// Join a cell as an observer and show it in this terminal
+    /// Join a cell as an observer and show it in the terminal
     Top(top::TopArguments),
-    /// Join a cell as an observer and record what all of it says (MCAP)
+    /// Join a cell as an observer and record all its messages (MCAP)
     Record(record::RecordArguments),
-    /// Run recorded reports again, in virtual time: the same input gives the same output
+    /// Fuse recorded reports again in virtual time: equal input gives equal output
     Replay(replay::ReplayArguments),
-    /// Write one page about a log: leadership, latency, gaps, reputations, coverage, drops
+    /// Write an HTML report about a log: leadership, latency, gaps, reputations, coverage, losses
     Report(report::ReportArguments),
-    /// Judge the output of a replay by what is true
+    /// Score the output of a replay against the ground truth
     Eval(eval::EvalArguments),
     /// Calibrate a camera from photographs of a chessboard
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
-    /// Make a cell's certificates: its CA, one for each node, and the list of those that are revoked
+    /// Make the certificates of a cell: its CA, one per node, and the revocation list
     #[command(subcommand)]
     Pki(pki::PkiCommand),
     /// Print the JSON Schemas of every payload
     Schema,
-    /// Print what a shell needs to complete these commands
+    /// Print a completion script for a shell
     Completions(shell::CompletionsArguments),
     /// Write manual pages
     Man(shell::ManArguments),
 }
 
-/// A command that failed, and how the process says so.
+/// A failed command and the exit code of the process.
 #[derive(Debug)]
 struct Failure {
     error: anyhow::Error,
     code: u8,
 }
 
-/// Exit code of a configuration or argument that cannot be used.
+/// Exit code for an unusable configuration or argument.
 const USAGE: u8 = 2;
 
 /// Runs the program with the process's arguments.
@@ -106,8 +121,8 @@ pub fn main() -> ExitCode {
         Some(Command::Top(_)) => "off",
         Some(_) => "warn",
     };
-    let runs_on = matches!(&cli.command, None | Some(Command::Record(_)));
-    logging::start(cli.log_format, runs_on, level);
+    let is_service = matches!(&cli.command, None | Some(Command::Record(_)));
+    logging::start(cli.log_format, is_service, level);
     let outcome = match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
@@ -137,7 +152,7 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Writes to standard output. A reader that has seen enough, such as `head`, is no failure.
+/// Writes to standard output. A reader that closes it early, such as `head`, is no failure.
 fn print(text: &str) -> anyhow::Result<()> {
     let mut output = std::io::stdout().lock();
     match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {
@@ -158,7 +173,7 @@ impl Failure {
     }
 }
 
-/// Writes JSON for programs.
+/// Writes a value as JSON for programs.
 fn write_json(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
     let mut text = serde_json::to_string_pretty(value)?;
     text.push('\n');

@@ -1,4 +1,4 @@
-//! `ecod-node report`: a log as one page.
+//! `ecod-node report`: an HTML report about a log.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,15 +16,15 @@ use crate::observe::report::Report;
 /// Flags of `report`.
 #[derive(Debug, Args)]
 pub(super) struct ReportArguments {
-    /// Logs of one node (MCAP) in order, or the directory that they are in
+    /// Log files of one node (MCAP) in order, or their directory
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
     #[command(flatten)]
     node: NodeArguments,
-    /// What really stands at each location (JSON, or CSV with the columns item,truth), or where all objects were (JSON)
+    /// Ground truth: labels by location (JSON, or CSV with the columns item,truth), or tracks of all objects (JSON)
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// The page that is written (HTML)
+    /// Report to write (HTML)
     #[arg(short, long, value_name = "FILE", default_value = "report.html")]
     output: PathBuf,
 }
@@ -42,7 +42,7 @@ pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
         eprintln!("ecod-node: {problem}");
     }
     if report.is_empty() {
-        return Err(anyhow!("there is nothing in the log").into());
+        return Err(anyhow!("the log is empty").into());
     }
     Ok(fs::write(output, report.page()).with_context(|| format!("cannot write {}", output.display()))?)
 }
