@@ -219,9 +219,9 @@ impl NodeBuilder {
             }
             #[cfg(feature = "camera")]
             ActorKind::Detector => {
-                let pictures = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
+                let images = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
-                let arguments = crate::node::camera::detector(&self.config, projector, pictures, self.counters());
+                let arguments = crate::node::camera::detector(&self.config, projector, images, self.counters());
                 let arguments = arguments.map_err(in_full)?;
                 slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }
