@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check live-check asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check live-check tracing-check asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -24,18 +24,18 @@ setup: ## install the system packages that are missing
 	fi
 
 demo: setup ## run a whole cell as separate processes on this machine and print what it saw
-	cargo build --release --locked --bin ecod-node
-	target/release/ecod-node demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
+	cargo build --release --locked --bin ecod-node --bin ecod-lab
+	$(BUILD)/release/ecod-lab demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
-	cargo build --release --locked --bin ecod-node
-	for setup in 1 2; do target/release/ecod-node testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
+	cargo build --release --locked --bin ecod-lab
+	for setup in 1 2; do $(BUILD)/release/ecod-lab testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
 	    --at-least 99.5 --occupied-at-least 99 --out target/testbed-setup$$setup.json || exit; done
-	target/release/ecod-node testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
+	$(BUILD)/release/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
 eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/algorithms.md
-	cargo build --release --locked --bin ecod-node
+	cargo build --release --locked --bin ecod-node --bin ecod-lab
 	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
 
@@ -47,6 +47,7 @@ eval-tracks-check: PACKAGES += python3-venv
 eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics from PyPI
 	packaging/check-eval-tracks
 
+# All programs are built before the first test: those of ecod-lab need ecod-node beside it.
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
 test: PACKAGES += mosquitto mosquitto-clients
 test: setup ## all tests
@@ -91,10 +92,13 @@ recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
 	python3 -m venv $(BUILD)/recording-venv
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap
-	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --nocapture python
+	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --include-ignored --nocapture python
 
 live-check: setup ## record with the feature foxglove, and look on as Foxglove does
 	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test recording
+
+tracing-check: setup ## follow a detection through two nodes, with the feature otel
+	cargo test --locked -p ecod-actors --features otel --test tracing
 
 fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each; TARGETS=payload,... runs those only
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
@@ -107,7 +111,7 @@ python-check: PACKAGES += mosquitto-clients python3-venv
 python-check: setup ## feed a live cell by the Python example; installs paho-mqtt in a directory of its own
 	python3 -m venv $(BUILD)/python-venv
 	$(BUILD)/python-venv/bin/pip install --quiet 'paho-mqtt>=2,<3'
-	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --nocapture
+	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --include-ignored --nocapture
 
 deb: setup ## Debian packages of a node, with camera and without, in target/debian
 	packaging/deb

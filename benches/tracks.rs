@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use ecod::names::NodeName;
 use ecod::reputation::ReputationConfig;
 use ecod::time::Timestamp;
-use ecod::tracks::{Tracker, TracksConfig};
+use ecod::tracking::{Tracker, TracksConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 
 use figures::Figures;

@@ -6,8 +6,8 @@
 //!
 //! DIR holds a folder for each set, or is one: `label.csv` with the columns `item,worker,label` and, if there are any,
 //! `confidence` (0 to 1, otherwise 1), and `truth.csv` with `item,truth`. Each set is written as a recording, run
-//! by `ecod-node replay` in one pass, with passes, and in `paper` mode, and judged by `ecod-node eval`. All files stay
-//! in the work folder.
+//! by `ecod-node replay` in one pass, with passes, and in `paper` mode, and judged by `ecod-lab eval`, which lies beside
+//! `ecod-node`. All files stay in the work folder.
 //!
 //! The recording is as from a drive: items one after the other in random order, all annotators of an item in random
 //! order within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests
@@ -56,7 +56,7 @@ struct Options {
 }
 
 fn options() -> anyhow::Result<Options> {
-    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let here = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
     let mut options = Options {
         program: here.join("target/release/ecod-node"),
         sets: here.join("examples/crowd_labels"),
@@ -189,7 +189,7 @@ fn measure(options: &Options, work: &Path, name: &str, config: &Path, passes: u3
     }
     run(&mut replay)?;
     let result = work.join(format!("{name}.json"));
-    let mut eval = Command::new(&options.program);
+    let mut eval = Command::new(options.program.with_file_name("ecod-lab"));
     eval.arg("eval").arg("--truth").arg(work.join("truth.json")).arg("--input").arg(&output);
     run(eval.arg("--reports").arg(&reports).arg("--out").arg(&result))?;
     let result: Value = serde_json::from_slice(&fs::read(&result)?)?;

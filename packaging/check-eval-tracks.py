@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Compares `ecod-node eval` of tracks with published implementations.
+"""Compares `ecod-lab eval` of tracks with published implementations.
 
     check-eval-tracks.py TRUTH MAPS RESULT [--write EXPECTED]
 
-TRUTH and MAPS are the input of `ecod-node eval`, RESULT what it wrote with --out. HOTA, CLEAR MOT and identity are
+TRUTH and MAPS are the input of `ecod-lab eval`, RESULT what it wrote with --out. HOTA, CLEAR MOT and identity are
 computed by TrackEval, switches, distances and IDF1 again by motmetrics, average precision by the function of PASCAL VOC as
 OPV2V's program has it. EXPECTED receives the figures of these programs.
 """

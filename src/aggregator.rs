@@ -1,15 +1,14 @@
-//! The aggregator of a cell, without its sockets and clocks: reports go in, maps and verdicts come out.
+//! The aggregator of a cell, without sockets and clocks: reports go in, maps and verdicts come out.
 //!
 //! Call [`Aggregator::report`] with every decoded report and [`Aggregator::tick`] at the latest at
-//! [`Aggregator::deadline`]; either may close a round and return what it made. The live node and the replay of a log
-//! run this same machine.
+//! [`Aggregator::deadline`]. Either may close a round and return it. A live node and the replay of a log run this same
+//! machine.
 //!
-//! A round is closed for PACE and VOTE together: map and verdicts of a round have the same epoch, number and time.
-//! Where both run, verdicts come from the first vote on. In VOTE's `paper` mode verdicts come with the rounds in which
-//! a packet of frames is complete, and only with them.
+//! A round closes for PACE and VOTE together: its map and verdicts have the same epoch, number and time. Where both run,
+//! the first vote starts verdicts. In VOTE's `paper` mode only rounds that complete a packet of frames have verdicts.
 //!
-//! A standby runs the machine without leading: it takes reports and closes rounds, but nothing comes out. From
-//! [`Aggregator::lead`] on its rounds count, with all the evidence it has gathered.
+//! A standby takes reports and closes rounds, but returns nothing. After [`Aggregator::lead`] it returns its rounds,
+//! which rest on all evidence that it has gathered.
 
 mod command;
 mod config;
@@ -29,25 +28,25 @@ use crate::pace::Pace;
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::round::{FirstRound, RoundTrigger};
 use crate::time::Timestamp;
-use crate::tracks::{Tracker, TracksLosses, TracksMode, TracksRound};
+use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::window::{Admitted, ReportWindow};
 use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
 
-/// What a round came to.
+/// A closed round.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fused {
-    /// The leadership in which it was closed.
+    /// The leadership that closed it.
     pub epoch: Epoch,
     /// Its number.
     pub round: u64,
-    /// What PACE made of it, if the cell runs PACE.
+    /// The map, if the cell runs PACE.
     pub map: Option<GlobalMap>,
-    /// What VOTE made of it, if the cell runs VOTE; in `paper` mode only when a packet of frames is complete.
+    /// The verdicts, if the cell runs VOTE; in `paper` mode only when a packet of frames is complete.
     pub verdicts: Option<Verdicts>,
-    /// Votes, and words about tracked objects, of which it has been settled whether they were right.
+    /// Votes and statements about tracked objects that are now known to be right or wrong.
     pub evidence: Vec<Evidence>,
-    /// In VOTE's `paper` mode, with the verdicts, how far each vehicle is trusted: no function of the evidence there.
+    /// The reputations, with the verdicts of VOTE's `paper` mode: they do not follow from the evidence there.
     pub reputations: Option<BTreeMap<NodeName, Reputation>>,
 }
 
@@ -60,19 +59,19 @@ pub struct Aggregator {
     rounds: RoundTrigger,
     pace: Option<Pace>,
     tracks: Option<Tracker>,
-    /// Whether tracking ends with the first known location.
+    /// Whether tracking ends when the first location becomes known.
     tracks_open_cell: bool,
-    /// Reports of which only tracking made use, because later ones of their vehicles came before.
+    /// Reports that only tracking used, because a later one of their vehicle came before.
     overtaken: u64,
     vote: Option<Vote>,
     by_packets: bool,
-    /// Whether anyone has voted: a cell that runs both algorithms spares its network verdicts about nothing until then.
+    /// Whether any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
     voted: bool,
 }
 
 impl Aggregator {
     /// An aggregator without evidence that does not lead; `config` is taken as valid.
-    pub fn standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
+    pub fn new_standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
         let is_tracking = config.tracks_objects(!landmarks.is_empty());
         let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
         let by_packets = vote.mode == VoteMode::Paper;
@@ -98,32 +97,31 @@ impl Aggregator {
 
     /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
     pub fn new(name: NodeName, epoch: u64, config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let mut aggregator = Self::standby(config, landmarks, now);
+        let mut aggregator = Self::new_standby(config, landmarks, now);
         aggregator.lead(Epoch::new(epoch, name), 1, FirstRound::OnTime, now);
         aggregator
     }
 
-    /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says. Evidence comes of
-    /// what vehicles say from then on: what they said before may have counted in another's lane, on the other side of a
-    /// split perhaps, and is never counted twice.
+    /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says. Only later reports
+    /// yield evidence: earlier ones may have counted in another lane, and no vote counts twice.
     pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {
         if self.leads.replace(epoch).is_none() {
             self.vote.iter_mut().for_each(|vote| vote.begin_record(now));
             self.tracks.iter_mut().for_each(|tracks| tracks.begin_record(now));
         }
         // Rounds that were closed meanwhile count.
-        let least = if first == FirstRound::InStep { self.next_round } else { 0 };
-        self.next_round = first_round.max(least);
+        let min_round = if first == FirstRound::InStep { self.next_round } else { 0 };
+        self.next_round = first_round.max(min_round);
         self.rounds.start(first, now);
     }
 
-    /// Lets the present round last its whole length: whoever takes the lead over has that long to say so.
+    /// Lets the present round last its whole length, as time for another node to take over the lead.
     pub fn hold(&mut self) {
         self.rounds.hold();
     }
 
-    /// Goes on as a standby.
-    pub fn stand_by(&mut self) {
+    /// Gives up the lead and continues as a standby.
+    pub fn step_down(&mut self) {
         self.leads = None;
     }
 
@@ -132,12 +130,11 @@ impl Aggregator {
         self.leads.as_ref()
     }
 
-    /// Takes a report received at `now`; returns what came of the round if it closes with it. One that a later report
-    /// of its vehicle overtook is of use to tracking only.
+    /// Takes a report received at `now`; returns the round if the report closes it. Only tracking uses a report that a
+    /// later one of its vehicle overtook.
     ///
     /// # Errors
-    /// The reason for which the report was not used; nothing is fused of it, at most the estimate of its vehicle's
-    /// clock changes.
+    /// The reason why the report was not used; at most the estimate of its vehicle's clock has changed.
     pub fn report(
         &mut self,
         kind: ReportKind,
@@ -185,7 +182,7 @@ impl Aggregator {
         self.rounds.deadline()
     }
 
-    /// Adds known locations for PACE; evidence stays, but tracks of `auto` end. VOTE takes locations from reports by
+    /// Adds known locations for PACE; evidence stays, but tracking in mode `auto` ends. VOTE takes locations from reports
     /// itself where none are known.
     pub fn add_landmarks(&mut self, landmarks: Vec<Landmark>) {
         if self.tracks_open_cell && !landmarks.is_empty() {
@@ -196,43 +193,41 @@ impl Aggregator {
         }
     }
 
-    /// Goes over VOTE's stored votes `passes` times and says what came of it, in a round of its own; see
-    /// [`Vote::refine`]. `None` without VOTE or leadership.
+    /// Judges VOTE's stored votes `passes` times and returns the verdicts as a round of their own; see [`Vote::refine`].
+    /// `None` without VOTE or leadership.
     pub fn refine(&mut self, passes: u32, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let verdicts = self.vote.as_mut()?.refine(passes);
-        Some(self.in_a_round_of_its_own(epoch, verdicts, now))
+        Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    /// Judges the packet that was begun in VOTE's `paper` mode, in a round of its own, as no frame will complete it;
-    /// for the end of a recording. `None` if no packet was begun, or without leadership.
+    /// Judges the incomplete packet of VOTE's `paper` mode in a round of its own, at the end of a recording. `None` if no
+    /// packet was begun, or without leadership.
     pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let by_packets = self.by_packets;
         let vote = self.vote.as_mut().filter(|vote| by_packets && vote.is_packet_begun())?;
         let verdicts = vote.close(now).verdicts;
-        Some(self.in_a_round_of_its_own(epoch, verdicts, now))
+        Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    fn in_a_round_of_its_own(&mut self, epoch: Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {
+    fn number_verdicts(&mut self, epoch: &Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {
+        let round = self.take_round_number();
+        Verdicts::new(epoch, round, now, verdicts)
+    }
+
+    fn take_round_number(&mut self) -> u64 {
         let round = self.next_round;
         self.next_round = round.saturating_add(1);
-        Verdicts {
-            schema: SCHEMA_VERSION,
-            aggregator: epoch.leader,
-            epoch: epoch.term,
-            round,
-            fused_at_us: now,
-            verdicts,
-        }
+        round
     }
 
-    /// How far VOTE trusts each vehicle by what it has seen itself.
+    /// VOTE's trust in each vehicle, from the evidence of this aggregator.
     pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
         self.vote.as_ref().map(Vote::reputations).unwrap_or_default()
     }
 
-    /// Starts from what a ledger knows, after a restart or a change of aggregator.
+    /// Starts from the evidence of a ledger, after a restart or a change of aggregator.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         if let Some(vote) = &mut self.vote {
             vote.adopt(ledger);
@@ -242,31 +237,31 @@ impl Aggregator {
         }
     }
 
-    /// Goes on with the identities of the objects in another aggregator's map, received at `now`.
+    /// Takes over the identities of the objects in another aggregator's map, received at `now`.
     pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
         if let Some(tracks) = &mut self.tracks {
             tracks.adopt_map(map, now);
         }
     }
 
-    /// What tracking could not use so far.
+    /// Numbers of reports and objects so far that tracking could not use.
     pub fn tracks_losses(&self) -> TracksLosses {
         self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
     }
 
-    /// Reports so far that tracking used and PACE did not: later ones of their vehicles came before.
+    /// Number of reports so far that only tracking used, because a later one of their vehicle came before.
     pub fn overtaken(&self) -> u64 {
         self.overtaken
     }
 
-    /// Goes on, in VOTE's `paper` mode, from reputations that were published.
+    /// Continues, in VOTE's `paper` mode, from published reputations.
     pub fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
         if let Some(vote) = &mut self.vote {
             vote.resume(reputations);
         }
     }
 
-    /// Objects that voted for nothing so far; see [`crate::vote`].
+    /// Number of objects so far that did not vote; see [`crate::vote`].
     pub fn ignored_votes(&self) -> u64 {
         self.vote.as_ref().map_or(0, Vote::ignored)
     }
@@ -285,8 +280,7 @@ impl Aggregator {
         if pace.is_none() && vote.is_none() {
             return None;
         }
-        let round = self.next_round;
-        self.next_round = round.saturating_add(1);
+        let round = self.take_round_number();
         let TracksRound { objects, pose_corrections, oldest_capture, evidence: seen } = tracks;
         let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
         evidence.extend(seen);
@@ -301,14 +295,7 @@ impl Aggregator {
             objects,
             pose_corrections,
         });
-        let verdicts = verdicts.map(|verdicts: Vec<Verdict>| Verdicts {
-            schema: SCHEMA_VERSION,
-            aggregator: epoch.leader.clone(),
-            epoch: epoch.term,
-            round,
-            fused_at_us: now,
-            verdicts,
-        });
+        let verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, now, verdicts));
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
         Some(Fused { epoch, round, map, verdicts, evidence, reputations })
     }

@@ -1,4 +1,4 @@
-//! The pinhole camera: intrinsics and how the camera sits on its vehicle.
+//! The pinhole camera: intrinsics and the mount on the vehicle.
 //!
 //! Camera frame: x to the right, y downwards, z along the axis, metres. Pixels: origin at the upper left corner of the
 //! image, x to the right, y downwards. Lens distortion is removed where images are handled; pixels here are
@@ -44,7 +44,7 @@ impl Intrinsics {
         ((self.cx - x_px) / self.fx).atan()
     }
 
-    /// Angle that each column takes when the field of view is spread evenly over the image, the paper's γ, in radians.
+    /// The paper's γ: the angle of a column in radians, with the field of view spread evenly over the image.
     pub fn angle_per_pixel(&self) -> f64 {
         self.horizontal_field_of_view() / f64::from(self.width)
     }
@@ -54,14 +54,14 @@ impl Intrinsics {
         self.bearing(0.0) - self.bearing(f64::from(self.width))
     }
 
-    /// Where a point of the camera frame appears, in pixels; `None` behind the camera.
+    /// The pixel of a point in the camera frame; `None` behind the camera.
     pub fn project(&self, point: &Point3<f64>) -> Option<Point2<f64>> {
         (point.z > 0.0)
             .then(|| Point2::new(self.cx + self.fx * point.x / point.z, self.cy + self.fy * point.y / point.z))
     }
 }
 
-/// Where the camera sits on its vehicle.
+/// The mount of the camera on its vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Mount {
     /// Metres ahead of the vehicle's reference point.

@@ -1,4 +1,4 @@
-//! Checking of configuration values: an error names the key, the value and what is allowed.
+//! Sections of the configuration: defaults, allowed ranges, and errors that name key, value and range.
 
 use std::fmt::Display;
 
@@ -27,6 +27,45 @@ impl ConfigError {
         self
     }
 }
+
+/// Defines a section of the configuration: the default of each field and its check, if any, stand beside its
+/// documentation. A check is a range, which may name other fields, or a function.
+///
+/// Generates the struct, its `Default` and `validate`.
+macro_rules! config_section {
+    ($(#[$attribute:meta])* pub struct $name:ident {
+        $($(#[$doc:meta])* pub $field:ident: $type:ty = $default:expr
+            $(, in $low:tt to $high:expr)? $(, checked by $check:expr)?;)*
+    }) => {
+        $(#[$attribute])*
+        #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct $name {
+            $($(#[$doc])* pub $field: $type,)*
+        }
+
+        impl Default for $name {
+            fn default() -> Self {
+                Self { $($field: $default,)* }
+            }
+        }
+
+        impl $name {
+            /// Checks all values.
+            ///
+            /// # Errors
+            /// [`ConfigError`](crate::config::ConfigError) that names the first key out of range.
+            pub fn validate(&self) -> Result<(), crate::config::ConfigError> {
+                #[allow(unused_variables)]
+                let Self { $($field,)* } = self;
+                $($(crate::config::check_range(stringify!($field), *$field as f64, $low, $high)?;)?)*
+                $($($check($field).map_err(|error| error.within(stringify!($field)))?;)?)*
+                Ok(())
+            }
+        }
+    };
+}
+pub(crate) use config_section;
 
 /// Checks that `value` is a number from `low` to `high`.
 ///

@@ -1,14 +1,14 @@
-//! The least delay of a one-way stream, which tells clock offset from queueing.
+//! Clock offset from the minimum delay of a one-way stream.
 
 use std::time::Duration;
 
 use crate::time::Timestamp;
 
-/// Least delay from sending to receipt over the last one to two spans of ten seconds.
+/// The minimum delay from sending to receipt over the last one to two spans of ten seconds.
 ///
-/// The least delay of a one-way stream is the clock offset plus the shortest transit, so later arrivals stand out by
-/// their queueing alone (Moon, Skelly, Towsley, "Estimation and removal of clock skew", INFOCOM 1999).
-#[derive(Debug, Clone)]
+/// The minimum is the clock offset plus the shortest transit; any delay above it is queueing (Moon, Skelly, Towsley,
+/// "Estimation and removal of clock skew", INFOCOM 1999). Unlike there, skew within a span is neglected.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct MinimumDelay {
     span_start: Timestamp,
     current_us: i64,
@@ -19,12 +19,12 @@ pub struct MinimumDelay {
 impl MinimumDelay {
     const SPAN: Duration = Duration::from_secs(10);
 
-    /// No delay is known yet.
+    /// An estimate without delays.
     pub fn new(now: Timestamp) -> Self {
         Self { span_start: now, current_us: i64::MAX, previous_us: i64::MAX, observed: 0 }
     }
 
-    /// Takes the delay of one message, in microseconds; negative when the sender's clock is ahead.
+    /// Takes the delay of one message in microseconds, which is negative if the sender's clock is ahead.
     pub fn observe(&mut self, delay_us: i64, now: Timestamp) {
         if now.since(self.span_start) >= Self::SPAN {
             self.previous_us = self.current_us;
@@ -35,12 +35,12 @@ impl MinimumDelay {
         self.observed += 1;
     }
 
-    /// The least delay in microseconds; `i64::MAX` without any.
+    /// The minimum delay in microseconds; `i64::MAX` without delays.
     pub fn least(&self) -> i64 {
         self.current_us.min(self.previous_us)
     }
 
-    /// How many delays the estimate has been given.
+    /// Number of delays in the estimate.
     pub fn observed(&self) -> u64 {
         self.observed
     }

@@ -1,4 +1,4 @@
-//! What a detector finds in one image, before it has a place in the world.
+//! Detections in one image, in pixels.
 
 use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
@@ -73,25 +73,25 @@ pub struct Detection {
     pub label: Label,
     /// The detector's confidence, 0 to 1.
     pub confidence: f64,
-    /// Where in the image, in pixels.
+    /// Bounds in the image, in pixels.
     pub bounding_box: BoundingBox,
     /// Corners of a square target in pixels, as seen from its front: top left, top right, bottom right, bottom left.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub corners: Option<[Point2<f64>; 4]>,
 }
 
-/// The detections of one frame, from a line of a recording: a JSON array.
+/// Reads the detections of one frame from a line of a recording, a JSON array.
 ///
 /// # Errors
-/// What is wrong with it, in words.
-pub fn detections_in(line: &str) -> Result<Vec<Detection>, String> {
+/// A description of the first flaw.
+pub fn parse_detections(line: &str) -> Result<Vec<Detection>, String> {
     let detections: Vec<Detection> = serde_json::from_str(line).map_err(|error| error.to_string())?;
     for Detection { label, confidence, bounding_box, .. } in &detections {
         if !bounding_box.is_valid() {
             return Err(format!("the box of {label:?} has no area"));
         }
         if !is_label(label) {
-            return Err(format!("the label {label:?} is no text of 1 to {MAX_NAME_BYTES} bytes"));
+            return Err(format!("the label {label:?} must be a text of 1 to {MAX_NAME_BYTES} bytes"));
         }
         if !(0.0..=1.0).contains(confidence) {
             return Err(format!("the confidence of {label:?} is {confidence}, must be 0 to 1"));

@@ -90,6 +90,20 @@ impl Covariance {
     }
 }
 
+/// From `[xx, xy, yy]`.
+impl From<[f64; 3]> for Covariance {
+    fn from([xx, xy, yy]: [f64; 3]) -> Self {
+        Self { xx, xy, yy }
+    }
+}
+
+/// To `[xx, xy, yy]`.
+impl From<Covariance> for [f64; 3] {
+    fn from(Covariance { xx, xy, yy }: Covariance) -> Self {
+        [xx, xy, yy]
+    }
+}
+
 impl std::ops::Add for Covariance {
     type Output = Self;
 

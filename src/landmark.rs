@@ -8,7 +8,7 @@ use nalgebra::Point2;
 
 pub(crate) use config::check_synonyms;
 pub use config::{LandmarkConfig, VacancyConfig};
-pub use index::{Candidate, Gate, LandmarkIndex};
+pub use index::{LandmarkCandidate, LandmarkGate, LandmarkIndex};
 
 use crate::names::{Label, LandmarkId};
 
@@ -17,33 +17,33 @@ use crate::names::{Label, LandmarkId};
 pub struct Landmark {
     /// The location's name.
     pub id: LandmarkId,
-    /// Where an object stands, in metres.
+    /// Position of an object in metres.
     pub position: Point2<f64>,
     /// Direction from which an object here can be read, in radians; `None` from all around.
     pub facing_rad: Option<f64>,
     /// A sign that is in view while the location is empty.
     pub vacancy: Option<VacancySign>,
-    /// Labels that count as one: each of these is taken for `label`.
+    /// Labels that count as another one here.
     pub synonyms: Vec<Synonym>,
 }
 
 impl Landmark {
-    /// The label that another one counts as here, if it does.
+    /// The label that `label` counts as here, if it has a synonym.
     pub fn synonym(&self, label: &Label) -> Option<&Label> {
         self.synonyms.iter().find(|synonym| synonym.from == *label).map(|synonym| &synonym.label)
     }
 }
 
-/// A fixed sign behind a location, such as a card that reads `EMPTY`; any object before it outweighs it.
+/// A fixed sign behind a location, such as a card that reads `EMPTY`; any object in front outweighs it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VacancySign {
-    /// What it reads.
+    /// The text of the sign.
     pub label: Label,
-    /// Where it stands, in metres.
+    /// Position in metres.
     pub position: Point2<f64>,
 }
 
-/// One label that is taken for another.
+/// A label that counts as another one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Synonym {
     /// The label as detected, such as `vase`.

@@ -8,27 +8,27 @@
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
 pub mod aggregator;
+pub mod association;
 pub mod camera;
 pub mod config;
 pub mod delay;
 pub mod detection;
-pub mod election;
 pub mod epoch;
-pub mod eval;
 pub mod geometry;
 pub mod landmark;
-pub mod motion;
+pub mod leadership;
 pub mod names;
 pub mod pace;
+pub mod pose_history;
 pub mod projection;
 pub mod replay;
 pub mod reputation;
 pub mod round;
-pub mod testbed;
 pub mod time;
-pub mod tracks;
-pub mod traffic;
+pub mod tracking;
 pub mod view;
 pub mod vote;
 pub mod window;
 pub mod wire;
+
+pub use leadership::election;

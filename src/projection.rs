@@ -1,14 +1,17 @@
-//! From a box or corners in an image to a position in the world, with its covariance.
+//! Projection of a box or corners in an image to a position in the world, with its covariance.
 //!
 //! ```text
 //! Detection --ranging--> forward, left of the camera --Pose--> PerceivedObject (east, north, covariance)
 //! ```
 //!
-//! [`Ranging`] names the ways to find the distance. All but [`Ranging::Paper`] are exact for a pinhole camera; what
-//! they assume about the object is said at each.
+//! Each [`Ranging`] finds the distance in its own way, in a file of its own. All but [`Ranging::Paper`] are exact for a
+//! pinhole camera, under the assumptions about the object that it states.
 
+mod box_height;
+mod box_width;
 mod config;
-mod pinhole;
+mod corners;
+mod paper;
 
 use nalgebra::Point3;
 
@@ -20,20 +23,20 @@ use crate::geometry::{Covariance, Pose};
 use crate::names::Label;
 use crate::wire::PerceivedObject;
 
-/// Why a detection has no position.
+/// The reason why a detection has no position.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ProjectionError {
     /// Neither a size for the label nor a default size is configured.
     #[error("no known size for label {0:?} and no default size")]
     UnknownSize(Label),
-    /// The box has no area, is not finite, or no distance follows from it.
-    #[error("no distance follows from the box of {0:?}")]
+    /// The box has no area, is not finite, or gives no distance.
+    #[error("the box of {0:?} gives no distance")]
     DegenerateBox(Label),
-    /// The image's edge cuts the object, so the box does not show its whole extent.
+    /// The image's edge cuts the object: the box does not show its whole extent.
     #[error("the image's edge cuts the box of {0:?}")]
     Clipped(Label),
-    /// The target's corners place it behind the camera or nowhere.
-    #[error("the corners of {0:?} place it nowhere before the camera")]
+    /// The target's corners give no position in front of the camera.
+    #[error("the corners of {0:?} give no position in front of the camera")]
     InvalidCorners(Label),
 }
 
@@ -49,7 +52,7 @@ impl ProjectionError {
     }
 }
 
-/// Places detections of one camera in the world.
+/// The projection of one camera's detections to the world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Projection {
     config: ProjectionConfig,
@@ -72,29 +75,29 @@ impl Projection {
         &self.intrinsics
     }
 
-    /// Checks that the image's edge does not cut the box where the distance is judged by it: call it with the box in
-    /// the image as taken, before distortion is removed.
+    /// Checks that the image's edge does not cut the side of the box that gives the distance. Call it with the box in the
+    /// raw image, before distortion is removed.
     ///
     /// # Errors
     /// [`ProjectionError::Clipped`].
-    pub fn check_whole(&self, detection: &Detection) -> Result<(), ProjectionError> {
+    pub fn check_unclipped(&self, detection: &Detection) -> Result<(), ProjectionError> {
         let bounds = &detection.bounding_box;
-        let cut = match self.config.ranging {
+        let is_clipped = match self.config.ranging {
             Ranging::Corners if detection.corners.is_some() => false,
-            Ranging::Corners | Ranging::BoxHeight => pinhole::is_cut_in_height(bounds, &self.intrinsics),
-            Ranging::BoxWidth => pinhole::is_cut_in_width(bounds, &self.intrinsics),
+            Ranging::Corners | Ranging::BoxHeight => box_height::is_clipped(bounds, &self.intrinsics),
+            Ranging::BoxWidth => box_width::is_clipped(bounds, &self.intrinsics),
             Ranging::Paper => false,
         };
-        if cut { Err(ProjectionError::Clipped(detection.label.clone())) } else { Ok(()) }
+        if is_clipped { Err(ProjectionError::Clipped(detection.label.clone())) } else { Ok(()) }
     }
 
-    /// Places a detection seen from `camera`, whose distortion has been removed; see also [`Self::check_whole`].
+    /// Places a detection from `camera` whose distortion has been removed; see also [`Self::check_unclipped`].
     ///
-    /// `target` is the middle of the detection's corners in the camera frame, in metres, where corners have been
-    /// solved for it; used by [`Ranging::Corners`] only.
+    /// `target` is the middle of the detection's solved corners in the camera frame, in metres; only [`Ranging::Corners`]
+    /// uses it.
     ///
     /// # Errors
-    /// [`ProjectionError`] when no position follows.
+    /// [`ProjectionError`] if the detection gives no position.
     pub fn place(
         &self,
         detection: &Detection,
@@ -106,11 +109,12 @@ impl Projection {
             return Err(ProjectionError::DegenerateBox(label.clone()));
         }
         let size = self.config.sizes.of(label).ok_or_else(|| ProjectionError::UnknownSize(label.clone()))?;
+        let (bounds, intrinsics) = (&detection.bounding_box, &self.intrinsics);
         let sight = match (self.config.ranging, target) {
-            (Ranging::Corners, Some(target)) => pinhole::from_target(detection, target)?,
-            (Ranging::Corners | Ranging::BoxHeight, _) => pinhole::from_height(detection, size, &self.intrinsics),
-            (Ranging::BoxWidth, _) => pinhole::from_width(detection, size, &self.intrinsics),
-            (Ranging::Paper, _) => paper(detection, size, &self.intrinsics)?,
+            (Ranging::Corners, Some(target)) => corners::line_of_sight(detection, target)?,
+            (Ranging::Corners | Ranging::BoxHeight, _) => box_height::line_of_sight(bounds, size, intrinsics),
+            (Ranging::BoxWidth, _) => box_width::line_of_sight(bounds, size, intrinsics),
+            (Ranging::Paper, _) => paper::line_of_sight(detection, size, intrinsics)?,
         };
         let direction_rad = camera.heading_rad + sight.bearing_rad;
         let (sin, cos) = direction_rad.sin_cos();
@@ -120,17 +124,17 @@ impl Projection {
             return Err(ProjectionError::DegenerateBox(label.clone()));
         }
         Ok(PerceivedObject {
-            covariance_m2: Some([covariance.xx, covariance.xy, covariance.yy]),
+            covariance_m2: Some(covariance.into()),
             ..PerceivedObject::new(label.clone(), detection.confidence, position.0, position.1)
         })
     }
 
-    /// First-order error propagation along and across the sight.
+    /// First-order error propagation along and across the line of sight.
     ///
-    /// Along: d ∝ size / extent, so σ_d/d is the root of the squared relative errors of the two; both edges of the
-    /// extent carry pixel noise. Across: pixel noise and heading error turn the sight. The camera's position error
-    /// and the floor add to both.
-    fn covariance(&self, sight: &Sight, size: &ObjectSize, direction_rad: f64) -> Covariance {
+    /// Along it, d ∝ size / extent: σ_d/d is the root of the sum of both squared relative errors, and both edges of the
+    /// extent have pixel noise. Across it, pixel noise and heading error turn the line of sight. The camera's position
+    /// error and the floor add to both.
+    fn covariance(&self, sight: &LineOfSight, size: &ObjectSize, direction_rad: f64) -> Covariance {
         let ProjectionConfig { pixel_sigma_px, heading_sigma_rad, position_sigma_m, floor_m, .. } = self.config;
         let edges = std::f64::consts::SQRT_2 * pixel_sigma_px / sight.extent_px;
         let everywhere = position_sigma_m.hypot(floor_m);
@@ -140,27 +144,24 @@ impl Projection {
     }
 }
 
-/// An object as seen from the camera, in the plane.
+/// Distance in pixels to the image's edge within which a box counts as cut by it.
+const EDGE_PX: f64 = 1.0;
+
+/// The line of sight from the camera to an object, in the plane.
 #[derive(Debug, Clone, Copy)]
-struct Sight {
+struct LineOfSight {
     /// Off the axis, counter-clockwise positive.
     bearing_rad: f64,
     distance_m: f64,
-    /// What the distance was judged by.
+    /// Extent in the image that gives the distance.
     extent_px: f64,
 }
 
-/// The paper's Algorithm 1, lines 8-14, to the letter; see [`Ranging::Paper`].
-fn paper(detection: &Detection, size: &ObjectSize, camera: &Intrinsics) -> Result<Sight, ProjectionError> {
-    let gamma = camera.angle_per_pixel();
-    let width_px = detection.bounding_box.width();
-    let alpha = gamma * width_px;
-    let distance_m = size.width_m / alpha.tan();
-    if !(distance_m.is_finite() && distance_m > 0.0) {
-        return Err(ProjectionError::DegenerateBox(detection.label.clone()));
+impl LineOfSight {
+    /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera.
+    fn to(forward_m: f64, left_m: f64, extent_px: f64) -> Self {
+        Self { bearing_rad: left_m.atan2(forward_m), distance_m: forward_m.hypot(left_m), extent_px }
     }
-    let x_center = detection.bounding_box.x_min + 0.5 * width_px;
-    Ok(Sight { bearing_rad: -(gamma * x_center), distance_m, extent_px: width_px })
 }
 
 #[cfg(test)]

@@ -1,15 +1,14 @@
-//! When a round closes: every period, or as soon as every live vehicle has reported. The first rounds of a leadership that
-//! was not handed over come in quicker succession.
+//! The trigger of rounds: a round closes every period, or as soon as every live vehicle has reported.
 //!
-//! A vehicle that sends both kinds of reports is waited for with both.
-//!
-//! Vehicles that report once a period, all about the same time, report just as the period ends: a round must not end in
-//! the midst of them, or those that come after would wait for another period, and so in every round to come. The end is
-//! put off for a moment while reports come in. Where a round ended in their midst nevertheless, the rest have one of
-//! their own as soon as the last of them is there, and from then on rounds end after them.
+//! - The first rounds of a leadership without handover follow each other more quickly.
+//! - A round waits for both reports of a vehicle that sends both kinds.
+//! - Vehicles often report once a period, all at about the same time, and just as a round ends. If it ended amid their
+//!   reports, the later ones would wait for another period, in every round. So the end is delayed a little while reports
+//!   come in. If a round ends amid them nevertheless, the rest get a round as soon as the last of them has reported;
+//!   later rounds then end after all of them.
 //!
 //! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at [`RoundTrigger::deadline`];
-//! either says when to close the round.
+//! either returns true when the round closes.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -17,118 +16,105 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::config_section;
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::ReportKind;
 
-/// The rhythm of rounds.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct RoundConfig {
-    /// Longest time between rounds in seconds, the paper's τ. Default 0.1.
-    pub period_s: f64,
-    /// What closes a round before the period is over.
-    pub close: RoundClose,
+config_section! {
+    /// The interval of rounds.
+    #[derive(JsonSchema)]
+    pub struct RoundConfig {
+        /// Longest time between rounds in seconds, the paper's τ. Default 0.1.
+        pub period_s: f64 = 0.1, in 0.005 to 60.0;
+        /// The condition that closes a round before the period is over.
+        pub close: RoundClose = RoundClose::WhenComplete;
+    }
 }
 
-/// What closes a round.
+/// The condition that closes a round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum RoundClose {
     /// Nothing but time, as in the paper. Adds up to a period of latency.
     Periodic,
-    /// Every live vehicle has reported since the last round; the period is the bound, or a tenth more while reports
+    /// Every live vehicle has reported since the last round, at the latest the period, or a tenth more while reports
     /// come in. The default.
     WhenComplete,
 }
 
-impl Default for RoundConfig {
-    fn default() -> Self {
-        Self { period_s: 0.1, close: RoundClose::WhenComplete }
-    }
-}
-
 impl RoundConfig {
-    /// Checks all values.
-    ///
-    /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("period_s", self.period_s, 0.005, 60.0)
-    }
-
     fn period(&self) -> Duration {
         Duration::from_secs_f64(self.period_s)
     }
 }
 
-/// Decides when to close a round.
+/// The state of the present round.
 #[derive(Debug, Clone)]
 pub struct RoundTrigger {
     config: RoundConfig,
     last_close: Timestamp,
-    /// When the first report of the present round came.
+    /// Time of the first report of the present round.
     first_report: Option<Timestamp>,
-    live: [BTreeMap<NodeName, Vehicle>; ReportKind::COUNT],
+    live: [BTreeMap<NodeName, Reporter>; ReportKind::COUNT],
+    /// Number of live vehicles that have not reported in the present round.
     missing: usize,
-    /// Vehicles whose report was due when the last round closed and that have not reported since.
+    /// Number of vehicles whose report was due when the last round closed and that have not reported since.
     due: usize,
-    /// How long the present round lasts.
+    /// Length of the present round.
     length: Duration,
-    /// Whether it lasts that long whoever has reported.
+    /// Whether it lasts that long even if all have reported.
     held: bool,
-    /// Rounds of [`EARLY`] that have begun.
+    /// Number of [`EARLY`] rounds that have begun.
     early: usize,
 }
 
 #[derive(Debug, Clone)]
-struct Vehicle {
+struct Reporter {
     last_report: Timestamp,
+    /// Whether it has reported in the present round.
     reported: bool,
-    /// Due to report when the last round closed.
+    /// Whether its report was due when the last round closed.
     due: bool,
 }
 
-/// When the first round of a leadership is due. After [`Self::Overdue`] and [`Self::AfterConnects`] a few more follow
+/// The due time of the first round of a leadership. After [`Self::Overdue`] and [`Self::AfterConnects`] a few more follow
 /// quickly.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum FirstRound {
-    /// When it would have been anyway: the node leads on.
+    /// Unchanged: the node continues to lead.
     InStep,
-    /// A period from now: the round before has just been closed by the node that handed over.
+    /// A period from now: the node that handed over has just closed a round.
     OnTime,
-    /// At once: the others are connected to this node's broker and wait.
+    /// At once: the other nodes are connected to this node's broker and wait.
     Overdue,
-    /// [`CONNECT_TIME`] from now: the others wait, but nobody told them before to connect here.
+    /// [`CONNECT_TIME`] from now: the other nodes wait, but are not connected to this node's broker yet.
     AfterConnects,
 }
 
-/// How long a vehicle takes to connect to a broker that it has just heard of, and some more. A map sent before is lost to
-/// it.
+/// Time for a vehicle to connect to a new broker, with a margin. The vehicle misses maps that are sent earlier.
 pub const CONNECT_TIME: Duration = Duration::from_millis(25);
 
-/// How long the rounds after the first of an unplanned leadership last: a vehicle that was not connected in time waits
-/// for one of these, not for a whole period.
+/// Lengths of the rounds after the first of an unplanned leadership: a vehicle that connects late waits for one of these,
+/// not for a whole period.
 const EARLY: [Duration; 2] = [CONNECT_TIME, Duration::from_millis(50)];
 
-/// How many rounds follow more quickly on the first of an unplanned leadership than rounds do otherwise.
+/// Number of shortened rounds after the first of an unplanned leadership.
 pub const EARLY_ROUNDS: usize = EARLY.len();
 
-/// Periods after which a silent vehicle is no longer waited for.
+/// Number of periods after which a silent vehicle is no longer live.
 const LIVE_PERIODS: u32 = 3;
 
-/// Rounds close at most this many times as often as the period says, those that follow at once with the reports of
-/// vehicles that were due excepted, and the first of a leadership. As a vehicle is not due again for half a period, these
-/// are few.
+/// Maximum number of rounds in a period. Excepted are the first rounds of a leadership and those that follow at once with
+/// the reports of vehicles that were due; they are few, as a vehicle is not due again for half a period.
 const MAX_RATE: u32 = 5;
 
-/// The part of a period by which its end is put off after the first report of a round.
-const COMING_IN: u32 = 10;
+/// Inverse share of a period by which the end of a round is delayed after its first report.
+const DELAY_DIVISOR: u32 = 10;
 
-/// A vehicle is due when its last report is older than this part of a period.
-const DUE: u32 = 2;
+/// Inverse share of a period after which the next report of a vehicle is due.
+const DUE_DIVISOR: u32 = 2;
 
 impl RoundTrigger {
     /// Starts counting at `now`.
@@ -146,8 +132,8 @@ impl RoundTrigger {
         }
     }
 
-    /// Takes note of a report; true when the round closes with it, because it was the last that was waited for. A
-    /// period that is over is left to [`Self::tick`], so that of reports that come at the end of it none is cut off.
+    /// Takes a report; true when it closes the round as the last missing one. [`Self::tick`] alone closes a round whose
+    /// period is over, so that it includes all reports that come at its end.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
         self.first_report.get_or_insert(now);
         let live = &mut self.live[kind as usize];
@@ -162,7 +148,7 @@ impl RoundTrigger {
                 was_last_due = self.due == 0;
             }
         } else {
-            live.insert(node.clone(), Vehicle { last_report: now, reported: true, due: false });
+            live.insert(node.clone(), Reporter { last_report: now, reported: true, due: false });
         }
         if was_last_due && !self.held && now.since(self.last_close) < self.config.period() / MAX_RATE {
             self.close(now);
@@ -182,14 +168,14 @@ impl RoundTrigger {
 
     fn close(&mut self, now: Timestamp) {
         let period = self.config.period();
-        // After a round that was held, whoever takes over has the word, or others are still connecting.
+        // After a round that was held, another node may take over, or vehicles are still connecting.
         let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
         (self.missing, self.due) = (0, 0);
         for live in &mut self.live {
             live.retain(|_, vehicle| now.since(vehicle.last_report) < period * LIVE_PERIODS);
             for vehicle in live.values_mut() {
                 vehicle.reported = false;
-                vehicle.due = by_reports && now.since(vehicle.last_report) > period / DUE;
+                vehicle.due = by_reports && now.since(vehicle.last_report) > period / DUE_DIVISOR;
                 self.missing += 1;
                 self.due += usize::from(vehicle.due);
             }
@@ -201,7 +187,7 @@ impl RoundTrigger {
         self.early += usize::from(self.held);
     }
 
-    /// Starts a run of rounds.
+    /// Starts the rounds of a leadership.
     pub fn start(&mut self, first: FirstRound, now: Timestamp) {
         let period = self.config.period();
         self.length = match first {
@@ -215,7 +201,7 @@ impl RoundTrigger {
         self.early = if self.held { 0 } else { EARLY.len() };
     }
 
-    /// Lets the present round last its whole length, whoever has reported.
+    /// Lets the present round last its whole length, even if all have reported.
     pub fn hold(&mut self) {
         self.held = true;
     }
@@ -230,7 +216,7 @@ impl RoundTrigger {
         let anyone = self.live.iter().any(|live| !live.is_empty());
         match self.first_report {
             _ if self.missing == 0 && anyone => self.last_close + period / MAX_RATE,
-            Some(first) => end.max(first + period / COMING_IN).min(end + period / COMING_IN),
+            Some(first) => end.max(first + period / DELAY_DIVISOR).min(end + period / DELAY_DIVISOR),
             None => end,
         }
     }

@@ -1,73 +1,43 @@
-//! Which known locations a camera has in view: near enough to be read, inside the image, not turned away, not hidden.
+//! The known locations in view of a camera: near enough to be read, inside the image, not turned away, not hidden.
 //!
-//! A report lists them as `seen`, so that a location in view without a detection is known to be empty. To claim too
-//! much hurts more than to claim too little: each condition alone rules a location out.
+//! A report lists them as `seen`, so that a location in view without a detection is known to be empty. A false claim does
+//! more harm than a missing one: a location must meet every condition.
 
 use nalgebra::{Point2, Point3, Vector2};
-use serde::{Deserialize, Serialize};
 
 use crate::camera::Intrinsics;
-use crate::config::{ConfigError, check_range};
+use crate::config::config_section;
 use crate::geometry::{Pose, wrap_angle};
 use crate::landmark::Landmark;
 use crate::names::LandmarkId;
 use crate::projection::ObjectSizes;
 use crate::wire::PerceivedObject;
 
-/// What it takes to have a location in view.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ViewConfig {
-    /// Width of the target or object to be recognised at a location, in metres; default 0.05.
-    pub target_width_m: f64,
-    /// Pixels that the target must take across, as it is turned; default 36: a placard code of 21 modules at 1.7
-    /// pixels each. Less claims more locations and with them some whose object is overlooked.
-    pub min_target_px: f64,
-    /// Pixels that the target must keep from the left and right edges of the image; default 8.
-    pub margin_px: f64,
-    /// Farthest location in metres; default 20.
-    pub max_range_m: f64,
-    /// Most that the camera may stand off the direction that the location faces, in radians; default 0.87 (50°).
-    pub max_yaw_rad: f64,
-    /// Width in metres of a perceived object whose label has no listed size, for what it hides; default 0.07.
-    pub occluder_width_m: f64,
-    /// Metres by which an object must be nearer than a location to hide it; default 0.05. Must exceed the error of a
-    /// position, or an object hides the place where it stands.
-    pub clearance_m: f64,
-}
-
-impl Default for ViewConfig {
-    fn default() -> Self {
-        Self {
-            target_width_m: 0.05,
-            min_target_px: 36.0,
-            margin_px: 8.0,
-            max_range_m: 20.0,
-            max_yaw_rad: 0.87,
-            occluder_width_m: 0.07,
-            clearance_m: 0.05,
-        }
+config_section! {
+    /// Conditions for a location to be in view.
+    pub struct ViewConfig {
+        /// Width of the target or object to be recognised at a location, in metres; default 0.05.
+        pub target_width_m: f64 = 0.05, in 1e-4 to 1e3;
+        /// Minimum width in pixels of the target as it is turned; default 36: a placard code of 21 modules at 1.7 pixels
+        /// each. Less claims more locations, some of which the detector cannot read.
+        pub min_target_px: f64 = 36.0, in 0.0 to 1e5;
+        /// Minimum distance in pixels of the target from the left and right edges of the image; default 8.
+        pub margin_px: f64 = 8.0, in 0.0 to 1e5;
+        /// Maximum distance of a location in metres; default 20.
+        pub max_range_m: f64 = 20.0, in 1e-3 to 1e6;
+        /// Maximum angle in radians between the facing of the location and the direction to the camera; default 0.87
+        /// (50°).
+        pub max_yaw_rad: f64 = 0.87, in 0.0 to std::f64::consts::PI;
+        /// Width in metres of an occluding object whose label has no listed size; default 0.07.
+        pub occluder_width_m: f64 = 0.07, in 0.0 to 1e3;
+        /// Distance in metres by which an object must be nearer than a location to hide it; default 0.05. It must exceed
+        /// the error of a position, or an object hides its own location.
+        pub clearance_m: f64 = 0.05, in 0.0 to 1e3;
     }
 }
 
-impl ViewConfig {
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// [`ConfigError`] with the first key out of range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("target_width_m", self.target_width_m, 1e-4, 1e3)?;
-        check_range("min_target_px", self.min_target_px, 0.0, 1e5)?;
-        check_range("margin_px", self.margin_px, 0.0, 1e5)?;
-        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
-        check_range("max_yaw_rad", self.max_yaw_rad, 0.0, std::f64::consts::PI)?;
-        check_range("occluder_width_m", self.occluder_width_m, 0.0, 1e3)?;
-        check_range("clearance_m", self.clearance_m, 0.0, 1e3)
-    }
-}
-
-/// The landmarks that `camera` has in view, in their order; `objects` are what it just perceived, `sizes` the widths
-/// by which listed labels hide what is behind them.
+/// The landmarks in view of `camera`, in their order. The perceived `objects` hide landmarks behind them, with the widths
+/// in `sizes` for listed labels.
 pub fn landmarks_in_view(
     landmarks: &[Landmark],
     camera: &Pose,
@@ -86,13 +56,18 @@ pub fn landmarks_in_view(
         range_m <= config.max_range_m
             && is_readable(landmark, camera, intrinsics, config)
             && !occluders.iter().any(|occluder| {
-                occluder.hides(range_m, bearing_rad, turned(landmark.facing_rad, camera, &landmark.position), config)
+                occluder.hides(
+                    range_m,
+                    bearing_rad,
+                    visible_width_share(landmark.facing_rad, camera, &landmark.position),
+                    config,
+                )
             })
     };
     landmarks.iter().filter(in_view).map(|landmark| landmark.id.clone()).collect()
 }
 
-/// Whether a target at the landmark, turned as the landmark faces, lies inside the image and is large enough there.
+/// Whether a target that faces as the landmark does is inside the image and large enough.
 fn is_readable(landmark: &Landmark, camera: &Pose, intrinsics: &Intrinsics, config: &ViewConfig) -> bool {
     let to_camera = camera.position - landmark.position;
     let towards_camera_rad = to_camera.y.atan2(to_camera.x);
@@ -117,7 +92,7 @@ fn column(point: &Point2<f64>, camera: &Pose, intrinsics: &Intrinsics) -> Option
     intrinsics.project(&in_camera).map(|pixel| pixel.x)
 }
 
-/// A perceived object as something that hides what is behind it.
+/// A perceived object that hides landmarks behind it.
 struct Occluder {
     range_m: f64,
     bearing_rad: f64,
@@ -125,7 +100,7 @@ struct Occluder {
 }
 
 impl Occluder {
-    /// An object that faces `facing_rad`, or is as wide from everywhere.
+    /// An object that faces `facing_rad`, or has the same width from all sides.
     fn new(
         object: &PerceivedObject,
         facing_rad: Option<f64>,
@@ -136,21 +111,21 @@ impl Occluder {
         let position = Point2::new(object.x_m, object.y_m);
         let (range_m, bearing_rad) = camera.range_bearing(&position);
         let width_m = sizes.labels.get(&object.label).map_or(config.occluder_width_m, |size| size.width_m);
-        let half_angle_rad = half_angle(width_m * turned(facing_rad, camera, &position), range_m);
+        let half_angle_rad = half_angle(width_m * visible_width_share(facing_rad, camera, &position), range_m);
         Self { range_m, bearing_rad, half_angle_rad }
     }
 
-    /// Whether any part of a target at the given place lies behind this object; `turned` is the part of its width that
-    /// shows.
-    fn hides(&self, range_m: f64, bearing_rad: f64, turned: f64, config: &ViewConfig) -> bool {
+    /// Whether any part of a target at the given range and bearing is behind this object; `width_share` is the visible
+    /// share of its width.
+    fn hides(&self, range_m: f64, bearing_rad: f64, width_share: f64, config: &ViewConfig) -> bool {
         self.range_m + config.clearance_m < range_m
             && wrap_angle(self.bearing_rad - bearing_rad).abs()
-                < self.half_angle_rad + half_angle(config.target_width_m * turned, range_m)
+                < self.half_angle_rad + half_angle(config.target_width_m * width_share, range_m)
     }
 }
 
-/// The part of a flat target's width that shows from the camera, 0 to 1; all of it when its facing is not known.
-fn turned(facing_rad: Option<f64>, camera: &Pose, position: &Point2<f64>) -> f64 {
+/// The visible share of a flat target's width, 0 to 1; 1 if its facing is not known.
+fn visible_width_share(facing_rad: Option<f64>, camera: &Pose, position: &Point2<f64>) -> f64 {
     let to_camera = camera.position - position;
     facing_rad.map_or(1.0, |facing_rad| (to_camera.y.atan2(to_camera.x) - facing_rad).cos().abs())
 }

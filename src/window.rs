@@ -1,55 +1,36 @@
-//! The gate for reports: freshest per vehicle, on the aggregator's clock.
+//! Admission of reports: each fresh report once, with its capture time on the aggregator's clock.
 //!
-//! Call [`ReportWindow::admit`] with every decoded report; what it returns may be fused once. A rejected report
-//! changes nothing but the vehicle's clock estimate. A report that was overtaken by a later one of its vehicle is
-//! admitted as such, once: for whoever can go back in time.
+//! Call [`ReportWindow::admit`] with every decoded report. An admitted report may be fused once; a rejected one changes
+//! at most the estimate of the vehicle's clock. A report that a later one of its vehicle overtook is admitted once as
+//! [`Admitted::OutOfOrder`], for algorithms that can go back in time.
 //!
-//! One wrong stamp does not silence its vehicle: a report that claims to be more than half of `max_age_s` further ahead
-//! than all before is rejected unless the next one agrees, and a first report that the second contradicts is forgotten.
+//! One wrong timestamp does not silence its vehicle. A report that is ahead of all before by more than half of
+//! `max_age_s` is rejected unless the next one agrees. A first report that the second contradicts is forgotten.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::config_section;
 use crate::delay::MinimumDelay;
 use crate::names::NodeName;
 use crate::time::Timestamp;
 use crate::wire::{ObjectReport, RejectReason};
 
-/// Which reports are fresh enough to be used.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct WindowConfig {
-    /// Age in seconds beyond which a report is stale. Default 1.0; higher bridges slower links, lower forgets sooner.
-    pub max_age_s: f64,
-    /// How far in seconds a vehicle's clock may be from the aggregator's. Default 2.0; offsets within it are estimated
-    /// and removed, reports beyond it rejected.
-    pub max_clock_offset_s: f64,
-    /// Clock offsets in seconds up to which clocks count as synchronised and nothing is removed. Default 0.05.
-    pub clock_tolerance_s: f64,
-    /// Most vehicles kept at once. Default 4096.
-    pub max_vehicles: usize,
-}
-
-impl Default for WindowConfig {
-    fn default() -> Self {
-        Self { max_age_s: 1.0, max_clock_offset_s: 2.0, clock_tolerance_s: 0.05, max_vehicles: 4096 }
-    }
-}
-
-impl WindowConfig {
-    /// Checks all values.
-    ///
-    /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("max_age_s", self.max_age_s, 0.01, 3600.0)?;
-        check_range("max_clock_offset_s", self.max_clock_offset_s, 0.0, 3600.0)?;
-        check_range("clock_tolerance_s", self.clock_tolerance_s, 0.0, self.max_clock_offset_s)?;
-        check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e6)
+config_section! {
+    /// Admission of reports by age and clock.
+    #[derive(JsonSchema)]
+    pub struct WindowConfig {
+        /// Age in seconds beyond which a report is stale. Default 1.0; higher bridges slower links, lower forgets sooner.
+        pub max_age_s: f64 = 1.0, in 0.01 to 3600.0;
+        /// Maximum offset in seconds of a vehicle's clock from the aggregator's. Default 2.0; smaller offsets are
+        /// estimated and removed, reports beyond it rejected.
+        pub max_clock_offset_s: f64 = 2.0, in 0.0 to 3600.0;
+        /// Clock offset in seconds up to which clocks count as synchronised and nothing is removed. Default 0.05.
+        pub clock_tolerance_s: f64 = 0.05, in 0.0 to *max_clock_offset_s;
+        /// Maximum number of vehicles. Default 4096.
+        pub max_vehicles: usize = 4096, in 1.0 to 1e6;
     }
 }
 
@@ -62,7 +43,7 @@ pub enum Admitted {
     OutOfOrder(Timestamp),
 }
 
-/// Admits each vehicle's reports once and puts them on the aggregator's clock.
+/// The state of admission.
 #[derive(Debug, Clone)]
 pub struct ReportWindow {
     config: WindowConfig,
@@ -73,11 +54,11 @@ pub struct ReportWindow {
 struct VehicleClock {
     last_captured: Timestamp,
     last_seq: Option<u64>,
-    /// Capture time and number of the latest reports that were admitted, in order, at most [`REMEMBERED`].
+    /// Capture time and `seq` of the latest admitted reports, ascending, at most [`MAX_REMEMBERED`].
     recent: VecDeque<(Timestamp, u64)>,
     last_received: Timestamp,
     delay: MinimumDelay,
-    /// Capture time of the last report, if it was rejected for a stamp too far ahead of all before.
+    /// Capture time of the last report, if it was rejected for being too far ahead of all before.
     suspect: Option<Timestamp>,
 }
 
@@ -90,8 +71,8 @@ impl ReportWindow {
     /// Admits a report and returns its capture time on the aggregator's clock.
     ///
     /// # Errors
-    /// [`RejectReason::FromTheFuture`] (also for a stamp that no other report agrees with), [`RejectReason::Stale`],
-    /// [`RejectReason::OutOfOrder`] for duplicates and what may be one, or [`RejectReason::TooManyVehicles`].
+    /// [`RejectReason::FromTheFuture`] (also for a timestamp that no other report agrees with), [`RejectReason::Stale`],
+    /// [`RejectReason::OutOfOrder`] for certain and possible duplicates, or [`RejectReason::TooManyVehicles`].
     pub fn admit(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<Admitted, RejectReason> {
         let delay = received_at.micros_from(report.captured_at_us);
         let reach = seconds(self.config.max_clock_offset_s) + seconds(self.config.max_age_s);
@@ -149,11 +130,11 @@ impl ReportWindow {
 }
 
 impl VehicleClock {
-    /// Takes note of a report that was not admitted before; of those older than all that are remembered nobody knows.
+    /// Remembers a report. It is rejected as a duplicate, also if it is older than all that are remembered.
     fn remember(&mut self, report: &ObjectReport) -> Result<(), RejectReason> {
         let entry = (report.captured_at_us, report.seq);
         let place = self.recent.partition_point(|known| *known < entry);
-        let is_full = self.recent.len() >= REMEMBERED;
+        let is_full = self.recent.len() >= MAX_REMEMBERED;
         if self.recent.get(place) == Some(&entry) || is_full && place == 0 {
             return Err(RejectReason::OutOfOrder);
         }
@@ -164,7 +145,7 @@ impl VehicleClock {
         Ok(())
     }
 
-    /// Whether the estimate rests on one report alone, whose clock was ahead, and this one's is not.
+    /// Whether the clock estimate rests on a single report that was ahead, and this report is not.
     fn is_contradicted(&self, captured: Timestamp, delay_us: i64, tolerance_us: i64, slack_us: i64) -> bool {
         let least = self.delay.least();
         self.delay.observed() == 1
@@ -173,7 +154,7 @@ impl VehicleClock {
             && delay_us.saturating_sub(least) > slack_us
     }
 
-    /// Whether the stamp is too far ahead of all before, and the report before this one did not say the same.
+    /// Whether the timestamp is too far ahead of all before, and the previous report does not confirm it.
     fn is_suspect(&mut self, captured: Timestamp, delay_us: i64, slack_us: i64) -> bool {
         let before = self.suspect.take();
         let least = self.delay.least();
@@ -186,11 +167,11 @@ impl VehicleClock {
     }
 }
 
-/// How long a silent vehicle's clock is remembered when room is short.
+/// Time after which a silent vehicle's clock is forgotten when room is short.
 const RETENTION: Duration = Duration::from_secs(10);
 
-/// Latest reports of a vehicle by which duplicates are told.
-const REMEMBERED: usize = 32;
+/// Number of a vehicle's latest reports that are remembered to detect duplicates.
+const MAX_REMEMBERED: usize = 32;
 
 fn seconds(s: f64) -> i64 {
     (s * 1e6) as i64

@@ -16,13 +16,12 @@
 
 #![deny(clippy::indexing_slicing)]
 
-mod check;
 mod codec;
 mod compact;
-mod ledger;
 mod object;
 mod reject;
 mod topic;
+mod validation;
 
 use std::collections::BTreeMap;
 
@@ -31,22 +30,22 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-pub use check::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, Payload, check_fused_at, is_label};
-pub use codec::{Encoding, decode, decode_report, encode};
-pub use ledger::{MAX_SHARE_ENTRIES, decode_share};
+pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
+pub use validation::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload, check_fused_at, is_label};
 
+use crate::epoch::Epoch;
 use crate::geometry::Pose;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::time::Timestamp;
-use compact::{Form, Half, Id, Millimetres, Single, Text, if_any};
+use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
 
 /// Major version of every payload; others are rejected.
 pub const SCHEMA_VERSION: u32 = 1;
 
-/// What one vehicle saw in one frame.
+/// The detections of one vehicle in one frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct ObjectReport {
     /// Major version of the payload, [`SCHEMA_VERSION`].
@@ -58,21 +57,21 @@ pub struct ObjectReport {
     /// Counts up by one with every report of a node since it started.
     #[n(2)]
     pub seq: u64,
-    /// When the frame was captured, by the node's own clock.
+    /// Capture time of the frame, by the node's own clock.
     #[n(3)]
     pub captured_at_us: Timestamp,
-    /// Where the camera was; absent when the node does not know.
+    /// Pose of the camera; absent when it is not known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(5)]
     pub pose: Option<WirePose>,
-    /// What was detected.
+    /// The detected objects.
     #[n(4)]
     pub objects: Vec<PerceivedObject>,
-    /// Landmarks that were in view, near enough and not hidden, whether or not something was detected there.
+    /// Landmarks that were in view, near enough and not hidden, with or without a detection.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(6), with = "Text", has_nil)]
     pub seen: Option<Vec<LandmarkId>>,
-    /// What the sensor covers from the pose; without it, the aggregator learns from the detections where a miss counts.
+    /// The field of view from the pose; without it, the aggregator learns from the detections where a miss counts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(7)]
     pub view: Option<FieldOfView>,
@@ -129,16 +128,16 @@ pub struct GlobalMap {
     /// The node that fused this map.
     #[n(1)]
     pub aggregator: NodeName,
-    /// Term of leadership in which it was fused.
+    /// Term of the leadership that fused it.
     #[n(2)]
     pub epoch: u64,
     /// Counts up by one with every round of an epoch.
     #[n(3)]
     pub round: u64,
-    /// When the round was closed, by the aggregator's clock.
+    /// Time when the round closed, by the aggregator's clock.
     #[n(4)]
     pub fused_at_us: Timestamp,
-    /// Capture time, on the aggregator's clock, of the oldest report that the map rests on; absent when none did.
+    /// Capture time, on the aggregator's clock, of the oldest report in the map; absent when it rests on none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(5)]
     pub oldest_capture_us: Option<Timestamp>,
@@ -148,13 +147,13 @@ pub struct GlobalMap {
     /// Objects that matched no known location.
     #[n(7)]
     pub objects: Vec<FusedObject>,
-    /// By vehicle, how its positions were corrected before they were fused.
+    /// Corrections of each vehicle's positions before fusion, by vehicle.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    #[cbor(n(8), with = "if_any", has_nil)]
+    #[cbor(n(8), with = "skip_empty", has_nil)]
     pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
 }
 
-/// What is agreed to be at one known location.
+/// The agreed state of one known location.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LandmarkState {
     /// The location.
@@ -172,13 +171,13 @@ pub struct LandmarkState {
     /// Fused north in metres, or the location's own.
     #[cbor(n(4), with = "Millimetres")]
     pub y_m: f64,
-    /// The nodes whose detections went into the entry.
+    /// The nodes whose detections are in the entry.
     #[n(5)]
     pub contributors: Vec<NodeName>,
-    /// The nodes that had the location in view, with or without a detection: a null label with observers is
-    /// known to be empty, without observers it is unknown.
+    /// The nodes that had the location in view, with or without a detection. A null label with observers means that the
+    /// location is empty; without observers it is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[cbor(n(6), with = "if_any", has_nil)]
+    #[cbor(n(6), with = "skip_empty", has_nil)]
     pub observers: Vec<NodeName>,
 }
 
@@ -191,18 +190,32 @@ pub struct Verdicts {
     /// The node that counted the votes.
     #[n(1)]
     pub aggregator: NodeName,
-    /// Term of leadership in which they were counted.
+    /// Term of the leadership that counted them.
     #[n(2)]
     pub epoch: u64,
     /// Counts up by one with every round of an epoch.
     #[n(3)]
     pub round: u64,
-    /// When the round was closed, by the aggregator's clock.
+    /// Time when the round closed, by the aggregator's clock.
     #[n(4)]
     pub fused_at_us: Timestamp,
     /// One entry per known location.
     #[n(5)]
     pub verdicts: Vec<Verdict>,
+}
+
+impl Verdicts {
+    /// The verdicts of a leadership's round that closed at `fused_at`.
+    pub fn new(epoch: &Epoch, round: u64, fused_at: Timestamp, verdicts: Vec<Verdict>) -> Self {
+        Self {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader.clone(),
+            epoch: epoch.term,
+            round,
+            fused_at_us: fused_at,
+            verdicts,
+        }
+    }
 }
 
 /// The agreed label of one known location.
@@ -217,18 +230,18 @@ pub struct Verdict {
     /// Score of the label; 0 without a label.
     #[cbor(n(2), with = "Half")]
     pub score: f64,
-    /// Score of the label minus that of the next best; below 0 while a label is held against flicker.
+    /// Score of the label minus that of the next best; below 0 while hysteresis keeps a label.
     #[cbor(n(3), with = "Half")]
     pub margin: f64,
     /// Score of every label that was voted for.
     #[cbor(n(4), with = "Half", has_nil)]
     pub votes: BTreeMap<Label, f64>,
-    /// The nodes whose votes went into the entry.
+    /// The nodes whose votes are in the entry.
     #[n(5)]
     pub contributors: Vec<NodeName>,
 }
 
-/// How far each vehicle is trusted.
+/// The trust in each vehicle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Reputations {
     /// Major version of the payload, [`SCHEMA_VERSION`].
@@ -241,7 +254,7 @@ pub struct Reputations {
     /// Term of leadership.
     #[n(2)]
     pub epoch: u64,
-    /// The last round that went into the reputations.
+    /// The last round in the reputations.
     #[n(3)]
     pub round: u64,
     /// One entry per known vehicle.
@@ -249,21 +262,21 @@ pub struct Reputations {
     pub reputations: BTreeMap<NodeName, Reputation>,
 }
 
-/// The trust in one vehicle and what it rests on.
+/// The trust in one vehicle and its evidence.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Reputation {
     /// Weight of the vehicle's votes, 0.30 to 1.00.
     #[cbor(n(0), with = "Half")]
     pub score: f64,
-    /// Votes that agreed with the verdict.
+    /// Number of votes that agreed with the verdict.
     #[n(1)]
     pub correct: u64,
-    /// Votes that did not.
+    /// Number of votes that did not.
     #[n(2)]
     pub incorrect: u64,
 }
 
-/// A part of the evidence that reputations rest on; receivers keep the larger of every count.
+/// A part of the evidence for reputations; receivers keep the larger of every count.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerShare {
     /// Major version of the payload, [`SCHEMA_VERSION`].
@@ -272,20 +285,20 @@ pub struct LedgerShare {
     /// The sender; equals the last level of the topic.
     #[n(1)]
     pub node: NodeName,
-    /// Term in which the sender leads; absent when it does not.
+    /// Term of the sender's leadership; absent when it does not lead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(2)]
     pub epoch: Option<u64>,
     /// Counts, at most [`MAX_SHARE_ENTRIES`].
     #[n(3)]
     pub entries: Vec<LedgerEntry>,
-    /// Marks, at most [`MAX_SHARE_ENTRIES`]; without them votes are not told from later ones.
+    /// Marks, at most [`MAX_SHARE_ENTRIES`]; without them earlier and later votes cannot be separated.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(4), default)]
     pub marks: Vec<LedgerMark>,
 }
 
-/// How often one vehicle was right and wrong with one label under one leadership.
+/// The numbers of right and wrong votes of one vehicle for one label under one leadership.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerEntry {
     /// Term of the leadership that counted.
@@ -300,15 +313,15 @@ pub struct LedgerEntry {
     /// The label that it stated.
     #[cbor(n(3), with = "Text")]
     pub label: Label,
-    /// Votes that agreed with the verdict, since the leadership began.
+    /// Number of votes that agreed with the verdict, since the leadership began.
     #[n(4)]
     pub correct: u64,
-    /// Votes that did not.
+    /// Number of votes that did not.
     #[n(5)]
     pub incorrect: u64,
 }
 
-/// How often one vehicle had been right and wrong under one leadership when it had so many votes; written once.
+/// The numbers of right and wrong votes of one vehicle under one leadership at an earlier number of votes; written once.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerMark {
     /// Term of the leadership that counted.
@@ -320,19 +333,19 @@ pub struct LedgerMark {
     /// The vehicle.
     #[n(2)]
     pub node: NodeName,
-    /// Its votes then, in 32.
+    /// Its number of votes then, divided by 32.
     #[n(3)]
     pub number: u64,
-    /// Those that agreed with the verdict.
+    /// Number of those that agreed with the verdict.
     #[n(4)]
     pub correct: u64,
-    /// Those that did not.
+    /// Number of those that did not.
     #[n(5)]
     pub incorrect: u64,
 }
 
-/// A node's own word about itself; the broker publishes the last will when the node goes silent.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+/// A node's status, published by itself; the broker publishes the last will when the node goes silent.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct NodeStatus {
     /// Major version of the payload, [`SCHEMA_VERSION`].
     #[n(0)]
@@ -341,12 +354,12 @@ pub struct NodeStatus {
     #[n(1)]
     pub node: NodeName,
     /// Identity of this run of the node.
-    #[cbor(n(2), with = "Id")]
+    #[cbor(n(2), with = "UuidBytes")]
     pub id: Uuid,
-    /// The role it was started with.
+    /// The configured role.
     #[n(3)]
     pub role: Role,
-    /// What it does now.
+    /// The present state.
     #[n(4)]
     pub state: NodeState,
     /// The epoch it follows or leads.
@@ -366,7 +379,7 @@ pub struct NodeStatus {
 }
 
 impl NodeStatus {
-    /// What a node says that has just started and follows nobody yet.
+    /// The status of a node that has just started and follows no aggregator yet.
     pub fn starting(node: NodeName, id: Uuid, role: Role, version: &str) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -382,7 +395,7 @@ impl NodeStatus {
     }
 }
 
-/// What a node is meant to do.
+/// The configured role of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 #[cbor(index_only)]
@@ -398,7 +411,7 @@ pub enum Role {
     Edge,
 }
 
-/// What a node does now.
+/// The present state of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 #[cbor(index_only)]
@@ -409,7 +422,7 @@ pub enum NodeState {
     /// Makes maps and verdicts.
     #[n(1)]
     Aggregating,
-    /// Not there.
+    /// Not connected.
     #[n(2)]
     Offline,
 }

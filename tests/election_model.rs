@@ -4,17 +4,24 @@
 //! then long random walks over four nodes. Every node's clock runs at its own pace, so every timeout may come too
 //! early.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::net::SocketAddr;
 use std::time::Duration;
 
-use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
-use ecod::epoch::{Epoch, EpochGate};
+use ecod::epoch::Epoch;
+use ecod::leadership::Leadership;
+use ecod::leadership::election::{Election, ElectionConfig, ElectionMessage};
+use ecod::leadership::health::HealthSample;
+use ecod::leadership::links::{DataPlane, LinkState};
+use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
+use ecod::leadership::round_filter::RoundFilter;
+use ecod::leadership::timers::EPOCH_MEMORY;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::wire::Role;
+use ecod::wire::{GlobalMap, NodeStatus, Role, SCHEMA_VERSION};
 use stateright::{Checker, HasDiscoveries, Model, Property, UniformChooser};
+use uuid::Uuid;
 
-const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
 /// Packets under way; beyond that the oldest are lost.
 const MAX_PACKETS: usize = 6;
 
@@ -40,18 +47,28 @@ enum Action {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum Packet {
     Election(usize, ElectionMessage),
-    Map(usize, Epoch, u64),
+    Map(usize, Map),
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Map {
+    epoch: Epoch,
+    round: u64,
+    fused_at: Timestamp,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Node {
-    election: Option<Election>,
+    machine: Option<LeadershipNode>,
+    leadership: Leadership,
+    filter: RoundFilter,
     clock: Timestamp,
     persisted: u64,
     publishing: Option<(Epoch, u64)>,
-    gate: EpochGate,
     /// The highest term accepted in any run.
     accepted: u64,
+    /// The last round accepted in this run, and when.
+    last: Option<(Epoch, u64, Timestamp)>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -62,6 +79,7 @@ struct Cell {
     led: BTreeMap<Epoch, usize>,
     crashes_left: usize,
     went_back: bool,
+    accepted_twice: bool,
     led_unwritten: bool,
     steps: usize,
 }
@@ -79,18 +97,39 @@ fn name(index: usize) -> NodeName {
 
 fn config(index: usize) -> ElectionConfig {
     let role = [Role::Edge, Role::Auto, Role::Auto, Role::Cav][index];
-    ElectionConfig { role, stable_ms: 200, join_ms: 100, handover_ms: 600, ..ElectionConfig::default() }
+    ElectionConfig { role, stable_ms: 200, join_ms: 100, handover_ms: 900, ..ElectionConfig::default() }
+}
+
+fn settings(index: usize) -> NodeSettings {
+    let election = config(index);
+    NodeSettings {
+        plane: DataPlane { external: None, embedded: true },
+        round_period: Duration::from_millis(100),
+        keeps_reputations: false,
+        status: NodeStatus::starting(name(index), Uuid::nil(), election.role, ""),
+        election,
+    }
+}
+
+fn broker(index: usize) -> SocketAddr {
+    SocketAddr::from(([10, 0, 0, 1], 1883 + index as u16))
+}
+
+fn member(index: usize) -> Member {
+    Member { name: name(index), run: 1, broker: Some(broker(index).into()), is_on_this_machine: false }
 }
 
 impl Cell {
     fn new(nodes: usize) -> Self {
         let down = Node {
-            election: None,
+            machine: None,
+            leadership: Leadership::default(),
+            filter: RoundFilter::new(0),
             clock: Timestamp(1_000_000_000),
             persisted: 0,
             publishing: None,
-            gate: EpochGate::default(),
             accepted: 0,
+            last: None,
         };
         let mut cell = Self {
             nodes: vec![down; nodes],
@@ -98,6 +137,7 @@ impl Cell {
             led: BTreeMap::new(),
             crashes_left: 2,
             went_back: false,
+            accepted_twice: false,
             led_unwritten: false,
             steps: 0,
         };
@@ -110,79 +150,148 @@ impl Cell {
     fn start(&mut self, index: usize) {
         let node = &mut self.nodes[index];
         node.clock = node.clock + Duration::from_millis(1);
-        let election = Election::new(config(index), name(index), node.persisted, node.clock);
-        node.gate = EpochGate::new(election.floor());
-        node.election = Some(election);
-        self.handle(index, Input::Health { health: FIT });
+        node.leadership = Leadership::default();
+        node.machine = Some(LeadershipNode::new(settings(index), node.persisted, &node.leadership, node.clock));
+        node.filter = RoundFilter::new(node.persisted);
+        node.last = None;
+        self.handle(index, Input::OwnBroker { address: Some(broker(index)) });
+        self.handle(index, Input::LinkChanged { broker: broker(index).into(), state: LinkState::Up });
         for peer in (0..self.nodes.len()).filter(|peer| *peer != index) {
-            self.handle(index, Input::PeerAlive { peer: name(peer) });
+            self.handle(index, Input::MemberAlive { member: member(peer) });
         }
     }
 
     fn handle(&mut self, index: usize, input: Input) {
         let node = &mut self.nodes[index];
-        let Some(election) = &mut node.election else { return };
-        let effects = election.handle(input, node.clock);
+        let Some(machine) = &mut node.machine else { return };
+        let effects = machine.handle(input, node.clock);
         self.carry_out(index, effects);
     }
 
+    /// The next thing that a timer does: a look at the own parts, which all work, is nothing.
     fn tick(&mut self, index: usize) -> Vec<Effect> {
-        let node = &mut self.nodes[index];
-        let Some(election) = &mut node.election else { return Vec::new() };
-        node.clock = node.clock.max(election.next_deadline());
-        election.tick(node.clock)
-    }
-
-    fn crash(&mut self, index: usize) {
-        self.nodes[index].election = None;
-        self.nodes[index].publishing = None;
-    }
-
-    fn carry_out(&mut self, index: usize, effects: Vec<Effect>) {
-        for effect in effects {
+        loop {
             let node = &mut self.nodes[index];
-            match effect {
-                Effect::PersistTerm { term } => node.persisted = term,
-                Effect::Lead { epoch, first_round, .. } => {
-                    self.led_unwritten |= epoch.term > node.persisted;
-                    *self.led.entry(epoch.clone()).or_default() += 1;
-                    node.publishing = Some((epoch, first_round));
-                }
-                Effect::StopPublishing { .. } => node.publishing = None,
-                Effect::Send { to, message } => {
-                    let known = (0..self.nodes.len()).find(|index| name(*index) == to);
-                    self.packets.extend(known.map(|to| Packet::Election(to, message)));
-                }
-                Effect::Prepare { .. } => self.handle(index, Input::Prepared),
-                Effect::Follow { .. } | Effect::Seek | Effect::AnnounceStandby { .. } | Effect::SendState { .. } => {}
+            let Some(machine) = &mut node.machine else { return Vec::new() };
+            node.clock = node.clock.max(machine.next_deadline());
+            let effects = machine.handle(Input::Wake, node.clock);
+            if !effects.contains(&Effect::Look) {
+                return effects;
+            }
+            let (looks, others): (Vec<_>, Vec<_>) =
+                effects.into_iter().partition(|effect| matches!(effect, Effect::Look | Effect::AskParts));
+            self.carry_out(index, looks);
+            if !others.is_empty() {
+                return others;
             }
         }
     }
 
-    fn publish(&mut self, index: usize) {
-        let Some((epoch, next)) = &mut self.nodes[index].publishing else { return };
-        let (epoch, round) = (epoch.clone(), *next);
-        *next += 1;
-        for to in (0..self.nodes.len()).filter(|to| *to != index) {
-            self.packets.push(Packet::Map(to, epoch.clone(), round));
-        }
-        self.accept(index, &epoch, round);
+    fn crash(&mut self, index: usize) {
+        self.nodes[index].machine = None;
+        self.nodes[index].publishing = None;
     }
 
-    fn accept(&mut self, index: usize, epoch: &Epoch, round: u64) {
+    fn carry_out(&mut self, index: usize, effects: Vec<Effect>) {
+        let mut effects = VecDeque::from(effects);
+        while let Some(effect) = effects.pop_front() {
+            let answer = self.carry_out_one(index, effect);
+            let node = &mut self.nodes[index];
+            if let (Some(input), Some(machine)) = (answer, &mut node.machine) {
+                effects.extend(machine.handle(input, node.clock));
+            }
+        }
+    }
+
+    /// Does what the machine wants; returns what it is to be told.
+    fn carry_out_one(&mut self, index: usize, effect: Effect) -> Option<Input> {
+        let nodes = self.nodes.len();
         let node = &mut self.nodes[index];
-        if node.election.is_none() || node.gate.admit(epoch, round).is_err() {
+        match effect {
+            Effect::PersistTerm { term } => node.persisted = term,
+            Effect::TellLeadership { leadership } => node.leadership = leadership,
+            Effect::Lead { epoch, first_round, .. } => {
+                self.led_unwritten |= epoch.term > node.persisted;
+                *self.led.entry(epoch.clone()).or_default() += 1;
+                node.publishing = Some((epoch, first_round));
+            }
+            Effect::StopPublishing { .. } => node.publishing = None,
+            Effect::Send { to, message } => {
+                let known = (0..nodes).find(|index| name(*index) == to);
+                self.packets.extend(known.map(|to| Packet::Election(to, message)));
+            }
+            Effect::Look => {
+                let members = (0..nodes).filter(|peer| *peer != index).map(member).collect();
+                let rounds_closed = node.clock.micros() / 100_000;
+                return Some(Input::Looked { rounds_closed, load_percent: 0, members });
+            }
+            Effect::AskParts => {
+                let links = [(broker(index).into(), LinkState::Up)].into();
+                let sample = HealthSample { broker_serves: true, links: Some(links), fuser_runs: true };
+                return Some(Input::PartsAnswered { sample });
+            }
+            Effect::HoldRound
+            | Effect::SetLinks { .. }
+            | Effect::PublishStatus { .. }
+            | Effect::SendSnapshot { .. }
+            | Effect::Log { .. } => {}
+        }
+        None
+    }
+
+    fn publish(&mut self, index: usize) {
+        let node = &mut self.nodes[index];
+        let Some((epoch, next)) = &mut node.publishing else { return };
+        let map = Map { epoch: epoch.clone(), round: *next, fused_at: node.clock };
+        *next += 1;
+        for to in (0..self.nodes.len()).filter(|to| *to != index) {
+            self.packets.push(Packet::Map(to, map.clone()));
+        }
+        self.accept(index, map);
+    }
+
+    fn accept(&mut self, index: usize, map: Map) {
+        let node = &mut self.nodes[index];
+        let Map { epoch, round, fused_at } = map;
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader.clone(),
+            epoch: epoch.term,
+            round,
+            fused_at_us: fused_at,
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+            pose_corrections: Default::default(),
+        };
+        let accepted = node.filter.accept_map(&map, node.clock, &node.leadership);
+        if node.machine.is_none() || accepted.is_err() {
             return;
         }
-        self.went_back |= epoch.term < node.accepted;
-        node.accepted = epoch.term;
-        self.handle(index, Input::Round { epoch: epoch.clone(), round });
+        let is_elected = node.leadership.present_epoch() == Some(&epoch);
+        let was_quiet = node.leadership.leader().is_none()
+            && node.last.as_ref().is_none_or(|(_, _, at)| node.clock.since(*at) >= EPOCH_MEMORY);
+        self.went_back |= epoch.term < node.accepted && !is_elected && !was_quiet;
+        self.accepted_twice |= node.last.as_ref().is_some_and(|(of, last, _)| *of == epoch && *last >= round);
+        node.accepted = node.accepted.max(epoch.term);
+        node.last = Some((epoch.clone(), round, node.clock));
+        self.handle(index, Input::RoundAccepted { epoch, round });
     }
 
     fn deliver(&mut self, packet: Packet) {
         match packet {
-            Packet::Election(to, message) => self.handle(to, Input::Receive { message }),
-            Packet::Map(to, epoch, round) => self.accept(to, &epoch, round),
+            Packet::Election(to, message) => {
+                let from = message.from.clone();
+                self.handle(to, Input::Receive { from, message });
+            }
+            Packet::Map(to, map) => self.accept(to, map),
+        }
+    }
+
+    /// A connection to a node's broker breaks, and its port refuses.
+    fn refuse(&mut self, to: usize, about: usize) {
+        for state in [LinkState::Up, LinkState::Down, LinkState::Refused] {
+            self.handle(to, Input::LinkChanged { broker: broker(about).into(), state });
         }
     }
 
@@ -194,16 +303,14 @@ impl Cell {
                 let packet = self.packets.remove(0);
                 self.deliver(packet);
             }
-            let due = |node: &Node| Some(node.election.as_ref()?.next_deadline().since(node.clock));
+            let due = |node: &Node| Some(node.machine.as_ref()?.next_deadline().since(node.clock));
             let next = self.nodes.iter().filter_map(due).min().unwrap_or(left);
             let step = next.clamp(Duration::from_millis(1), Duration::from_millis(20)).min(left);
             left -= step;
             for index in 0..self.nodes.len() {
                 let node = &mut self.nodes[index];
                 node.clock = node.clock + step;
-                let Some(election) = &mut node.election else { continue };
-                let effects = election.tick(node.clock);
-                self.carry_out(index, effects);
+                self.handle(index, Input::Wake);
             }
         }
     }
@@ -212,8 +319,8 @@ impl Cell {
         let mut quiet = self.clone();
         // A peer that fell silent counts as heard for 2.5 idle beats (6.25 s); then come `stable_ms` and a handover.
         quiet.run_quietly(14_000);
-        let running = || quiet.nodes.iter().filter_map(|node| node.election.as_ref());
-        let candidates = quiet.nodes.iter().take(3).any(|node| node.election.is_some());
+        let running = || quiet.nodes.iter().filter_map(|node| node.machine.as_ref()).map(LeadershipNode::election);
+        let candidates = quiet.nodes.iter().take(3).any(|node| node.machine.is_some());
         let leaders = running().filter(|election| election.is_leading()).count();
         let followed: BTreeSet<_> = running().map(Election::leader).collect();
         leaders == usize::from(candidates) && (!candidates || followed.len() == 1)
@@ -243,7 +350,7 @@ impl Model for CellModel {
             actions.push(Action::Deliver { packet, again: true });
         }
         for (index, node) in cell.nodes.iter().enumerate() {
-            if node.election.is_none() {
+            if node.machine.is_none() {
                 actions.push(Action::Restart(index));
                 let others = (0..cell.nodes.len()).filter(|to| *to != index);
                 actions.extend(others.map(|to| Action::Gone { to, about: index }));
@@ -285,7 +392,7 @@ impl Model for CellModel {
                 cell.crashes_left -= 1;
             }
             Action::Restart(index) => cell.start(index),
-            Action::Gone { to, about } => cell.handle(to, Input::PeerGone { peer: name(about) }),
+            Action::Gone { to, about } => cell.refuse(to, about),
         }
         let surplus = cell.packets.len().saturating_sub(MAX_PACKETS);
         cell.packets.drain(..surplus);
@@ -302,9 +409,11 @@ impl Model for CellModel {
                 cell.led.values().all(|count| *count == 1)
             }),
             Property::always("the term is on disk before it is led in", |_, cell: &Cell| !cell.led_unwritten),
+            // But to the elected leader's, and to a lone publisher's after a while without any round.
             Property::always("terms accepted by a node never go back, restarts included", |_, cell: &Cell| {
                 !cell.went_back
             }),
+            Property::always("no round is accepted twice in a row", |_, cell: &Cell| !cell.accepted_twice),
             Property::always("a quiet component converges", |model: &Self, cell: &Cell| {
                 !model.settles(cell) || cell.converges()
             }),
@@ -315,7 +424,8 @@ impl Model for CellModel {
     }
 }
 
-/// A cell that has just elected its leader, and one a moment before its edge is handed the lead.
+/// A cell that starts, one that has just elected its leader, one a moment before its edge is offered the lead and one before
+/// it is ready to take it, and one that was split.
 fn settled(nodes: usize) -> Vec<Cell> {
     let cold = Cell::new(nodes);
     let mut quiet = cold.clone();
@@ -325,12 +435,14 @@ fn settled(nodes: usize) -> Vec<Cell> {
     late_edge.run_quietly(1500);
     late_edge.start(0);
     late_edge.run_quietly(195);
+    let mut ready_edge = late_edge.clone();
+    ready_edge.run_quietly(320);
     let mut split = quiet.clone();
     split.crash(0);
     split.run_quietly(400);
     split.start(0);
     split.packets.clear();
-    vec![cold, quiet, late_edge, split]
+    vec![cold, quiet, late_edge, ready_edge, split]
 }
 
 #[test]
@@ -341,6 +453,7 @@ fn three_nodes_in_every_order() {
     checker.assert_no_discovery("never two leaderships with one epoch");
     checker.assert_no_discovery("the term is on disk before it is led in");
     checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
+    checker.assert_no_discovery("no round is accepted twice in a row");
     checker.assert_no_discovery("a quiet component converges");
     assert!(checker.unique_state_count() > 10_000, "the model hardly moves");
 }
@@ -358,6 +471,7 @@ fn four_nodes_in_long_random_orders() {
     checker.assert_no_discovery("never two leaderships with one epoch");
     checker.assert_no_discovery("the term is on disk before it is led in");
     checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
+    checker.assert_no_discovery("no round is accepted twice in a row");
     checker.assert_no_discovery("a quiet component converges");
     assert!(checker.discovery("two lead at once").is_some(), "the walks never split the cell");
 }

@@ -10,7 +10,7 @@ use ecod::names::NodeName;
 use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::{TracksConfig, TracksMode};
+use ecod::tracking::{TracksConfig, TracksMode};
 use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, RejectReason, ReportKind, encode};
 use nalgebra::Point2;
 
@@ -104,7 +104,7 @@ fn beside_known_locations_only_the_rest_is_tracked_and_only_if_asked_for() {
 
 #[test]
 fn a_standby_leads_on_with_the_same_identities() {
-    let open = || Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(START));
+    let open = || Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(START));
     let (mut leader, mut standby) = (open(), open());
     leader.lead(Epoch::new(1, NodeName::from_static("edge")), 1, FirstRound::OnTime, Timestamp(START));
     let mut map = None;

@@ -1,16 +1,9 @@
-//! Command line of `ecod-node`.
+//! Command line of `ecod-node`, with the parts that `ecod-lab` shares.
 
-mod bench;
 #[cfg(feature = "camera")]
 mod calibrate;
-mod columns;
-#[cfg(feature = "camera")]
-mod demo;
 mod doctor;
-mod eval;
-#[cfg(feature = "camera")]
-mod intersection;
-mod lines;
+pub mod lines;
 mod logging;
 mod logs;
 mod pki;
@@ -20,23 +13,21 @@ mod report;
 mod run;
 mod schema;
 mod shell;
-#[cfg(feature = "camera")]
-mod testbed;
 mod top;
 
-use std::fs;
 use std::io::{ErrorKind, Write};
-use std::path::Path;
 use std::process::ExitCode;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
+use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, Parser, Subcommand};
-use serde::Serialize;
 
+pub use logging::{LogFormat, start as start_log};
+pub use replay::cell;
 #[cfg(fuzzing)]
 pub use replay::rounds_of_log;
+pub use report::{PageArguments, page};
 
-use logging::LogFormat;
 use run::RunArguments;
 
 /// Cooperative perception of camera vehicles: run a node of a cell, or one of the commands
@@ -69,14 +60,6 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Run a whole cell on this machine as separate processes, and print its map
-    #[cfg(feature = "camera")]
-    Demo(demo::DemoArguments),
-    /// Run recorded scenes in virtual time: rendered parking lots, or detections at an intersection
-    #[cfg(feature = "camera")]
-    Testbed(testbed::TestbedArguments),
-    /// Measure a live cell with simulated vehicles: latency, capacity and cost
-    Bench(bench::BenchArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
     Doctor(doctor::DoctorArguments),
     /// Join a cell as an observer and show it in the terminal
@@ -87,8 +70,6 @@ enum Command {
     Replay(replay::ReplayArguments),
     /// Write an HTML report about a log: leadership, latency, gaps, reputations, coverage, losses
     Report(report::ReportArguments),
-    /// Score the output of a replay against the ground truth
-    Eval(eval::EvalArguments),
     /// Calibrate a camera from photographs of a chessboard
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
@@ -103,9 +84,12 @@ enum Command {
     Man(shell::ManArguments),
 }
 
+/// Commands of `ecod-lab`, which is not installed on vehicles.
+const LAB_COMMANDS: [&str; 4] = ["bench", "demo", "eval", "testbed"];
+
 /// A failed command and the exit code of the process.
 #[derive(Debug)]
-struct Failure {
+pub struct Failure {
     error: anyhow::Error,
     code: u8,
 }
@@ -115,45 +99,63 @@ const USAGE: u8 = 2;
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    exit("ecod-node", parse().and_then(run_command))
+}
+
+/// The exit code of `program`; a failure is told of on standard error.
+pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure { error, code }) => {
+            eprintln!("{program}: {error:#}");
+            ExitCode::from(code)
+        }
+    }
+}
+
+/// The process's arguments; ends the process on those that no program of the project has.
+fn parse() -> Result<Cli, Failure> {
+    Cli::try_parse().map_err(|error| match error.get(ContextKind::InvalidSubcommand) {
+        Some(ContextValue::String(command)) if LAB_COMMANDS.contains(&command.as_str()) => in_lab(command),
+        _ => error.exit(),
+    })
+}
+
+/// Names the program that has the command, and how to get it.
+fn in_lab(command: &str) -> Failure {
+    let build = "build that program from the sources by `cargo build --release --bin ecod-lab`";
+    Failure::usage(anyhow!("run `ecod-lab {command}` instead; {build}"))
+}
+
+fn run_command(cli: Cli) -> Result<(), Failure> {
     let level = match &cli.command {
         None | Some(Command::Record(_)) => "info,rmqtt=warn,rmqtt_net=warn",
         Some(Command::Top(_)) => "off",
         Some(_) => "warn",
     };
     let is_service = matches!(&cli.command, None | Some(Command::Record(_)));
-    logging::start(cli.log_format, is_service, level);
-    let outcome = match cli.command {
+    let _export = logging::start(cli.log_format, is_service, level);
+    match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
-        Some(Command::Demo(arguments)) => demo::run(&arguments),
-        #[cfg(feature = "camera")]
-        Some(Command::Testbed(arguments)) => testbed::run(&arguments),
-        #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
-        Some(Command::Bench(arguments)) => bench::run(&arguments),
         Some(Command::Doctor(arguments)) => doctor::run(&arguments),
         Some(Command::Top(arguments)) => top::run(&arguments),
         Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
         Some(Command::Report(arguments)) => report::run(&arguments),
-        Some(Command::Eval(arguments)) => eval::run(&arguments),
         Some(Command::Pki(command)) => pki::run(&command),
         Some(Command::Schema) => schema::run(),
         Some(Command::Completions(arguments)) => shell::completions(&arguments, Cli::command()),
         Some(Command::Man(arguments)) => shell::man(&arguments, Cli::command()),
-    };
-    match outcome {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(Failure { error, code }) => {
-            eprintln!("ecod-node: {error:#}");
-            ExitCode::from(code)
-        }
     }
 }
 
 /// Writes to standard output. A reader that closes it early, such as `head`, is no failure.
-fn print(text: &str) -> anyhow::Result<()> {
+///
+/// # Errors
+/// When it cannot be written.
+pub fn print(text: &str) -> anyhow::Result<()> {
     let mut output = std::io::stdout().lock();
     match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
@@ -168,14 +170,8 @@ impl From<anyhow::Error> for Failure {
 }
 
 impl Failure {
-    fn usage(error: impl Into<anyhow::Error>) -> Self {
+    /// A configuration or argument that cannot be used.
+    pub fn usage(error: impl Into<anyhow::Error>) -> Self {
         Self { error: error.into(), code: USAGE }
     }
-}
-
-/// Writes a value as JSON for programs.
-fn write_json(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
-    let mut text = serde_json::to_string_pretty(value)?;
-    text.push('\n');
-    fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }

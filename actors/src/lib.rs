@@ -18,19 +18,13 @@
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
 pub mod actors;
-pub mod bench;
 pub mod camera;
 pub mod cli;
-#[cfg(feature = "camera")]
-pub mod demo;
 pub mod doctor;
 pub mod messages;
 pub mod node;
-pub mod node_process;
 pub mod observe;
 pub mod platform;
 pub mod telemetry;
-#[cfg(feature = "camera")]
-pub mod testbed;
 pub mod top;
 pub mod transport;

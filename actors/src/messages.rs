@@ -9,7 +9,6 @@ pub mod follower;
 pub mod fuser;
 pub mod gateway;
 pub mod leader_election;
-pub mod leadership;
 pub mod membership;
 pub mod newest;
 #[cfg(feature = "camera")]

@@ -31,6 +31,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::leadership::Leadership;
+use ecod::leadership::readiness::Readiness;
 use ecod::wire::{Reputations, Verdicts};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
 use tokio::sync::watch;
@@ -40,11 +42,10 @@ use tokio::time::MissedTickBehavior;
 pub use restarts::{MAX_RESTARTS, RESTART_SPAN};
 pub use slots::{ActorKind, ActorSlots};
 
-use crate::messages::leadership::Leadership;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::node::config::NodeConfig;
 use crate::node::service::ServiceManager;
-use crate::observe::readiness::{Readiness, Vitals};
+use crate::observe::readiness::Vitals;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::Member;

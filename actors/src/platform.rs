@@ -2,5 +2,6 @@
 
 pub mod clock;
 pub mod latest_slot;
+pub mod secret;
 pub mod state_file;
 pub(crate) mod throttle;

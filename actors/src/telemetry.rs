@@ -1,3 +1,6 @@
-//! Counters of a node.
+//! Counters of a node, and spans of what it does.
 
 pub mod counters;
+#[cfg(feature = "otel")]
+pub mod otlp;
+pub mod spans;

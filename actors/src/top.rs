@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::Leadership;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{Reputations, Verdict, Verdicts};
@@ -13,7 +14,6 @@ use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
-use crate::messages::leadership::Leadership;
 use crate::messages::newest::{Received, ReceivedMap};
 use crate::node::NodeHandle;
 use crate::node::config::NodeConfig;
@@ -219,12 +219,12 @@ fn span(time: Duration) -> String {
 mod tests {
     use std::sync::Arc;
 
+    use ecod::leadership::Position;
     use ecod::wire::{GlobalMap, LandmarkState, Role, SCHEMA_VERSION};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
     use super::*;
-    use crate::messages::leadership::Position;
     use crate::telemetry::counters::{Counters, ShedReason};
 
     fn name(text: &str) -> NodeName {
@@ -260,7 +260,12 @@ mod tests {
             cell: name("lot-1"),
             patience: Some(Duration::from_secs(3)),
             now,
-            leadership: Leadership { position: Position::Following, epoch: Some(epoch), standby: Some(name("gauss")) },
+            leadership: Leadership {
+                position: Position::Following,
+                term: epoch.term,
+                epoch: Some(epoch),
+                standby: Some(name("gauss")),
+            },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
             members: vec![Member {
                 name: name("gauss"),

@@ -4,7 +4,7 @@
 
 use std::net::{SocketAddr, TcpStream};
 
-use ecod_actors::transport::broker::{BrokerConfig, BrokerError, BrokerHealth, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::broker::{BrokerConfig, BrokerError, BrokerHealth, EmbeddedBroker, MqttBroker};
 
 const LOOPBACK: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 

@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::landmark::LandmarkConfig;
+use ecod::leadership::Position;
 use ecod::names::NodeName;
 use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
 use ecod_actors::messages::gateway::GatewayMessage;
-use ecod_actors::messages::leadership::Position;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::observe::recorder::RecordConfig;

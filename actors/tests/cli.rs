@@ -197,106 +197,22 @@ fn a_vehicle_without_a_camera_is_told_that_it_only_follows() {
     assert!(node.wait().unwrap().success());
 }
 
-#[cfg(feature = "camera")]
-mod demo {
-    use std::path::{Path, PathBuf};
-    use std::time::{Duration, Instant};
-
-    use nix::sys::signal::{Signal, kill};
-    use nix::unistd::Pid;
-
-    use super::*;
-
-    const PATIENCE: Duration = Duration::from_secs(60);
-
-    fn scenes() -> PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json")
+#[test]
+fn a_command_of_the_laboratory_is_told_where_it_is() {
+    for (arguments, run) in [
+        (&["demo", "--seconds", "3"][..], "`ecod-lab demo`"),
+        (&["--log-format", "text", "testbed"], "`ecod-lab testbed`"),
+        (&["bench", "--costs"], "`ecod-lab bench`"),
+        (&["eval", "--truth", "truth.json"], "`ecod-lab eval`"),
+        (&["report", "log", "--truth", "truth.json"], "`ecod-lab report --truth`"),
+    ] {
+        let output = ecod_node().args(arguments).output().unwrap();
+        let error = stderr(&output);
+        assert_eq!((output.status.code(), error.lines().count()), (Some(2), 1), "{error}");
+        assert!(error.contains(run) && error.contains("`cargo build --release --bin ecod-lab`"), "{error}");
     }
-
-    #[test]
-    fn an_output_that_cannot_be_written_is_told_of_before_the_run() {
-        let directory = tempfile::tempdir().unwrap();
-        let file = directory.path().join("file");
-        std::fs::write(&file, "kept").unwrap();
-        for (command, out) in [("testbed", "/no/such/result.json"), ("demo", file.to_str().unwrap())] {
-            let started = Instant::now();
-            let output = ecod_node().args([command, "--out", out, "--scenes"]).arg(scenes()).output().unwrap();
-            let error = stderr(&output);
-            assert_eq!(output.status.code(), Some(1), "{error}");
-            assert!(error.contains(out) && output.stdout.is_empty(), "{error}");
-            assert!(started.elapsed() < Duration::from_secs(10), "{command} went to work first");
-        }
-        assert_eq!(std::fs::read_to_string(file).unwrap(), "kept");
-    }
-
-    /// Four cameras, each before two of eight spots; `change` is applied to the file.
-    fn result_of(change: impl Fn(&mut serde_json::Value)) -> serde_json::Value {
-        let directory = tempfile::tempdir().unwrap();
-        let mut file: serde_json::Value = serde_json::from_slice(&std::fs::read(scenes()).unwrap()).unwrap();
-        change(&mut file);
-        let (scenes, out) = (directory.path().join("scenes.json"), directory.path().join("result.json"));
-        std::fs::write(&scenes, file.to_string()).unwrap();
-        let mut testbed = ecod_node();
-        testbed.args(["testbed", "--scene", "setup1-lot2", "--verdicts", "3", "--scenes"]).arg(&scenes);
-        let output = testbed.arg("--out").arg(&out).output().unwrap();
-        assert!(output.status.success(), "{}", stderr(&output));
-        serde_json::from_slice::<serde_json::Value>(&std::fs::read(out).unwrap()).unwrap()["scenes"][0].clone()
-    }
-
-    #[test]
-    fn scenes_may_differ_from_the_recorded_ones() {
-        let free_without_placards = result_of(|file| {
-            for spot in file["scenes"][1]["spots"].as_array_mut().unwrap() {
-                spot.as_object_mut().unwrap().remove("empty_placard");
-            }
-        });
-        assert_eq!(free_without_placards["pace_accuracy_pct"], 100.0, "{free_without_placards}");
-        let slow = result_of(|file| {
-            file["camera"]["capture_interval_s"] = 2.0.into();
-            file["camera"]["submission_interval_s"] = 4.0.into();
-            file["scenes"][1]["recorded"] = serde_json::json!([{"run": "14a"}]);
-        });
-        assert_eq!(slow["pace_accuracy_pct"], 100.0, "{slow}");
-        let without_cars = result_of(|file| {
-            for spot in file["scenes"][1]["spots"].as_array_mut().unwrap() {
-                spot["truth"] = serde_json::Value::Null;
-            }
-        });
-        assert_eq!(without_cars["occupied_accuracy_pct"], 100.0, "{without_cars}");
-        assert_eq!(without_cars["always_empty_pct"], 100.0);
-    }
-
-    /// Processes with the directory in their command line.
-    fn working_in(directory: &Path) -> Vec<i32> {
-        let processes = std::fs::read_dir("/proc").unwrap().filter_map(Result::ok);
-        let directory = directory.to_str().unwrap();
-        let ours = processes.filter(|process| {
-            // A process that has ended but was not waited for has an empty command line.
-            let line = std::fs::read(process.path().join("cmdline")).unwrap_or_default();
-            String::from_utf8_lossy(&line).contains(directory)
-        });
-        ours.filter_map(|process| process.file_name().to_str()?.parse().ok()).collect()
-    }
-
-    fn until(what: &str, reached: impl Fn() -> bool) {
-        let started = Instant::now();
-        while !reached() {
-            assert!(started.elapsed() < PATIENCE, "never reached: {what}");
-            std::thread::sleep(Duration::from_millis(20));
-        }
-    }
-
-    #[test]
-    fn a_demo_that_is_killed_leaves_no_nodes_behind() {
-        let directory = tempfile::tempdir().unwrap();
-        let mut demo = ecod_node();
-        demo.args(["demo", "--scene", "setup1-lot1", "--out"]).arg(directory.path());
-        let mut demo = demo.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        until("five nodes and the demo run", || working_in(directory.path()).len() == 6);
-        kill(Pid::from_raw(i32::try_from(demo.id()).unwrap()), Signal::SIGKILL).unwrap();
-        demo.wait().unwrap();
-        until("all nodes have ended", || working_in(directory.path()).is_empty());
-    }
+    let typo = ecod_node().arg("demos").output().unwrap();
+    assert!(typo.status.code() == Some(2) && stderr(&typo).contains("unrecognized"), "{}", stderr(&typo));
 }
 
 /// From nothing to a node with certificates, and what it says when they are another's.

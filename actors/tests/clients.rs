@@ -59,13 +59,10 @@ fn found(program: &str, arguments: &[&str]) -> bool {
 }
 
 /// A Python that has paho-mqtt.
-fn python() -> Option<String> {
+fn python() -> String {
     let python = std::env::var("PAHO_PYTHON").unwrap_or("python3".into());
-    if found(&python, &["-c", "import paho.mqtt.client"]) {
-        return Some(python);
-    }
-    eprintln!("SKIPPED: {python} has no paho-mqtt; `make python-check` installs it in a directory of its own");
-    None
+    assert!(found(&python, &["-c", "import paho.mqtt.client"]), "{python} has no paho-mqtt: run `make python-check`");
+    python
 }
 
 /// What a detector of any kind writes about a frame.
@@ -92,8 +89,9 @@ fn feed(python: &str, broker: SocketAddr, arguments: &[&str], lines: &[&str]) ->
 /// The example reports what a detector writes and prints maps and verdicts with it; lines that are no frames it skips
 /// and names.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs paho-mqtt, which `make python-check` installs"]
 async fn the_python_example_feeds_a_cell_and_prints_what_it_agrees_on() {
-    let Some(python) = python() else { return };
+    let python = python();
     let (node, broker) = edge(None).await;
     let junk = ["loading model", r#"{"seen":["slot-0"]}"#, "[1]"];
     let lines = [&[FRAME; 3][..], &junk, &[FRAME; 17]].concat();
@@ -111,8 +109,9 @@ async fn the_python_example_feeds_a_cell_and_prints_what_it_agrees_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs paho-mqtt, which `make python-check` installs"]
 async fn the_python_example_joins_a_cell_with_certificates_by_its_own() {
-    let Some(python) = python() else { return };
+    let python = python();
     let (directory, now) = (tempfile::tempdir().unwrap(), clock::now());
     let cell = NodeName::from_static("lot-1");
     let mut authority = Authority::init(directory.path(), &cell, now).unwrap();
@@ -154,8 +153,9 @@ fn broker_that_answers(code: u8) -> (SocketAddr, JoinHandle<Vec<u8>>) {
 }
 
 #[test]
+#[ignore = "needs paho-mqtt, which `make python-check` installs"]
 fn the_python_example_says_that_a_broker_refuses_or_is_gone_and_fails() {
-    let Some(python) = python() else { return };
+    let python = python();
     let (broker, login) = broker_that_answers(5);
     let refused = feed(&python, broker, &["--user", "ada", "--password", "hush4711"], &[FRAME; 30]);
     let login = String::from_utf8_lossy(&login.join().unwrap()).into_owned();
@@ -182,10 +182,8 @@ fn commands(document: &str, section: &str) -> Vec<String> {
 /// Both blocks are run as they are, but for the port: the first reports, the second waits for a map and for verdicts.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_documented_commands_of_mosquitto_report_and_receive() {
-    if !found("sh", &["-c", "command -v mosquitto_pub mosquitto_sub"]) {
-        eprintln!("SKIPPED: mosquitto_pub is not installed (Debian: mosquitto-clients)");
-        return;
-    }
+    let is_installed = found("sh", &["-c", "command -v mosquitto_pub mosquitto_sub"]);
+    assert!(is_installed, "mosquitto_pub is missing: install Debian's package mosquitto-clients");
     let (node, broker) = edge(None).await;
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");

@@ -1,4 +1,4 @@
-//! `ecod-node replay` and `ecod-node eval` as programs.
+//! `ecod-node replay` as a program.
 
 use std::fs;
 use std::io::Write;
@@ -65,39 +65,6 @@ fn equal_inputs_give_byte_equal_outputs_by_file_and_by_pipe() {
 }
 
 #[test]
-fn a_replay_is_judged_beside_majority_and_every_vehicle() {
-    let folder = TempDir::new().unwrap();
-    let output = replay_lot(&folder, "out.jsonl");
-    let (truth, reports, config) =
-        (example("recordings/lot_truth.json"), example("recordings/lot.jsonl"), example("recordings/lot.toml"));
-    let result = folder.path().join("result.json");
-    let run = ecod(&[
-        "eval",
-        "--truth",
-        text(&truth),
-        "--input",
-        text(&output),
-        "--reports",
-        text(&reports),
-        "--config",
-        text(&config),
-        "--out",
-        text(&result),
-    ]);
-    assert!(run.status.success(), "{}", said(&run));
-    let table = String::from_utf8(run.stdout).unwrap();
-    assert!(["PACE", "VOTE", "majority %", "euclid", "truth"].iter().all(|part| table.contains(part)), "{table}");
-    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
-    for (algorithm, least) in [("pace", 100.0), ("vote", 75.0)] {
-        let scores = &result[algorithm];
-        assert_eq!(scores["items"].as_u64(), Some(8));
-        assert!(scores["accuracy_pct"].as_f64().unwrap() >= least, "{scores}");
-        assert_eq!(scores["vehicles"].as_object().unwrap().len(), 4);
-        assert!(scores["vehicles"]["euclid"]["accuracy_pct"].as_f64().unwrap() < 100.0);
-    }
-}
-
-#[test]
 fn lines_that_cannot_be_used_are_counted_by_reason() {
     let recording = fs::read(example("recordings/lot.jsonl")).unwrap();
     let first = recording.split(|byte| *byte == b'\n').next().unwrap();
@@ -144,9 +111,7 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
         fs::write(&path, content).unwrap();
         path
     };
-    let (recording, typo, truth) =
-        (file("in.jsonl", "{}\n"), file("typo.toml", "[fusion.pace]\ngat_m = 1\n"), file("truth.json", "{\"a\": {}}"));
-    let empty = file("empty.jsonl", "");
+    let (recording, typo) = (file("in.jsonl", "{}\n"), file("typo.toml", "[fusion.pace]\ngat_m = 1\n"));
     let out = folder.path().join("out.jsonl");
     let (recording, out) = (text(&recording), text(&out));
     for (arguments, code, part) in [
@@ -157,14 +122,6 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
         (vec!["replay", "--config", text(&typo), "--input", recording, "--output", out], 2, "fusion.pace.gat_m"),
         (vec!["replay", "--config", "/no.toml", "--input", recording, "--output", out], 2, "/no.toml"),
         (vec!["replay", "--input", recording, "--output", out, "--passes", "0"], 2, "--passes"),
-        (vec!["eval", "--truth", "/no.json", "--input", recording], 2, "/no.json"),
-        (vec!["eval", "--truth", text(&truth), "--input", recording], 2, "`a` has {}"),
-        (vec!["eval", "--truth", text(&example("recordings/lot_truth.json")), "--input", text(&empty)], 1, "no map"),
-        (
-            vec!["eval", "--truth", text(&example("recordings/lot_truth.json")), "--input", recording],
-            1,
-            "1 lines are neither",
-        ),
     ] {
         let run = ecod(&arguments);
         assert_eq!(run.status.code(), Some(code), "{arguments:?}: {}", said(&run));
@@ -172,73 +129,4 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
     }
     assert_eq!(fs::read_to_string(recording).unwrap(), "{}\n");
     assert!(!Path::new(out).exists());
-}
-
-#[test]
-fn objects_that_move_are_judged_by_where_they_were() {
-    let folder = TempDir::new().unwrap();
-    let recorded = |name: &str| Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/eval_tracks")).join(name);
-    let (truth, maps, result) = (recorded("truth.json"), recorded("maps.jsonl"), folder.path().join("result.json"));
-    let run = ecod(&["eval", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)]);
-    assert!(run.status.success(), "{}", said(&run));
-    let table = String::from_utf8(run.stdout).unwrap();
-    assert!(
-        ["AP@0.5 %", "AP@4 %", "bicycle", "MODA %", "HOTA %", "switches"].iter().all(|p| table.contains(p)),
-        "{table}"
-    );
-    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
-    let ap_pct = result["tracks"]["ap_pct"].as_array().unwrap();
-    assert!(ap_pct.len() == 4 && ap_pct.iter().all(|ap| ap.as_f64().is_some_and(|ap| ap > 10.0)), "{result}");
-    let broken = folder.path().join("broken.json");
-    fs::write(&broken, r#"{"frames": [{"t_us": 1, "objects": [{"id": 1, "label": "car", "x_m": 0}]}]}"#).unwrap();
-    let run = ecod(&["eval", "--truth", text(&broken), "--input", text(&maps)]);
-    assert_eq!(run.status.code(), Some(2));
-    assert!(said(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"), "{}", said(&run));
-}
-
-#[cfg(feature = "camera")]
-#[test]
-fn the_recorded_intersection_is_judged_right() {
-    let folder = TempDir::new().unwrap();
-    let (scenes, out, reports) = (
-        example("testbed/vote_recording.json"),
-        folder.path().join("result.json"),
-        folder.path().join("reports.jsonl"),
-    );
-    let run = ecod(&[
-        "testbed",
-        "--scenes",
-        text(&scenes),
-        "--generated",
-        "3",
-        "--out",
-        text(&out),
-        "--reports",
-        text(&reports),
-    ]);
-    assert!(run.status.success(), "{}", said(&run));
-    let result: Value = serde_json::from_slice(&fs::read(out).unwrap()).unwrap();
-    let recording = &result["scenes"][0];
-    assert_eq!((recording["verdicts"].as_u64(), recording["vote_accuracy_pct"].as_f64()), (Some(9), Some(100.0)));
-    assert_eq!(result["scenes"][1]["scenes"].as_u64(), Some(3));
-    let replayed = ecod(&["replay", "--input", text(&reports), "--output", "-"]);
-    assert!(said(&replayed).starts_with("12 lines, 12 used, "), "{}", said(&replayed));
-}
-
-#[cfg(feature = "camera")]
-#[test]
-fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_intersection() {
-    let folder = TempDir::new().unwrap();
-    let recorded = fs::read_to_string(example("testbed/vote_recording.json")).unwrap();
-    let mut silent: Value = serde_json::from_str(&recorded).unwrap();
-    silent["frames"]["euclid"].as_array_mut().unwrap().truncate(1);
-    let renamed = recorded.replace("mouse", "remote").replace("\"cup\"", "\"bottle\"");
-    for scene in [renamed, silent.to_string()] {
-        let (scenes, out) = (folder.path().join("scenes.json"), folder.path().join("result.json"));
-        fs::write(&scenes, scene).unwrap();
-        let run = ecod(&["testbed", "--scenes", text(&scenes), "--scene", "recording", "--out", text(&out)]);
-        assert!(run.status.success(), "{}", said(&run));
-        let result: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
-        assert_eq!(result["scenes"][0]["vote_accuracy_pct"].as_f64(), Some(100.0), "{result}");
-    }
 }

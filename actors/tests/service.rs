@@ -156,6 +156,7 @@ fn logs_that_no_terminal_shows_are_json() {
     let text = log(&["--log-format", "text"]);
     assert!(text.iter().all(|line| !line.starts_with('{')), "{text:?}");
     assert!(text.iter().any(|line| line.contains(" INFO ") && line.contains("address=127.0.0.1:")), "{text:?}");
+    assert!(text.iter().all(|line| !line.contains("Actor{")), "the actor that wrote a line is no part of it: {text:?}");
 }
 
 /// The variable is inherited by whatever a service starts; only the stream that it names is the journal.

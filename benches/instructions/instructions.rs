@@ -5,8 +5,8 @@
 use std::hint::black_box;
 
 use ecod::detection::Detection;
-use ecod::election::{Effect, Election, Input};
 use ecod::geometry::Pose;
+use ecod::leadership::election::{Election, ElectionEffect, ElectionInput};
 use ecod::names::NodeName;
 use ecod::pace::Pace;
 use ecod::projection::Projection;
@@ -55,7 +55,7 @@ fn decode_32_objects((bytes, node): (Vec<u8>, NodeName)) -> Option<ObjectReport>
 
 #[library_benchmark]
 #[bench::of_a_beat(workload::following())]
-fn election_step((mut election, beat, now): (Election, Input, Timestamp)) -> (Election, Vec<Effect>) {
+fn election_step((mut election, beat, now): (Election, ElectionInput, Timestamp)) -> (Election, Vec<ElectionEffect>) {
     let effects = election.handle(beat, now);
     (election, effects)
 }

@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use ecod::camera::Intrinsics;
 use ecod::detection::{BoundingBox, Detection};
-use ecod::election::{Body, Election, ElectionConfig, ElectionMessage, Health, Input, Standing};
 use ecod::epoch::Epoch;
 use ecod::geometry::Pose;
 use ecod::landmark::{Landmark, LandmarkIndex};
+use ecod::leadership::election::{Body, Candidacy, Election, ElectionConfig, ElectionInput, ElectionMessage, Health};
 use ecod::names::NodeName;
 use ecod::pace::{Pace, PaceConfig};
 use ecod::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
@@ -79,11 +79,11 @@ pub fn payload(encoding: Encoding) -> (Vec<u8>, NodeName) {
 }
 
 /// A node that follows a leader, and the leader's next beat.
-pub fn following() -> (Election, Input, Timestamp) {
+pub fn following() -> (Election, ElectionInput, Timestamp) {
     let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, NOON);
     let health = Health { broker: true, fuser: true, gateway: true, load_percent: 5 };
-    election.handle(Input::Health { health }, NOON);
-    election.handle(Input::PeerAlive { peer: NodeName::from_static("edge") }, NOON);
+    election.handle(ElectionInput::Health { health }, NOON);
+    election.handle(ElectionInput::PeerAlive { peer: NodeName::from_static("edge") }, NOON);
     let mut now = NOON;
     for seq in 1..100 {
         now = now + Duration::from_millis(50);
@@ -94,7 +94,7 @@ pub fn following() -> (Election, Input, Timestamp) {
     (election, beat(100), now + Duration::from_millis(50))
 }
 
-fn beat(seq: u64) -> Input {
+fn beat(seq: u64) -> ElectionInput {
     let edge = NodeName::from_static("edge");
     let successors = vec![NodeName::from_static("euclid")];
     let message = ElectionMessage {
@@ -102,13 +102,13 @@ fn beat(seq: u64) -> Input {
         from: edge.clone(),
         run: NOON.micros(),
         seq,
-        standing: Standing { role: Role::Edge, priority: 100, load: 1, fit: true },
+        candidacy: Candidacy { role: Role::Edge, priority: 100, load: 1, fit: true },
         term: 1,
         epoch: Some(Epoch::new(1, edge)),
         hears_you: true,
         body: Body::Beat { every_ms: 50, round: seq, followers: 1, after: None, successors },
     };
-    Input::Receive { message }
+    ElectionInput::Receive { message }
 }
 
 fn landmark(index: usize) -> Landmark {

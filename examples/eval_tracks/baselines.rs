@@ -7,10 +7,10 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use ecod::eval::tracks::SaidObject;
 use ecod::names::{Label, NodeName};
 use ecod::time::Timestamp;
 use ecod::wire::ObjectReport;
+use ecod_lab::eval::tracks::SaidObject;
 use nalgebra::{Point2, Vector2};
 
 /// Age beyond which a vehicle's last report is not used.

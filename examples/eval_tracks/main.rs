@@ -5,7 +5,7 @@
 //!
 //! Parameters are chosen on the seeds `tuning` and figures reported on the seeds `report`; `--count` takes the first
 //! of them. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
-//! `ecod-node eval`.
+//! `ecod-lab eval`.
 
 mod baselines;
 mod plot;
@@ -21,12 +21,12 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
-use ecod::eval::tracks::{AP_DISTANCES_M, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
 use ecod::geometry::Covariance;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
-use ecod::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind, SCHEMA_VERSION};
+use ecod_lab::eval::tracks::{AP_DISTANCES_M, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
+use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use uuid::Uuid;

@@ -2,7 +2,7 @@
 //!
 //! `cargo run --example split_heal`
 //!
-//! A simulation: election, aggregator and ledger of each vehicle are those that a node runs, and what travels is
+//! A simulation: leadership, round filter, aggregator and replication of each vehicle are those that a node runs, and what travels is
 //! encoded and decoded, but time is a number and the network a queue, so that every run is the same. Cells of real
 //! processes are split by `make trials`, in network namespaces.
 //!
@@ -16,7 +16,6 @@ use std::time::Duration;
 
 use anyhow::ensure;
 use ecod::aggregator::FusionConfig;
-use ecod::election::Input;
 use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
@@ -77,8 +76,11 @@ impl Cell {
         // A vehicle's vote counts as evidence once in this time.
         fusion.vote.weighted.freshness_s = 0.5;
         let landmarks = PLACES.map(|(id, x_m)| Landmark::from(&LandmarkConfig::at(id, x_m, 0.0)));
-        let vehicle = |(name, _)| Vehicle::new(NodeName::from_static(name), fusion.clone(), landmarks.to_vec(), START);
-        Self { now: START, vehicles: SEEN.map(vehicle).into(), packets: VecDeque::new(), is_split: false }
+        let vehicle = |(index, (name, _)): (u8, (&'static str, _))| {
+            Vehicle::new(NodeName::from_static(name), index, fusion.clone(), landmarks.to_vec(), START)
+        };
+        let vehicles = (1..).zip(SEEN).map(vehicle).collect();
+        Self { now: START, vehicles, packets: VecDeque::new(), is_split: false }
     }
 
     /// Cuts or mends the links between the halves; the memberships find out a while later.
@@ -88,9 +90,8 @@ impl Cell {
         self.run_for(NOTICE_MS)?;
         for node in 0..SEEN.len() {
             for other in (0..SEEN.len()).filter(|other| *other != node) {
-                let (peer, is_linked) = (self.vehicles[other].name.clone(), self.is_linked(node, other));
-                let input = if is_linked { Input::PeerAlive { peer } } else { Input::PeerDown { peer } };
-                self.vehicles[node].handle(input, self.now);
+                let (member, is_linked) = (self.vehicles[other].as_member(), self.is_linked(node, other));
+                self.vehicles[node].notice(member, is_linked, self.now);
             }
         }
         Ok(())
@@ -158,7 +159,7 @@ impl Cell {
             ensure!(*settled > 0, "{epoch} settled nothing");
             ensure!(held.iter().all(|held| held == settled), "evidence of {epoch} was lost or counted twice");
         }
-        let leaders = self.vehicles.iter().filter(|vehicle| vehicle.election.is_leading()).count();
+        let leaders = self.vehicles.iter().filter(|vehicle| vehicle.leadership.is_leading()).count();
         let sources = self.vehicles.iter().map(|vehicle| vehicle.map.as_ref().map(|map| (map.epoch, &map.aggregator)));
         let sources: BTreeSet<_> = sources.collect();
         ensure!(leaders == 1 && sources.len() == 1, "{leaders} lead, and maps come from {sources:?}");

@@ -1,20 +1,29 @@
 //! One vehicle: what a node runs, without clock, sockets and actors.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
-use ecod::election::{Body, Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
-use ecod::epoch::{Epoch, EpochGate};
+use ecod::epoch::Epoch;
 use ecod::landmark::Landmark;
+use ecod::leadership::Leadership;
+use ecod::leadership::election::{ElectionConfig, ElectionMessage};
+use ecod::leadership::health::HealthSample;
+use ecod::leadership::ledger_resync::LedgerResync;
+use ecod::leadership::links::{DataPlane, LinkState};
+use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
+use ecod::leadership::round_filter::RoundFilter;
 use ecod::names::NodeName;
 use ecod::reputation::ReputationLedger;
 use ecod::time::Timestamp;
 use ecod::wire::{
-    Encoding, GlobalMap, LedgerShare, Limits, ObjectReport, ReportKind, SCHEMA_VERSION, decode, decode_report,
+    Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, ReportKind, Role, decode, decode_report,
     decode_share, encode,
 };
+use uuid::Uuid;
 
 /// What vehicles send each other, as it travels.
 #[derive(Debug, Clone)]
@@ -27,10 +36,17 @@ pub(crate) enum Payload {
 
 pub(crate) struct Vehicle {
     pub(crate) name: NodeName,
-    pub(crate) election: Election,
+    index: u8,
+    machine: LeadershipNode,
+    pub(crate) leadership: Leadership,
+    filter: RoundFilter,
+    resync: LedgerResync,
+    tick_at: Timestamp,
     aggregator: Aggregator,
     pub(crate) ledger: ReputationLedger,
-    gate: EpochGate,
+    /// The other vehicles.
+    pub(crate) members: BTreeMap<NodeName, Member>,
+    rounds_closed: u64,
     /// The last map that it accepted.
     pub(crate) map: Option<GlobalMap>,
     /// Votes that it settled in each of its leaderships.
@@ -41,46 +57,88 @@ pub(crate) struct Vehicle {
     pub(crate) news: Vec<String>,
 }
 
+/// Time between two publications of what changed in the ledger, and how many make up a period in which all is sent.
+const SHARE_PERIOD: Duration = Duration::from_secs(1);
+const SHARES_PER_SNAPSHOT: u32 = 3;
+
 impl Vehicle {
-    pub(crate) fn new(name: NodeName, fusion: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
-        let mut election = Election::new(ElectionConfig::default(), name.clone(), 0, now);
-        let health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
-        election.handle(Input::Health { health }, now);
-        Self {
-            name,
-            election,
-            aggregator: Aggregator::standby(fusion, landmarks, now),
+    pub(crate) fn new(
+        name: NodeName,
+        index: u8,
+        fusion: FusionConfig,
+        landmarks: Vec<Landmark>,
+        now: Timestamp,
+    ) -> Self {
+        let settings = NodeSettings {
+            election: ElectionConfig::default(),
+            plane: DataPlane { external: None, embedded: true },
+            round_period: Duration::from_secs_f64(fusion.round.period_s),
+            keeps_reputations: true,
+            status: NodeStatus::starting(name.clone(), Uuid::nil(), Role::Auto, ""),
+        };
+        let mut vehicle = Self {
+            machine: LeadershipNode::new(settings, 0, &Leadership::default(), now),
+            leadership: Leadership::default(),
+            filter: RoundFilter::new(0),
+            resync: LedgerResync::new(name.clone(), SHARES_PER_SNAPSHOT),
+            tick_at: now + SHARE_PERIOD,
+            aggregator: Aggregator::new_standby(fusion, landmarks, now),
             ledger: ReputationLedger::default(),
-            gate: EpochGate::default(),
+            members: BTreeMap::new(),
+            rounds_closed: 0,
             map: None,
             settled: BTreeMap::new(),
             outbox: Vec::new(),
             news: Vec::new(),
+            name,
+            index,
+        };
+        vehicle.handle(Input::OwnBroker { address: Some(broker(index)) }, now);
+        vehicle.handle(Input::LinkChanged { broker: broker(index).into(), state: LinkState::Up }, now);
+        vehicle
+    }
+
+    pub(crate) fn as_member(&self) -> Member {
+        let broker = Some(broker(self.index).into());
+        Member { name: self.name.clone(), run: 1, broker, is_on_this_machine: false }
+    }
+
+    /// What the membership finds out about another vehicle.
+    pub(crate) fn notice(&mut self, member: Member, is_there: bool, now: Timestamp) {
+        if is_there {
+            self.members.insert(member.name.clone(), member.clone());
+            self.handle(Input::MemberAlive { member }, now);
+        } else {
+            self.members.remove(&member.name);
+            self.handle(Input::MemberDown { name: member.name }, now);
         }
     }
 
     pub(crate) fn tick(&mut self, now: Timestamp) -> anyhow::Result<()> {
-        let effects = self.election.tick(now);
-        self.carry_out(effects, now);
+        if now >= self.machine.next_deadline() {
+            self.handle(Input::Wake, now);
+        }
+        if now >= self.tick_at {
+            self.tick_at = now + SHARE_PERIOD;
+            let shares = self.resync.tick(&self.ledger, &self.leadership, now);
+            self.share(shares);
+        }
+        if now >= self.aggregator.deadline() {
+            self.rounds_closed += 1;
+        }
         self.aggregator.tick(now).map_or(Ok(()), |fused| self.publish(fused, now))
-    }
-
-    pub(crate) fn handle(&mut self, input: Input, now: Timestamp) {
-        let effects = self.election.handle(input, now);
-        self.carry_out(effects, now);
     }
 
     pub(crate) fn receive(&mut self, from: &NodeName, payload: &Payload, now: Timestamp) -> anyhow::Result<()> {
         let limits = Limits::default();
         match payload {
-            Payload::Election(bytes) => self.handle(Input::Receive { message: ElectionMessage::decode(bytes)? }, now),
+            Payload::Election(bytes) => {
+                let message = ElectionMessage::decode(bytes)?;
+                self.handle(Input::Receive { from: from.clone(), message }, now);
+            }
             Payload::Report(kind, bytes) => self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?,
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),
-            Payload::Evidence(bytes) => {
-                if self.ledger.merge_entries(decode_share(bytes, from, &limits)?.entries, self.election.epoch()) {
-                    self.aggregator.adopt(&self.ledger);
-                }
-            }
+            Payload::Evidence(bytes) => self.merge(&decode_share(bytes, from, &limits)?, now),
         }
         Ok(())
     }
@@ -102,54 +160,87 @@ impl Vehicle {
     /// Publishes a round of its own, and keeps what the round says of vehicles in the lane of its epoch.
     fn publish(&mut self, fused: Fused, now: Timestamp) -> anyhow::Result<()> {
         let Fused { epoch, map, evidence, .. } = fused;
-        evidence.iter().for_each(|vote| self.ledger.record(epoch.term, &epoch.leader, vote));
+        let shares = self.resync.record(&epoch, &evidence, &mut self.ledger);
+        self.share(shares);
         *self.settled.entry(epoch).or_default() += evidence.len() as u64;
-        if !evidence.is_empty() {
-            self.share(None);
-        }
         let map = map.context("PACE does not run")?;
         self.outbox.push((None, Payload::Map(encode(&map, Encoding::Cbor))));
         self.accept(map, now);
         Ok(())
     }
 
-    /// Takes a map unless it was superseded.
+    /// Takes a map that its filter accepts.
     fn accept(&mut self, map: GlobalMap, now: Timestamp) {
-        if self.gate.admit_map(&map).is_ok() {
-            let (epoch, round) = (Epoch::new(map.epoch, map.aggregator.clone()), map.round);
-            self.map = Some(map);
-            self.handle(Input::Round { epoch, round }, now);
+        let Ok(accepted) = self.filter.accept_map(&map, now, &self.leadership) else { return };
+        self.map = Some(map);
+        self.handle(Input::RoundAccepted { epoch: accepted.epoch, round: accepted.round }, now);
+    }
+
+    fn merge(&mut self, share: &LedgerShare, now: Timestamp) {
+        self.handle(Input::EvidenceReceived { from: share.node.clone() }, now);
+        let candidates: Vec<_> = self.members.keys().cloned().collect();
+        let Ok(merged) = self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, now) else {
+            return;
+        };
+        if merged.is_news {
+            self.aggregator.adopt(&self.ledger);
         }
+        self.share(merged.shares);
     }
 
-    fn share(&mut self, to: Option<NodeName>) {
-        let (entries, marks) = (self.ledger.entries().collect(), self.ledger.marks().collect());
-        let share = LedgerShare { schema: SCHEMA_VERSION, node: self.name.clone(), epoch: None, entries, marks };
-        self.outbox.push((to, Payload::Evidence(encode(&share, Encoding::Cbor))));
+    fn share(&mut self, shares: Vec<LedgerShare>) {
+        let shares = shares.iter().map(|share| (None, Payload::Evidence(encode(share, Encoding::Cbor))));
+        self.outbox.extend(shares);
     }
 
-    fn carry_out(&mut self, effects: Vec<Effect>, now: Timestamp) {
-        for effect in effects {
-            match effect {
-                Effect::Send { to, message } => {
-                    if matches!(message.body, Body::Yield { .. }) {
-                        self.aggregator.hold();
-                    }
-                    self.outbox.push((Some(to), Payload::Election(message.encode(Encoding::Cbor))));
-                }
-                Effect::Lead { epoch, first_round, first } => {
-                    self.news.push(format!("{epoch} leads from #{first_round}"));
-                    self.aggregator.lead(epoch, first_round, first, now);
-                }
-                Effect::StopPublishing { epoch } => {
-                    self.news.push(format!("{epoch} stops"));
-                    self.aggregator.stand_by();
-                }
-                Effect::Prepare { .. } => self.handle(Input::Prepared, now),
-                Effect::SendState { to } => self.share(Some(to)),
-                // Nobody restarts here, and everybody sends to all.
-                Effect::PersistTerm { .. } | Effect::Follow { .. } | Effect::Seek | Effect::AnnounceStandby { .. } => {}
+    fn handle(&mut self, input: Input, now: Timestamp) {
+        let mut inputs = VecDeque::from([input]);
+        while let Some(input) = inputs.pop_front() {
+            for effect in self.machine.handle(input, now) {
+                inputs.extend(self.carry_out(effect, now));
             }
         }
     }
+
+    /// Does what the machine wants; returns what it is to be told.
+    fn carry_out(&mut self, effect: Effect, now: Timestamp) -> Option<Input> {
+        match effect {
+            Effect::Send { to, message } => {
+                self.outbox.push((Some(to), Payload::Election(message.encode(Encoding::Cbor))));
+            }
+            Effect::TellLeadership { leadership } => self.leadership = leadership,
+            Effect::Lead { epoch, first_round, first } => {
+                self.news.push(format!("{epoch} leads from #{first_round}"));
+                self.resync.lead(epoch.clone());
+                self.aggregator.lead(epoch, first_round, first, now);
+                self.share(self.resync.snapshot(&self.ledger));
+            }
+            Effect::HoldRound => self.aggregator.hold(),
+            Effect::StopPublishing { epoch } => {
+                self.news.push(format!("{epoch} stops"));
+                self.resync.step_down();
+                self.aggregator.step_down();
+            }
+            Effect::SendSnapshot { .. } => self.share(self.resync.snapshot(&self.ledger)),
+            Effect::Look => {
+                let members = self.members.values().cloned().collect();
+                return Some(Input::Looked { rounds_closed: self.rounds_closed, load_percent: 0, members });
+            }
+            Effect::AskParts => {
+                let links = [(broker(self.index).into(), LinkState::Up)].into();
+                let sample = HealthSample { broker_serves: true, links: Some(links), fuser_runs: true };
+                return Some(Input::PartsAnswered { sample });
+            }
+            // Nobody restarts here, and everybody sends to all.
+            Effect::PersistTerm { .. }
+            | Effect::SetLinks { .. }
+            | Effect::PublishStatus { .. }
+            | Effect::Log { .. } => {}
+        }
+        None
+    }
+}
+
+fn broker(index: u8) -> SocketAddr {
+    SocketAddr::from(([10, 0, 0, index], 1883))
 }

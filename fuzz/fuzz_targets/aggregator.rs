@@ -13,7 +13,7 @@ use ecod::names::NodeName;
 use ecod::pace::PaceMode;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::TracksMode;
+use ecod::tracking::TracksMode;
 use ecod::vote::VoteMode;
 use ecod::wire::{
     Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose, decode, encode,
@@ -43,7 +43,7 @@ enum Step {
     Wait {
         ms: u16,
     },
-    StandBy,
+    StepDown,
     Lead,
 }
 
@@ -96,7 +96,7 @@ fuzz_target!(|cell: Cell| {
                 now = now + Duration::from_millis(ms.into());
                 aggregator.tick(now).iter().for_each(check);
             }
-            Step::StandBy => aggregator.stand_by(),
+            Step::StepDown => aggregator.step_down(),
             Step::Lead => {
                 epoch += 1;
                 aggregator.lead(Epoch::new(epoch, NodeName::from_static("edge")), 1, FirstRound::OnTime, now);

@@ -2,11 +2,11 @@
 
 #![no_main]
 
-use ecod_actors::broker::read_login;
+use ecod_actors::transport::broker::read_connect_packet;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|sent: &[u8]| {
-    if let Some(length) = read_login(sent) {
-        assert_eq!(read_login(&sent[..length]), Some(length), "nothing beyond the packet is read");
+    if let Some(length) = read_connect_packet(sent) {
+        assert_eq!(read_connect_packet(&sent[..length]), Some(length), "nothing beyond the packet is read");
     }
 });

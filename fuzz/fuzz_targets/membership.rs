@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use ecod_actors::membership::fuzzing::Listener;
+use ecod_actors::transport::gossip::fuzzing::Listener;
 use libfuzzer_sys::arbitrary::{self, Arbitrary};
 use libfuzzer_sys::fuzz_target;
 

@@ -7,7 +7,7 @@
 
 use std::fmt::Debug;
 
-use ecod::election::ElectionMessage;
+use ecod::leadership::election::ElectionMessage;
 use ecod::wire::{
     Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, Payload, Reputations, Verdicts, decode, encode,
 };

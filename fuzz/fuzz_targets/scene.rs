@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use ecod::testbed::{Recording, Testbed};
+use ecod_lab::testbed::{IntersectionRecording, Testbed};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|text: &str| {
@@ -14,7 +14,7 @@ fuzz_target!(|text: &str| {
             }
         }
     }
-    if let Ok(recording) = Recording::from_json(text) {
+    if let Ok(recording) = IntersectionRecording::from_json(text) {
         drop((recording.landmarks(), recording.frame_count()));
     }
 });

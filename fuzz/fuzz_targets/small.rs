@@ -6,14 +6,15 @@
 
 use std::sync::LazyLock;
 
-use ecod::detection::detections_in;
-use ecod::eval::Truth;
-use ecod::eval::tracks::TrackTruth;
+use ecod::detection::parse_detections;
 use ecod::time::Timestamp;
-use ecod_actors::config::NodeConfig;
-use ecod_actors::gateway::{Secret, Security};
-use ecod_actors::reputation_keeper::read_saved;
-use ecod_actors::vehicle_pose::read_pose;
+use ecod_actors::actors::reputation_keeper::read_saved;
+use ecod_actors::camera::vehicle_pose::read_pose;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::platform::secret::Secret;
+use ecod_actors::transport::mqtt::Security;
+use ecod_lab::eval::Truth;
+use ecod_lab::eval::tracks::TrackTruth;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|input: &[u8]| {
@@ -26,10 +27,10 @@ fuzz_target!(|input: &[u8]| {
             }
         }
         1 => {
-            let detections = detections_in(text).unwrap_or_default();
+            let detections = parse_detections(text).unwrap_or_default();
             assert!(detections.iter().all(|detection| detection.bounding_box.is_valid()));
         }
-        2 => assert!(SIGNING.keeps_shut("ecod/lot-1/detections/euclid", bytes)),
+        2 => assert!(SIGNING.rejects_forgery("ecod/lot-1/detections/euclid", bytes)),
         3 => read_saved(bytes),
         _ => drop((Truth::parse(text), TrackTruth::is_in(text), TrackTruth::parse(text))),
     }
@@ -40,5 +41,5 @@ static SIGNING: LazyLock<Security> = LazyLock::new(|| {
     let mut config = NodeConfig::default();
     config.mqtt.sign = true;
     config.membership.key = Some(Secret::new("01".repeat(32)));
-    Security::of(&config).expect("the key is a key")
+    config.security().expect("the key is a key")
 });

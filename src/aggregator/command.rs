@@ -1,5 +1,5 @@
-//! What an aggregator is told beside reports, as values: whoever keeps them, the reports, and the times of both can run
-//! it again.
+//! The calls that an aggregator gets beside reports, as values. Commands, reports and the times of both are enough to
+//! run it again.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use crate::round::FirstRound;
 use crate::time::Timestamp;
 use crate::wire::{GlobalMap, Reputation};
 
-/// Something an aggregator is told; see the method of the same name.
+/// A call of an aggregator's method of the same name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Command {
@@ -32,11 +32,12 @@ pub enum Command {
     },
     /// [`Aggregator::hold`].
     Hold,
-    /// [`Aggregator::stand_by`].
-    StandBy,
+    /// [`Aggregator::step_down`].
+    #[serde(rename = "stand_by")]
+    StepDown,
     /// [`Aggregator::adopt`].
     Adopt {
-        /// All evidence that is known.
+        /// All known evidence.
         #[schemars(with = "serde_json::Value")]
         ledger: Arc<ReputationLedger>,
     },
@@ -55,13 +56,13 @@ pub enum Command {
 }
 
 impl Aggregator {
-    /// Does what it is told at `now`; returns what came of the round if that closes it.
+    /// Carries out a command at `now`; returns the round if that closes it.
     pub fn command(&mut self, command: &Command, now: Timestamp) -> Option<Fused> {
         match command {
             Command::Tick => return self.tick(now),
             Command::Lead { epoch, first_round, first } => self.lead(epoch.clone(), *first_round, *first, now),
             Command::Hold => self.hold(),
-            Command::StandBy => self.stand_by(),
+            Command::StepDown => self.step_down(),
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::Resume { reputations } => self.resume(reputations),

@@ -1,4 +1,4 @@
-//! How a cell's reports are fused.
+//! Settings of fusion.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,11 +6,11 @@ use crate::config::ConfigError;
 use crate::pace::PaceConfig;
 use crate::reputation::ReputationConfig;
 use crate::round::RoundConfig;
-use crate::tracks::{TracksConfig, TracksMode};
+use crate::tracking::{TracksConfig, TracksMode};
 use crate::vote::VoteConfig;
 use crate::window::WindowConfig;
 
-/// Which algorithms a cell runs.
+/// The algorithms that a cell runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Algorithms {
@@ -35,29 +35,29 @@ impl Algorithms {
     }
 }
 
-/// How a cell's reports are fused.
+/// Settings of the fusion of a cell's reports.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionConfig {
-    /// Which algorithms run: `pace`, `vote` or `both`, the default: PACE, and VOTE from the first vote on. Reports for
-    /// one that does not run are rejected.
+    /// The algorithms that run: `pace`, `vote` or `both`, the default. With `both`, VOTE starts with the first vote.
+    /// Reports for an algorithm that does not run are rejected.
     pub algorithms: Algorithms,
-    /// Which reports are fresh enough.
+    /// Admission of reports by age and clock.
     pub window: WindowConfig,
-    /// The rhythm of rounds.
+    /// The interval of rounds.
     pub round: RoundConfig,
     /// Parameters of PACE.
     pub pace: PaceConfig,
-    /// Parameters of tracking: what maps say of objects without a known place.
+    /// Parameters of tracking: the objects in maps that are at no known location.
     pub tracks: TracksConfig,
     /// Parameters of VOTE.
     pub vote: VoteConfig,
-    /// How evidence becomes the reputations that are published.
+    /// Parameters of the published reputations.
     pub reputation: ReputationConfig,
 }
 
 impl FusionConfig {
-    /// Whether objects are tracked in a cell that has known locations, or in one that has none.
+    /// Whether objects are tracked in a cell with or without known locations.
     pub fn tracks_objects(&self, has_landmarks: bool) -> bool {
         let is_wanted = match self.tracks.mode {
             TracksMode::Auto => !has_landmarks,
@@ -67,7 +67,7 @@ impl FusionConfig {
         self.algorithms.pace() && is_wanted
     }
 
-    /// Whether rounds say anything about vehicles, in a cell that has known locations or in one that has none.
+    /// Whether rounds yield evidence about vehicles in a cell with or without known locations.
     pub fn rates_vehicles(&self, has_landmarks: bool) -> bool {
         self.algorithms.vote() || self.tracks_objects(has_landmarks)
     }

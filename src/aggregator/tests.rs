@@ -91,7 +91,7 @@ fn where_both_run_verdicts_come_from_the_first_vote_on() {
 
 #[test]
 fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
-    let mut cell = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
+    let mut cell = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     for step in 1..=20 {
         for kind in [Detections, VoteDetections] {
             assert_eq!(cell.report(kind, &report("euclid", "cup", step * 50), at(step * 50)), Ok(None));
@@ -109,7 +109,7 @@ fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
     assert_eq!(cell.report(ReportKind::Detections, &report("euclid", "cup", 1150), at(1150)), Ok(None));
     assert_eq!(cell.tick(at(1164)), None, "the others are still connecting");
     assert_eq!(cell.tick(at(1165)).map(|fused| fused.round), Some(90));
-    cell.stand_by();
+    cell.step_down();
     assert_eq!(cell.tick(at(1300)), None);
 }
 
@@ -170,7 +170,7 @@ fn settled(cell: &mut Aggregator, nodes: &[&str], (from_ms, until_ms): (u64, u64
 #[test]
 fn votes_that_are_open_when_the_cell_splits_are_settled_on_one_side_only() {
     let mut edge = leader(FusionConfig::default());
-    let mut standby = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
+    let mut standby = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     for step in 1..10u64 {
         for node in ["euclid", "gauss"] {
             let vote = report(node, "cup", step * 100);
@@ -188,7 +188,7 @@ fn votes_that_are_open_when_the_cell_splits_are_settled_on_one_side_only() {
 
 #[test]
 fn what_is_said_to_a_new_leader_is_its_evidence() {
-    let mut standby = Aggregator::standby(FusionConfig::default(), landmarks(), at(0));
+    let mut standby = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     let before = settled(&mut standby, &["euclid", "gauss"], (100, 1000));
     assert!(before.is_empty());
     standby.lead(Epoch::new(4, NodeName::from_static("standby")), 10, FirstRound::Overdue, at(5000));

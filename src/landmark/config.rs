@@ -1,4 +1,4 @@
-//! Known locations as they are written in a configuration file.
+//! Known locations in a configuration file.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -16,9 +16,9 @@ use crate::wire::is_label;
 pub struct LandmarkConfig {
     /// Name, unique in the cell.
     pub id: LandmarkId,
-    /// East in metres of where an object stands.
+    /// Position of an object in metres east.
     pub x_m: f64,
-    /// North in metres of where an object stands.
+    /// Position of an object in metres north.
     pub y_m: f64,
     /// Direction in degrees, counter-clockwise from east, from which an object here can be read. Default: from all
     /// around.
@@ -46,7 +46,7 @@ pub(crate) fn check_synonyms(synonyms: &BTreeMap<Label, Label>) -> Result<(), Co
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VacancyConfig {
-    /// What the sign reads.
+    /// The text of the sign.
     pub label: Label,
     /// East in metres.
     pub x_m: f64,

@@ -1,4 +1,4 @@
-//! Nearest-landmark queries whose cost does not grow with the number of landmarks far away.
+//! Nearest-landmark queries; their cost does not depend on the number of landmarks far away.
 
 use std::cmp::Ordering;
 
@@ -10,11 +10,11 @@ use super::grid::{Grid, GridPoint};
 use crate::geometry::Covariance;
 use crate::names::{Label, LandmarkId};
 
-/// Landmarks in configuration order with a spatial index over where objects and vacancy signs stand.
+/// Landmarks in configuration order with a spatial index of the positions of objects and vacancy signs.
 #[derive(Debug, Clone)]
 pub struct LandmarkIndex {
     landmarks: Vec<Landmark>,
-    /// Side by side, for [`Self::position_near`].
+    /// A contiguous copy of the ids, for [`Self::position_near`].
     ids: Vec<LandmarkId>,
     by_id: HashMap<LandmarkId, usize>,
     objects: Grid,
@@ -23,24 +23,24 @@ pub struct LandmarkIndex {
 
 /// A landmark that a detection may belong to.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Candidate {
+pub struct LandmarkCandidate {
     /// Position of the landmark in configuration order.
     pub landmark: usize,
-    /// Whether the detection is the landmark's vacancy sign rather than an object before it.
+    /// Whether the detection is the landmark's vacancy sign rather than an object in front of it.
     pub is_vacancy_sign: bool,
     /// Squared distance in standard deviations.
     pub mahalanobis_squared: f64,
 }
 
-/// How near a detection must be to a landmark.
+/// The gate of the association of detections with landmarks.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gate {
+pub struct LandmarkGate {
     /// Largest distance in metres, the paper's δ.
     pub radius_m: f64,
     /// Largest distance in standard deviations.
     pub sigmas: f64,
-    /// Standard deviation in metres that is added to every reported one, for what the vehicle does not know: where
-    /// exactly the object stands and where the vehicle itself is.
+    /// Standard deviation in metres that is added to every reported one. It covers errors that the vehicle cannot report:
+    /// those of the map and of its own pose.
     pub floor_m: f64,
 }
 
@@ -83,35 +83,41 @@ impl LandmarkIndex {
         if self.ids.get(expected) == Some(id) { Some(expected) } else { self.position_of(id) }
     }
 
-    /// Landmarks whose object would stand within `radius_m` of a point in metres, in no particular order.
+    /// Landmarks whose object position is within `radius_m` of a point in metres, in no particular order.
     pub fn within(&self, point: &Point2<f64>, radius_m: f64) -> impl Iterator<Item = usize> {
         self.objects.within(*point, radius_m).map(|(near, _)| near.landmark as usize)
     }
 
-    /// The landmark that best explains a detection: within the gate and at the least Mahalanobis distance.
+    /// The landmark within the gate at the smallest Mahalanobis distance from a detection.
     ///
-    /// A detection that reads what a landmark's vacancy sign reads is compared with where the sign stands, any other
-    /// with where objects stand.
-    pub fn best(&self, label: &Label, point: &Point2<f64>, covariance: &Covariance, gate: &Gate) -> Option<Candidate> {
-        // A fold from nothing: `min_by` steps to the first candidate, which keeps the search from becoming plain loops.
+    /// A detection with the label of a landmark's vacancy sign is compared with the sign's position, any other with the
+    /// position of objects.
+    pub fn best(
+        &self,
+        label: &Label,
+        point: &Point2<f64>,
+        covariance: &Covariance,
+        gate: &LandmarkGate,
+    ) -> Option<LandmarkCandidate> {
+        // A fold and not `min_by`, which takes the first candidate apart and thus prevents plain loops.
         self.candidates(label, *point, *covariance, *gate).fold(None, |best, candidate| match best {
             Some(best) if candidate.compare(&best) != Ordering::Less => Some(best),
             _ => Some(candidate),
         })
     }
 
-    /// All landmarks that explain a detection, as for [`Self::best`], in no particular order.
+    /// All landmarks within the gate of a detection, as for [`Self::best`], in no particular order.
     pub fn candidates<'a>(
         &'a self,
         label: &'a Label,
         point: Point2<f64>,
         covariance: Covariance,
-        gate: Gate,
-    ) -> impl Iterator<Item = Candidate> + 'a {
+        gate: LandmarkGate,
+    ) -> impl Iterator<Item = LandmarkCandidate> + 'a {
         let near = move |grid: &'a Grid, is_vacancy_sign: bool| {
             grid.within(point, gate.radius_m)
                 .filter(move |(near, _)| self.reads_sign(label, near) == is_vacancy_sign)
-                .map(move |(near, offset)| Candidate {
+                .map(move |(near, offset)| LandmarkCandidate {
                     landmark: near.landmark as usize,
                     is_vacancy_sign,
                     mahalanobis_squared: covariance.mahalanobis_squared(&offset, gate.floor_m),
@@ -122,14 +128,14 @@ impl LandmarkIndex {
         near(&self.objects, false).chain(signs.into_iter().flat_map(move |signs| near(signs, true)))
     }
 
-    /// Whether a label is what the vacancy sign of a landmark reads.
+    /// Whether a label is the text of a landmark's vacancy sign.
     fn reads_sign(&self, label: &Label, near: &GridPoint) -> bool {
         let sign = || self.landmarks[near.landmark as usize].vacancy.as_ref();
         near.has_sign && sign().is_some_and(|sign| sign.label == *label)
     }
 }
 
-impl Candidate {
+impl LandmarkCandidate {
     fn compare(&self, other: &Self) -> Ordering {
         self.mahalanobis_squared.total_cmp(&other.mahalanobis_squared).then(self.landmark.cmp(&other.landmark))
     }

@@ -1,19 +1,13 @@
 //! At most one object of a report for each place, and one place for each object.
 //!
-//! Every object would like the place it is nearest to. Where no two want the same, that is the assignment, and it costs
-//! nothing to see. Objects that contest a place are settled together with all that they could displace, so that the
-//! sum of the benefits 1 − d²/g² is the greatest possible, d the distance and g the gate in standard deviations: the
-//! global nearest neighbour (Blackman, Popoli, "Design and Analysis of Modern Tracking Systems", 1999, chapter 6.4),
-//! by the algorithm of Kuhn and Munkres. An object that gets no place is left out.
+//! Every object prefers the place it is nearest to. Where no two prefer the same, that is the assignment. Objects that
+//! contest a place are assigned together with all that they could displace, with the greatest sum of the benefits
+//! 1 − d²/g²; d is the distance and g the gate in standard deviations. An object that gets no place is left out.
 
-use std::collections::BTreeMap;
-
-use hashbrown::{HashMap, HashSet};
-use pathfinding::kuhn_munkres::kuhn_munkres;
-use pathfinding::matrix::Matrix;
-use pathfinding::undirected::connected_components::separate_components;
+use hashbrown::HashSet;
 
 use super::grouping::Place;
+use crate::association::{Candidate, ClusterSize, assign};
 use crate::wire::PerceivedObject;
 
 /// An object at a place within its gate.
@@ -25,13 +19,13 @@ pub(super) struct Pairing<'a> {
     pub(super) distance_squared: f64,
 }
 
-/// Objects or places in one contest, whichever are fewer, beyond which the nearest object keeps each place: the time to
-/// settle a contest grows with the square of this. Contests are of a handful, unless a report is made up.
-const LARGEST_CONTEST: usize = 64;
+/// Objects or places in one contest, whichever are fewer, beyond which the nearest object keeps each place. Larger
+/// contests occur in fabricated reports only and would take too long to solve.
+const MAX_CONTEST: usize = 64;
 
-/// Settles all contests of one report.
+/// Assigns the objects of one report to places.
 ///
-/// `wishes` is each object at its nearest place, ascending by place and distance; `pairings` lists all places that an
+/// `wishes` has each object at its nearest place, ascending by place and distance; `pairings` lists all places that an
 /// object can take, within a gate of `gate_sigmas` standard deviations. The result is ascending by place.
 pub(super) fn one_to_one<'a, I>(
     wishes: Vec<Pairing<'a>>,
@@ -47,83 +41,64 @@ where
         return wishes;
     }
     contested.dedup();
-    // All that could be displaced: whoever wants a contested place, the other places that these could take, whoever
-    // wants those, and so on. Everyone else keeps the place wanted, the best there is.
+    // Collects all that could be displaced: the objects at a contested place, the other places that these could take,
+    // the objects there, and so on. Every other object keeps its nearest place.
     let mut reached: HashSet<Place> = contested.iter().copied().collect();
     let mut contestants = Vec::new();
+    let mut objects = 0;
     while let Some(place) = contested.pop() {
         let first = wishes.partition_point(|wish| wish.place < place);
         for wish in wishes[first..].iter().take_while(|wish| wish.place == place) {
-            let pairings: Vec<_> = pairings(wish.object).collect();
-            contested.extend(pairings.iter().map(|pairing| pairing.place).filter(|place| reached.insert(*place)));
-            contestants.push(Contestant { wish: *wish, pairings });
+            for pairing in pairings(wish.object) {
+                if reached.insert(pairing.place) {
+                    contested.push(pairing.place);
+                }
+                contestants.push(Contestant { pairing, object: objects, is_wish: pairing.place == place, gate_sigmas });
+            }
+            objects += 1;
         }
     }
     let mut settled: Vec<_> = wishes.into_iter().filter(|wish| !reached.contains(&wish.place)).collect();
-    for contest in contests(contestants) {
-        settle(&contest, gate_sigmas, &mut settled);
-    }
+    settled.extend(assign(contestants, nearest_if_crowded).iter().map(|contestant| contestant.pairing));
     settled.sort_by_key(|pairing| pairing.place);
     settled
 }
 
-/// An object that may be displaced.
+/// A pairing in a contest.
+#[derive(Debug, Clone, Copy)]
 struct Contestant<'a> {
-    wish: Pairing<'a>,
-    /// The wish and all others.
-    pairings: Vec<Pairing<'a>>,
+    pairing: Pairing<'a>,
+    /// Number of the object in the contests of the report.
+    object: u32,
+    /// Whether the place is the object's nearest.
+    is_wish: bool,
+    gate_sigmas: f64,
 }
 
-/// Contestants that have no place in common, not even by way of others, are in different contests.
-fn contests(contestants: Vec<Contestant<'_>>) -> impl Iterator<Item = Vec<Contestant<'_>>> {
-    let places: Vec<Vec<Place>> = contestants
-        .iter()
-        .map(|contestant| contestant.pairings.iter().map(|pairing| pairing.place).collect())
-        .collect();
-    let (_, contest_of) = separate_components(&places);
-    let mut contests: BTreeMap<usize, Vec<_>> = BTreeMap::new();
-    for (contestant, contest) in contestants.into_iter().zip(contest_of) {
-        contests.entry(contest).or_default().push(contestant);
+impl Candidate for Contestant<'_> {
+    fn row(&self) -> u32 {
+        self.object
     }
-    contests.into_values()
+
+    fn column(&self) -> u32 {
+        self.pairing.place.0
+    }
+
+    /// 1 − d²/g² in units of 2⁻⁴⁰, at least one unit.
+    fn benefit(&self) -> i64 {
+        const UNIT: f64 = (1i64 << 40) as f64;
+        ((1.0 - self.pairing.distance_squared / (self.gate_sigmas * self.gate_sigmas)) * UNIT) as i64 + 1
+    }
 }
 
-/// Adds the best pairings of one contest to `settled`.
-fn settle<'a>(contestants: &[Contestant<'a>], gate_sigmas: f64, settled: &mut Vec<Pairing<'a>>) {
-    let mut columns = HashMap::new();
-    for pairing in contestants.iter().flat_map(|contestant| &contestant.pairings) {
-        let next = columns.len();
-        columns.entry(pairing.place).or_insert(next);
-    }
-    let (objects, places) = (contestants.len(), columns.len());
-    if objects.min(places) > LARGEST_CONTEST {
+/// Of a contest that is too large, the nearest object at each place.
+fn nearest_if_crowded<'a>(size: ClusterSize, contest: &[Contestant<'a>]) -> Option<Vec<Contestant<'a>>> {
+    (size.rows.min(size.columns) > MAX_CONTEST).then(|| {
         // They come place by place, the nearest first.
-        let mut nearest: Vec<_> = contestants.iter().map(|contestant| contestant.wish).collect();
-        nearest.dedup_by_key(|wish| wish.place);
-        settled.extend(nearest);
-        return;
-    }
-    // The algorithm wants at least as many columns as rows.
-    let cell = |object: usize, place: usize| if objects <= places { (object, place) } else { (place, object) };
-    let pairings = || {
-        let numbered = contestants.iter().enumerate();
-        let columns = &columns;
-        numbered.flat_map(move |(object, contestant)| {
-            contestant.pairings.iter().map(move |pairing| (cell(object, columns[&pairing.place]), *pairing))
-        })
-    };
-    let mut benefits = Matrix::new(objects.min(places), objects.max(places), 0);
-    for (cell, pairing) in pairings() {
-        benefits[cell] = benefit(pairing.distance_squared, gate_sigmas);
-    }
-    let (_, column_of) = kuhn_munkres(&benefits);
-    settled.extend(pairings().filter(|((row, column), _)| column_of[*row] == *column).map(|(_, pairing)| pairing));
-}
-
-/// 1 − d²/g² in units of 2⁻⁴⁰, and more than nothing for whatever is within the gate.
-fn benefit(distance_squared: f64, gate_sigmas: f64) -> i64 {
-    const UNIT: f64 = (1i64 << 40) as f64;
-    ((1.0 - distance_squared / (gate_sigmas * gate_sigmas)) * UNIT) as i64 + 1
+        let mut nearest: Vec<_> = contest.iter().filter(|contestant| contestant.is_wish).copied().collect();
+        nearest.dedup_by_key(|contestant| contestant.pairing.place);
+        nearest
+    })
 }
 
 #[cfg(test)]
@@ -217,7 +192,7 @@ mod tests {
 
     #[test]
     fn the_nearest_keep_their_places_in_an_enormous_contest() {
-        let count = 2 * LARGEST_CONTEST as u32;
+        let count = 2 * MAX_CONTEST as u32;
         let crowd: Vec<_> = (0..count).flat_map(|n| [vec![(n, 1), (n + 1, 3)], vec![(n, 2), (n + 1, 4)]]).collect();
         let nearest: Vec<_> = (0..count).map(|n| (2 * n as usize, n)).collect();
         assert_eq!(assigned(&crowd), nearest);

@@ -1,21 +1,22 @@
 //! PACE with evidence of presence and of absence.
 //!
-//! Every vehicle keeps, for every landmark that it looked at lately, the log-odds of each label it read there, as in
-//! an occupancy grid (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, chapter 9.2): a frame that shows label l
-//! with confidence c adds c·ln(p_d/p_f) to l and takes as much from the others; a frame in which the landmark was in
-//! view and nothing was found takes ln((1−p_f)/(1−p_d)) from all. One vehicle's evidence is bounded, so that a fast or
-//! stubborn vehicle does not outvote the others.
+//! Each vehicle has the log-odds of each label at each landmark that it had in view lately, as in an occupancy grid
+//! (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, chapter 9.2). Unlike there, a cell has one value per label:
 //!
-//! A round adds the vehicles' log-odds: S(ρ,l) = Σ_v L_v(ρ,l), label = argmax S, confidence = e^S(l) / (1 + Σ e^S), the
-//! posterior when the labels and "nothing" exclude each other and are equally likely at first. The position is the
-//! mean of the vehicles' last positions weighted by their inverse covariances.
+//! - A frame that shows label l with confidence c adds c·ln(p_d/p_f) to l and subtracts as much from the other labels.
+//! - A frame without a detection in a landmark that is in view subtracts ln((1−p_f)/(1−p_d)) from all labels.
+//! - One vehicle's evidence is bounded, so that a fast or stubborn vehicle does not outvote the others.
 //!
-//! A landmark's vacancy sign is read where it stands and agreed on in the same way; any object outweighs it, because a
-//! sign behind an object can still be seen from the side. A landmark in whose place vehicles looked and found nothing
-//! is known to be empty: it takes the vacancy sign's label if it has a sign, and null otherwise.
+//! A round adds the vehicles' log-odds: S(ρ,l) = Σ_v L_v(ρ,l), label = argmax S, confidence = e^S(l) / (1 + Σ e^S). This
+//! is the posterior if labels and "nothing" exclude each other and have equal priors. The position is the mean of the
+//! vehicles' last positions weighted by their inverse covariances.
+//!
+//! A vacancy sign is a second place with its own log-odds. Any object outweighs it, because a sign behind an object can
+//! still be seen from the side. A landmark is known to be empty where vehicles looked and found nothing: it then takes
+//! the label of its vacancy sign, or null without one.
 
-mod evidence;
-mod tally;
+mod belief;
+mod consensus;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,26 +24,26 @@ use std::sync::Arc;
 use nalgebra::Point2;
 use smallvec::SmallVec;
 
-use self::evidence::{Look, Sighting, Vehicle, Worth};
-use self::tally::{NamedLook, Tally, WeightedMean};
+use self::belief::{Belief, Increments, Observation, VehicleBelief};
+use self::consensus::{LabelScores, NamedBelief, WeightedMean};
 use super::assignment::{Pairing, one_to_one};
 use super::grouping::{ByPlace, Grouping, Place};
 use super::{PaceConfig, PaceRound};
-use crate::landmark::{Candidate, Landmark, LandmarkIndex};
+use crate::landmark::{Landmark, LandmarkCandidate, LandmarkIndex};
 use crate::names::{Label, NodeName};
 use crate::time::Timestamp;
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
 
-/// The looks at one place; most places are in few vehicles' view.
-type Looks<'a> = SmallVec<[NamedLook<'a>; 16]>;
+/// The beliefs about one place; most places are in view of few vehicles.
+type Beliefs<'a> = SmallVec<[NamedBelief<'a>; 16]>;
 
 /// See the module.
 #[derive(Debug, Clone)]
 pub struct BayesPace {
     config: PaceConfig,
-    worth: Worth,
+    increments: Increments,
     landmarks: Arc<LandmarkIndex>,
-    vehicles: BTreeMap<NodeName, Vehicle>,
+    vehicles: BTreeMap<NodeName, VehicleBelief>,
     published: Vec<Option<Label>>,
     grouping: Grouping,
 }
@@ -50,7 +51,7 @@ pub struct BayesPace {
 impl BayesPace {
     pub(super) fn new(config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         Self {
-            worth: Worth::new(&config),
+            increments: Increments::new(&config),
             config,
             published: vec![None; landmarks.landmarks().len()],
             landmarks,
@@ -70,9 +71,9 @@ impl BayesPace {
     }
 
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
-        let sightings = self.sightings(report);
+        let observations = self.observations(report);
         let vehicle = self.vehicles.entry(report.node.clone()).or_default();
-        vehicle.observe(&sightings, captured_at, self.worth, &self.config);
+        vehicle.observe(&observations, captured_at, self.increments, &self.config);
     }
 
     pub(super) fn close(&mut self, now: Timestamp) -> PaceRound {
@@ -84,8 +85,8 @@ impl BayesPace {
             oldest.is_some()
         });
         let mut grouping = std::mem::take(&mut self.grouping);
-        let held: Vec<_> = self.vehicles.iter().map(|(node, vehicle)| vehicle.held_by(node)).collect();
-        let by_place = grouping.group(&held, 2 * self.landmarks.landmarks().len());
+        let items: Vec<_> = self.vehicles.iter().map(|(node, vehicle)| vehicle.items_of(node)).collect();
+        let by_place = grouping.group(&items, 2 * self.landmarks.landmarks().len());
         let mut published = std::mem::take(&mut self.published);
         let mut landmarks = Vec::with_capacity(published.len());
         for (index, (landmark, published)) in self.landmarks.landmarks().iter().zip(&mut published).enumerate() {
@@ -98,25 +99,25 @@ impl BayesPace {
         PaceRound { landmarks, oldest_capture }
     }
 
-    /// Every place that the vehicle looked at, ascending: where it found something and what it says it saw.
-    fn sightings<'a>(&self, report: &'a ObjectReport) -> Vec<Sighting<'a>> {
-        let mut sightings = self.associate(&report.objects);
+    /// Every place that the vehicle had in view, ascending: those with a detection and those listed as `seen`.
+    fn observations<'a>(&self, report: &'a ObjectReport) -> Vec<Observation<'a>> {
+        let mut observations = self.associate(&report.objects);
         let mut expected = 0;
-        sightings.extend(report.seen.iter().flatten().filter_map(|id| {
+        observations.extend(report.seen.iter().flatten().filter_map(|id| {
             let landmark = self.landmarks.position_near(id, expected)?;
             expected = landmark + 1;
-            Some(Sighting { place: Place::object(landmark), found: None })
+            Some(Observation { place: Place::object(landmark), found: None })
         }));
-        // Stable: what was found at a place comes before the bare fact that it was in view.
-        sightings.sort_by_key(|sighting| sighting.place);
-        sightings.dedup_by(|later, kept| later.place == kept.place && later.found.is_none());
-        sightings
+        // A stable sort: a detection at a place comes before the entry in `seen`.
+        observations.sort_by_key(|observation| observation.place);
+        observations.dedup_by(|later, kept| later.place == kept.place && later.found.is_none());
+        observations
     }
 
     /// The objects at their nearest places, with `one_to_one` settled so that they share none; ascending by place.
-    fn associate<'a>(&self, objects: &'a [PerceivedObject]) -> Vec<Sighting<'a>> {
+    fn associate<'a>(&self, objects: &'a [PerceivedObject]) -> Vec<Observation<'a>> {
         let gate = self.config.gate();
-        let pairing = |object, candidate: Candidate| Pairing {
+        let pairing = |object, candidate: LandmarkCandidate| Pairing {
             place: Place::of(&candidate),
             object,
             distance_squared: candidate.mahalanobis_squared,
@@ -136,48 +137,48 @@ impl BayesPace {
         if self.config.one_to_one {
             wishes = one_to_one(wishes, pairings, self.config.gate_sigmas);
         }
-        let mut sightings = Vec::with_capacity(2 * wishes.len());
-        sightings
-            .extend(wishes.into_iter().map(|pairing| Sighting { place: pairing.place, found: Some(pairing.object) }));
-        sightings
+        let mut observations = Vec::with_capacity(2 * wishes.len());
+        observations.extend(
+            wishes.into_iter().map(|pairing| Observation { place: pairing.place, found: Some(pairing.object) }),
+        );
+        observations
     }
 
-    /// What the vehicles agree on for one landmark.
+    /// The state of one landmark that the vehicles agree on.
     fn agree(
         &self,
         landmark: &Landmark,
         published: Option<&Label>,
         index: usize,
-        by_place: &ByPlace<'_, Look>,
+        by_place: &ByPlace<'_, Belief>,
     ) -> LandmarkState {
-        let looks: Looks<'_> = by_place.at(Place::object(index)).collect();
-        if let Some(state) = self.agree_on_label(landmark, published, &looks, &looks) {
+        let beliefs: Beliefs<'_> = by_place.at(Place::object(index)).collect();
+        if let Some(state) = self.agree_on_label(landmark, published, &beliefs, &beliefs) {
             return state;
         }
         if landmark.vacancy.is_some() {
-            let signs: Looks<'_> = by_place.at(Place::vacancy_sign(index)).collect();
-            if let Some(state) = self.agree_on_label(landmark, published, &signs, &looks) {
+            let signs: Beliefs<'_> = by_place.at(Place::vacancy_sign(index)).collect();
+            if let Some(state) = self.agree_on_label(landmark, published, &signs, &beliefs) {
                 return state;
             }
         }
-        self.without_label(landmark, &looks)
+        self.without_label(landmark, &beliefs)
     }
 
-    /// The label that the looks at one place have the most evidence for, if they have any; `observers` looked at the
-    /// landmark at all.
+    /// The label with the most evidence at one place, if there is any; `observers` had the landmark in view.
     fn agree_on_label(
         &self,
         landmark: &Landmark,
         published: Option<&Label>,
-        looks: &[NamedLook<'_>],
-        observers: &[NamedLook<'_>],
+        beliefs: &[NamedBelief<'_>],
+        observers: &[NamedBelief<'_>],
     ) -> Option<LandmarkState> {
-        let winner = Tally::of(looks).winner(published, self.config.switch_lead)?;
-        let mut contributors = Vec::with_capacity(looks.len());
+        let winner = LabelScores::of(beliefs).winner(published, self.config.switch_lead)?;
+        let mut contributors = Vec::with_capacity(beliefs.len());
         let mut mean = WeightedMean::default();
-        for (node, look) in looks.iter().filter(|(_, look)| look.nats_for(winner.label) > 0.0) {
+        for (node, belief) in beliefs.iter().filter(|(_, belief)| belief.nats_for(winner.label) > 0.0) {
             contributors.push((*node).clone());
-            if let Some((position, covariance)) = &look.position {
+            if let Some((position, covariance)) = &belief.position {
                 mean.add(position, covariance, self.config.position_floor_m);
             }
         }
@@ -193,12 +194,12 @@ impl BayesPace {
         })
     }
 
-    /// Known to be empty or never looked at.
-    fn without_label(&self, landmark: &Landmark, looks: &[NamedLook<'_>]) -> LandmarkState {
-        let absence: f64 = -looks.iter().map(|(_, look)| look.anything).sum::<f64>();
+    /// The state of a landmark that is known to be empty or was not in view.
+    fn without_label(&self, landmark: &Landmark, beliefs: &[NamedBelief<'_>]) -> LandmarkState {
+        let absence: f64 = -beliefs.iter().map(|(_, belief)| belief.anything).sum::<f64>();
         let known_empty = absence >= self.config.empty_evidence;
         let vacancy = landmark.vacancy.as_ref().filter(|_| known_empty);
-        let observers = if known_empty { names(looks) } else { Vec::new() };
+        let observers = if known_empty { names(beliefs) } else { Vec::new() };
         LandmarkState {
             id: landmark.id.clone(),
             label: vacancy.map(|sign| sign.label.clone()),
@@ -211,8 +212,8 @@ impl BayesPace {
     }
 }
 
-fn names(looks: &[NamedLook<'_>]) -> Vec<NodeName> {
-    looks.iter().map(|(node, _)| (*node).clone()).collect()
+fn names(beliefs: &[NamedBelief<'_>]) -> Vec<NodeName> {
+    beliefs.iter().map(|(node, _)| (*node).clone()).collect()
 }
 
 fn logistic(nats: f64) -> f64 {

@@ -1,8 +1,8 @@
-//! What many vehicles hold about many places, regrouped from vehicles to places.
+//! Regrouping of items from vehicles to places.
 
 use crate::names::NodeName;
 
-/// Something that vehicles look at, counted from 0.
+/// Index of something that vehicles observe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Place(pub(super) u32);
 
@@ -12,32 +12,32 @@ impl Place {
     }
 }
 
-/// What one vehicle holds: items, and the place of each beside them, so that regrouping reads nothing but places.
+/// The items of one vehicle and the place of each. Places are apart from items, so that regrouping reads nothing else.
 #[derive(Debug, Clone)]
-pub(super) struct Held<'a, T> {
+pub(super) struct VehicleItems<'a, T> {
     pub(super) node: NodeName,
     pub(super) places: &'a [Place],
     pub(super) items: &'a [T],
 }
 
-/// Buffers that group items by place in time linear in items and places; kept from round to round.
+/// Buffers of a counting sort by place, kept from round to round; its time is linear in items and places.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Grouping {
     /// (vehicle, item) by place.
     entries: Vec<(u32, u32)>,
-    /// Where the entries of each place end.
+    /// End of the entries of each place.
     ends: Vec<u32>,
 }
 
 /// Items grouped by place.
 pub(super) struct ByPlace<'a, T> {
-    vehicles: &'a [Held<'a, T>],
+    vehicles: &'a [VehicleItems<'a, T>],
     grouping: &'a Grouping,
 }
 
 impl Grouping {
     /// Groups the vehicles' items for `places` places, keeping the order of vehicles and of their items within a place.
-    pub(super) fn group<'a, T>(&'a mut self, vehicles: &'a [Held<'a, T>], places: usize) -> ByPlace<'a, T> {
+    pub(super) fn group<'a, T>(&'a mut self, vehicles: &'a [VehicleItems<'a, T>], places: usize) -> ByPlace<'a, T> {
         self.ends.clear();
         self.ends.resize(places + 1, 0);
         for place in vehicles.iter().flat_map(|vehicle| vehicle.places) {
@@ -47,7 +47,7 @@ impl Grouping {
             self.ends[place] += self.ends[place - 1];
         }
         self.entries.resize(self.ends[places] as usize, (0, 0));
-        // The start of each place serves as its cursor and so becomes its end.
+        // The start of each place serves as its cursor and thus becomes its end.
         for (v, vehicle) in vehicles.iter().enumerate() {
             for (i, place) in vehicle.places.iter().enumerate() {
                 let cursor = &mut self.ends[place.index()];
@@ -60,7 +60,7 @@ impl Grouping {
 }
 
 impl<'a, T> ByPlace<'a, T> {
-    /// The items at a place with their vehicles' names.
+    /// The items at a place with the names of their vehicles.
     pub(super) fn at(&self, place: Place) -> impl ExactSizeIterator<Item = (&'a NodeName, &'a T)> + Clone + '_ {
         let Grouping { entries, ends } = self.grouping;
         let start = if place.index() == 0 { 0 } else { ends[place.index() - 1] };

@@ -1,8 +1,8 @@
-//! PACE as the paper writes it (Algorithm 2).
+//! PACE as the paper prints it (Algorithm 2).
 //!
-//! For each location ρ, O_ρ is every object of the vehicles' freshest reports within δ of ρ; the label has the largest
-//! sum of confidences, the confidence is Σc²/Σc over O_ρ, the position the mean. An object within δ of two locations
-//! counts at both. Vacancy signs, covariances, `seen` and the order of frames play no part.
+//! For each location ρ, O_ρ holds every object of the vehicles' latest reports within δ of ρ. The label has the largest
+//! sum of confidences, the confidence is Σc²/Σc over O_ρ, and the position is the mean. An object within δ of two
+//! locations counts at both. Vacancy signs, covariances, `seen` and the order of frames are not used.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use std::time::Duration;
 use nalgebra::{Point2, Vector2};
 use smallvec::SmallVec;
 
-use super::grouping::{Grouping, Held, Place};
+use super::grouping::{Grouping, Place, VehicleItems};
 use super::{PaceConfig, PaceRound};
 use crate::landmark::{Landmark, LandmarkIndex};
 use crate::names::{Label, NodeName};
@@ -24,21 +24,21 @@ pub struct PaperPace {
     gate_m: f64,
     max_age: Duration,
     landmarks: Arc<LandmarkIndex>,
-    vehicles: BTreeMap<NodeName, Freshest>,
+    vehicles: BTreeMap<NodeName, LatestReport>,
     grouping: Grouping,
 }
 
-/// A vehicle's freshest report: its objects near any location, once for each.
+/// A vehicle's latest report: its objects near known locations, once for each location.
 #[derive(Debug, Clone, Default)]
-struct Freshest {
+struct LatestReport {
     captured_at: Timestamp,
     places: Vec<Place>,
-    objects: Vec<Near>,
+    objects: Vec<NearbyObject>,
 }
 
-/// What counts of an object.
+/// The used fields of an object.
 #[derive(Debug, Clone)]
-struct Near {
+struct NearbyObject {
     label: Label,
     confidence: f64,
     position: Vector2<f64>,
@@ -59,57 +59,61 @@ impl PaperPace {
         self.landmarks = Arc::new(self.landmarks.extended(added, self.gate_m));
     }
 
-    /// The known locations, and how near an object must be to one.
+    /// The known locations and the gate in metres.
     pub(super) fn places(&self) -> (&LandmarkIndex, f64) {
         (&self.landmarks, self.gate_m)
     }
 
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
-        let freshest = self.vehicles.entry(report.node.clone()).or_default();
-        freshest.captured_at = captured_at;
-        freshest.places.clear();
-        freshest.objects.clear();
+        let latest = self.vehicles.entry(report.node.clone()).or_default();
+        latest.captured_at = captured_at;
+        latest.places.clear();
+        latest.objects.clear();
         for object in &report.objects {
             let position = Vector2::new(object.x_m, object.y_m);
             for landmark in self.landmarks.within(&Point2::from(position), self.gate_m) {
-                freshest.places.push(Place(landmark as u32));
-                freshest.objects.push(Near { label: object.label.clone(), confidence: object.confidence, position });
+                latest.places.push(Place(landmark as u32));
+                latest.objects.push(NearbyObject {
+                    label: object.label.clone(),
+                    confidence: object.confidence,
+                    position,
+                });
             }
         }
     }
 
     pub(super) fn close(&mut self, now: Timestamp) -> PaceRound {
-        self.vehicles.retain(|_, freshest| now.since(freshest.captured_at) <= self.max_age);
-        let held: Vec<_> = self
+        self.vehicles.retain(|_, latest| now.since(latest.captured_at) <= self.max_age);
+        let items: Vec<_> = self
             .vehicles
             .iter()
-            .map(|(node, freshest)| Held { node: node.clone(), places: &freshest.places, items: &freshest.objects })
+            .map(|(node, latest)| VehicleItems { node: node.clone(), places: &latest.places, items: &latest.objects })
             .collect();
-        let by_place = self.grouping.group(&held, self.landmarks.landmarks().len());
+        let by_place = self.grouping.group(&items, self.landmarks.landmarks().len());
         let landmarks = self.landmarks.landmarks().iter().enumerate();
         PaceRound {
             landmarks: landmarks.map(|(index, landmark)| agree(landmark, by_place.at(Place(index as u32)))).collect(),
-            oldest_capture: self.vehicles.values().map(|freshest| freshest.captured_at).min(),
+            oldest_capture: self.vehicles.values().map(|latest| latest.captured_at).min(),
         }
     }
 }
 
-/// The map's entry for a location, given O_ρ by vehicle.
+/// The map's entry for a location ρ, given O_ρ by vehicle.
 fn agree<'a>(
     landmark: &Landmark,
-    near: impl ExactSizeIterator<Item = (&'a NodeName, &'a Near)> + Clone,
+    near: impl ExactSizeIterator<Item = (&'a NodeName, &'a NearbyObject)> + Clone,
 ) -> LandmarkState {
     let count = near.len();
     let (mut position_sum, mut confidence_sum, mut confidence_square_sum) = (Vector2::zeros(), 0.0, 0.0);
-    // A pass of its own: its loads do not wait for each other, and most of the time goes into them.
-    for (_, Near { confidence, position, .. }) in near.clone() {
+    // A separate pass: its loads, which take most of the time, do not wait for each other.
+    for (_, NearbyObject { confidence, position, .. }) in near.clone() {
         position_sum += position;
         confidence_sum += confidence;
         confidence_square_sum += confidence * confidence;
     }
     let mut labels: SmallVec<[(&Label, f64); 4]> = SmallVec::new();
     let mut contributors: Vec<NodeName> = Vec::with_capacity(count);
-    for (node, Near { label, confidence, .. }) in near {
+    for (node, NearbyObject { label, confidence, .. }) in near {
         match labels.iter_mut().find(|(known, _)| *known == label) {
             Some((_, sum)) => *sum += confidence,
             None => labels.push((label, *confidence)),

@@ -1,34 +1,27 @@
-//! How distances are found and how exact they are.
+//! Settings of projection: the way of ranging, object sizes and uncertainties.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::{ConfigError, check_range, config_section};
 use crate::names::Label;
 
-/// How the distance of a detection is found.
+/// The way to find the distance of a detection.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranging {
-    /// From the four corners of a square target, whatever its yaw; the most exact. Detections without corners are
-    /// ranged by [`Ranging::BoxHeight`].
+    /// From the four corners of a square target, at any yaw; the most exact. Detections without corners are ranged by
+    /// [`Ranging::BoxHeight`].
     #[default]
     Corners,
-    /// z = f_y · height / box height: exact for an upright object, whatever its yaw.
+    /// z = f_y · height / box height: exact for an upright object at any yaw.
     BoxHeight,
-    /// d = s / (2 tan(α/2)) with the angle α between the two edges' bearings: exact for a width that is square to the
-    /// line of sight, too far for one that is turned away.
+    /// d = s / (2 tan(α/2)) with α the angle between the bearings of the two edges: exact for a width perpendicular to
+    /// the line of sight, too far for one that is turned away.
     BoxWidth,
-    /// The paper's formulas (PACE client, Algorithm 1) to the letter, with γ the field of view over the image width,
-    /// w and x_center the width and middle column of the box, and s the object's width:
-    ///
-    /// α = γ·w, d = s / tan α, θ = θ_v − γ·x_center, position = (x_v + d cos θ, y_v + d sin θ).
-    ///
-    /// What differs from the geometry: x_center counts from the left edge of the image, so θ_v is the direction of
-    /// that edge and an axis heading turns every object half a field of view clockwise; the angle is spread evenly
-    /// over the columns, where a flat sensor spreads its tangent; and tan α takes the far leg of a right triangle, 2
-    /// tan(α/2) the base of an isosceles one.
+    /// The paper's formulas (PACE client, Algorithm 1) to the letter, with their errors: d = s / tan α with α spread
+    /// evenly over the columns, and bearings from the left edge of the image. `projection/paper.rs` explains them.
     Paper,
 }
 
@@ -41,7 +34,7 @@ pub struct ObjectSize {
     /// Height in metres; the side of a square target.
     pub height_m: f64,
     /// Relative standard deviation of sizes of this kind and of the focal length together; default 0.02. Too small
-    /// makes positions over-confident along the sight, too large makes them count less in fusion.
+    /// makes positions over-confident along the line of sight; too large makes them count less in fusion.
     #[serde(default = "default_relative_sigma")]
     pub relative_sigma: f64,
 }
@@ -63,8 +56,7 @@ impl ObjectSize {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObjectSizes {
-    /// Size of labels that are not listed, such as decoded texts; default none: detections of unlisted labels have
-    /// no position.
+    /// Size of labels that are not listed, such as decoded texts. Default none: their detections have no position.
     pub default: Option<ObjectSize>,
     /// Sizes of listed labels; default none.
     pub labels: BTreeMap<Label, ObjectSize>,
@@ -90,50 +82,23 @@ impl ObjectSizes {
     }
 }
 
-/// How detections are placed in the world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ProjectionConfig {
-    /// How distances are found; default `corners`. `box_height` needs upright objects, `box_width` objects that face
-    /// the camera, `paper` repeats the published formulas with their error.
-    pub ranging: Ranging,
-    /// True sizes of objects; default none.
-    pub sizes: ObjectSizes,
-    /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
-    /// detectors 3 and more.
-    pub pixel_sigma_px: f64,
-    /// Standard deviation of the camera's heading in radians; default 0.01.
-    pub heading_sigma_rad: f64,
-    /// Standard deviation of the camera's position in metres, each axis; default 0.005.
-    pub position_sigma_m: f64,
-    /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps covariances away from zero.
-    pub floor_m: f64,
-}
-
-impl Default for ProjectionConfig {
-    fn default() -> Self {
-        Self {
-            ranging: Ranging::default(),
-            sizes: ObjectSizes::default(),
-            pixel_sigma_px: 1.0,
-            heading_sigma_rad: 0.01,
-            position_sigma_m: 0.005,
-            floor_m: 0.005,
-        }
-    }
-}
-
-impl ProjectionConfig {
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// [`ConfigError`] with the first key out of range.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        self.sizes.validate().map_err(|e| e.within("sizes"))?;
-        check_range("pixel_sigma_px", self.pixel_sigma_px, 0.0, 1e3)?;
-        check_range("heading_sigma_rad", self.heading_sigma_rad, 0.0, std::f64::consts::PI)?;
-        check_range("position_sigma_m", self.position_sigma_m, 0.0, 1e3)?;
-        check_range("floor_m", self.floor_m, 1e-6, 1e3)
+config_section! {
+    /// Settings of projection.
+    pub struct ProjectionConfig {
+        /// The way of ranging; default `corners`. `box_height` needs upright objects, `box_width` objects that face the
+        /// camera; `paper` has the published formulas with their errors.
+        pub ranging: Ranging = Ranging::default();
+        /// True sizes of objects; default none.
+        pub sizes: ObjectSizes = ObjectSizes::default(), checked by ObjectSizes::validate;
+        /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
+        /// detectors 3 and more.
+        pub pixel_sigma_px: f64 = 1.0, in 0.0 to 1e3;
+        /// Standard deviation of the camera's heading in radians; default 0.01.
+        pub heading_sigma_rad: f64 = 0.01, in 0.0 to std::f64::consts::PI;
+        /// Standard deviation of the camera's position in metres, each axis; default 0.005.
+        pub position_sigma_m: f64 = 0.005, in 0.0 to 1e3;
+        /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps covariances away from zero.
+        pub floor_m: f64 = 0.005, in 1e-6 to 1e3;
     }
 }
 

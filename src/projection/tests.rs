@@ -163,7 +163,7 @@ fn each_unusable_detection_has_its_reason() {
     let flat = detection(BoundingBox { x_max: whole.bounding_box.x_min, ..whole.bounding_box });
     assert_eq!(reason(&projection(Ranging::BoxWidth), &flat, None), "degenerate_box");
 
-    let clipped = |ranging, seen: &Detection| projection(ranging).check_whole(seen).is_err();
+    let clipped = |ranging, seen: &Detection| projection(ranging).check_unclipped(seen).is_err();
     let cut_below = detection(BoundingBox { y_max: 480.0, ..whole.bounding_box });
     assert!(clipped(Ranging::BoxHeight, &cut_below) && !clipped(Ranging::BoxWidth, &cut_below));
     let cut_left = detection(BoundingBox { x_min: 0.0, ..whole.bounding_box });

@@ -1,17 +1,17 @@
-//! The time of a replay: that of the newest line that can be believed.
+//! The virtual time of a replay: that of the newest plausible line.
 
 use std::time::Duration;
 
 use crate::time::Timestamp;
 
-/// Most time that may pass before a line that no other line follows.
+/// Maximum gap before the last line of a recording.
 const LAST_STEP: Duration = Duration::from_secs(3600);
 
-/// Goes forward with the lines, never back.
+/// A clock that moves forward with the lines, never back.
 #[derive(Debug, Clone)]
 pub(super) struct VirtualClock {
     now: Option<Timestamp>,
-    /// By how much clocks may differ.
+    /// Maximum difference between clocks.
     tolerance: Duration,
 }
 
@@ -25,7 +25,7 @@ impl VirtualClock {
         self.now.unwrap_or_default()
     }
 
-    /// Whether a line is not ahead of the present, or of most of the lines that follow, by more than clocks may differ.
+    /// Whether a line is ahead of the present, or of most lines that follow, by at most the tolerance.
     pub(super) fn is_plausible(&self, at: Timestamp, following: impl Iterator<Item = Timestamp>) -> bool {
         if self.now.is_some_and(|now| at.since(now) <= self.tolerance) {
             return true;
@@ -39,7 +39,7 @@ impl VirtualClock {
         at.since(*median) <= self.tolerance
     }
 
-    /// Goes to the time of a line; true if it was past already.
+    /// Moves to the time of a line; true if the line is late, that is before the present.
     pub(super) fn advance(&mut self, at: Timestamp) -> bool {
         let is_late = self.now.is_some_and(|now| at < now);
         if !is_late {

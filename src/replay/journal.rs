@@ -1,9 +1,9 @@
-//! The journal of an aggregator: what it was told and when, from which it is run again to the last bit.
+//! The journal of an aggregator: its inputs and their times, from which a replay gives bit-equal rounds.
 //!
-//! Call [`Rerun::entry`] and [`Rerun::report`] in the order in which the aggregator was told; out come the maps and
-//! verdicts that it made. That holds from a [`JournalEvent::Start`] on, with the same configuration and version; where
-//! the journal of another run of the node follows, call [`Rerun::restart`] first. After
-//! [`JournalEvent::Continue`] or [`JournalEvent::Missing`] the rounds are the same but may rest on less evidence.
+//! Call [`JournalReplay::entry`] and [`JournalReplay::report`] in the recorded order; they return the aggregator's maps
+//! and verdicts. Rounds are equal from a [`JournalEvent::Start`] on, with the same configuration and version. After
+//! [`JournalEvent::Continue`] or [`JournalEvent::Missing`] they may rest on less evidence. Call
+//! [`JournalReplay::restart`] where the journal of another run of the node follows.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,70 +23,69 @@ use crate::wire::{ObjectReport, RejectReason, ReportKind};
 /// One entry of a journal. Reports are kept beside it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct JournalEntry {
-    /// The present time as the aggregator was told.
+    /// The time that the aggregator was given as the present.
     pub at_us: Timestamp,
-    /// What happened.
+    /// The event.
     pub event: JournalEvent,
 }
 
-/// What happens to an aggregator beside reports.
+/// An input of an aggregator beside reports.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum JournalEvent {
-    /// A run of it began: without votes or detections, as a standby.
+    /// A run began as a standby without votes or detections.
     Start {
-        /// The evidence that it began with.
+        /// The evidence at the beginning.
         #[schemars(with = "serde_json::Value")]
         ledger: Arc<ReputationLedger>,
     },
     /// The journal begins in the middle of a run.
     Continue {
-        /// Whom it leads as, if it does.
+        /// The leadership, if it leads.
         leads: Option<Epoch>,
-        /// Number of its next round.
+        /// Number of the next round.
         next_round: u64,
     },
-    /// It was told something.
+    /// A command.
     Command(Command),
-    /// About here entries or reports were lost.
+    /// Entries or reports were lost about here.
     Missing {
-        /// How many.
+        /// Their number.
         entries: u64,
     },
 }
 
-/// What became of a journal.
+/// Statistics of a journal's replay.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct RerunSummary {
+pub struct JournalSummary {
     /// Reports in it.
     pub reports: u64,
-    /// Reports that were not used, by reason; a live aggregator that has two ways to hear of the same report rejects
-    /// many.
+    /// Rejected reports by reason; many where a live aggregator gets the same report over two links.
     pub rejected: BTreeMap<RejectReason, u64>,
     /// Entries and reports that were lost.
     pub missing: u64,
     /// Whether it began in the middle of a run.
     pub continued: bool,
-    /// Maps and sets of verdicts made.
+    /// Maps and sets of verdicts.
     pub written: u64,
 }
 
-/// Runs an aggregator again.
+/// A running replay of a journal.
 #[derive(Debug, Clone)]
-pub struct Rerun {
+pub struct JournalReplay {
     fusion: FusionConfig,
     landmarks: Vec<Landmark>,
     aggregator: Option<Aggregator>,
-    summary: RerunSummary,
+    summary: JournalSummary,
 }
 
-impl Rerun {
-    /// Nothing has happened yet; `fusion` is taken as valid.
+impl JournalReplay {
+    /// A replay without entries; `fusion` is taken as valid.
     pub fn new(fusion: FusionConfig, landmarks: Vec<Landmark>) -> Self {
-        Self { fusion, landmarks, aggregator: None, summary: RerunSummary::default() }
+        Self { fusion, landmarks, aggregator: None, summary: JournalSummary::default() }
     }
 
-    /// What comes is of another run of the node, under this configuration; `fusion` is taken as valid.
+    /// Begins another run of the node with this configuration; `fusion` is taken as valid.
     pub fn restart(&mut self, fusion: FusionConfig, landmarks: Vec<Landmark>) {
         (self.fusion, self.landmarks, self.aggregator) = (fusion, landmarks, None);
     }
@@ -134,16 +133,16 @@ impl Rerun {
         }
     }
 
-    /// What became of the journal so far.
-    pub fn summary(&self) -> &RerunSummary {
+    /// Statistics so far.
+    pub fn summary(&self) -> &JournalSummary {
         &self.summary
     }
 
     fn standby(&self, at: Timestamp) -> Aggregator {
-        Aggregator::standby(self.fusion.clone(), self.landmarks.clone(), at)
+        Aggregator::new_standby(self.fusion.clone(), self.landmarks.clone(), at)
     }
 
-    /// The present run; one whose beginning is not in the journal began as a standby.
+    /// The present run; a run without a recorded beginning starts as a standby.
     fn running(&mut self, at: Timestamp) -> &mut Aggregator {
         if self.aggregator.is_none() {
             self.summary.continued = true;

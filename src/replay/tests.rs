@@ -1,5 +1,8 @@
+use nalgebra::Point2;
+
 use super::*;
-use crate::testbed::Testbed;
+use crate::geometry::Pose;
+use crate::landmark::VacancySign;
 use crate::vote::VoteMode;
 use crate::wire::{Encoding, PerceivedObject, WirePose, encode};
 
@@ -202,34 +205,45 @@ fn the_first_line_of_a_kind_of_junk_is_told() {
     assert_eq!(summary.rejected[&RejectReason::Malformed], Rejections { lines: 3, first_line: 2 });
 }
 
-/// Reports of the recorded lot's vehicles, of both kinds, with disagreement.
+/// Reports of four vehicles around a lot of eight spots, of both kinds, with disagreement.
 fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
-    let testbed = Testbed::from_json(include_str!("../../examples/testbed/pace_setup1.json")).unwrap();
-    let scene = &testbed.scenes[0];
-    let landmarks = scene.landmarks(&testbed.placard);
+    let spots: [(f64, f64, Option<&str>); 8] = [
+        (0.25, 0.48, Some("EFGH456")),
+        (0.25, 0.71, Some("ABCD123")),
+        (0.25, 0.84, None),
+        (0.25, 0.97, Some("IJKL789")),
+        (0.64, 0.48, Some("MNOP012")),
+        (0.64, 0.61, None),
+        (0.64, 0.84, Some("QRST345")),
+        (0.64, 0.97, Some("UVWX678")),
+    ];
+    let vacancy = |x: f64, y: f64| VacancySign { label: "EMPTY".into(), position: Point2::new(x - 0.09, y) };
+    let landmarks = spots.iter().enumerate().map(|(n, &(x, y, _))| Landmark {
+        id: LandmarkId::new(format!("slot-{n}")),
+        position: Point2::new(x, y),
+        facing_rad: Some(0.0),
+        vacancy: Some(vacancy(x, y)),
+        synonyms: Vec::new(),
+    });
+    let poses = [("euclid", 0.5, 0.3), ("fermat", 0.6, 0.5), ("gauss", 0.5, 1.1), ("watson", 0.9, 0.7)];
     let mut reports = Vec::new();
     for step in 0..60u64 {
-        for (number, cav) in scene.cavs.iter().enumerate() {
+        for (number, (name, x, y)) in poses.into_iter().enumerate() {
             let captured_at = Timestamp(START + step * 90_000 + number as u64 * 7_000);
-            let object = |(n, spot): (usize, &crate::testbed::Spot)| {
+            let object = |(n, &(x, y, truth)): (usize, &(f64, f64, Option<&str>))| {
                 let is_wrong = (step as usize + 3 * n + 5 * number).is_multiple_of(7);
-                let label = spot.truth.clone().filter(|_| !is_wrong).unwrap_or("EMPTY".into());
+                let label = truth.filter(|_| !is_wrong).unwrap_or("EMPTY");
                 let off = 0.002 * ((n + number) % 5) as f64;
                 PerceivedObject {
                     covariance_m2: Some([1e-4, 0.0, 1e-4]),
-                    landmark: Some(spot.id.clone()),
-                    ..PerceivedObject::new(
-                        label,
-                        0.6 + 0.05 * number as f64,
-                        spot.occupied.x + off,
-                        spot.occupied.y - off,
-                    )
+                    landmark: Some(LandmarkId::new(format!("slot-{n}"))),
+                    ..PerceivedObject::new(label, 0.6 + 0.05 * number as f64, x + off, y - off)
                 }
             };
             let report = ObjectReport {
-                pose: Some(WirePose::from(cav.pose)),
-                objects: scene.spots.iter().enumerate().map(object).collect(),
-                ..ObjectReport::new(cav.name.clone(), step + 1, captured_at)
+                pose: Some(WirePose::from(Pose::new(x, y, 2.8))),
+                objects: spots.iter().enumerate().map(object).collect(),
+                ..ObjectReport::new(NodeName::from_static(name), step + 1, captured_at)
             };
             let received_at = captured_at + Duration::from_millis(5);
             reports.push((ReportKind::Detections, report.clone(), received_at));
@@ -237,7 +251,7 @@ fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
         }
     }
     reports.sort_by_key(|(_, _, received_at)| *received_at);
-    (landmarks, reports)
+    (landmarks.collect(), reports)
 }
 
 /// What a live node does until the round of the last report: reports as they come, timers at their deadlines.

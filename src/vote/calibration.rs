@@ -1,29 +1,31 @@
-//! What a stated confidence is worth, learned from agreement with the other vehicles.
+//! Calibration: the weight of a stated confidence, learned from agreement with the other vehicles.
 
 use std::collections::BTreeSet;
 
+/// Bands of ranks of a confidence among its vehicle's.
 const BANDS: usize = 10;
-const STEPS: usize = 20;
-/// Weight, in votes, of the middle rank against a vehicle's own record of confidences.
+/// Bins of the histogram of a vehicle's confidences.
+const BINS: usize = 20;
+/// Weight, in votes, of the middle rank against a vehicle's own confidences.
 const RANK_PRIOR_VOTES: f64 = 5.0;
 /// Weight, in votes, of the overall rate of agreement against a band's own.
 const BAND_PRIOR_VOTES: f64 = 100.0;
-/// Spread of pooled bands, in variances of one vote, that is not taken for knowledge: three times what ten equal bands
-/// come to by chance, 1/2 + … + 1/10 (Barlow et al. 1972).
+/// Spread of pooled bands, in variances of one vote, that is taken for noise: three times the chance spread of ten equal
+/// bands, 1/2 + … + 1/10 (Barlow et al. 1972).
 const NOISE: f64 = 6.0;
-/// Votes over which the memory of what confidences are worth fades to 1/e.
+/// Votes over which settled agreement fades to 1/e.
 const MEMORY_VOTES: f64 = 20_000.0;
-/// Least and most that a vote weighs for its confidence.
+/// Least and greatest weight of a vote for its confidence.
 const WEIGHT_RANGE: (f64, f64) = (0.1, 3.0);
 
-/// Agreement of votes with what the others say, by band.
+/// Agreement of votes with those of the other vehicles, by band.
 #[derive(Debug, Clone, Default, PartialEq)]
-struct Bands {
+struct BandCounts {
     agreed: [f64; BANDS],
     votes: [f64; BANDS],
 }
 
-impl Bands {
+impl BandCounts {
     fn add(&mut self, band: usize, agreement: f64, sign: f64) {
         self.votes[band] += sign;
         self.agreed[band] += sign * agreement;
@@ -34,27 +36,30 @@ impl Bands {
     }
 }
 
-/// How often a vehicle stated which confidence.
+/// Number of times that a vehicle stated each confidence.
 #[derive(Debug, Clone, Default)]
-struct Scale {
-    stated: [f64; STEPS],
+struct ConfidenceHistogram {
+    stated: [f64; BINS],
     total: f64,
 }
 
-/// What confidences are worth.
+/// Weights of confidences.
 ///
-/// A detector's confidence orders its detections but is no probability, and one vehicle's 0.6 may be another's 0.9.
-/// How good a vehicle is on the whole is its reputation; its confidence tells which of its votes are the better ones.
-/// So a vote's band is the rank of its confidence among all of the vehicle's. Its weight is the log-odds of being right
-/// in that band against the log-odds over all bands, made non-decreasing by pooling adjacent violators (Barlow et al.
-/// 1972; Zadrozny & Elkan 2002): confidence that misleads ends up weighing nothing. Of what then differs between bands
-/// only the part beyond chance is kept (James & Stein 1961): confidence that says nothing ends up so too. Until there is
-/// evidence, the weight is the stated confidence against the mean of all.
-#[derive(Debug, Clone)]
+/// A detector's confidence orders its detections but is no probability: one vehicle's 0.6 may be another's 0.9. A
+/// vehicle's overall quality is its reputation; its confidence tells which of its votes are better than others.
+///
+/// - A vote's band is the rank of its confidence among all of the vehicle's.
+/// - Its weight is the log-odds of being right in that band, divided by the log-odds over all bands.
+/// - The weights are made non-decreasing by pooling adjacent violators (Barlow et al. 1972; Zadrozny & Elkan 2002):
+///   confidence that misleads has no effect.
+/// - Of the differences between bands only the part beyond chance is kept (James & Stein 1961): confidence that is
+///   uninformative has no effect.
+/// - Until there is evidence, the weight is the stated confidence divided by the mean of all.
+#[derive(Debug, Clone, Default)]
 pub(super) struct Calibration {
-    live: Bands,
-    settled: Bands,
-    scales: Vec<Scale>,
+    live: BandCounts,
+    settled: BandCounts,
+    histograms: Vec<ConfidenceHistogram>,
     /// Sum and number of all stated confidences.
     stated: (f64, f64),
     prior_votes: f64,
@@ -63,58 +68,60 @@ pub(super) struct Calibration {
 impl Calibration {
     /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in votes.
     pub(super) fn new(prior_votes: f64) -> Self {
-        Self { live: Bands::default(), settled: Bands::default(), scales: Vec::new(), stated: (0.0, 0.0), prior_votes }
+        Self { prior_votes, ..Self::default() }
     }
 
-    /// Takes in that a vehicle stated a confidence.
-    pub(super) fn state(&mut self, vehicle: usize, confidence: f64) {
-        if self.scales.len() <= vehicle {
-            self.scales.resize(vehicle + 1, Scale::default());
+    /// Counts that a vehicle stated a confidence.
+    pub(super) fn record_confidence(&mut self, vehicle: usize, confidence: f64) {
+        if self.histograms.len() <= vehicle {
+            self.histograms.resize(vehicle + 1, ConfidenceHistogram::default());
         }
         self.stated = (self.stated.0 + confidence, self.stated.1 + 1.0);
-        let scale = &mut self.scales[vehicle];
-        scale.stated[step(confidence)] += 1.0;
-        scale.total += 1.0;
+        let histogram = &mut self.histograms[vehicle];
+        histogram.stated[bin(confidence)] += 1.0;
+        histogram.total += 1.0;
     }
 
-    /// Forgets which confidences vehicles stated; their numbers may stand for others from now on.
+    /// Forgets the confidences of vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
         for &vehicle in vehicles {
-            self.scales.get_mut(vehicle).into_iter().for_each(|scale| *scale = Scale::default());
+            if let Some(histogram) = self.histograms.get_mut(vehicle) {
+                *histogram = ConfidenceHistogram::default();
+            }
         }
     }
 
     /// Band of a vote: the rank of its confidence among the vehicle's.
     pub(super) fn band(&self, vehicle: usize, confidence: f64) -> usize {
-        let (stated, total) = self.scales.get(vehicle).map_or(([0.0; STEPS], 0.0), |s| (s.stated, s.total));
-        let step = step(confidence);
-        let below: f64 = stated[..step].iter().sum();
-        let rank = (below + 0.5 * stated[step] + 0.5 * RANK_PRIOR_VOTES) / (total + RANK_PRIOR_VOTES);
+        let (stated, total) = self.histograms.get(vehicle).map_or(([0.0; BINS], 0.0), |s| (s.stated, s.total));
+        let bin = bin(confidence);
+        let below: f64 = stated[..bin].iter().sum();
+        let rank = (below + 0.5 * stated[bin] + 0.5 * RANK_PRIOR_VOTES) / (total + RANK_PRIOR_VOTES);
         ((rank * BANDS as f64) as usize).min(BANDS - 1)
     }
 
-    /// Counts that the others support a vote with probability `agreement`; `sign` −1 takes it back.
+    /// Counts a live vote that the others support with probability `agreement`; `sign` −1 takes it back.
     pub(super) fn count(&mut self, band: usize, agreement: f64, sign: f64) {
         self.live.add(band, agreement, sign);
     }
 
-    /// Counts a vote that is past.
+    /// Counts a settled vote.
     pub(super) fn settle(&mut self, band: usize, agreement: f64) {
         self.settled.fade(1.0 - 1.0 / MEMORY_VOTES);
         self.settled.add(band, agreement, 1.0);
     }
 
-    /// Goes on with the live evidence of `other`.
+    /// Replaces the live evidence by that of `other`.
     pub(super) fn take_live(&mut self, other: Self) {
         self.live = other.live;
     }
 
     /// Forgets the live evidence.
     pub(super) fn clear_live(&mut self) {
-        self.live = Bands::default();
+        self.live = BandCounts::default();
     }
 
-    /// Weights of votes.
+    /// The present weights of votes.
     pub(super) fn weights(&self) -> Weights {
         let mut bands = self.settled.clone();
         for band in 0..BANDS {
@@ -128,8 +135,8 @@ impl Calibration {
         let mut ratios = [1.0; BANDS];
         if overall > 0.1 {
             let mut band = 0;
-            let pools = pooled(&bands);
-            let kept = beyond_noise(&pools);
+            let pools = pool_adjacent_violators(&bands);
+            let kept = shrinkage(&pools);
             for (agreed, votes, width) in pools {
                 let ratio = 1.0 + kept * (shrunk(agreed, votes) / overall - 1.0);
                 ratios[band..band + width].fill(ratio.clamp(WEIGHT_RANGE.0, WEIGHT_RANGE.1));
@@ -140,8 +147,8 @@ impl Calibration {
     }
 }
 
-/// (agreed, votes, number of bands) of runs of bands in which agreement does not fall.
-fn pooled(bands: &Bands) -> Vec<(f64, f64, usize)> {
+/// Runs of bands between which agreement rises, as (agreed, votes, number of bands).
+fn pool_adjacent_violators(bands: &BandCounts) -> Vec<(f64, f64, usize)> {
     let mut pools: Vec<(f64, f64, usize)> = Vec::with_capacity(BANDS);
     for (&agreed, &votes) in bands.agreed.iter().zip(&bands.votes) {
         let mut pool = (agreed, votes, 1);
@@ -156,11 +163,11 @@ fn pooled(bands: &Bands) -> Vec<(f64, f64, usize)> {
     pools
 }
 
-/// Part of the difference between pools that is kept: James–Stein shrinkage (positive part) towards one rate for all.
-fn beyond_noise(pools: &[(f64, f64, usize)]) -> f64 {
+/// Kept part of the difference between pools: positive-part James–Stein shrinkage towards one rate for all.
+fn shrinkage(pools: &[(f64, f64, usize)]) -> f64 {
     let with_votes = || pools.iter().filter(|(_, votes, _)| *votes > 0.0);
     let (agreed, votes) = with_votes().fold((0.0, 0.0), |(a, n), (agreed, votes, _)| (a + agreed, n + votes));
-    // Taking counts back leaves rounding errors: more may seem to have agreed than voted.
+    // Counts that are taken back leave rounding errors: more votes may seem to have agreed than there are.
     let rate = (agreed / f64::max(votes, 1e-9)).clamp(0.0, 1.0);
     let spread: f64 = with_votes().map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2)).sum();
     let noise = NOISE * rate * (1.0 - rate);
@@ -172,8 +179,8 @@ fn odds(rate: f64) -> f64 {
     (rate / (1.0 - rate)).ln()
 }
 
-fn step(confidence: f64) -> usize {
-    ((confidence * STEPS as f64) as usize).min(STEPS - 1)
+fn bin(confidence: f64) -> usize {
+    ((confidence * BINS as f64) as usize).min(BINS - 1)
 }
 
 /// Weights of votes, fixed for a round.
@@ -201,7 +208,7 @@ mod tests {
 
     fn learned(votes: impl Iterator<Item = (usize, f64, bool)> + Clone) -> Calibration {
         let mut calibration = Calibration::new(10.0);
-        votes.clone().for_each(|(vehicle, confidence, _)| calibration.state(vehicle, confidence));
+        votes.clone().for_each(|(vehicle, confidence, _)| calibration.record_confidence(vehicle, confidence));
         for (vehicle, confidence, agreed) in votes {
             calibration.settle(calibration.band(vehicle, confidence), f64::from(agreed));
         }
@@ -242,8 +249,8 @@ mod tests {
     fn confidence_that_says_nothing_weighs_nothing() {
         // Agreement and confidence repeat with periods that have no common factor.
         let calibration = learned((0..2000).map(|n| (0, f64::from(n % 19) / 19.0 + 0.02, n % 7 > 1)));
-        for step in 0..19 {
-            let weight = weight(&calibration, 0, f64::from(step) / 19.0 + 0.02);
+        for bin in 0..19 {
+            let weight = weight(&calibration, 0, f64::from(bin) / 19.0 + 0.02);
             assert!((weight - 1.0).abs() < 0.02, "{weight}");
         }
     }

@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_range};
+use crate::config::{ConfigError, check_range, config_section};
 use crate::landmark::check_synonyms;
 use crate::names::Label;
 
-/// Most labels that a cell can tell apart.
+/// Maximum number of labels of a cell.
 pub const MAX_LABELS: usize = 65_535;
 
-/// How votes become verdicts.
+/// The voting method.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VoteMode {
@@ -26,22 +26,22 @@ pub enum VoteMode {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VoteConfig {
-    /// Which tally; default `weighted`.
+    /// The voting method; default `weighted`.
     pub mode: VoteMode,
     /// Settings of `paper` mode.
     pub paper: PaperConfig,
     /// Settings of `weighted` mode.
     pub weighted: WeightedConfig,
-    /// Most landmarks; an open cell forgets the oldest beyond it. Default 1024. Bounds memory.
+    /// Maximum number of landmarks; beyond it an open cell forgets the oldest. Default 1024. Bounds memory.
     pub max_landmarks: usize,
-    /// Most vehicles; beyond it, long silent ones make room, or else reports of others are rejected. Default 256.
-    /// Bounds memory.
+    /// Maximum number of vehicles. Beyond it long silent ones are forgotten; without any, reports of new vehicles are
+    /// rejected. Default 256. Bounds memory.
     pub max_vehicles: usize,
-    /// Most distinct labels of the cell, in `paper` mode of a landmark. Beyond it the labels that others can best do
-    /// without make room, those of who brought in the most first; in `paper` mode, whose sums never end, votes for new
-    /// ones are ignored. Default 256. Bounds memory.
+    /// Maximum number of distinct labels of the cell, in `paper` mode of a landmark. Default 256. Bounds memory. Beyond
+    /// it the least useful labels are forgotten, first those of the vehicle that introduced most. In `paper` mode, whose
+    /// sums never end, votes for new labels are ignored.
     pub max_labels: usize,
-    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
+    /// LabelTable that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
     /// Default: none.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,
@@ -76,129 +76,68 @@ impl VoteConfig {
     }
 }
 
-/// Settings of `paper` mode.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct PaperConfig {
-    /// Distance d_max in metres beyond which a vote is ignored; default 2.54, the 100 in of the paper's testbed.
-    pub max_range_m: f64,
-    /// Weight p_d of distance against angle, 0 to 1; default 0.7.
-    pub distance_weight: f64,
-    /// Reputation r_v at the start; default 0.5.
-    pub initial_reputation: f64,
-    /// Change of r_v after a verdict in which every vote was right; default 0.01.
-    pub step: f64,
-    /// Frames of each vehicle between verdicts; default 5. A driver closes a round when a vehicle has sent so many.
-    pub frames_per_verdict: u32,
-}
-
-impl Default for PaperConfig {
-    fn default() -> Self {
-        Self { max_range_m: 2.54, distance_weight: 0.7, initial_reputation: 0.5, step: 0.01, frames_per_verdict: 5 }
+config_section! {
+    /// Settings of `paper` mode.
+    pub struct PaperConfig {
+        /// Distance d_max in metres beyond which a vote is ignored; default 2.54, the 100 in of the paper's testbed.
+        pub max_range_m: f64 = 2.54, in 1e-3 to 1e6;
+        /// Weight p_d of distance against angle, 0 to 1; default 0.7.
+        pub distance_weight: f64 = 0.7, in 0.0 to 1.0;
+        /// Reputation r_v at the start; default 0.5.
+        pub initial_reputation: f64 = 0.5, in 0.3 to 1.0;
+        /// Change of r_v after a verdict in which every vote was right; default 0.01.
+        pub step: f64 = 0.01, in 0.0 to 1.0;
+        /// Frames of a vehicle between verdicts; default 5. A round closes when any vehicle has sent this many.
+        pub frames_per_verdict: u32 = 5, in 1.0 to 1e6;
     }
 }
 
-impl PaperConfig {
-    fn validate(&self) -> Result<(), ConfigError> {
-        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
-        check_range("distance_weight", self.distance_weight, 0.0, 1.0)?;
-        check_range("initial_reputation", self.initial_reputation, 0.3, 1.0)?;
-        check_range("step", self.step, 0.0, 1.0)?;
-        check_range("frames_per_verdict", f64::from(self.frames_per_verdict), 1.0, 1e6)
-    }
-}
-
-/// Settings of `weighted` mode. Counts of votes are pseudo-counts: how much data it takes to outweigh an assumption.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct WeightedConfig {
-    /// Seconds that a vote counts; default 2. Longer survives gaps, shorter follows change. A vehicle adds to its
-    /// evidence about a landmark once in so many seconds however fast it publishes.
-    pub freshness_s: f64,
-    /// Part of `freshness_s` in which what a vehicle stated on a landmark fades to 1/e in its present vote; default 0.5.
-    /// More lets fewer frames through in which an object was taken for another, and is slower to notice another object;
-    /// 0 takes its last statement alone, as it must be where who states something else corrects himself.
-    pub smoothing_share: f64,
-    /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion against its own record of one
-    /// class; default 5. Less learns classes faster from noise.
-    pub class_prior_votes: f64,
-    /// Weight, in votes, of the fleet's reliability against the vehicle's own; default 8.
-    pub vehicle_prior_votes: f64,
-    /// How often a vehicle is assumed right before there is any evidence, 0.5 to 1; default 0.7.
-    pub assumed_accuracy: f64,
-    /// Share of the fleet's confusion, against all wrong labels alike, in what is assumed of an error; default 0.5.
-    pub confusion_sharing: f64,
-    /// Number of verdicts that the shares of the classes are trusted like; default 100. More favours frequent labels.
-    pub class_share_verdicts: f64,
-    /// Votes over which the memory of a vehicle fades to 1/e; default 500. Shorter notices a change of mind sooner.
-    pub memory_votes: f64,
-    /// Comparisons over which the memory of two vehicles' agreement fades to 1/e; default 100. Shorter notices sooner
-    /// that vehicles begin to copy each other, longer finds fainter dependence.
-    pub pair_memory_votes: f64,
-    /// Votes until a vehicle counts as proven; default 10.
-    pub probation_votes: f64,
-    /// Most that newcomers together weigh against the proven vehicles at a landmark; default 0.5. Bounds what an
-    /// attacker gains by rejoining under new names; larger lets newcomers in sooner.
-    pub newcomer_share: f64,
-    /// Probability by which a label must lead the one shown to replace it; default 0.1. More flickers less, reacts
-    /// later.
-    pub hysteresis: f64,
-    /// Distance in metres beyond which a vote is ignored; default 50. What a detector tells reliably.
-    pub max_range_m: f64,
-    /// Angle off the camera's axis in radians at which visibility has halved; default 0.8.
-    pub half_visibility_rad: f64,
-    /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the square of the distance.
-    pub visibility_at_max_range: f64,
-    /// Older landmarks that are judged again per fresh vote, in votes; default 8. More settles sooner, costs more.
-    pub revisit_votes: f64,
-    /// Weight, in votes, of stated confidences against what they proved to be worth; default 10. More believes them
-    /// for longer.
-    pub calibration_votes: f64,
-}
-
-impl Default for WeightedConfig {
-    fn default() -> Self {
-        Self {
-            freshness_s: 2.0,
-            smoothing_share: 0.5,
-            class_prior_votes: 5.0,
-            vehicle_prior_votes: 8.0,
-            assumed_accuracy: 0.7,
-            confusion_sharing: 0.5,
-            class_share_verdicts: 100.0,
-            memory_votes: 500.0,
-            pair_memory_votes: 100.0,
-            probation_votes: 10.0,
-            newcomer_share: 0.5,
-            hysteresis: 0.1,
-            max_range_m: 50.0,
-            half_visibility_rad: 0.8,
-            visibility_at_max_range: 0.3,
-            revisit_votes: 8.0,
-            calibration_votes: 10.0,
-        }
-    }
-}
-
-impl WeightedConfig {
-    fn validate(&self) -> Result<(), ConfigError> {
-        check_range("freshness_s", self.freshness_s, 1e-3, 1e12)?;
-        check_range("smoothing_share", self.smoothing_share, 0.0, 10.0)?;
-        check_range("class_prior_votes", self.class_prior_votes, 1e-3, 1e6)?;
-        check_range("vehicle_prior_votes", self.vehicle_prior_votes, 1e-3, 1e6)?;
-        check_range("assumed_accuracy", self.assumed_accuracy, 0.5, 0.999)?;
-        check_range("confusion_sharing", self.confusion_sharing, 0.0, 1.0)?;
-        check_range("class_share_verdicts", self.class_share_verdicts, 2.0, 1e9)?;
-        check_range("memory_votes", self.memory_votes, 1.0, 1e9)?;
-        check_range("pair_memory_votes", self.pair_memory_votes, 2.0, 1e9)?;
-        check_range("probation_votes", self.probation_votes, 0.0, 1e6)?;
-        check_range("newcomer_share", self.newcomer_share, 0.0, 1e9)?;
-        check_range("hysteresis", self.hysteresis, 0.0, 0.99)?;
-        check_range("max_range_m", self.max_range_m, 1e-3, 1e6)?;
-        check_range("half_visibility_rad", self.half_visibility_rad, 1e-3, 10.0)?;
-        check_range("visibility_at_max_range", self.visibility_at_max_range, 1e-3, 1.0)?;
-        check_range("revisit_votes", self.revisit_votes, 0.0, 1e6)?;
-        check_range("calibration_votes", self.calibration_votes, 1e-3, 1e9)
+config_section! {
+    /// Settings of `weighted` mode. Weights in votes are pseudo-counts: the number of votes that outweighs an assumption.
+    pub struct WeightedConfig {
+        /// Time in seconds that a vote counts; default 2. Longer survives gaps, shorter follows change. A vehicle adds to
+        /// the evidence about a landmark once in this time, however fast it publishes.
+        pub freshness_s: f64 = 2.0, in 1e-3 to 1e12;
+        /// Part of `freshness_s` in which a vehicle's statement on a landmark fades to 1/e in its present vote; default 0.5.
+        /// More suppresses more single frames with a wrong label, but notices a new object later. 0 takes the last statement
+        /// alone, for inputs in which a new statement corrects the earlier one.
+        pub smoothing_share: f64 = 0.5, in 0.0 to 10.0;
+        /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion against its own record of one
+        /// class; default 5. Less learns classes faster from noise.
+        pub class_prior_votes: f64 = 5.0, in 1e-3 to 1e6;
+        /// Weight, in votes, of the fleet's reliability against the vehicle's own; default 8.
+        pub vehicle_prior_votes: f64 = 8.0, in 1e-3 to 1e6;
+        /// Assumed rate of right votes of a vehicle without evidence, 0.5 to 1; default 0.7.
+        pub assumed_accuracy: f64 = 0.7, in 0.5 to 0.999;
+        /// Share of the fleet's confusion in the assumed distribution of errors; the rest is spread evenly over all wrong
+        /// labels. Default 0.5.
+        pub confusion_sharing: f64 = 0.5, in 0.0 to 1.0;
+        /// Maximum weight of the shares of the classes, in verdicts; default 100. More favours frequent labels.
+        pub class_share_verdicts: f64 = 100.0, in 2.0 to 1e9;
+        /// Votes over which the memory of a vehicle fades to 1/e; default 500. Shorter notices a change of mind sooner.
+        pub memory_votes: f64 = 500.0, in 1.0 to 1e9;
+        /// Comparisons over which the memory of two vehicles' agreement fades to 1/e; default 100. Shorter notices sooner
+        /// that vehicles begin to copy each other, longer finds fainter dependence.
+        pub pair_memory_votes: f64 = 100.0, in 2.0 to 1e9;
+        /// Votes until a vehicle counts as proven; default 10.
+        pub probation_votes: f64 = 10.0, in 0.0 to 1e6;
+        /// Maximum weight of all newcomers at a landmark, as a multiple of the proven vehicles'; default 0.5. Bounds the gain
+        /// of an attacker who rejoins under new names; larger lets newcomers in sooner.
+        pub newcomer_share: f64 = 0.5, in 0.0 to 1e9;
+        /// Probability by which a label must lead the one published to replace it; default 0.1. More flickers less, reacts
+        /// later.
+        pub hysteresis: f64 = 0.1, in 0.0 to 0.99;
+        /// Distance in metres beyond which a vote is ignored; default 50. Set it to the reliable range of the detector.
+        pub max_range_m: f64 = 50.0, in 1e-3 to 1e6;
+        /// Angle off the camera's axis in radians at which visibility has halved; default 0.8.
+        pub half_visibility_rad: f64 = 0.8, in 1e-3 to 10.0;
+        /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the square of the distance.
+        pub visibility_at_max_range: f64 = 0.3, in 1e-3 to 1.0;
+        /// Votes on older landmarks that are judged again per fresh vote; default 8. More settles sooner, costs more.
+        pub revisit_votes: f64 = 8.0, in 0.0 to 1e6;
+        /// Weight, in votes, of stated confidences against calibrated ones; default 10. More trusts stated confidences for
+        /// longer.
+        pub calibration_votes: f64 = 10.0, in 1e-3 to 1e9;
     }
 }
 

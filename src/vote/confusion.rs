@@ -1,15 +1,15 @@
-//! Evidence about how labels are taken for one another.
+//! Confusion counts: how often each label was stated where each was true.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Number of a label within a cell, in order of first appearance.
+/// Index of a label in the cell's [`LabelTable`](super::label_table::LabelTable).
 pub(super) type LabelIndex = u16;
 
-/// Scale below which counts are written anew.
-const LEAST_SCALE: f64 = 1e-60;
+/// ConfidenceHistogram below which counts are written anew.
+const MIN_SCALE: f64 = 1e-60;
 
-/// Expected counts of (true label, stated label), sparse: what was never seen takes no memory. All counts are kept in
-/// units of one scale, so that to fade costs the same however many there are.
+/// Sparse expected counts of (true label, stated label): pairs that never occurred take no memory. All counts share one
+/// scale, so that the cost of fading does not depend on their number.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Confusion {
     cells: BTreeMap<(LabelIndex, LabelIndex), f64>,
@@ -26,7 +26,7 @@ impl Default for Confusion {
 }
 
 impl Confusion {
-    /// Adds `weight`, negative to take back.
+    /// Adds `weight`; a negative one takes evidence back.
     pub(super) fn add(&mut self, truth: LabelIndex, stated: LabelIndex, weight: f64) {
         self.add_scaled(truth, stated, weight / self.scale);
     }
@@ -40,7 +40,7 @@ impl Confusion {
         }
     }
 
-    /// Forgets all evidence that is about any of `labels`.
+    /// Forgets all evidence about any of `labels`.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         let is_about =
             |&(truth, stated): &(LabelIndex, LabelIndex)| labels.contains(&truth) || labels.contains(&stated);
@@ -52,10 +52,10 @@ impl Confusion {
         self.rows.retain(|truth, _| !labels.contains(truth));
     }
 
-    /// Lets all evidence fade by `factor`.
+    /// Multiplies all evidence by `factor`.
     pub(super) fn fade(&mut self, factor: f64) {
         self.scale *= factor;
-        if self.scale < LEAST_SCALE {
+        if self.scale < MIN_SCALE {
             self.cells.values_mut().for_each(|c| *c *= self.scale);
             self.rows.values_mut().for_each(|r| *r *= self.scale);
             self.correct *= self.scale;
@@ -64,27 +64,27 @@ impl Confusion {
         }
     }
 
-    /// Count of `truth` stated as `stated`.
+    /// Number of votes for `stated` where `truth` was true.
     pub(super) fn cell(&self, truth: LabelIndex, stated: LabelIndex) -> f64 {
         self.cells.get(&(truth, stated)).map_or(0.0, |c| self.scale * c.max(0.0))
     }
 
-    /// Count of votes on `truth`.
+    /// Number of votes where `truth` was true.
     pub(super) fn row(&self, truth: LabelIndex) -> f64 {
         self.rows.get(&truth).map_or(0.0, |r| self.scale * r.max(0.0))
     }
 
-    /// True labels with their counts.
+    /// True labels with their numbers of votes.
     pub(super) fn rows(&self) -> impl Iterator<Item = (LabelIndex, f64)> {
         self.rows.iter().map(|(&truth, &count)| (truth, self.scale * count.max(0.0)))
     }
 
-    /// Votes that were right.
+    /// Number of right votes.
     pub(super) fn correct(&self) -> f64 {
         (self.scale * self.correct).clamp(0.0, self.total())
     }
 
-    /// All votes.
+    /// Number of all votes.
     pub(super) fn total(&self) -> f64 {
         self.scale * self.total.max(0.0)
     }

@@ -1,287 +1,120 @@
-//! The default tally: learned reputation × calibrated confidence × visibility.
+//! The default voting: learned reputation × calibrated confidence × visibility.
 
-mod adopt;
-mod refine;
-mod room;
+mod batch;
+mod eviction;
+mod from_ledger;
+mod settlement;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 use std::time::Duration;
 
-use super::ballot::{Ballot, Cast, Recent, probability};
 use super::calibration::{Calibration, Weights};
-use super::config::WeightedConfig;
+use super::config::{VoteConfig, WeightedConfig};
 use super::confusion::LabelIndex;
+use super::dawid_skene::{DawidSkene, VehicleEvidence};
 use super::dependence::Dependence;
-use super::labels::Labels;
-use super::model::{Model, Witness};
+use super::label_table::LabelTable;
+use super::landmark_votes::{LandmarkVotes, RecentStatements, StoredVote};
+use super::method::{self, NewVote, VotingMethod};
 use super::paper::REPUTATION_RANGE;
-use crate::names::{Label, LandmarkId, NodeName};
-use crate::reputation::Evidence;
+use super::visibility;
+use crate::names::{LandmarkId, NodeName};
+use crate::reputation::{Counts, Evidence, ReputationLedger};
 use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
 
-/// A statement counts this much at least among the vehicle's own.
-const LEAST_WEIGHT: f64 = 0.01;
+/// Least weight of a statement among the vehicle's own.
+const MIN_WEIGHT: f64 = 0.01;
 
-/// Incremental expectation maximisation (Neal & Hinton 1998) over the votes that are fresh.
-#[derive(Debug, Clone)]
-pub(super) struct WeightedTally {
+/// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes.
+#[derive(Debug, Clone, Default)]
+pub(super) struct WeightedVoting {
     config: WeightedConfig,
-    model: Model,
+    model: DawidSkene,
     calibration: Calibration,
     dependence: Dependence,
+    /// Index of each vehicle.
     vehicles: BTreeMap<NodeName, usize>,
+    /// By index of the vehicle.
     names: Vec<NodeName>,
-    /// Numbers of forgotten vehicles.
+    /// Indices of forgotten vehicles.
     free: Vec<usize>,
-    records: Vec<(u64, u64)>,
-    labels: Labels,
-    ballots: BTreeMap<LandmarkId, Ballot>,
-    touched: BTreeSet<LandmarkId>,
-    /// When which landmark is due, each once at most.
+    /// Settled votes, by index of the vehicle.
+    counts: Vec<Counts>,
+    labels: LabelTable,
+    landmarks: BTreeMap<LandmarkId, LandmarkVotes>,
+    /// Landmarks to judge when the round closes.
+    changed: BTreeSet<LandmarkId>,
+    /// The next expiry of each landmark that has votes.
     expiries: BTreeSet<(Timestamp, LandmarkId)>,
+    /// The landmark that was judged again last.
     revisit_after: Option<LandmarkId>,
+    /// Votes since the last round.
     fresh_votes: usize,
     evidence: Vec<Evidence>,
     /// Votes from then on become evidence.
     recorded_from: Timestamp,
 }
 
-impl WeightedTally {
+impl WeightedVoting {
     pub(super) fn new(config: WeightedConfig) -> Self {
         Self {
-            model: Model::new(config.clone()),
+            model: DawidSkene::new(config.clone()),
             calibration: Calibration::new(config.calibration_votes),
             dependence: Dependence::new(config.pair_memory_votes),
             config,
-            vehicles: BTreeMap::new(),
-            names: Vec::new(),
-            free: Vec::new(),
-            records: Vec::new(),
-            labels: Labels::default(),
-            ballots: BTreeMap::new(),
-            touched: BTreeSet::new(),
-            expiries: BTreeSet::new(),
-            revisit_after: None,
-            fresh_votes: 0,
-            evidence: Vec::new(),
-            recorded_from: Timestamp::default(),
+            ..Self::default()
         }
     }
 
-    /// See [`super::Vote::begin_record`].
-    pub(super) fn begin_record(&mut self, now: Timestamp) {
-        self.recorded_from = now;
-        self.evidence.clear();
-        self.ballots.values_mut().flat_map(|ballot| &mut ballot.casts).for_each(|cast| cast.since = now);
+    fn freshness(&self) -> Duration {
+        Duration::from_secs_f64(self.config.freshness_s)
     }
 
-    pub(super) fn expect(&mut self, landmark: LandmarkId) {
-        self.ballots.entry(landmark).or_default();
-    }
-
-    /// Forgets a landmark; what its votes taught stays.
-    pub(super) fn forget(&mut self, landmark: &LandmarkId) {
-        let everything = |_: &Cast| true;
-        self.retire(landmark, everything);
-        if let Some(due) = self.ballots.remove(landmark).and_then(|ballot| ballot.due) {
-            self.expiries.remove(&(due, landmark.clone()));
-        }
-        self.touched.remove(landmark);
-    }
-
-    /// Whether a vehicle has voted often enough to be judged, and was right more often than wrong.
-    pub(super) fn is_proven(&self, node: &NodeName) -> bool {
-        let is_good = |vehicle: usize| !self.model.is_newcomer(vehicle) && self.model.reliability(vehicle) > 0.5;
-        self.vehicles.get(node).is_some_and(|&vehicle| is_good(vehicle))
-    }
-
+    /// The index of a vehicle, a new or free one if it has none.
     fn vehicle(&mut self, node: &NodeName) -> usize {
         if let Some(&vehicle) = self.vehicles.get(node) {
             return vehicle;
         }
-        if let Some(vehicle) = self.free.pop() {
-            self.vehicles.insert(node.clone(), vehicle);
+        let vehicle = if let Some(vehicle) = self.free.pop() {
             self.names[vehicle] = node.clone();
-            return vehicle;
-        }
-        let vehicle = self.names.len();
+            vehicle
+        } else {
+            self.names.push(node.clone());
+            self.counts.push(Counts::default());
+            self.model.vehicles.push(VehicleEvidence::default());
+            self.names.len() - 1
+        };
         self.vehicles.insert(node.clone(), vehicle);
-        self.names.push(node.clone());
-        self.records.push((0, 0));
-        self.model.witnesses.push(Witness::default());
         vehicle
     }
 
-    /// Takes a vote in the place of the vehicle's earlier one on the landmark.
-    pub(super) fn cast(
-        &mut self,
-        landmark: &LandmarkId,
-        node: &NodeName,
-        (label, confidence, visibility): (&Label, f64, f64),
-        at: Timestamp,
-    ) {
-        self.expire(at);
-        let vehicle = self.vehicle(node);
-        let label = self.label(label, Some((vehicle, at)));
-        let freshness = Duration::from_secs_f64(self.config.freshness_s);
-        let earlier = self.ballots.get(landmark).and_then(|b| b.casts.iter().find(|c| c.vehicle == vehicle).copied());
-        let mut recent = earlier.map_or_else(Recent::default, |earlier| earlier.recent);
-        let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
-        let fading_s = self.config.freshness_s * self.config.smoothing_share;
-        let kept = if fading_s > 0.0 { (-age_s / fading_s).exp() } else { 0.0 };
-        let stated_most = recent.state(label, (confidence * visibility).max(LEAST_WEIGHT), kept);
-        let (label, confidence, visibility) = match earlier {
-            Some(earlier) if stated_most != label => (earlier.label, earlier.confidence, earlier.visibility),
-            _ => (label, confidence, visibility),
-        };
-        let first = Cast {
-            vehicle,
-            label,
-            confidence,
-            visibility,
-            recent,
-            weight: 1.0,
-            own: 1.0,
-            at,
-            since: at,
-            band: 0,
-            agreement: None,
-            judged: false,
-            compared: false,
-        };
-        let cast = match earlier {
-            Some(earlier) if at.since(earlier.since) >= freshness => {
-                self.settle_all(landmark);
-                first
-            }
-            Some(Cast { since, compared, .. }) => {
-                self.uncount(landmark);
-                let said_before = earlier.filter(|earlier| earlier.label == label);
-                let rest = said_before.map_or(first, |earlier| Cast { confidence, visibility, recent, at, ..earlier });
-                Cast { since, compared, agreement: None, ..rest }
-            }
-            None => {
-                self.uncount(landmark);
-                first
-            }
-        };
-        let ballot = self.ballots.entry(landmark.clone()).or_default();
-        match ballot.casts.binary_search_by_key(&vehicle, |c| c.vehicle) {
-            Ok(place) => ballot.casts[place] = cast,
-            Err(place) => ballot.casts.insert(place, cast),
-        }
-        if ballot.due.is_none_or(|due| due > at + freshness) {
-            self.look_again(landmark);
-        }
-        self.touched.insert(landmark.clone());
-        self.fresh_votes += 1;
-    }
-
-    /// Makes a landmark due when the oldest of its votes will be past.
-    fn look_again(&mut self, landmark: &LandmarkId) {
-        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        let oldest = ballot.casts.iter().map(|cast| cast.at).min();
-        let due = oldest.map(|at| at + Duration::from_secs_f64(self.config.freshness_s));
-        if let Some(before) = std::mem::replace(&mut ballot.due, due) {
-            self.expiries.remove(&(before, landmark.clone()));
-        }
-        self.expiries.extend(due.map(|due| (due, landmark.clone())));
-    }
-
-    /// Takes a landmark's votes out of the live evidence until it is judged again.
-    fn uncount(&mut self, landmark: &LandmarkId) {
-        if let Some(ballot) = self.ballots.get_mut(landmark)
-            && std::mem::take(&mut ballot.counted)
-        {
-            self.model.count(&ballot.words(), &ballot.posterior, -1.0);
-            for cast in &mut ballot.casts {
-                if let Some(agreement) = cast.agreement.take() {
-                    self.calibration.count(cast.band, agreement, -1.0);
-                }
-            }
-        }
-    }
-
-    /// Removes the votes that `is_past` selects, once all on the landmark have become evidence.
-    fn retire(&mut self, landmark: &LandmarkId, is_past: impl Fn(&Cast) -> bool) {
-        if !self.ballots.get(landmark).is_some_and(|b| b.casts.iter().any(&is_past)) {
-            return;
-        }
-        self.settle_all(landmark);
-        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        ballot.casts.retain(|cast| !is_past(cast));
-        if ballot.casts.is_empty() {
-            ballot.shown = None;
-            ballot.posterior.clear();
-        }
-    }
-
-    /// Turns the judged votes on a landmark into fading evidence and a record; they begin to count anew. All at once:
-    /// were each settled in its turn, the first would for a while be judged by evidence that the others still lack.
-    fn settle_all(&mut self, landmark: &LandmarkId) {
-        self.uncount(landmark);
-        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        if ballot.is_witnessed() {
-            let judged = ballot.casts.iter().filter(|cast| cast.judged);
-            // Judged by the others: a vehicle that decides alone must not prove itself right.
-            let settled: Vec<_> =
-                judged.map(|cast| (*cast, self.model.without(&ballot.posterior, &cast.word()))).collect();
-            for (cast, others) in settled {
-                self.model.settle(&cast.word(), &others, &ballot.posterior);
-                self.calibration.settle(cast.band, probability(&others, cast.label));
-                let correct = ballot.shown == Some(cast.label);
-                let record = &mut self.records[cast.vehicle];
-                *(if correct { &mut record.0 } else { &mut record.1 }) += 1;
-                if cast.at >= self.recorded_from {
-                    self.evidence.push(Evidence {
-                        node: self.names[cast.vehicle].clone(),
-                        label: self.labels.name(cast.label).clone(),
-                        correct,
-                    });
-                }
-            }
-        }
-        for cast in &mut ballot.casts {
-            (cast.since, cast.judged, cast.compared) = (cast.at, false, false);
-        }
-        self.touched.insert(landmark.clone());
-    }
-
-    fn expire(&mut self, now: Timestamp) {
-        let freshness = Duration::from_secs_f64(self.config.freshness_s);
-        while let Some((due, landmark)) = self.expiries.first().cloned() {
-            if due > now {
-                break;
-            }
-            self.expiries.pop_first();
-            self.retire(&landmark, |cast| cast.at + freshness <= now);
-            self.look_again(&landmark);
-        }
-    }
-
+    /// Judges a landmark's votes from scratch.
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
-        self.uncount(landmark);
-        let Some(ballot) = self.ballots.get_mut(landmark) else { return };
-        ballot.compare(&mut self.dependence, &mut self.calibration, |vehicle| vehicle);
-        ballot.weigh(&self.dependence, &self.calibration, weights);
-        ballot.casts.iter_mut().for_each(|cast| cast.judged = true);
-        let words = ballot.words();
-        self.model.prepare(words.iter().map(|w| w.vehicle));
-        ballot.posterior = self.model.posterior(&words, &ballot.candidates());
-        ballot.agree(&self.model, &mut self.calibration);
-        self.model.count(&words, &ballot.posterior, 1.0);
-        ballot.counted = true;
-        ballot.show(self.config.hysteresis);
+        self.remove_live(landmark);
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
+        landmark_votes.compare(&mut self.dependence, &mut self.calibration, |vehicle| vehicle);
+        landmark_votes.weigh(&self.dependence, &self.calibration, weights);
+        landmark_votes.votes.iter_mut().for_each(|vote| vote.judged = true);
+        let votes = landmark_votes.weighted_votes();
+        self.model.refresh(votes.iter().map(|vote| vote.vehicle));
+        landmark_votes.posterior = self.model.posterior(&votes, &landmark_votes.candidates());
+        landmark_votes.record_agreement(&self.model, &mut self.calibration);
+        self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
+        landmark_votes.counted = true;
+        landmark_votes.publish(self.config.hysteresis);
     }
 
-    /// Finds who depends on whom. If the main group is thought wrong more often than right and those who copy right,
-    /// then verdicts of the copies' own making taught it: that evidence is void, and learning starts again.
+    /// Finds the vehicles that depend on each other.
+    ///
+    /// If the main group is thought wrong more often than right and its copies right, then verdicts that the copies
+    /// made themselves taught that. Such evidence is void: learning starts again.
     fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
-        self.ballots.values().flat_map(|b| &b.casts).for_each(|c| present[c.vehicle] = true);
+        self.landmarks.values().flat_map(|l| &l.votes).for_each(|vote| present[vote.vehicle] = true);
         let groups = self.dependence.fit(&present);
         let trust = |vehicles: &[usize]| {
             vehicles.iter().map(|&v| self.model.reliability(v)).sum::<f64>() / vehicles.len().max(1) as f64
@@ -293,65 +126,149 @@ impl WeightedTally {
         }
     }
 
-    /// Judges the landmarks that changed, then some older ones in turn; returns those of which something is new.
-    pub(super) fn close(&mut self, now: Timestamp) -> BTreeSet<LandmarkId> {
-        self.expire(now);
-        let weights = self.calibration.weights();
-        if self.dependence.is_due() {
-            self.fit_dependence();
-        }
-        let mut changed = std::mem::take(&mut self.touched);
-        for landmark in &changed {
-            self.judge(landmark, &weights);
-        }
+    /// Judges older landmarks in turn, as far as the budget for this round's fresh votes goes; adds those whose
+    /// published label changed to `changed`.
+    fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<LandmarkId>) {
         let mut budget = (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
-        let mut visits = self.ballots.len();
+        let mut visits = self.landmarks.len();
         while budget > 0 && visits > 0 {
             visits -= 1;
-            let next = match &self.revisit_after {
-                Some(after) => {
-                    let later = (std::ops::Bound::Excluded(after), std::ops::Bound::Unbounded);
-                    self.ballots.range::<LandmarkId, _>(later).next()
-                }
-                None => self.ballots.first_key_value(),
-            };
-            let Some((landmark, ballot)) = next.map(|(l, b)| (l.clone(), b)) else {
+            let after = self.revisit_after.as_ref().map_or(Bound::Unbounded, Bound::Excluded);
+            let next = self.landmarks.range::<LandmarkId, _>((after, Bound::Unbounded)).next();
+            let Some((landmark, landmark_votes)) = next.map(|(l, v)| (l.clone(), v)) else {
                 self.revisit_after = None;
                 continue;
             };
-            budget = budget.saturating_sub(ballot.casts.len().max(1));
-            let before = ballot.shown;
-            self.judge(&landmark, &weights);
-            if self.ballots.get(&landmark).is_some_and(|b| b.shown != before) {
+            budget = budget.saturating_sub(landmark_votes.votes.len().max(1));
+            let before = landmark_votes.published;
+            self.judge(&landmark, weights);
+            if self.landmarks.get(&landmark).is_some_and(|l| l.published != before) {
                 changed.insert(landmark.clone());
             }
             self.revisit_after = Some(landmark);
         }
-        changed
-    }
-
-    pub(super) fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
-        let ballot = self.ballots.get(landmark)?;
-        let mass: f64 = ballot.casts.iter().map(|c| self.score(c.vehicle) * c.weight * c.own).sum();
-        let name = |label: LabelIndex| self.labels.name(label).clone();
-        let votes = ballot.posterior.iter().map(|&(label, p)| (name(label), p * mass)).collect();
-        let mut contributors: Vec<_> = ballot.casts.iter().map(|c| self.names[c.vehicle].clone()).collect();
-        contributors.sort();
-        Some(super::verdict(landmark.clone(), votes, ballot.shown.map(name), contributors))
     }
 
     fn score(&self, vehicle: usize) -> f64 {
         self.model.reliability(vehicle).clamp(REPUTATION_RANGE.0, REPUTATION_RANGE.1)
     }
+}
 
-    pub(super) fn take_evidence(&mut self) -> Vec<Evidence> {
-        std::mem::take(&mut self.evidence)
+impl VotingMethod for WeightedVoting {
+    fn add_landmark(&mut self, landmark: LandmarkId) {
+        self.landmarks.entry(landmark).or_default();
     }
 
-    pub(super) fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
-        let entry = |vehicle: usize| {
-            let (correct, incorrect) = self.records[vehicle];
-            let live = &self.model.witnesses[vehicle].live;
+    /// Keeps what its votes taught.
+    fn remove_landmark(&mut self, landmark: &LandmarkId) {
+        self.remove_votes(landmark, |_| true);
+        if let Some(due) = self.landmarks.remove(landmark).and_then(|landmark_votes| landmark_votes.due) {
+            self.expiries.remove(&(due, landmark.clone()));
+        }
+        self.changed.remove(landmark);
+    }
+
+    /// Forgets their votes and all evidence about them; other vehicles take their indices.
+    fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
+        self.evict_vehicles(nodes);
+    }
+
+    fn make_room_for(&mut self, vote: &NewVote<'_>, max_labels: usize) -> Option<usize> {
+        Some(self.evict_labels_for(vote.label, max_labels))
+    }
+
+    /// Takes a vote in the place of the vehicle's earlier one on the landmark.
+    fn add_vote(&mut self, vote: &NewVote<'_>) {
+        let &NewVote { landmark, confidence, at, .. } = vote;
+        let visibility = vote.range_bearing.map_or(1.0, |(d, a)| visibility::weighted(&self.config, d, a));
+        self.expire(at);
+        let vehicle = self.vehicle(vote.node);
+        let label = self.label(vote.label, Some((vehicle, at)));
+        let freshness = self.freshness();
+        let earlier = self.landmarks.get(landmark).and_then(|l| l.votes.iter().find(|v| v.vehicle == vehicle).copied());
+        let mut recent = earlier.map_or_else(RecentStatements::default, |earlier| earlier.recent);
+        let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
+        let fading_s = self.config.freshness_s * self.config.smoothing_share;
+        let kept = if fading_s > 0.0 { (-age_s / fading_s).exp() } else { 0.0 };
+        let stated_most = recent.add(label, (confidence * visibility).max(MIN_WEIGHT), kept);
+        let (label, confidence, visibility) = match earlier {
+            Some(earlier) if stated_most != label => (earlier.label, earlier.confidence, earlier.visibility),
+            _ => (label, confidence, visibility),
+        };
+        let first = StoredVote {
+            vehicle,
+            label,
+            confidence,
+            visibility,
+            recent,
+            weight: 1.0,
+            independence: 1.0,
+            at,
+            since: at,
+            band: 0,
+            agreement: None,
+            judged: false,
+            compared: false,
+        };
+        let stored = match earlier {
+            Some(earlier) if at.since(earlier.since) >= freshness => {
+                self.settle_votes(landmark);
+                first
+            }
+            Some(earlier) => {
+                self.remove_live(landmark);
+                let StoredVote { since, compared, .. } = earlier;
+                let is_repeated = earlier.label == label;
+                let rest =
+                    if is_repeated { StoredVote { confidence, visibility, recent, at, ..earlier } } else { first };
+                StoredVote { since, compared, agreement: None, ..rest }
+            }
+            None => {
+                self.remove_live(landmark);
+                first
+            }
+        };
+        let landmark_votes = self.landmarks.entry(landmark.clone()).or_default();
+        match landmark_votes.votes.binary_search_by_key(&vehicle, |vote| vote.vehicle) {
+            Ok(place) => landmark_votes.votes[place] = stored,
+            Err(place) => landmark_votes.votes.insert(place, stored),
+        }
+        if landmark_votes.due.is_none_or(|due| due > at + freshness) {
+            self.schedule_expiry(landmark);
+        }
+        self.changed.insert(landmark.clone());
+        self.fresh_votes += 1;
+    }
+
+    /// Judges the landmarks that changed, then some older ones in turn.
+    fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>) {
+        self.expire(now);
+        let weights = self.calibration.weights();
+        if self.dependence.is_due() {
+            self.fit_dependence();
+        }
+        let mut changed = std::mem::take(&mut self.changed);
+        for landmark in &changed {
+            self.judge(landmark, &weights);
+        }
+        self.revisit(&weights, &mut changed);
+        (changed, std::mem::take(&mut self.evidence))
+    }
+
+    fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
+        let LandmarkVotes { votes, posterior, published, .. } = self.landmarks.get(landmark)?;
+        let mass: f64 = votes.iter().map(|v| self.score(v.vehicle) * v.weight * v.independence).sum();
+        let name = |label: LabelIndex| self.labels.name(label).clone();
+        let scores = posterior.iter().map(|&(label, p)| (name(label), p * mass)).collect();
+        let mut contributors: Vec<_> = votes.iter().map(|vote| self.names[vote.vehicle].clone()).collect();
+        contributors.sort();
+        Some(method::verdict(landmark.clone(), scores, published.map(name), contributors))
+    }
+
+    fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
+        let reputation = |vehicle: usize| {
+            let Counts { correct, incorrect } = self.counts[vehicle];
+            let live = &self.model.vehicles[vehicle].live;
             let live_correct = live.correct().round() as u64;
             Reputation {
                 score: self.score(vehicle),
@@ -359,6 +276,25 @@ impl WeightedTally {
                 incorrect: incorrect + (live.total().round() as u64).saturating_sub(live_correct),
             }
         };
-        self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), entry(vehicle))).collect()
+        self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), reputation(vehicle))).collect()
+    }
+
+    fn is_proven(&self, node: &NodeName) -> bool {
+        let is_proven = |vehicle: usize| !self.model.is_newcomer(vehicle) && self.model.reliability(vehicle) > 0.5;
+        self.vehicles.get(node).is_some_and(|&vehicle| is_proven(vehicle))
+    }
+
+    fn begin_record(&mut self, now: Timestamp) {
+        self.recorded_from = now;
+        self.evidence.clear();
+        self.landmarks.values_mut().flat_map(|l| &mut l.votes).for_each(|vote| vote.since = now);
+    }
+
+    fn refine(&mut self, passes: u32) {
+        self.judge_all(passes);
+    }
+
+    fn adopt(&mut self, ledger: &ReputationLedger, limits: &VoteConfig) {
+        self.take_over(ledger, limits);
     }
 }

@@ -4,19 +4,19 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::compact::{self, is_compact};
-use super::{Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
+use super::{LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
 use crate::names::NodeName;
 
-/// How a payload is written.
+/// The encoding of a payload.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Encoding {
-    /// Text that people and every language can read; the default.
+    /// Text that people and all languages can read; the default.
     #[default]
     Json,
     /// RFC 8949 with the same field names.
     Cbor,
-    /// RFC 8949 with places for names and rounded numbers, for links that are short of bytes.
+    /// RFC 8949 with array indices in place of names and with rounded numbers, for slow links.
     Compact,
 }
 
@@ -59,14 +59,28 @@ pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReas
 /// # Errors
 /// The first reason found; see [`RejectReason`].
 pub fn decode_report(bytes: &[u8], topic_node: &NodeName, limits: &Limits) -> Result<ObjectReport, RejectReason> {
-    let report: ObjectReport = decode(bytes, limits)?;
-    if report.node != *topic_node {
-        return Err(RejectReason::NodeMismatch);
-    }
-    Ok(report)
+    decode_from(bytes, topic_node, limits, |report: &ObjectReport| &report.node)
 }
 
-/// The version of a payload that cannot be read otherwise.
+/// Reads a share and checks every value in it; `topic_node` is the node named by its topic.
+///
+/// # Errors
+/// The first reason found; see [`RejectReason`].
+pub fn decode_share(bytes: &[u8], topic_node: &NodeName, limits: &Limits) -> Result<LedgerShare, RejectReason> {
+    decode_from(bytes, topic_node, limits, |share: &LedgerShare| &share.node)
+}
+
+fn decode_from<T: Payload>(
+    bytes: &[u8],
+    topic_node: &NodeName,
+    limits: &Limits,
+    node: impl FnOnce(&T) -> &NodeName,
+) -> Result<T, RejectReason> {
+    let payload = decode(bytes, limits)?;
+    if node(&payload) == topic_node { Ok(payload) } else { Err(RejectReason::NodeMismatch) }
+}
+
+/// The version of a payload whose other fields cannot be read.
 fn schema(bytes: &[u8]) -> Option<u32> {
     #[derive(Deserialize)]
     struct SchemaOnly {
@@ -90,9 +104,9 @@ fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
 fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
         Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|error| {
-            // serde_json has no other way to tell 1e999 from a syntax error.
+            // serde_json has no other way to distinguish 1e999 from a syntax error.
             let overflow = error.to_string().starts_with("number out of range");
-            let not_finite = overflow || (error.is_syntax() && names_no_number(bytes, &error));
+            let not_finite = overflow || (error.is_syntax() && is_at_non_finite_word(bytes, &error));
             if not_finite { RejectReason::NotFinite } else { RejectReason::Malformed }
         }),
         Some(_) => ciborium::from_reader(bytes).map_err(|_| RejectReason::Malformed),
@@ -100,10 +114,10 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     }
 }
 
-/// Whether it is at a word for a number that is none, as Python writes them, that the text ends to be JSON.
-fn names_no_number(bytes: &[u8], error: &serde_json::Error) -> bool {
+/// Whether the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not finite.
+fn is_at_non_finite_word(bytes: &[u8], error: &serde_json::Error) -> bool {
     let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
-    // The column is that of the word's first letter, or of one beside it.
+    // The column is at the first letter of the word or next to it.
     let from = line.get(error.column().saturating_sub(3)..).unwrap_or_default();
     let around = from.get(.."-Infinity".len() + 2).unwrap_or(from);
     ["NaN", "Infinity"].iter().any(|word| around.windows(word.len()).any(|part| part == word.as_bytes()))

@@ -1,8 +1,8 @@
-//! The compact encoding: CBOR in which a struct is an array and a number is no wider than what it tells.
+//! The compact encoding: CBOR with structs as arrays and with rounded numbers of few bytes.
 //!
-//! The number `n` at a field of a payload is its place in the array. Places never change their meaning, new fields are
-//! appended. What is absent is null, or left out at the end; places beyond the known ones are passed over. Every number
-//! may be read as an integer or a float of any width; [`Form`] says how it is written.
+//! The number `n` at a field of a payload is its index in the array. An index never changes its meaning; new fields are
+//! appended. An absent field is null, or left out at the end; readers skip unknown indices. Readers take every number as
+//! an integer or a float of any width; its [`Form`] decides how it is written.
 
 mod number;
 
@@ -17,9 +17,9 @@ use uuid::Uuid;
 use super::RejectReason;
 use crate::names::NodeName;
 use crate::time::Timestamp;
-pub(crate) use number::{Half, Millimetres, Single, Spread};
+pub(crate) use number::{CovarianceForm, Half, Millimetres, Single};
 
-/// Whether a payload begins as a compact one: with an array, where JSON and CBOR with names begin with a map.
+/// Whether the first byte of a payload is that of a compact one: an array, where JSON and CBOR with names have a map.
 pub(super) fn is_compact(first: u8) -> bool {
     const ARRAY: u8 = 4;
     first >> 5 == ARRAY
@@ -45,18 +45,18 @@ pub(super) fn schema(bytes: &[u8]) -> Option<u32> {
     decoder.u32().ok()
 }
 
-/// A way to write values of type `T`, where the type alone does not tell it.
+/// A written form of values of type `T`, for types with several forms or without one in minicbor.
 pub(crate) trait Form<T> {
     fn encode<C, W: Write>(value: &T, e: &mut Encoder<W>, context: &mut C) -> Result<(), encode::Error<W::Error>>;
 
     fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<T, decode::Error>;
 
-    /// What is meant where nothing is written.
+    /// The value of an absent field, if it may be absent.
     fn nil() -> Option<T> {
         None
     }
 
-    /// Whether nothing need be written.
+    /// Whether the field is left out.
     fn is_nil(_value: &T) -> bool {
         false
     }
@@ -76,9 +76,9 @@ impl Form<SmolStr> for Text {
 }
 
 /// The 16 bytes of a UUID.
-pub(crate) struct Id;
+pub(crate) struct UuidBytes;
 
-impl Form<Uuid> for Id {
+impl Form<Uuid> for UuidBytes {
     fn encode<C, W: Write>(value: &Uuid, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
         e.bytes(value.as_bytes())?.ok()
     }
@@ -89,7 +89,7 @@ impl Form<Uuid> for Id {
 }
 
 /// Collections that are left out when they are empty.
-pub(crate) mod if_any {
+pub(crate) mod skip_empty {
     use super::{Decode, Decoder, Encode, Encoder, Write, decode, encode};
 
     pub(crate) fn encode<C, T: Encode<()>, W: Write>(
@@ -154,7 +154,7 @@ impl<T, F: Form<T>> Form<Vec<T>> for F {
     fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<Vec<T>, decode::Error> {
         let count = d.array()?;
         let mut values = Vec::new();
-        while goes_on(d, count, values.len())? {
+        while has_more(d, count, values.len())? {
             values.push(F::decode(d, context)?);
         }
         Ok(values)
@@ -177,7 +177,7 @@ impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
     fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<BTreeMap<SmolStr, f64>, decode::Error> {
         let count = d.map()?;
         let (mut values, mut read) = (BTreeMap::new(), 0);
-        while goes_on(d, count, read)? {
+        while has_more(d, count, read)? {
             values.insert(d.str()?.into(), F::decode(d, context)?);
             read += 1;
         }
@@ -193,8 +193,8 @@ impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
     }
 }
 
-/// Whether a collection has more entries than were read; one without a count ends with a break.
-fn goes_on(d: &mut Decoder<'_>, count: Option<u64>, read: usize) -> Result<bool, decode::Error> {
+/// Whether a collection has more entries than `read`; one without a count ends with a break.
+fn has_more(d: &mut Decoder<'_>, count: Option<u64>, read: usize) -> Result<bool, decode::Error> {
     match count {
         Some(count) => Ok((read as u64) < count),
         None if d.datatype()? == Type::Break => d.skip().map(|()| false),

@@ -1,4 +1,4 @@
-//! Objects as a vehicle reports them and as the aggregator agrees on them.
+//! Objects in reports of vehicles and in maps of the aggregator.
 
 use std::collections::BTreeMap;
 
@@ -7,13 +7,13 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
-use super::compact::{Form, Half, Id, Millimetres, Single, Spread, Text};
+use super::compact::{CovarianceForm, Form, Half, Millimetres, Single, Text, UuidBytes};
 use crate::geometry::Covariance;
 use crate::names::{Label, LandmarkId, NodeName};
 use crate::time::Timestamp;
 
-/// A detection with its place in the world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+/// A detection with its position in the world.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct PerceivedObject {
     /// Class label or decoded text.
     #[cbor(n(0), with = "Text")]
@@ -29,9 +29,9 @@ pub struct PerceivedObject {
     pub y_m: f64,
     /// Position covariance `[xx, xy, yy]` in m².
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cbor(n(4), with = "Spread", has_nil)]
+    #[cbor(n(4), with = "CovarianceForm", has_nil)]
     pub covariance_m2: Option<[f64; 3]>,
-    /// The known location that the node takes this object for; required in VOTE.
+    /// The known location to which the node assigns this object; required in VOTE.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(5), with = "Text", has_nil)]
     pub landmark: Option<LandmarkId>,
@@ -39,7 +39,7 @@ pub struct PerceivedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(6), with = "Half", has_nil)]
     pub velocity_mps: Option<[f64; 2]>,
-    /// Direction in which the object points, in radians counter-clockwise from east.
+    /// Heading of the object in radians, counter-clockwise from east.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(7), with = "Half", has_nil)]
     pub heading_rad: Option<f64>,
@@ -47,39 +47,28 @@ pub struct PerceivedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(8), with = "Half", has_nil)]
     pub size_m: Option<[f64; 2]>,
-    /// The detector's confidence in each class, 0 to 1, if it tells more than the best one.
+    /// The detector's confidence in each class, 0 to 1, if it gives more than the best one.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[cbor(n(9), with = "Half", has_nil)]
     pub scores: BTreeMap<Label, f64>,
 }
 
 impl PerceivedObject {
-    /// An object of which no more is known than what and where it is.
+    /// An object with label, confidence and position only.
     pub fn new(label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64) -> Self {
-        Self {
-            label: label.into(),
-            confidence,
-            x_m,
-            y_m,
-            covariance_m2: None,
-            landmark: None,
-            velocity_mps: None,
-            heading_rad: None,
-            size_m: None,
-            scores: BTreeMap::new(),
-        }
+        Self { label: label.into(), confidence, x_m, y_m, ..Self::default() }
     }
 
     /// The reported covariance, if any.
     pub fn covariance(&self) -> Option<Covariance> {
-        self.covariance_m2.map(|[xx, xy, yy]| Covariance { xx, xy, yy })
+        self.covariance_m2.map(Covariance::from)
     }
 }
 
-/// What a camera or scanner covers, seen from the pose of its report and centred on its heading.
+/// The field of view of a camera or scanner, from the pose of its report and centred on its heading.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FieldOfView {
-    /// Range in metres within which objects are found as a rule.
+    /// Range in metres within which objects are usually detected.
     #[cbor(n(0), with = "Half")]
     pub range_m: f64,
     /// Opening angle in radians, both sides together; 2π for all around.
@@ -87,17 +76,16 @@ pub struct FieldOfView {
     pub angle_rad: f64,
 }
 
-/// An object of the open world, where it is at the time of fusion.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+/// An object at no known location, at the time of fusion.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FusedObject {
     /// Stable identity of the object.
-    #[cbor(n(0), with = "Id")]
+    #[cbor(n(0), with = "UuidBytes")]
     pub id: Uuid,
     /// The agreed label.
     #[cbor(n(1), with = "Text")]
     pub label: Label,
-    /// How far the entry may be relied on, 0 to 1: the probability that the object is there, and within 1.5 m of the
-    /// position.
+    /// Probability, 0 to 1, that the object exists and is within 1.5 m of the position.
     #[cbor(n(2), with = "Half")]
     pub confidence: f64,
     /// East in metres.
@@ -107,9 +95,9 @@ pub struct FusedObject {
     #[cbor(n(4), with = "Millimetres")]
     pub y_m: f64,
     /// Position covariance `[xx, xy, yy]` in m².
-    #[cbor(n(5), with = "Spread")]
+    #[cbor(n(5), with = "CovarianceForm")]
     pub covariance_m2: [f64; 3],
-    /// The nodes whose detections went into the entry.
+    /// The nodes whose detections are in the entry.
     #[n(6)]
     pub contributors: Vec<NodeName>,
     /// Probability that the object exists and is still there.
@@ -124,7 +112,7 @@ pub struct FusedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(8), with = "Half", has_nil)]
     pub velocity_mps: Option<[f64; 2]>,
-    /// Direction in which the object points, in radians counter-clockwise from east.
+    /// Heading of the object in radians, counter-clockwise from east.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(9), with = "Half", has_nil)]
     pub heading_rad: Option<f64>,
@@ -136,51 +124,34 @@ pub struct FusedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(11), with = "Half", has_nil)]
     pub age_s: Option<f64>,
-    /// When it was first detected, by the aggregator's clock.
+    /// Time of the first detection, by the aggregator's clock.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(12)]
     pub first_seen_us: Option<Timestamp>,
-    /// The node that this object is, by its own word.
+    /// The node that this object is, by the node's own report.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(13)]
     pub vehicle: Option<NodeName>,
 }
 
 impl FusedObject {
-    /// An object of which no more is known than what and where it is.
+    /// An object with label, confidence and position only.
     pub fn new(id: Uuid, label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64, covariance: Covariance) -> Self {
-        Self {
-            id,
-            label: label.into(),
-            confidence,
-            x_m,
-            y_m,
-            covariance_m2: [covariance.xx, covariance.xy, covariance.yy],
-            contributors: Vec::new(),
-            existence: None,
-            scores: BTreeMap::new(),
-            velocity_mps: None,
-            heading_rad: None,
-            size_m: None,
-            age_s: None,
-            first_seen_us: None,
-            vehicle: None,
-        }
+        Self { id, label: label.into(), confidence, x_m, y_m, covariance_m2: covariance.into(), ..Self::default() }
     }
 
     /// The position covariance.
     pub fn covariance(&self) -> Covariance {
-        let [xx, xy, yy] = self.covariance_m2;
-        Covariance { xx, xy, yy }
+        self.covariance_m2.into()
     }
 }
 
-/// By how much a vehicle's positions are off, as estimated from what several vehicles see.
+/// The estimated error of a vehicle's positions, from objects that several vehicles detect.
 ///
-/// A reported position p belongs at R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`, `dy_m`).
+/// A reported position p is corrected to R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`, `dy_m`).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct PoseCorrection {
-    /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of what the vehicle sees.
+    /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of the vehicle's detections.
     #[cbor(n(0), with = "Millimetres")]
     pub about_m: [f64; 2],
     /// East in metres.
@@ -192,7 +163,7 @@ pub struct PoseCorrection {
     /// Rotation in radians, counter-clockwise.
     #[cbor(n(3), with = "Half")]
     pub dheading_rad: f64,
-    /// Pairs of detections that the estimate rests on, older ones counting less.
+    /// Number of pairs of detections in the estimate; older ones count less.
     #[cbor(n(4), with = "Half")]
     pub pairs: f64,
 }

@@ -1,15 +1,26 @@
 //! One node of a simulated cell, and what can happen to it.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::time::Duration;
 
-use ecod::election::{Election, ElectionConfig};
-use ecod::epoch::{Epoch, EpochGate};
+use ecod::epoch::Epoch;
+use ecod::leadership::election::{Election, ElectionConfig};
+use ecod::leadership::health::HealthSample;
+use ecod::leadership::ledger_resync::LedgerResync;
+use ecod::leadership::links::{DataPlane, LinkState};
+use ecod::leadership::node::{LeadershipNode, NodeSettings};
+use ecod::leadership::round_filter::{PublisherFilter, RoundFilter};
+use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::names::NodeName;
+use ecod::reputation::ReputationLedger;
 use ecod::round::{RoundClose, RoundConfig, RoundTrigger};
 use ecod::time::Timestamp;
+use ecod::wire::{LedgerShare, NodeStatus};
+use uuid::Uuid;
 
 /// What can happen to a cell.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone)]
 pub(crate) enum Fault {
     /// The process starts, with its disk.
     Start(usize),
@@ -29,33 +40,93 @@ pub(crate) enum Fault {
     Loss(u64),
     /// The node's broker breaks, or works again.
     Broker { node: usize, works: bool },
+    /// The node's fuser closes no rounds, or does again.
+    Fuser { node: usize, works: bool },
+    /// The node's gateway answers nobody, or does again.
+    Gateway { node: usize, works: bool },
 }
 
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+/// Something that is going to happen.
+#[derive(Debug, Clone)]
 pub(crate) enum Event {
-    Packet { to: usize, life: u64, bytes: Vec<u8> },
-    Map { to: usize, life: u64, epoch: Epoch, round: u64 },
-    Tell { to: usize, life: u64, about: usize, news: News },
-    Prepared { to: usize, life: u64 },
-    Broker { to: usize, life: u64, works: bool },
-    Timer { to: usize, life: u64, armed: u64 },
-    Publish { to: usize, life: u64, term: u64 },
-    Resume { to: usize },
+    /// At one node, if this run of it is still there.
+    At {
+        node: usize,
+        life: u64,
+        arrival: Arrival,
+    },
+    /// A process goes on after a pause.
+    Resume {
+        node: usize,
+    },
     Gossip,
     Fault(Fault),
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum News {
-    Alive,
-    Down,
-    Gone,
+/// Something that reaches a running node.
+#[derive(Debug, Clone)]
+pub(crate) enum Arrival {
+    Packet {
+        from: usize,
+        bytes: Vec<u8>,
+    },
+    /// A map for the node's broker to pass on.
+    Relay {
+        from: usize,
+        map: Map,
+    },
+    Map {
+        map: Map,
+    },
+    Share {
+        share: Box<LedgerShare>,
+    },
+    /// News of the membership.
+    Tell {
+        about: usize,
+        about_life: u64,
+        is_there: bool,
+    },
+    /// The gateway tries to connect to a broker.
+    Connect {
+        broker: usize,
+    },
+    /// A connection to a broker broke, and its port refuses.
+    Refused {
+        broker: usize,
+    },
+    /// The parts answer.
+    Answered,
+    Broker {
+        works: bool,
+    },
+    Timer {
+        armed: u64,
+    },
+    /// A round is due.
+    Publish {
+        term: u64,
+    },
+    /// A publication period of reputations has passed.
+    Keep,
+}
+
+/// A published map.
+#[derive(Debug, Clone)]
+pub(crate) struct Map {
+    pub(crate) epoch: Epoch,
+    pub(crate) round: u64,
+    /// Time of its fusion by its publisher's clock.
+    pub(crate) fused_at: Timestamp,
+    /// The same by the simulation's, in µs.
+    pub(crate) made_at: u64,
 }
 
 /// A round accepted by a node.
 #[derive(Debug, Clone)]
 pub(crate) struct Accepted {
     pub(crate) at: u64,
+    pub(crate) epoch: Epoch,
     pub(crate) round: u64,
 }
 
@@ -63,34 +134,64 @@ pub(crate) struct Accepted {
 pub(crate) struct Node {
     pub(crate) name: NodeName,
     pub(crate) config: ElectionConfig,
-    pub(crate) election: Option<Election>,
+    pub(crate) machine: Option<LeadershipNode>,
+    pub(crate) filter: RoundFilter,
+    /// The rule of its broker.
+    pub(crate) publishers: PublisherFilter,
+    pub(crate) resync: LedgerResync,
+    pub(crate) ledger: ReputationLedger,
+    /// The ledger on disk.
+    pub(crate) saved: ReputationLedger,
+    /// The leadership as the machine told it.
+    pub(crate) leadership: Leadership,
     pub(crate) accepted: Vec<Accepted>,
-    pub(crate) stale_refused: u64,
+    pub(crate) refused: u64,
     pub(crate) life: u64,
+    pub(crate) started_at: u64,
     pub(crate) persisted: u64,
+    /// Difference between the node's clock, which may be set, and the time of the simulation, in µs.
     pub(crate) clock: i64,
+    /// The same when the process started: its rounds are dated by a clock that nobody sets.
+    pub(crate) steady_clock: i64,
     pub(crate) armed: u64,
     pub(crate) paused_until: u64,
-    pub(crate) waiting: Vec<Event>,
+    pub(crate) waiting: Vec<Arrival>,
     pub(crate) publishing: Option<(Epoch, u64)>,
     pub(crate) rounds: RoundTrigger,
-    pub(crate) gate: EpochGate,
-    pub(crate) elected_refused_since: Option<u64>,
-    pub(crate) known: BTreeSet<usize>,
+    pub(crate) broker_works: bool,
+    pub(crate) fuser_works: bool,
+    pub(crate) gateway_works: bool,
+    /// Rounds that the fuser closed before it last stopped or started, and when that was.
+    pub(crate) closed: (u64, u64),
+    /// State of the links that the machine wants, by node.
+    pub(crate) links: BTreeMap<usize, LinkState>,
+    /// Nodes that the membership is about to tell of, and their runs.
+    pub(crate) known: BTreeMap<usize, u64>,
+    /// Nodes that the membership has told of, and their runs.
+    pub(crate) members: BTreeMap<usize, u64>,
     pub(crate) packets: u64,
 }
 
 impl Node {
     pub(crate) fn new(index: usize, config: ElectionConfig) -> Self {
+        let name = NodeName::new(format!("n{index:02}")).expect("valid name");
         Self {
-            name: NodeName::new(format!("n{index:02}")).expect("valid name"),
+            resync: LedgerResync::new(name.clone(), TICKS_PER_SNAPSHOT),
+            name,
             config,
-            election: None,
+            machine: None,
+            filter: RoundFilter::new(0),
+            publishers: PublisherFilter::default(),
+            ledger: ReputationLedger::default(),
+            saved: ReputationLedger::default(),
+            leadership: Leadership::default(),
             accepted: Vec::new(),
-            stale_refused: 0,
+            refused: 0,
             life: 0,
+            started_at: 0,
             persisted: 0,
             clock: 0,
+            steady_clock: 0,
             armed: 0,
             paused_until: 0,
             waiting: Vec::new(),
@@ -99,18 +200,86 @@ impl Node {
                 RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() },
                 Timestamp(0),
             ),
-            gate: EpochGate::default(),
-            elected_refused_since: None,
-            known: BTreeSet::new(),
+            broker_works: true,
+            fuser_works: true,
+            gateway_works: true,
+            closed: (0, 0),
+            links: BTreeMap::new(),
+            known: BTreeMap::new(),
+            members: BTreeMap::new(),
             packets: 0,
         }
     }
 
+    /// Begins a run of the process, with its disk.
+    pub(crate) fn start(&mut self, now: u64) {
+        self.life += 1;
+        self.started_at = now;
+        self.paused_until = 0;
+        self.steady_clock = self.clock;
+        (self.broker_works, self.fuser_works, self.gateway_works) = (true, true, true);
+        self.closed = (0, now);
+        self.publishers = PublisherFilter::default();
+        self.resync = LedgerResync::new(self.name.clone(), TICKS_PER_SNAPSHOT);
+        self.ledger.clone_from(&self.saved);
+        (self.known, self.members, self.links) = Default::default();
+        self.leadership = Leadership::default();
+        self.filter = RoundFilter::new(self.persisted);
+        let status = NodeStatus::starting(self.name.clone(), Uuid::from_u128(self.life.into()), self.config.role, "");
+        let settings = NodeSettings {
+            election: self.config.clone(),
+            plane: DataPlane { external: None, embedded: true },
+            round_period: Duration::from_millis(100),
+            keeps_reputations: true,
+            status,
+        };
+        let clock = Timestamp(now).shifted(self.clock);
+        self.machine = Some(LeadershipNode::new(settings, self.persisted, &self.leadership, clock));
+    }
+
+    pub(crate) fn election(&self) -> Option<&Election> {
+        self.machine.as_ref().map(LeadershipNode::election)
+    }
+
     pub(crate) fn leads(&self) -> bool {
-        self.election.as_ref().is_some_and(Election::is_leading)
+        self.election().is_some_and(Election::is_leading)
     }
 
     pub(crate) fn leader(&self) -> Option<&NodeName> {
-        self.election.as_ref().and_then(Election::leader)
+        self.election().and_then(Election::leader)
     }
+
+    pub(crate) fn standby(&self) -> Option<&NodeName> {
+        self.election().and_then(Election::standby)
+    }
+
+    /// Lets the fuser stop, or close rounds again.
+    pub(crate) fn set_fuser(&mut self, works: bool, now: u64) {
+        (self.closed, self.fuser_works) = ((self.rounds_closed(now), now), works);
+    }
+
+    /// Rounds that the fuser has closed by `now`, published or not.
+    pub(crate) fn rounds_closed(&self, now: u64) -> u64 {
+        let (closed, since) = self.closed;
+        if self.fuser_works { closed + (now - since) / 100_000 } else { closed }
+    }
+
+    /// What broker, gateway and fuser answer.
+    pub(crate) fn sample(&self) -> HealthSample {
+        let links = || self.links.iter().map(|(broker, state)| (address_of(*broker), *state)).collect();
+        let links = self.gateway_works.then(links);
+        HealthSample { broker_serves: self.broker_works, links, fuser_runs: true }
+    }
+}
+
+/// Publication periods between two times that a leader shares everything.
+const TICKS_PER_SNAPSHOT: u32 = 4;
+
+/// Where a node's broker listens.
+pub(crate) fn broker_of(index: usize) -> SocketAddr {
+    SocketAddr::from(([10, 0, 0, u8::try_from(index + 1).expect("a small cell")], 1883))
+}
+
+pub(crate) fn address_of(index: usize) -> BrokerAddress {
+    broker_of(index).into()
 }

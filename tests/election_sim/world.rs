@@ -1,22 +1,31 @@
-//! A cell in simulated time: nodes, links that lose, delay, repeat and cut, and a data plane that carries rounds.
+//! A cell in simulated time: nodes, and a network that loses, delays, repeats and cuts.
+//!
+//! Each node runs the machines that a real one does, and carries out their effects as the actors do.
 
-use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
+use std::cmp::{Ordering, Reverse};
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
-use ecod::election::{Effect, Election, ElectionConfig, ElectionMessage, Health, Input};
-use ecod::epoch::{Epoch, EpochGate};
+use ecod::epoch::Epoch;
+use ecod::leadership::Position;
+use ecod::leadership::election::{ElectionConfig, ElectionMessage};
+use ecod::leadership::links::LinkState;
+use ecod::leadership::node::{Effect, Input, Member};
 use ecod::names::NodeName;
-use ecod::round::FirstRound;
 use ecod::time::Timestamp;
 use ecod::wire::{Encoding, Role};
 
-use crate::node::{Accepted, Event, Fault, News, Node};
+use crate::evidence::PUBLISH_PERIOD;
+use crate::node::{Arrival, Event, Fault, Node, address_of, broker_of};
 use crate::random::Random;
 
 /// Microseconds in a millisecond.
 pub(crate) const MS: u64 = 1000;
-/// All parts work.
-pub(crate) const FIT: Health = Health { broker: true, fuser: true, gateway: true, load_percent: 10 };
+
+/// Start of the simulation, in Unix microseconds.
+const START: u64 = 1_732_154_400_000_000;
+
+/// Processor load of every node, in percent.
+const LOAD: u8 = 10;
 
 /// The cell and everything under way in it.
 pub(crate) struct World {
@@ -30,24 +39,54 @@ pub(crate) struct World {
     pub(crate) lateness: u64,
     /// What to print when a check fails.
     pub(crate) history: Vec<String>,
+    /// Votes that were settled in each leadership.
+    pub(crate) recorded: BTreeMap<Epoch, u64>,
     cuts: BTreeSet<(usize, usize)>,
-    loss_percent: u64,
-    queue: BinaryHeap<Reverse<(u64, u64, Event)>>,
+    pub(crate) loss_percent: u64,
+    queue: BinaryHeap<Planned>,
     events: u64,
     owners: BTreeMap<Epoch, (usize, u64)>,
+}
+
+/// An event and when it happens; of two at one time the first planned comes first.
+struct Planned {
+    at: u64,
+    number: u64,
+    event: Event,
+}
+
+impl PartialEq for Planned {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Planned {}
+
+impl PartialOrd for Planned {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Planned {
+    fn cmp(&self, other: &Self) -> Ordering {
+        (other.at, other.number).cmp(&(self.at, self.number))
+    }
 }
 
 impl World {
     pub(crate) fn new(seed: u64, configs: Vec<ElectionConfig>) -> Self {
         let nodes = configs.into_iter().enumerate().map(|(index, config)| Node::new(index, config)).collect();
         let mut world = Self {
-            now: 1_732_154_400_000_000,
+            now: START,
             nodes,
             random: Random::new(seed),
             led: Vec::new(),
             packets: 0,
             lateness: 2 * MS,
             history: Vec::new(),
+            recorded: BTreeMap::new(),
             cuts: BTreeSet::new(),
             loss_percent: 0,
             queue: BinaryHeap::new(),
@@ -65,10 +104,8 @@ impl World {
 
     pub(crate) fn run_for(&mut self, micros: u64) {
         let end = self.now + micros;
-        while let Some(Reverse((at, _, _))) = self.queue.peek()
-            && *at <= end
-        {
-            let Some(Reverse((at, _, event))) = self.queue.pop() else { break };
+        while self.queue.peek().is_some_and(|next| next.at <= end) {
+            let Some(Planned { at, event, .. }) = self.queue.pop() else { break };
             self.now = at;
             self.happen(event);
         }
@@ -76,7 +113,7 @@ impl World {
     }
 
     pub(crate) fn alive(&self) -> impl Iterator<Item = (usize, &Node)> {
-        self.nodes.iter().enumerate().filter(|(_, node)| node.election.is_some())
+        self.nodes.iter().enumerate().filter(|(_, node)| node.machine.is_some())
     }
 
     pub(crate) fn leaders(&self) -> Vec<usize> {
@@ -93,73 +130,82 @@ impl World {
 
     fn push(&mut self, after: u64, event: Event) {
         self.events += 1;
-        self.queue.push(Reverse((self.now + after, self.events, event)));
+        self.queue.push(Planned { at: self.now + after, number: self.events, event });
+    }
+
+    /// Lets something reach the present run of a node `after` µs from now.
+    pub(crate) fn push_to(&mut self, node: usize, after: u64, arrival: Arrival) {
+        let life = self.nodes[node].life;
+        self.push(after, Event::At { node, life, arrival });
     }
 
     fn happen(&mut self, event: Event) {
         match event {
             Event::Fault(fault) => self.strike(&fault),
             Event::Gossip => self.gossip(),
-            Event::Resume { to } => {
-                for event in std::mem::take(&mut self.nodes[to].waiting) {
-                    self.reach(to, event);
+            Event::Resume { node } => {
+                for arrival in std::mem::take(&mut self.nodes[node].waiting) {
+                    self.reach(node, arrival);
                 }
-                self.arm(to);
+                self.arm(node);
             }
-            Event::Packet { to, life, .. }
-            | Event::Map { to, life, .. }
-            | Event::Tell { to, life, .. }
-            | Event::Prepared { to, life }
-            | Event::Broker { to, life, .. }
-            | Event::Timer { to, life, .. }
-            | Event::Publish { to, life, .. } => {
-                let node = &mut self.nodes[to];
-                if node.life != life || node.election.is_none() {
+            Event::At { node: index, life, arrival } => {
+                let node = &mut self.nodes[index];
+                if node.life != life || node.machine.is_none() {
                     return;
                 }
                 if node.paused_until > self.now {
-                    node.waiting.push(event);
+                    node.waiting.push(arrival);
                 } else {
-                    self.reach(to, event);
+                    self.reach(index, arrival);
                 }
             }
         }
     }
 
-    fn reach(&mut self, to: usize, event: Event) {
-        match event {
-            Event::Packet { bytes, .. } => {
+    fn reach(&mut self, to: usize, arrival: Arrival) {
+        match arrival {
+            Arrival::Packet { from, bytes } => {
                 let message = ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
-                self.handle(to, Input::Receive { message });
+                let from = self.nodes[from].name.clone();
+                self.handle(to, Input::Receive { from, message });
             }
-            Event::Map { epoch, round, .. } => self.accept(to, &epoch, round),
-            Event::Tell { about, news, .. } => {
-                let peer = self.nodes[about].name.clone();
-                self.handle(
-                    to,
-                    match news {
-                        News::Alive => Input::PeerAlive { peer },
-                        News::Down => Input::PeerDown { peer },
-                        News::Gone => Input::PeerGone { peer },
-                    },
-                );
+            Arrival::Relay { from, map } => self.relay(to, from, &map),
+            Arrival::Map { map } => self.accept(to, &map),
+            Arrival::Share { share } => self.take_share(to, &share),
+            Arrival::Tell { about, about_life, is_there: true } => {
+                self.nodes[to].members.insert(about, about_life);
+                self.handle(to, Input::MemberAlive { member: self.member(about, about_life) });
             }
-            Event::Prepared { .. } => self.handle(to, Input::Prepared),
-            Event::Broker { works, .. } => {
-                self.handle(to, Input::Health { health: Health { broker: works, ..FIT } });
+            Arrival::Tell { about, .. } => {
+                self.nodes[to].members.remove(&about);
+                self.handle(to, Input::MemberDown { name: self.nodes[about].name.clone() });
             }
-            Event::Timer { armed, .. } if armed == self.nodes[to].armed => {
-                let now = self.clock_of(to);
-                let effects = self.nodes[to].election.as_mut().map(|election| election.tick(now));
-                self.carry_out(to, effects.unwrap_or_default());
+            Arrival::Connect { broker } => self.connect(to, broker),
+            Arrival::Refused { broker } => {
+                if self.nodes[to].links.contains_key(&broker) {
+                    self.set_link(to, broker, LinkState::Down);
+                    self.set_link(to, broker, LinkState::Refused);
+                    self.plan_connect(to, broker, 80 * MS);
+                }
             }
-            Event::Publish { term, .. } => self.publish(to, term),
-            Event::Timer { .. } | Event::Resume { .. } | Event::Gossip | Event::Fault(_) => {}
+            Arrival::Answered => self.handle(to, Input::PartsAnswered { sample: self.nodes[to].sample() }),
+            Arrival::Broker { works } => {
+                self.nodes[to].broker_works = works;
+                if !works && self.nodes[to].links.contains_key(&to) {
+                    self.set_link(to, to, LinkState::Down);
+                }
+                self.plan_connect(to, to, 0);
+            }
+            Arrival::Timer { armed } if armed == self.nodes[to].armed => self.handle(to, Input::Wake),
+            Arrival::Timer { .. } => {}
+            Arrival::Publish { term } => self.publish(to, term),
+            Arrival::Keep => self.keep(to),
         }
     }
 
     fn strike(&mut self, fault: &Fault) {
-        self.history.push(format!("{:>10} µs {fault:?}", self.now - 1_732_154_400_000_000));
+        self.history.push(format!("{:>10} µs {fault:?}", self.now - START));
         match *fault {
             Fault::Start(index) => self.start(index),
             Fault::Kill { node, seen } => self.kill(node, seen),
@@ -169,7 +215,7 @@ impl World {
             }
             Fault::Pause { node, micros } => {
                 self.nodes[node].paused_until = self.now + micros;
-                self.push(micros, Event::Resume { to: node });
+                self.push(micros, Event::Resume { node });
             }
             Fault::SetClock { node, micros } => self.nodes[node].clock += micros,
             Fault::Cut { from, to } => {
@@ -177,42 +223,37 @@ impl World {
             }
             Fault::Heal => self.cuts.clear(),
             Fault::Loss(percent) => self.loss_percent = percent,
-            Fault::Broker { node, works } => {
-                let life = self.nodes[node].life;
-                self.push(0, Event::Broker { to: node, life, works });
-            }
+            Fault::Broker { node, works } => self.push_to(node, 0, Arrival::Broker { works }),
+            Fault::Fuser { node, works } => self.nodes[node].set_fuser(works, self.now),
+            Fault::Gateway { node, works } => self.nodes[node].gateway_works = works,
         }
     }
 
     fn start(&mut self, index: usize) {
-        if self.nodes[index].election.is_some() {
+        if self.nodes[index].machine.is_some() {
             return;
         }
-        let now = self.clock_of(index);
-        let node = &mut self.nodes[index];
-        node.life += 1;
-        node.known.clear();
-        node.paused_until = 0;
-        let election = Election::new(node.config.clone(), node.name.clone(), node.persisted, now);
-        node.gate = EpochGate::new(election.floor());
-        node.election = Some(election);
-        let life = node.life;
-        self.arm(index);
-        // A node is met by others before it has found its own parts fit.
-        let after = self.random.between(5 * MS, 300 * MS);
-        self.push(after, Event::Broker { to: index, life, works: true });
+        self.nodes[index].start(self.now);
+        let after = self.random.between(0, PUBLISH_PERIOD);
+        self.push_to(index, after, Arrival::Keep);
+        self.handle(index, Input::OwnBroker { address: Some(broker_of(index)) });
+        for to in 0..self.nodes.len() {
+            if to != index && self.nodes[to].links.contains_key(&index) {
+                self.plan_connect(to, index, 0);
+            }
+        }
     }
 
     fn kill(&mut self, index: usize, seen: bool) {
         let node = &mut self.nodes[index];
-        node.election = None;
+        node.machine = None;
         node.publishing = None;
         node.waiting.clear();
         if seen {
             for to in 0..self.nodes.len() {
-                if self.linked(to, index) {
-                    let (life, after) = (self.nodes[to].life, self.random.between(MS, 6 * MS));
-                    self.push(after, Event::Tell { to, life, about: index, news: News::Gone });
+                if self.linked(to, index) && self.nodes[to].links.get(&index) == Some(&LinkState::Up) {
+                    let after = self.random.between(MS, 6 * MS);
+                    self.push_to(to, after, Arrival::Refused { broker: index });
                 }
             }
         }
@@ -222,22 +263,23 @@ impl World {
     fn gossip(&mut self) {
         for to in 0..self.nodes.len() {
             for about in 0..self.nodes.len() {
-                let there = self.nodes[about].election.is_some()
+                let is_there = self.nodes[about].machine.is_some()
                     && self.nodes[about].paused_until < self.now + 300 * MS
                     && self.linked(to, about);
-                let known = self.nodes[to].known.contains(&about);
-                if to == about || there == known || self.nodes[to].election.is_none() || self.random.chance(50) {
+                let about_life = self.nodes[about].life;
+                let known = self.nodes[to].known.get(&about);
+                let is_news = if is_there { known != Some(&about_life) } else { known.is_some() };
+                if to == about || !is_news || self.nodes[to].machine.is_none() || self.random.chance(50) {
                     continue;
                 }
-                let (life, after) = (self.nodes[to].life, self.random.between(20 * MS, 300 * MS));
+                let after = self.random.between(20 * MS, 300 * MS);
                 let node = &mut self.nodes[to];
-                let news = if there { News::Alive } else { News::Down };
-                if there {
-                    node.known.insert(about)
+                if is_there {
+                    node.known.insert(about, about_life);
                 } else {
-                    node.known.remove(&about)
-                };
-                self.push(after, Event::Tell { to, life, about, news });
+                    node.known.remove(&about);
+                }
+                self.push_to(to, after, Arrival::Tell { about, about_life, is_there });
             }
         }
         self.push(100 * MS, Event::Gossip);
@@ -257,51 +299,77 @@ impl World {
         Timestamp(self.now).shifted(self.nodes[index].clock)
     }
 
-    fn handle(&mut self, to: usize, input: Input) {
-        let now = self.clock_of(to);
-        if let Some(election) = &mut self.nodes[to].election {
-            let effects = election.handle(input, now);
-            self.carry_out(to, effects);
-        }
+    fn member(&self, about: usize, run: u64) -> Member {
+        let name = self.nodes[about].name.clone();
+        Member { name, run, broker: Some(address_of(about)), is_on_this_machine: false }
     }
 
-    fn carry_out(&mut self, index: usize, effects: impl IntoIterator<Item = Effect>) {
-        let life = self.nodes[index].life;
-        for effect in effects {
-            match effect {
-                Effect::PersistTerm { term } => self.nodes[index].persisted = term,
-                Effect::Send { to, message } => self.send(index, &to, &message),
-                Effect::Lead { epoch, first_round, first } => {
-                    assert!(epoch.term <= self.nodes[index].persisted, "led in a term that is not on disk");
-                    let owner = self.owners.insert(epoch.clone(), (index, life));
-                    assert_eq!(owner, None, "two leaderships share {epoch}");
-                    self.led.push((self.now, epoch.clone()));
-                    self.history.push(format!("{:>10} µs {epoch} leads", self.now - 1_732_154_400_000_000));
-                    self.begin_to_publish(index, epoch, first_round, first);
-                }
-                Effect::StopPublishing { .. } => self.nodes[index].publishing = None,
-                Effect::Follow { epoch, .. } => {
-                    assert!(self.nodes[index].publishing.is_none(), "follows {epoch} and still publishes");
-                }
-                Effect::Prepare { .. } => {
-                    let after = self.random.between(5 * MS, 120 * MS);
-                    self.push(after, Event::Prepared { to: index, life });
-                }
-                Effect::Seek | Effect::AnnounceStandby { .. } | Effect::SendState { .. } => {}
+    /// Hands in what happened and carries out what comes of it, as the actors do.
+    pub(crate) fn handle(&mut self, index: usize, input: Input) {
+        let mut inputs = VecDeque::from([input]);
+        while let Some(input) = inputs.pop_front() {
+            let now = self.clock_of(index);
+            let Some(machine) = &mut self.nodes[index].machine else { return };
+            for effect in machine.handle(input, now) {
+                inputs.extend(self.carry_out(index, effect));
             }
         }
         self.arm(index);
+    }
+
+    /// Does what the machine wants; returns what it is to be told at once.
+    fn carry_out(&mut self, index: usize, effect: Effect) -> Option<Input> {
+        match effect {
+            Effect::PersistTerm { term } => self.nodes[index].persisted = term,
+            Effect::Send { to, message } => self.send(index, &to, &message),
+            Effect::TellLeadership { leadership } => {
+                let follows = matches!(leadership.position, Position::Following | Position::StandingBy);
+                assert!(!follows || self.nodes[index].publishing.is_none(), "follows and still publishes");
+                self.nodes[index].leadership = leadership;
+            }
+            Effect::Lead { epoch, first_round, first } => {
+                assert!(epoch.term <= self.nodes[index].persisted, "led in a term that is not on disk");
+                assert!(self.nodes[index].leadership.is_leading(), "leads before it is told");
+                let owner = self.owners.insert(epoch.clone(), (index, self.nodes[index].life));
+                assert_eq!(owner, None, "two leaderships share {epoch}");
+                self.led.push((self.now, epoch.clone()));
+                self.history.push(format!("{:>10} µs {epoch} leads", self.now - START));
+                self.nodes[index].resync.lead(epoch.clone());
+                self.begin_to_publish(index, epoch, first_round, first);
+                self.share_all(index);
+            }
+            Effect::HoldRound => self.nodes[index].rounds.hold(),
+            Effect::StopPublishing { .. } => {
+                self.nodes[index].publishing = None;
+                self.nodes[index].resync.step_down();
+            }
+            Effect::SendSnapshot { .. } => self.share_all(index),
+            Effect::SetLinks { links } => self.set_links(index, &links),
+            Effect::Look => {
+                let node = &self.nodes[index];
+                let members = node.members.iter().map(|(about, run)| self.member(*about, *run)).collect();
+                let rounds_closed = node.rounds_closed(self.now);
+                return Some(Input::Looked { rounds_closed, load_percent: LOAD, members });
+            }
+            Effect::AskParts => {
+                let answers = self.nodes[index].gateway_works;
+                let after = if answers { self.random.between(MS, 20 * MS) } else { 1000 * MS };
+                self.push_to(index, after, Arrival::Answered);
+            }
+            Effect::PublishStatus { .. } | Effect::Log { .. } => {}
+        }
+        None
     }
 
     fn arm(&mut self, index: usize) {
         let now = self.clock_of(index);
         let late = self.random.between(0, self.lateness);
         let node = &mut self.nodes[index];
-        let Some(election) = &node.election else { return };
-        let after = election.next_deadline().since(now).as_micros() as u64 + late;
+        let Some(machine) = &node.machine else { return };
+        let after = machine.next_deadline().since(now).as_micros() as u64 + late;
         node.armed += 1;
-        let event = Event::Timer { to: index, life: node.life, armed: node.armed };
-        self.push(after, event);
+        let armed = node.armed;
+        self.push_to(index, after, Arrival::Timer { armed });
     }
 
     fn send(&mut self, from: usize, to: &NodeName, message: &ElectionMessage) {
@@ -314,64 +382,8 @@ impl World {
         let bytes = message.encode(Encoding::Cbor);
         let copies = if self.random.chance(self.loss_percent / 4) { 2 } else { 1 };
         for _ in 0..copies {
-            let (life, after) = (self.nodes[to].life, self.random.between(200, 3 * MS));
-            self.push(after, Event::Packet { to, life, bytes: bytes.clone() });
-        }
-    }
-
-    fn begin_to_publish(&mut self, index: usize, epoch: Epoch, first_round: u64, first: FirstRound) {
-        let node = &mut self.nodes[index];
-        let term = epoch.term;
-        node.publishing = Some((epoch, first_round));
-        node.rounds.start(first, Timestamp(self.now));
-        self.plan_round(index, term);
-    }
-
-    fn plan_round(&mut self, index: usize, term: u64) {
-        let node = &self.nodes[index];
-        let (life, after) = (node.life, node.rounds.deadline().since(Timestamp(self.now)));
-        self.push(after.as_micros() as u64, Event::Publish { to: index, life, term });
-    }
-
-    fn publish(&mut self, index: usize, term: u64) {
-        let node = &mut self.nodes[index];
-        let Some((epoch, next)) = &mut node.publishing else { return };
-        if epoch.term != term {
-            return;
-        }
-        let (epoch, round) = (epoch.clone(), *next);
-        *next += 1;
-        node.rounds.tick(Timestamp(self.now));
-        self.plan_round(index, term);
-        for to in 0..self.nodes.len() {
-            if to != index && self.linked(index, to) {
-                let retry = if self.random.chance(self.loss_percent) { 30 * MS } else { 0 };
-                let (life, after) = (self.nodes[to].life, retry + self.random.between(300, 3 * MS));
-                self.push(after, Event::Map { to, life, epoch: epoch.clone(), round });
-            }
-        }
-        self.accept(index, &epoch, round);
-    }
-
-    fn accept(&mut self, to: usize, epoch: &Epoch, round: u64) {
-        let now = self.now;
-        let node = &mut self.nodes[to];
-        let is_elected = node.election.as_ref().and_then(Election::epoch) == Some(epoch);
-        if node.gate.admit(epoch, round).is_err() {
-            node.stale_refused += 1;
-            // As the gate of a real node: the elected is not refused for ever.
-            let since = is_elected.then(|| *node.elected_refused_since.get_or_insert(now));
-            if since.is_none_or(|since| now - since < 500 * MS) {
-                return;
-            }
-            node.gate = EpochGate::default();
-            node.gate.admit(epoch, round).expect("the first");
-        }
-        node.accepted.push(Accepted { at: now, round });
-        // As in a real node: rounds of others prove nothing.
-        if is_elected {
-            node.elected_refused_since = None;
-            self.handle(to, Input::Round { epoch: epoch.clone(), round });
+            let after = self.random.between(200, 3 * MS);
+            self.push_to(to, after, Arrival::Packet { from, bytes: bytes.clone() });
         }
     }
 }

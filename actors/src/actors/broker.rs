@@ -6,17 +6,16 @@
 //!    └─ EmbeddedBroker  a thread of its own; clients see only its socket
 //! ```
 //!
-//! A broker that cannot start is an answer to whoever asked, not a failure of the actor: the node decides whether
-//! another address, an external broker or giving up is right. One that ended by itself, or hangs, ends the actor as
-//! soon as anyone asks how it is, so that the node starts both anew. One that hangs keeps its port, so that the node
-//! then ends: only a new process is rid of it.
+//! A failed start is an answer to the caller, not a failure of the actor: the node decides what to do. A broker that has
+//! ended by itself, or hangs, ends the actor at the next query of its state, so that the node restarts both. A broker
+//! that hangs keeps its port. The node then ends, as only a new process can have the port again.
 
 #![deny(clippy::indexing_slicing)]
 
 use ractor::{Actor, ActorProcessingErr, ActorRef, RpcReplyPort};
 
 use crate::messages::broker::BrokerMessage;
-use crate::transport::broker::{BrokerHealth, Mqtt};
+use crate::transport::broker::{BrokerHealth, MqttBroker};
 
 /// Owns the embedded broker; stops it when the actor ends, however it ends.
 #[derive(Debug, Default)]
@@ -24,8 +23,8 @@ pub struct Broker;
 
 impl Actor for Broker {
     type Msg = BrokerMessage;
-    type State = Box<dyn Mqtt>;
-    type Arguments = Box<dyn Mqtt>;
+    type State = Box<dyn MqttBroker>;
+    type Arguments = Box<dyn MqttBroker>;
 
     async fn pre_start(
         &self,
@@ -78,7 +77,7 @@ impl Actor for Broker {
 
 fn answer<T: Send + 'static>(reply: RpcReplyPort<T>, value: T) {
     if reply.send(value).is_err() {
-        tracing::debug!("nobody waited for the broker's answer");
+        tracing::debug!("caller did not wait for the broker's answer");
     }
 }
 
@@ -90,9 +89,9 @@ mod tests {
     use crate::transport::broker::BrokerError;
 
     #[derive(Debug)]
-    struct Fallen;
+    struct DeadBroker;
 
-    impl Mqtt for Fallen {
+    impl MqttBroker for DeadBroker {
         fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
             Ok(address)
         }
@@ -106,7 +105,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_broker_that_ended_by_itself_ends_its_actor_so_that_it_is_started_anew() {
-        let (actor, ended) = Actor::spawn(None, Broker, Box::new(Fallen) as Box<dyn Mqtt>).await.unwrap();
+        let (actor, ended) = Actor::spawn(None, Broker, Box::new(DeadBroker) as Box<dyn MqttBroker>).await.unwrap();
         let health = ractor::call!(actor, |reply| BrokerMessage::Health { reply }).unwrap();
         assert_eq!(health, BrokerHealth::Dead);
         ended.await.unwrap();

@@ -23,6 +23,7 @@ use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::spans::Spans;
 
 /// Arguments of a detector's start.
 pub struct DetectorArguments {
@@ -40,6 +41,8 @@ pub struct DetectorArguments {
     pub images: Option<ImageRecorder>,
     /// Counters of the node.
     pub counters: Arc<Counters>,
+    /// The node's spans.
+    pub spans: Spans,
 }
 
 /// Runs the detection algorithm on the latest frame, again and again.
@@ -71,9 +74,9 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, optics, projector, images, counters } = arguments;
+        let DetectorArguments { open, capture, detect, optics, projector, images, counters, spans } = arguments;
         let capture = Capture::start(open, capture)?;
-        let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters)));
+        let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters), spans));
         let detect = Some(detect);
         Ok(DetectorState { detect, optics, mismatch: None, failing: false, projector, images, counters, pump })
     }
@@ -88,8 +91,10 @@ impl Actor for Detector {
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let mut images = state.images.take();
+        let span = tracing::info_span!("detect");
         let (detect, images, outcome) = spawn_blocking(move || {
-            let outcome = detect.detect(&frame);
+            let outcome = span.in_scope(|| detect.detect(&frame));
+            drop(span);
             if let Some(images) = &mut images {
                 images.offer(&frame);
             }
@@ -140,7 +145,7 @@ impl Drop for DetectorState {
 }
 
 /// Sends the latest frame whenever the detector is ready, until the source or the detector ends.
-async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>) {
+async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>, spans: Spans) {
     let permits = Arc::new(Semaphore::new(1));
     let mut status = capture.status();
     let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
@@ -162,7 +167,8 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
             }
         };
         let Some(frame) = frame else { return };
-        if detector.cast(DetectorMessage::Detect { frame, permit }).is_err() {
+        let span = spans.frame(frame.captured_at);
+        if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit })).is_err() {
             return;
         }
     }

@@ -15,17 +15,16 @@ mod intake;
 mod tests;
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use ecod::aggregator::{Aggregator, Command, Fused};
 use ecod::epoch::Epoch;
+use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::replay::JournalEvent;
 use ecod::round::FirstRound;
 use ecod::time::Timestamp;
-use ecod::tracks::TracksLosses;
+use ecod::tracking::TracksLosses;
 use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
-use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 pub use intake::{Intake, Put};
@@ -36,14 +35,13 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::observe::recorder::{LogItem, LogSender};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::spans::{RoundReports, Spans};
 use crate::transport::mqtt::{Delivery, Incoming};
 
 /// What a fuser needs at its start.
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
-    /// The highest term that the election knows.
-    pub term: watch::Receiver<u64>,
     /// Where vehicles' reports wait.
     pub intake: Intake,
     /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
@@ -56,10 +54,9 @@ pub struct FuserArguments {
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
+    /// The node's spans.
+    pub spans: Spans,
 }
-
-/// How old a map may be whose objects a new leader goes on with.
-const FRESH_MAP: Duration = Duration::from_secs(1);
 
 /// Drives an [`Aggregator`] with the clock and the gateway.
 #[derive(Debug, Default)]
@@ -68,7 +65,6 @@ pub struct Fuser;
 /// The aggregator and its alarm.
 pub struct FuserState {
     aggregator: Aggregator,
-    term: watch::Receiver<u64>,
     intake: Intake,
     recording: LogSender,
     gateway: ActorSlot<GatewayMessage>,
@@ -80,6 +76,9 @@ pub struct FuserState {
     timer: Option<AbortHandle>,
     /// What the aggregator has left out so far and is counted already.
     losses: [u64; 4],
+    spans: Spans,
+    /// Reports of the present round, while their spans are recorded.
+    reports: RoundReports,
 }
 
 impl Actor for Fuser {
@@ -119,8 +118,8 @@ impl Actor for Fuser {
                 state.alarm = Timestamp(u64::MAX);
             }
             FuserMessage::StopPublishing => {
-                state.command(Command::StandBy);
-                state.keeper.send(ReputationKeeperMessage::StandBy);
+                state.command(Command::StepDown);
+                state.keeper.send(ReputationKeeperMessage::StepDown);
             }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
@@ -133,10 +132,9 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
-        let FuserArguments { aggregator, term, intake, newest, recording, gateway, keeper, counters } = arguments;
+        let FuserArguments { aggregator, intake, newest, recording, gateway, keeper, counters, spans } = arguments;
         Self {
             aggregator,
-            term,
             intake,
             recording,
             gateway,
@@ -146,6 +144,8 @@ impl FuserState {
             alarm: Timestamp(u64::MAX),
             timer: None,
             losses: [0; 4],
+            spans,
+            reports: RoundReports::default(),
         }
     }
 
@@ -160,7 +160,12 @@ impl FuserState {
         self.recording.send(delivery.received_at, LogItem::Report(*kind, Arc::clone(report)));
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
-            Ok(fused) => self.publish(fused, delivery.received_at),
+            Ok(fused) => {
+                if self.aggregator.leads().is_some() {
+                    self.spans.note(report, delivery.received_at, &mut self.reports);
+                }
+                self.publish(fused, delivery.received_at);
+            }
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
                 self.counters.reject(reason);
@@ -168,19 +173,19 @@ impl FuserState {
         }
     }
 
-    /// Keeps the map that was admitted last. While nobody is known to lead, the gate admits any epoch: one that the
-    /// election does not know is nobody's to go on from.
+    /// Keeps the map that was accepted last, to go on from it when this node leads.
     fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
-        if self.aggregator.leads().is_none() && map.epoch <= *self.term.borrow() {
+        if self.aggregator.leads().is_none() {
             self.last_map = Some((map, received_at));
         }
     }
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
+        self.reports = RoundReports::default();
         self.keeper
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
         if let Some((map, received_at)) = self.last_map.take()
-            && clock::now().since(received_at) < FRESH_MAP
+            && clock::now().since(received_at) < MAX_ADOPTED_MAP_AGE
         {
             self.command(Command::AdoptMap { map, received_at });
         }
@@ -217,8 +222,10 @@ impl FuserState {
         }
     }
 
-    fn publish(&self, fused: Option<Fused>, now: Timestamp) {
-        let Some(Fused { epoch, round, map, verdicts, evidence, reputations }) = fused else { return };
+    fn publish(&mut self, fused: Option<Fused>, now: Timestamp) {
+        let Some(fused) = fused else { return };
+        let _round = self.spans.round(&fused, &std::mem::take(&mut self.reports)).entered();
+        let Fused { epoch, round, map, verdicts, evidence, reputations } = fused;
         self.recording.send(now, LogItem::Round(round));
         let has_verdicts = verdicts.is_some();
         if let Some(map) = map {

@@ -1,7 +1,7 @@
 //! The actor that owns all MQTT connections of a node.
 //!
-//! A link is kept to every broker it is told of: usually the aggregator's and its standby's, so that a change of
-//! aggregator costs no connecting. Every payload is encoded once and sent on every link.
+//! It keeps a link to each configured broker, usually the aggregator's and its standby's: a change of aggregator then
+//! needs no new connection. Every payload is encoded once and sent on every link.
 //!
 //! ```text
 //! other actors ── PublishReport, PublishMap, … ──> Gateway ── try_publish ──> link ── MQTT ──> broker
@@ -10,9 +10,9 @@
 //! ```
 //!
 //! - Nothing waits: a link that is down or full refuses, which is counted. A new connection starts with an empty queue,
-//!   so nothing old is delivered late.
-//! - Packets are decoded on the link's own task; a payload that cannot be used is a counter, never an error.
-//! - What a node publishes and also subscribes to reaches its own receivers in-process; the broker's echo is dropped.
+//!   so that no old message is sent late.
+//! - The link's own task decodes packets. A payload that cannot be used is a counter, never an error.
+//! - The node's own messages reach its own receivers in-process. The broker's echo is dropped.
 //! - `nodes/<node>` is published on every connection before anything else and has `offline` as last will.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -23,6 +23,7 @@ use bytes::Bytes;
 use ecod::names::NodeName;
 use ecod::wire::{Encoding, NodeState, NodeStatus, Payload, Topic, Topics, encode};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tracing::Span;
 use uuid::Uuid;
 
 pub use ecod::wire::ReportKind;
@@ -30,21 +31,21 @@ pub use ecod::wire::ReportKind;
 use crate::messages::gateway::GatewayMessage;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
-use crate::transport::mqtt::connection::{Handling, LastWill, last_will};
+use crate::transport::mqtt::connection::{LastWill, Retention, offline_payload};
 use crate::transport::mqtt::inbox::Inbox;
-use crate::transport::mqtt::link::{Link, LinkId, LinkNews, LinkSetup, LinkSink};
+use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink};
 use crate::transport::mqtt::subscription_role::REPORTS;
 use crate::transport::mqtt::{
     BrokerAddress, Incoming, LinkEvent, LinkState, MqttConfig, Security, Subscriber, SubscriptionRole,
 };
 
-/// What a gateway needs to know at its start.
+/// Arguments of a [`Gateway`].
 pub struct GatewayArguments {
     /// The cell's name.
     pub cell: NodeName,
-    /// Which topics to take.
-    pub part: SubscriptionRole,
-    /// What the node says about itself until told otherwise; names the node and this run of it.
+    /// Topics to subscribe to.
+    pub role: SubscriptionRole,
+    /// First status of the node. It holds the name and the id of this run.
     pub status: NodeStatus,
     /// Protocol, credentials and limits.
     pub mqtt: MqttConfig,
@@ -52,9 +53,9 @@ pub struct GatewayArguments {
     pub security: Security,
     /// The node's counters.
     pub counters: Arc<Counters>,
-    /// Gets every message.
+    /// Callback for every message.
     pub subscriber: Subscriber,
-    /// Seed of the jitter of reconnecting.
+    /// Seed of the jitter between attempts to connect.
     pub seed: u64,
 }
 
@@ -62,28 +63,27 @@ pub struct GatewayArguments {
 #[derive(Debug, Default)]
 pub struct Gateway;
 
-/// The links and what is sent on them.
-#[derive(Debug)]
+/// The links and the node's status.
 pub struct GatewayState {
     topics: Topics,
-    part: SubscriptionRole,
+    role: SubscriptionRole,
     encoding: Encoding,
     report_brokers: Option<Vec<BrokerAddress>>,
-    /// Whether reports are taken from every broker.
+    /// Whether to subscribe to reports on every broker.
     watches_reports: bool,
     status: NodeStatus,
     status_topic: String,
     status_payload: Bytes,
     links: BTreeMap<LinkId, Link>,
     next_link: u64,
-    /// Topics whose last payload was not sent for its size.
+    /// Topics whose last payload was too large to be sent.
     too_large: BTreeSet<String>,
     /// Other living runs of this node's name.
     namesakes: BTreeSet<Uuid>,
     setup: Arc<LinkSetup>,
 }
 
-/// How long a broker may take to accept the farewell.
+/// Time limit for sending the DISCONNECT of a link.
 const LEAVE_TIMEOUT: Duration = Duration::from_millis(300);
 
 impl Actor for Gateway {
@@ -113,31 +113,32 @@ impl Actor for Gateway {
             GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
-                state.publish(&kind.topic(report.node.clone()), &*report, Handling::Stream);
+                publishing()
+                    .in_scope(|| state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient));
                 inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {
-                state.publish(&Topic::GlobalDetections, &*map, Handling::Stream);
+                publishing().in_scope(|| state.publish(&Topic::GlobalDetections, &*map, Retention::Transient));
                 links_first().await;
                 inbox.deliver_local(Incoming::Map(map));
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
-                state.publish(&Topic::GlobalVerdicts, &*verdicts, Handling::Stream);
+                publishing().in_scope(|| state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient));
                 links_first().await;
                 inbox.deliver_local(Incoming::Verdicts(verdicts));
             }
             GatewayMessage::PublishReputations { reputations } => {
-                state.publish(&Topic::Reputations, &*reputations, Handling::State);
+                state.publish(&Topic::Reputations, &*reputations, Retention::Retained);
                 inbox.deliver_local(Incoming::Reputations(reputations));
             }
             GatewayMessage::PublishShare { share } => {
-                state.publish(&Topic::Ledger(share.node.clone()), &share, Handling::Stream);
+                state.publish(&Topic::Ledger(share.node.clone()), &share, Retention::Transient);
             }
             GatewayMessage::PublishStatus { status } => state.set_status(status),
             GatewayMessage::Links { reply } => {
                 let links = state.links.values().map(|link| (link.broker.clone(), link.state)).collect();
                 if reply.send(links).is_err() {
-                    tracing::debug!("nobody waited for the state of the links");
+                    tracing::debug!("caller did not wait for the state of the links");
                 }
             }
             GatewayMessage::LinkChanged { event } => state.link_changed(event),
@@ -154,31 +155,30 @@ impl Actor for Gateway {
     }
 }
 
-/// Lets the links' tasks send what was just published before this node's own parts work on it.
+/// Encoding and handing to the links, as part of a frame's or a round's way.
+fn publishing() -> Span {
+    tracing::info_span!("publish")
+}
+
+/// Lets the links' tasks send the message before this node's own actors process it.
 async fn links_first() {
     tokio::task::yield_now().await;
 }
 
 impl GatewayState {
     fn new(arguments: GatewayArguments) -> Self {
-        let GatewayArguments { cell, part, status, mqtt, security, counters, subscriber, seed } = arguments;
+        let GatewayArguments { cell, role, status, mqtt, security, counters, subscriber, seed } = arguments;
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
         let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
-        let filters = part.levels().iter().map(|level| topics.filter(level)).collect();
-        let seal = |payload: Bytes| sealed(&security, &status_topic, payload);
-        let will = LastWill { topic: status_topic.clone(), payload: seal(last_will(&status, encoding)) };
-        let status_payload = seal(encode(&status, encoding).into());
-        let inbox = Inbox::new(
-            (status.node.clone(), status.id),
-            topics.clone(),
-            (mqtt.limits(), security.signing.clone()),
-            (mqtt.inbox, mqtt.max_report_hz),
-            Arc::clone(&counters),
-            subscriber,
-        );
-        // One id for a run of the node: a broker that still holds the last connection ends it before it takes the next,
-        // so that the will comes before the new status.
+        let filters = role.filters().iter().map(|level| topics.filter(level)).collect();
+        let seal = |payload| Bytes::from(security.seal(&status_topic, payload));
+        let will = LastWill { topic: status_topic.clone(), payload: seal(offline_payload(&status, encoding)) };
+        let status_payload = seal(encode(&status, encoding));
+        let signing = security.signing.clone();
+        let inbox = Inbox::new(&status, topics.clone(), &mqtt, signing, Arc::clone(&counters), subscriber);
+        // One client id for each run: a broker ends the old connection before it accepts the new one, so that the last
+        // will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
         let (will, inbox) = (Mutex::new(will), Arc::new(inbox));
         let setup = LinkSetup { client_id, filters, will, config: mqtt, security, inbox, counters, seed };
@@ -186,7 +186,7 @@ impl GatewayState {
             report_brokers: None,
             watches_reports: false,
             topics,
-            part,
+            role,
             encoding,
             status_payload,
             status,
@@ -203,10 +203,8 @@ impl GatewayState {
         let mut wanted: BTreeSet<_> = addresses.into_iter().collect();
         let gone: Vec<_> = self.links.extract_if(.., |_, link| !wanted.remove(&link.broker)).collect();
         for (_, link) in gone {
-            // The status is taken back: this node lives on, but that broker will not hear of it.
-            if let Some(client) = &link.client {
-                client.publish(&self.status_topic, &Bytes::new(), Handling::State);
-            }
+            // Deletes the retained status: that broker would not learn of later changes.
+            link.publish(&self.status_topic, &Bytes::new(), Retention::Retained);
             tokio::spawn(link.leave(LEAVE_TIMEOUT));
         }
         for broker in wanted {
@@ -219,12 +217,12 @@ impl GatewayState {
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
         let reports = self.watches_reports || self.takes_reports_of(broker);
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
-        self.part.levels().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
+        self.role.filters().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
 
-    /// Whether this node needs the reports that go to this broker, whoever else watches them.
+    /// Whether this node itself needs the reports on a broker.
     fn takes_reports_of(&self, broker: &BrokerAddress) -> bool {
-        match self.part {
+        match self.role {
             SubscriptionRole::Candidate => self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker)),
             SubscriptionRole::Observer => true,
             SubscriptionRole::Follower => false,
@@ -242,35 +240,35 @@ impl GatewayState {
                 true => client.subscribe(&self.filters(&link.broker)),
                 false => client.unsubscribe(&reports),
             });
-            tracing::debug!(broker = %link.broker, wanted, ?told, "reports to be looked at");
+            tracing::debug!(broker = %link.broker, wanted, ?told, "subscription to reports changed");
         }
     }
 
     fn set_status(&mut self, status: NodeStatus) {
-        let seal = |payload: Bytes| sealed(&self.setup.security, &self.status_topic, payload);
-        self.status_payload = seal(encode(&status, self.encoding).into());
-        let will = seal(last_will(&status, self.encoding));
+        let seal = |payload| Bytes::from(self.setup.security.seal(&self.status_topic, payload));
+        self.status_payload = seal(encode(&status, self.encoding));
+        let will = seal(offline_payload(&status, self.encoding));
         self.setup.will.lock().unwrap_or_else(PoisonError::into_inner).payload = will;
         self.status = status;
-        self.send(&self.status_topic, &self.status_payload, Handling::State);
+        self.send(&self.status_topic, &self.status_payload, Retention::Retained);
     }
 
-    fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, handling: Handling) {
-        let payload = Bytes::from(encode(payload, self.encoding));
+    fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, retention: Retention) {
+        let payload = encode(payload, self.encoding);
         let path = self.topics.path(topic);
-        if self.fits::<T>(&path, &payload) {
-            let payload = sealed(&self.setup.security, &path, payload);
-            self.send(&path, &payload, handling);
-            self.expect_back(topic);
+        if self.fits::<T>(&path, payload.len()) {
+            let payload = self.setup.security.seal(&path, payload).into();
+            self.send(&path, &payload, retention);
+            self.expect_echo(topic);
         }
     }
 
-    /// Notes on which links what was just sent should come back, and which broker passes nothing on any more.
-    fn expect_back(&mut self, topic: &Topic) {
+    /// Expects the echo of a message that was just sent. A link whose broker has not echoed for too long is stalled.
+    fn expect_echo(&mut self, topic: &Topic) {
         let now = clock::now();
         let of_all = matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts);
         let of_one = matches!(topic, Topic::Detections(_) | Topic::VoteDetections(_))
-            && self.part == SubscriptionRole::Candidate;
+            && self.role == SubscriptionRole::Candidate;
         let reports: Vec<_> = self.links.values().map(|link| of_one && self.takes_reports_of(&link.broker)).collect();
         for (link, reports) in self.links.values_mut().zip(reports) {
             if (of_all || reports) && link.state == LinkState::Up && link.misses_echo(now) {
@@ -280,69 +278,59 @@ impl GatewayState {
         }
     }
 
-    /// Whether receivers with this node's limits take the payload. One beyond them would cost links, or be dropped by
-    /// every receiver without a word here; the first in a row is told of.
-    fn fits<T: Payload>(&mut self, topic: &str, payload: &Bytes) -> bool {
+    /// Whether receivers with this node's limits accept a payload. A larger one would cut links, or every receiver would
+    /// drop it. The first of each topic is logged.
+    fn fits<T: Payload>(&mut self, topic: &str, bytes: usize) -> bool {
         let limit = T::max_bytes(&self.setup.config.limits());
-        if payload.len() <= limit {
+        if bytes <= limit {
             self.too_large.remove(topic);
             return true;
         }
         self.setup.counters.count(Event::PublishTooLarge);
         if self.too_large.insert(topic.to_owned()) {
-            tracing::warn!(
-                topic,
-                bytes = payload.len(),
-                limit,
-                "payload too large to be sent, raise the limit in [mqtt]"
-            );
+            tracing::warn!(topic, bytes, limit, "payload too large to be sent, raise the limit in [mqtt]");
         }
         false
     }
 
-    fn send(&self, topic: &str, payload: &Bytes, handling: Handling) {
+    fn send(&self, topic: &str, payload: &Bytes, retention: Retention) {
         for link in self.links.values() {
-            let sent = link.client.as_ref().is_some_and(|client| client.publish(topic, payload, handling));
+            let sent = link.publish(topic, payload, retention);
             self.setup.counters.count(if sent { Event::Published } else { Event::PublishRefused });
         }
     }
 
-    fn link_changed(&mut self, LinkEvent { link: id, news }: LinkEvent) {
-        // Computed for the one event that needs them.
-        let filters = match &news {
-            LinkNews::Accepted(_) => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
+    fn link_changed(&mut self, LinkEvent { link: id, change }: LinkEvent) {
+        let filters = match &change {
+            LinkChange::Accepted(_) => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
             _ => Vec::new(),
         };
         let Some(link) = self.links.get_mut(&id) else { return };
-        let state = match news {
-            LinkNews::Accepted(client) => {
+        let state = match change {
+            LinkChange::Accepted(client) => {
                 // The queue of a new connection is empty, so that both fit.
-                client.publish(&self.status_topic, &self.status_payload, Handling::State);
+                client.publish(&self.status_topic, &self.status_payload, Retention::Retained);
                 client.subscribe(&filters);
                 link.client = Some(client);
                 LinkState::Up
             }
-            LinkNews::DeclaredOffline => {
-                tracing::warn!(broker = %link.broker, "broker took this node for dead");
-                if let Some(client) = &link.client {
-                    client.publish(&self.status_topic, &self.status_payload, Handling::State);
-                }
+            LinkChange::DeclaredOffline => {
+                tracing::warn!(broker = %link.broker, "broker published the last will of this node, which is alive");
+                link.publish(&self.status_topic, &self.status_payload, Retention::Retained);
                 return;
             }
-            LinkNews::Namesake(run) => {
-                // Answered once for each, so that both know and neither goes on for ever.
+            LinkChange::Namesake(run) => {
+                // One answer for each run: the other run is warned too, and the exchange ends.
                 if self.namesakes.len() < MAX_NAMESAKES && self.namesakes.insert(run) {
                     let node = &self.status.node;
                     tracing::warn!(broker = %link.broker, %node, %run, "another living node has this node's name, rename one");
-                    if let Some(client) = &link.client {
-                        client.publish(&self.status_topic, &self.status_payload, Handling::State);
-                    }
+                    link.publish(&self.status_topic, &self.status_payload, Retention::Retained);
                 }
                 return;
             }
-            LinkNews::Answered if link.state == LinkState::Stalled => LinkState::Up,
-            LinkNews::Answered => return,
-            LinkNews::Lost(state) => {
+            LinkChange::Answered if link.state == LinkState::Stalled => LinkState::Up,
+            LinkChange::Answered => return,
+            LinkChange::Lost(state) => {
                 link.client = None;
                 state
             }
@@ -354,26 +342,18 @@ impl GatewayState {
     }
 }
 
-/// Hands the events of a link to the gateway itself.
+/// Callback that sends a link's events to the gateway itself.
 fn events_to(gateway: &ActorRef<GatewayMessage>) -> LinkSink {
     let gateway = gateway.clone();
     Arc::new(move |event| gateway.cast(GatewayMessage::LinkChanged { event }).is_ok())
 }
 
-/// Tells this node's parts that a link is no longer as it was.
+/// Delivers the new state of a link to this node's actors.
 fn tell_state(inbox: &Inbox, link: &Link) {
     let (broker, state) = (link.broker.clone(), link.state);
     tracing::info!(%broker, ?state, "link changed");
     inbox.deliver_local(Incoming::Link { broker, state });
 }
 
-/// The payload with its signature, where payloads are signed.
-fn sealed(security: &Security, topic: &str, payload: Bytes) -> Bytes {
-    match &security.signing {
-        Some(key) => key.seal(topic, &payload).into(),
-        None => payload,
-    }
-}
-
-/// Most runs of this node's name that are told of.
+/// Maximum runs with this node's name that are logged.
 const MAX_NAMESAKES: usize = 16;

@@ -1,4 +1,4 @@
-//! The actor that owns the node's gossip socket: who is alive, independent of MQTT, and small datagrams between nodes.
+//! The actor that owns the gossip socket: liveness of nodes, independent of MQTT, and small datagrams between nodes.
 //!
 //! ```text
 //! LeaderElection ── Send ──> Membership <──── UDP ────> other nodes
@@ -22,30 +22,30 @@ use tokio::task::JoinSet;
 use crate::messages::membership::MembershipMessage;
 use crate::platform::clock;
 use crate::transport::gossip::key::{CellKey, SessionId};
-use crate::transport::gossip::machine::{Machine, Output, Setup};
+use crate::transport::gossip::machine::{GossipMachine, GossipOutput, GossipSetup};
 use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::socket::GossipSocket;
 use crate::transport::gossip::{
     EventSink, FrameCounters, FrameEvent, MAX_PAYLOAD_BYTES, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
 
-/// What a membership needs at its start.
+/// Arguments of a [`Membership`].
 pub struct MembershipArguments {
     /// The node's name.
     pub name: NodeName,
-    /// The cell; nodes of others are not heard.
+    /// The cell. Nodes of other cells are ignored.
     pub cell: NodeName,
-    /// When the node started, in Unix microseconds.
+    /// Time of the node's start in Unix microseconds.
     pub run: u64,
     /// The role it was started with.
     pub role: Role,
-    /// Where the node's broker listens, if it has one; others put what they see of this node in place of 0.0.0.0.
+    /// Address of the node's broker, if it has one. Others replace 0.0.0.0 by the address at which they see the node.
     pub broker: Option<SocketAddr>,
     /// Timings, seeds and limits.
     pub config: MembershipConfig,
-    /// Gets every event.
+    /// Callback for every event.
     pub events: EventSink,
-    /// Holds all living nodes but this one, by name.
+    /// All living nodes but this one, by name.
     pub members: watch::Sender<Vec<Member>>,
     /// The counters of the gossip socket.
     pub counters: Arc<FrameCounters>,
@@ -57,15 +57,15 @@ pub struct Membership;
 
 /// The membership and its socket.
 pub struct MembershipState {
-    machine: Machine,
+    machine: GossipMachine,
     socket: Arc<GossipSocket>,
     deadline: watch::Sender<Option<Timestamp>>,
-    /// Tells the watch over the socket that a [`MembershipMessage::Wake`] was handled.
+    /// Tells the socket's task that a [`MembershipMessage::Wake`] was handled.
     handled: Arc<Notify>,
     events: EventSink,
     members: watch::Sender<Vec<Member>>,
     counters: Arc<FrameCounters>,
-    /// End with the actor.
+    /// Tasks that end with the actor.
     _tasks: JoinSet<()>,
 }
 
@@ -83,13 +83,13 @@ impl Actor for Membership {
         let key = CellKey::load(&config, &cell)?;
         let socket = Arc::new(GossipSocket::bind(&config)?);
         let address = socket.address();
-        say_who_can_take_part(&config, address);
+        log_who_can_take_part(&config, address);
         let now = clock::now();
         let gossip = config.advertise.unwrap_or(address);
         let own = NodeId { name, run, life: run.max(now.micros()), role, gossip, broker };
         let (session, secret, seed) = draw_secrets()?;
-        let setup = Setup { own, key, session, secret, seed, counters: Arc::clone(&counters) };
-        let machine = Machine::new(setup, &config, now);
+        let setup = GossipSetup { own, key, session, secret, seed, counters: Arc::clone(&counters) };
+        let machine = GossipMachine::new(setup, &config, now);
         let (deadline, deadlines) = watch::channel(machine.next_deadline());
         let handled = Arc::new(Notify::new());
         let mut tasks = JoinSet::new();
@@ -131,10 +131,10 @@ impl Actor for Membership {
 }
 
 impl MembershipState {
-    /// Takes what waits before anything that is due: after a stall, signs of life come before suspicions.
+    /// Processes waiting datagrams before due timers: after a stall, signs of life come before suspicions.
     fn wake(&mut self) {
         let mut buffer = [0; 2 * MAX_PAYLOAD_BYTES];
-        for _ in 0..MOST_AT_ONCE {
+        for _ in 0..MAX_DATAGRAMS_PER_WAKE {
             let Some((length, from)) = self.socket.receive(&mut buffer) else { break };
             self.machine.receive(buffer.get(..length).unwrap_or_default(), from, clock::now());
             self.carry_out();
@@ -147,9 +147,9 @@ impl MembershipState {
         let mut changed = false;
         while let Some(output) = self.machine.poll() {
             let sent = match output {
-                Output::Send { to, frame } => Some(self.socket.send(&frame, to)),
-                Output::Multicast { frame } => self.socket.multicast(&frame),
-                Output::Tell(event) => {
+                GossipOutput::Send { to, frame } => Some(self.socket.send(&frame, to)),
+                GossipOutput::Multicast { frame } => self.socket.multicast(&frame),
+                GossipOutput::Tell(event) => {
                     changed |= !matches!(event, MembershipEvent::Received { .. });
                     (self.events)(event);
                     None
@@ -171,10 +171,10 @@ impl MembershipState {
     }
 }
 
-/// Most datagrams taken before what is due is done: a flood does not keep the node from that.
-const MOST_AT_ONCE: usize = 1024;
+/// Maximum datagrams before due timers run, even in a flood.
+const MAX_DATAGRAMS_PER_WAKE: usize = 1024;
 
-/// Wakes the actor when datagrams wait or something is due; never twice before it has woken.
+/// Wakes the actor when datagrams wait or a timer is due, and again only once it has handled that.
 async fn watch_socket(
     socket: Arc<GossipSocket>,
     mut deadline: watch::Receiver<Option<Timestamp>>,
@@ -186,7 +186,7 @@ async fn watch_socket(
         let wait = due.map_or(Duration::MAX, |due| due.since(clock::now()));
         tokio::select! {
             _ = socket.readable() => (),
-            () = tokio::time::sleep(wait.min(LONGEST_SLEEP)) => (),
+            () = tokio::time::sleep(wait.min(MAX_SLEEP)) => (),
             changed = deadline.changed() => match changed {
                 Ok(()) => continue,
                 Err(_) => return,
@@ -202,7 +202,7 @@ async fn watch_socket(
 /// Time between two attempts to join the multicast group.
 const REJOIN_PERIOD: Duration = Duration::from_secs(5);
 
-/// Joins the multicast group, if there is to be one; false when that does not work here, or not yet.
+/// Joins the multicast group, if enabled; false when that does not work, or not yet.
 fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
     if config.enabled && socket.address().is_ipv6() {
         tracing::warn!("key `membership.bind`: no discovery by multicast on IPv6, which takes `membership.seeds`");
@@ -216,7 +216,7 @@ fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
     }
 }
 
-/// A machine that starts may have its network later than its node.
+/// Joins the multicast group later: the network of a starting machine may come up after its node.
 async fn join_later(socket: Arc<GossipSocket>, config: MulticastConfig) {
     loop {
         tokio::time::sleep(REJOIN_PERIOD).await;
@@ -226,7 +226,7 @@ async fn join_later(socket: Arc<GossipSocket>, config: MulticastConfig) {
     }
 }
 
-const LONGEST_SLEEP: Duration = Duration::from_secs(60);
+const MAX_SLEEP: Duration = Duration::from_secs(60);
 
 fn draw_secrets() -> Result<(SessionId, [u8; 32], u64), ActorProcessingErr> {
     let random = SystemRandom::new();
@@ -236,7 +236,7 @@ fn draw_secrets() -> Result<(SessionId, [u8; 32], u64), ActorProcessingErr> {
     Ok((session, secret, u64::from_le_bytes(seed)))
 }
 
-fn say_who_can_take_part(config: &MembershipConfig, address: SocketAddr) {
+fn log_who_can_take_part(config: &MembershipConfig, address: SocketAddr) {
     match (config.has_key(), address.ip().is_loopback()) {
         (true, _) => tracing::info!(%address, "gossiping with whoever has the cell's key"),
         (false, true) => tracing::info!(%address, "gossiping on this machine only: no cell key is set"),

@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use ecod::aggregator::Algorithms;
 use ecod::detection::Detection;
-use ecod::motion::Motion;
+use ecod::pose_history::PoseHistory;
 use ecod::time::Timestamp;
 use ecod::wire::{ObjectReport, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
@@ -46,7 +46,7 @@ pub struct Projector;
 pub struct ProjectorState {
     perception: Perception,
     /// Recent poses of a moving vehicle.
-    motion: Option<Motion>,
+    poses: Option<PoseHistory>,
     algorithms: Algorithms,
     gateway: ActorSlot<GatewayMessage>,
     counters: Arc<Counters>,
@@ -69,8 +69,8 @@ impl Actor for Projector {
         if let Some(address) = poses {
             feed.spawn(pose_feed::listen(address, myself, Arc::clone(&counters)));
         }
-        let motion = poses.map(|_| Motion::default());
-        Ok(ProjectorState { perception, motion, algorithms, gateway, counters, _feed: feed })
+        let history = poses.map(|_| PoseHistory::default());
+        Ok(ProjectorState { perception, poses: history, algorithms, gateway, counters, _feed: feed })
     }
 
     async fn handle(
@@ -82,7 +82,7 @@ impl Actor for Projector {
         match message {
             ProjectorMessage::Report { detections, captured_at } => state.report(detections, captured_at),
             ProjectorMessage::TakePose { at, pose } => {
-                if state.motion.as_mut().is_some_and(|motion| !motion.take(at, pose)) {
+                if state.poses.as_mut().is_some_and(|poses| !poses.push(at, pose)) {
                     state.counters.count(Event::PoseRejected);
                 }
             }
@@ -93,12 +93,14 @@ impl Actor for Projector {
 
 impl ProjectorState {
     fn report(&mut self, detections: Vec<Detection>, captured_at: Timestamp) {
-        if let Some(motion) = &self.motion {
-            let Some(pose) = motion.at(captured_at) else { return self.counters.count(Event::FrameWithoutPose) };
+        if let Some(poses) = &self.poses {
+            let Some(pose) = poses.at(captured_at) else { return self.counters.count(Event::FrameWithoutPose) };
             self.perception.set_pose(pose);
         }
         let found = detections.len();
-        let report = self.perception.report(detections, captured_at);
+        let span = tracing::info_span!("project");
+        let report = span.in_scope(|| self.perception.report(detections, captured_at));
+        drop(span);
         self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
         if self.algorithms.vote() {
             self.publish(ReportKind::VoteDetections, votes(&report));

@@ -15,10 +15,10 @@ use std::sync::mpsc::sync_channel;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use ecod::leadership::Leadership;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
-use crate::messages::leadership::Leadership;
 use crate::messages::recorder::RecorderMessage;
 use crate::observe::recorder::log_sender::LogItem;
 use crate::observe::recorder::writer::LogWriter;

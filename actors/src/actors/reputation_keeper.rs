@@ -1,39 +1,28 @@
 //! The actor that keeps what is known about vehicles: publishes, persists and replicates it.
 //!
 //! ```text
-//! Fuser ── Lead, Record, StandBy ──> ReputationKeeper ── PublishReputations, PublishShare ──> Gateway
+//! Fuser ── Lead, Record, StepDown ─> ReputationKeeper ── PublishReputations, PublishShare ──> Gateway
 //! Gateway ── Merge ────────────────>   │ ▲      │ └──── Adopt, Resume ──> Fuser
 //! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
 //! ```
 //!
-//! - The leader records in the lane of its own epoch; every count that changed is shared with the other candidates
-//!   after the round, and all counts every [`ReputationKeeperConfig::snapshot_period_s`], in case a share was lost.
-//!   Receivers take the larger count: shares may come late, twice, or in any order.
-//! - What is published was saved before. What an actor knew outlives it in its [`Book`]; what a node knew outlives it in
-//!   its state directory.
-//! - Whoever has led sends all it knows to a leader that it hears for the first time, and everybody, a little later, what
-//!   has not been shared since: when a split heals, the evidence of both sides is kept, that of leaders who are gone too.
-//!   So a leader shares even that it has none.
-//! - Evidence is taken of members that may lead, and of terms that the election knows; the present leader's always has room.
-
-use crate::messages::reputation_keeper::ReputationKeeperMessage;
+//! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. What is
+//! published was saved before. What an actor knew outlives it in its [`Book`]; what a node knew outlives it in its state
+//! directory.
 
 mod book;
 mod config;
-mod owed;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Duration;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::Leadership;
+use ecod::leadership::ledger_resync::LedgerResync;
+use ecod::leadership::timers::DISK_TIMEOUT;
 use ecod::names::NodeName;
-use ecod::reputation::{EntryKey, Evidence, ReputationConfig};
-use ecod::time::Timestamp;
-use ecod::wire::{
-    LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, Reputation, Reputations, Role,
-    SCHEMA_VERSION,
-};
+use ecod::reputation::{Evidence, ReputationConfig};
+use ecod::wire::{LedgerShare, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -46,15 +35,14 @@ pub use config::ReputationKeeperConfig;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
-use crate::messages::leadership::Leadership;
 use crate::messages::newest::Received;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::{Delivery, Incoming};
 use book::Saved;
-use owed::Owed;
 
 /// What a keeper needs at its start.
 pub struct ReputationKeeperArguments {
@@ -76,8 +64,6 @@ pub struct ReputationKeeperArguments {
     pub members: watch::Receiver<Vec<Member>>,
     /// Who leads.
     pub leadership: watch::Receiver<Leadership>,
-    /// The highest term that the election knows.
-    pub term: watch::Receiver<u64>,
     /// Where reputations and shares are published.
     pub gateway: ActorSlot<GatewayMessage>,
     /// Starts from evidence of others.
@@ -93,20 +79,14 @@ pub struct ReputationKeeper;
 /// The ledger and what has not been done with it yet.
 pub struct ReputationKeeperState {
     arguments: ReputationKeeperArguments,
-    leads: Option<Epoch>,
-    has_led: bool,
+    resync: LedgerResync,
     last_round: u64,
     published: Option<(Epoch, u64)>,
-    owed: Owed,
     unsaved: bool,
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
     disk_failed: bool,
-    ticks: u32,
 }
-
-/// How long a disk may take before reputations are published unsaved.
-const WRITE_PATIENCE: Duration = Duration::from_secs(1);
 
 impl Actor for ReputationKeeper {
     type Msg = ReputationKeeperMessage;
@@ -137,9 +117,9 @@ impl Actor for ReputationKeeper {
                 state.send_snapshot();
             }
             ReputationKeeperMessage::Record { epoch, round, evidence, reputations } => {
-                state.record(epoch, round, &evidence, reputations);
+                state.record(&epoch, round, &evidence, reputations);
             }
-            ReputationKeeperMessage::StandBy => state.leads = None,
+            ReputationKeeperMessage::StepDown => state.resync.step_down(),
             ReputationKeeperMessage::Merge { delivery } => state.merge(&delivery),
             ReputationKeeperMessage::SendSnapshot { to } => {
                 tracing::info!(%to, "sharing all evidence");
@@ -159,18 +139,15 @@ impl Actor for ReputationKeeper {
 impl ReputationKeeperState {
     fn new(arguments: ReputationKeeperArguments) -> Self {
         Self {
+            resync: LedgerResync::new(arguments.name.clone(), arguments.config.ticks_per_snapshot()),
             arguments,
-            leads: None,
-            has_led: false,
             last_round: 0,
             published: None,
-            owed: Owed::default(),
             // A run before may have left something.
             unsaved: true,
             unadopted: false,
             writing: None,
             disk_failed: false,
-            ticks: 0,
         }
     }
 
@@ -181,131 +158,75 @@ impl ReputationKeeperState {
             book.standing.clone_from(&newest.reputations);
         }
         self.arguments.fuser.send(FuserMessage::Resume { reputations: book.standing.clone() });
-        self.leads = Some(epoch);
-        self.has_led = true;
+        self.resync.lead(epoch);
         self.last_round = last_round;
     }
 
     fn record(
         &mut self,
-        epoch: Epoch,
+        epoch: &Epoch,
         round: u64,
         evidence: &[Evidence],
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     ) {
         self.unsaved |= !evidence.is_empty() || reputations.is_some();
-        let key = |evidence: &Evidence| {
-            let Evidence { node, label, .. } = evidence.clone();
-            EntryKey { lane: epoch.clone(), node, label }
-        };
-        let keys: BTreeSet<_> = evidence.iter().map(key).collect();
         let mut book = self.arguments.book.open();
-        for evidence in evidence {
-            book.ledger.record(epoch.term, &epoch.leader, evidence);
-        }
+        let shares = self.resync.record(epoch, evidence, &mut book.ledger);
         if let Some(reputations) = reputations {
             book.standing = reputations;
         }
-        let changed = book.ledger.entries_of(&keys);
-        let reached = book.ledger.marks_reached(epoch.term, &epoch.leader, evidence);
         drop(book);
-        self.leads = Some(epoch);
         self.last_round = round;
-        self.share(&changed, &reached);
+        self.publish_shares(shares);
     }
 
     fn merge(&mut self, delivery: &Delivery) {
         let Incoming::Ledger(share) = &delivery.message else { return };
-        let may_lead = |member: &Member| member.name == share.node && member.role != Role::Cav;
-        if !self.arguments.members.borrow().iter().any(may_lead) {
-            tracing::debug!(node = %share.node, "evidence of a node that is no candidate");
-            return self.arguments.counters.reject(RejectReason::NotCandidate);
-        }
-        let term = *self.arguments.term.borrow();
-        let lanes = share.entries.iter().map(|entry| entry.epoch).chain(share.marks.iter().map(|mark| mark.epoch));
-        if lanes.max() > Some(term) {
-            tracing::debug!(node = %share.node, term, "evidence of a later term");
+        let candidates = self.candidates();
+        let leadership = self.arguments.leadership.borrow().clone();
+        let mut book = self.arguments.book.open();
+        let merged = self.resync.merge(share, &mut book.ledger, &candidates, &leadership, delivery.received_at);
+        drop(book);
+        let merged = match merged {
+            Ok(merged) => merged,
+            Err(reason) => {
+                tracing::debug!(node = %share.node, %reason, "evidence not used");
+                return self.arguments.counters.reject(reason);
+            }
+        };
+        if merged.has_unknown_terms {
+            tracing::debug!(node = %share.node, term = leadership.term, "evidence of a later term");
             self.arguments.counters.reject(RejectReason::UnknownTerm);
         }
-        let is_news = |epoch: u64, leader: &NodeName| {
-            epoch <= term && self.leads.as_ref().is_none_or(|own| own.term != epoch || own.leader != *leader)
-        };
-        let entries: Vec<_> = share.entries.iter().filter(|e| is_news(e.epoch, &e.aggregator)).cloned().collect();
-        let marks: Vec<_> = share.marks.iter().filter(|m| is_news(m.epoch, &m.aggregator)).cloned().collect();
-        let present = self.leads.clone().or_else(|| self.arguments.leadership.borrow().epoch.clone());
-        let leader = share.epoch.filter(|claimed| *claimed <= term).map(|term| Epoch::new(term, share.node.clone()));
-        if self.owed.is_first_of(leader, self.ticks_to_listen()) {
-            let (entries, _) = self.evidence();
-            self.owed
-                .owe_everything(self.has_led || entries.iter().any(|entry| entry.aggregator == self.arguments.name));
-        }
-        self.owed.note(&entries, &marks);
-        let mut book = self.arguments.book.open();
-        let present = present.as_ref();
-        let changed = book.ledger.merge_entries(entries, present) | book.ledger.merge_marks(marks, present);
-        drop(book);
-        if changed {
+        if merged.is_news {
             self.arguments.counters.count(Event::LedgerMerged);
             self.unsaved = true;
             self.unadopted = true;
         }
-        self.send_all(delivery.received_at);
+        self.publish_shares(merged.shares);
     }
 
-    /// Sends everything to a leader that may not have it, not too often.
-    fn send_all(&mut self, now: Timestamp) {
-        if self.owed.takes_everything(now) {
-            let (entries, marks) = self.evidence();
-            self.share(&entries, &marks);
-        }
-    }
-
-    /// For how long a leader is listened to before it is told what it has not shared: it shares everything in two thirds
-    /// of that, and who comes earlier among the candidates speaks first.
-    fn ticks_to_listen(&self) -> u32 {
+    /// The other nodes that may lead.
+    fn candidates(&self) -> Vec<NodeName> {
         let members = self.arguments.members.borrow();
-        let earlier = members.iter().filter(|member| member.role != Role::Cav && member.name < self.arguments.name);
-        let period = self.arguments.config.ticks_per_snapshot();
-        period + period.div_ceil(2) + u32::try_from(earlier.count()).unwrap_or(u32::MAX) % period.max(1)
-    }
-
-    /// Sends the leader what nobody has shared with it.
-    fn send_owed(&mut self) {
-        if self.leads.is_some() {
-            return;
-        }
-        let Some(shared) = self.owed.tick(self.arguments.config.ticks_per_snapshot()) else { return };
-        let term = *self.arguments.term.borrow();
-        let (mut entries, mut marks) = self.arguments.book.open().ledger.beyond(shared);
-        entries.retain(|entry| entry.epoch <= term);
-        marks.retain(|mark| mark.epoch <= term);
-        if !entries.is_empty() || !marks.is_empty() {
-            tracing::info!(entries = entries.len(), "sharing evidence that the leader has not shared");
-            self.share(&entries, &marks);
-        }
+        members.iter().filter(|member| member.role != Role::Cav).map(|member| member.name.clone()).collect()
     }
 
     async fn tick(&mut self) {
         self.save().await;
         self.publish();
-        self.send_all(clock::now());
-        self.send_owed();
+        let leadership = self.arguments.leadership.borrow().clone();
+        let shares = self.resync.tick(&self.arguments.book.open().ledger, &leadership, clock::now());
+        self.publish_shares(shares);
         if std::mem::take(&mut self.unadopted) {
             let ledger = Arc::new(self.arguments.book.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });
-        }
-        self.ticks += 1;
-        if self.ticks >= self.arguments.config.ticks_per_snapshot() {
-            self.ticks = 0;
-            if self.leads.is_some() {
-                self.send_snapshot();
-            }
         }
     }
 
     /// Publishes what the book says, unless it did so after the same round.
     fn publish(&mut self) {
-        let Some(epoch) = &self.leads else { return };
+        let Some(epoch) = self.resync.leads() else { return };
         let now = Some((epoch.clone(), self.last_round));
         if self.published == now {
             return;
@@ -321,34 +242,15 @@ impl ReputationKeeperState {
         self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
     }
 
-    fn evidence(&self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
-        let book = self.arguments.book.open();
-        (book.ledger.entries().collect(), book.ledger.marks().collect())
-    }
-
-    /// Shares all evidence, and that there is none: whoever takes over waits for it, and whoever has some gives it.
     fn send_snapshot(&self) {
-        let (entries, marks) = self.evidence();
-        if entries.is_empty() {
-            self.publish_share(&[], &[]);
+        let shares = self.resync.snapshot(&self.arguments.book.open().ledger);
+        self.publish_shares(shares);
+    }
+
+    fn publish_shares(&self, shares: Vec<LedgerShare>) {
+        for share in shares {
+            self.arguments.gateway.send(GatewayMessage::PublishShare { share });
         }
-        self.share(&entries, &marks);
-    }
-
-    fn share(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) {
-        entries.chunks(MAX_SHARE_ENTRIES).for_each(|entries| self.publish_share(entries, &[]));
-        marks.chunks(MAX_SHARE_ENTRIES).for_each(|marks| self.publish_share(&[], marks));
-    }
-
-    fn publish_share(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) {
-        let share = LedgerShare {
-            schema: SCHEMA_VERSION,
-            node: self.arguments.name.clone(),
-            epoch: self.leads.as_ref().map(|epoch| epoch.term),
-            entries: entries.to_vec(),
-            marks: marks.to_vec(),
-        };
-        self.arguments.gateway.send(GatewayMessage::PublishShare { share });
     }
 
     /// Saves what has changed; a disk that fails or hangs is counted, and the node goes on.
@@ -360,7 +262,7 @@ impl ReputationKeeperState {
             self.writing = Some(tokio::task::spawn_blocking(move || file.save(&saved)));
         }
         let Some(writing) = &mut self.writing else { return };
-        let written = match tokio::time::timeout(WRITE_PATIENCE, writing).await {
+        let written = match tokio::time::timeout(DISK_TIMEOUT, writing).await {
             Ok(written) => {
                 self.writing = None;
                 written.map_err(std::io::Error::other).flatten()

@@ -2,18 +2,15 @@
 
 pub mod capture;
 pub(crate) mod images;
-mod testbed;
 mod video;
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use ecod::config::{ConfigError, check_range};
-use ecod::names::NodeName;
 use serde::{Deserialize, Serialize};
 
 use self::images::ImageSequence;
-use self::testbed::TestbedVehicle;
 use self::video::Video;
 use crate::camera::frame::Frame;
 
@@ -112,18 +109,6 @@ pub enum SourceConfig {
         #[serde(default)]
         looping: bool,
     },
-    /// A vehicle of a testbed scene, rendered at the rate of its camera.
-    Testbed {
-        /// The scene file.
-        scenes: PathBuf,
-        /// Name of the scene.
-        scene: String,
-        /// Name of the vehicle.
-        cav: NodeName,
-        /// Seed of everything that varies from frame to frame; default 1.
-        #[serde(default = "default_seed")]
-        seed: u64,
-    },
 }
 
 impl SourceConfig {
@@ -138,9 +123,6 @@ impl SourceConfig {
             Self::Url { url } => Ok(Box::new(Video::url(url, timeout)?)),
             Self::Video { path, looping } => Ok(Box::new(Video::file(path, *looping)?)),
             Self::Images { path, fps, looping } => Ok(Box::new(ImageSequence::open(path, *fps, *looping)?)),
-            Self::Testbed { scenes, scene, cav, seed } => {
-                Ok(Box::new(TestbedVehicle::open(scenes, scene, cav, *seed)?))
-            }
         }
     }
 
@@ -185,10 +167,6 @@ fn default_device() -> PathBuf {
 
 fn default_fps() -> f64 {
     10.0
-}
-
-fn default_seed() -> u64 {
-    1
 }
 
 /// Delays recorded frames to their own rate.

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use ecod::camera::Mount;
 use ecod::detection::Detection;
 use ecod::geometry::Pose;
-use ecod::landmark::{Gate, LandmarkIndex};
+use ecod::landmark::{LandmarkGate, LandmarkIndex};
 use ecod::names::NodeName;
 use ecod::projection::{Projection, ProjectionConfig, Ranging};
 use ecod::time::Timestamp;
@@ -40,7 +40,7 @@ pub struct Perception {
     camera: Pose,
     projection: Projection,
     view: ViewConfig,
-    gate: Gate,
+    gate: LandmarkGate,
     seq: u64,
     discarded: DiscardCounts,
 }
@@ -64,7 +64,12 @@ impl DiscardCounts {
 impl Perception {
     /// A producer without reports yet; the configurations must be valid. `gate` limits the distance between an object
     /// and its known location.
-    pub fn new(vehicle_camera: VehicleCamera, projection: ProjectionConfig, view: ViewConfig, gate: Gate) -> Self {
+    pub fn new(
+        vehicle_camera: VehicleCamera,
+        projection: ProjectionConfig,
+        view: ViewConfig,
+        gate: LandmarkGate,
+    ) -> Self {
         let camera = vehicle_camera.mount.camera_pose(&vehicle_camera.pose);
         let projection = Projection::new(projection, vehicle_camera.lens.intrinsics);
         Self { vehicle_camera, camera, projection, view, gate, seq: 0, discarded: DiscardCounts::default() }
@@ -78,7 +83,7 @@ impl Perception {
 
     /// The report of one frame. Detections without a position are discarded and counted.
     pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
-        detections.retain(|detection| match self.projection.check_whole(detection) {
+        detections.retain(|detection| match self.projection.check_unclipped(detection) {
             Ok(()) => true,
             Err(error) => {
                 self.discarded.count(error.as_str(), &error);
@@ -154,7 +159,7 @@ mod tests {
         };
         let sizes = ObjectSizes { default: Some(ObjectSize::square(0.5)), ..ObjectSizes::default() };
         let projection = ProjectionConfig { ranging: Ranging::BoxHeight, sizes, ..ProjectionConfig::default() };
-        let gate = Gate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
+        let gate = LandmarkGate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
         let mut perception = Perception::new(vehicle_camera, projection, ViewConfig::default(), gate);
         let seen = |label: &str, confidence: f64, y_max: f64| Detection {
             label: label.into(),

@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 
 /// Result of reading a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum LineRead {
+pub enum LineRead {
     /// The whole line, without its end.
     Whole,
     /// More than the limit; the rest was skipped.
@@ -21,7 +21,7 @@ pub(super) enum LineRead {
 ///
 /// # Errors
 /// When the source cannot be read.
-pub(super) fn read_line(source: &mut impl BufRead, limit: usize, line: &mut Vec<u8>) -> io::Result<LineRead> {
+pub fn read_line(source: &mut impl BufRead, limit: usize, line: &mut Vec<u8>) -> io::Result<LineRead> {
     line.clear();
     let bound = u64::try_from(limit).unwrap_or(u64::MAX).saturating_add(1);
     if source.by_ref().take(bound).read_until(b'\n', line)? == 0 {
@@ -40,7 +40,7 @@ pub(super) fn read_line(source: &mut impl BufRead, limit: usize, line: &mut Vec<
 ///
 /// # Errors
 /// Naming the file.
-pub(super) fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
+pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     if path == Path::new("-") {
         return Ok(Box::new(io::stdin().lock()));
     }
@@ -55,7 +55,7 @@ pub(super) fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
 ///
 /// # Errors
 /// Naming the file.
-pub(super) fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<()> {
+pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<()> {
     let ours = fs::canonicalize(path).ok();
     if ours.is_some() && inputs.iter().any(|input| fs::canonicalize(input).ok() == ours) {
         bail!("{} is to be both read and written", path.display());
@@ -67,7 +67,7 @@ pub(super) fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::
 ///
 /// # Errors
 /// Naming the file.
-pub(super) fn create(path: &Path, inputs: &[PathBuf]) -> anyhow::Result<Box<dyn Write>> {
+pub fn create(path: &Path, inputs: &[PathBuf]) -> anyhow::Result<Box<dyn Write>> {
     if path == Path::new("-") {
         return Ok(Box::new(BufWriter::new(io::stdout().lock())));
     }

@@ -1,12 +1,17 @@
-//! Format and destination of the program's log.
+//! Format and destination of the program's log, and the export of its spans.
 
 use std::io::{IsTerminal, stderr};
 use std::os::unix::fs::MetadataExt;
 
 use clap::ValueEnum;
+use tracing::level_filters::LevelFilter;
+use tracing_subscriber::filter::{FilterExt, filter_fn};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry};
+
+#[cfg(feature = "otel")]
+use crate::telemetry::otlp::Export;
 
 /// Help on log formats, printed once by `ecod-node --help`.
 pub(super) const HELP: &str = "\
@@ -20,7 +25,7 @@ RUST_LOG sets the log level, such as RUST_LOG=debug.";
 
 /// Format of the log.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
-pub(super) enum LogFormat {
+pub enum LogFormat {
     /// The journal if connected; else JSON for nodes outside a terminal, text otherwise
     #[default]
     Auto,
@@ -32,11 +37,15 @@ pub(super) enum LogFormat {
     Journal,
 }
 
+/// Standard variable with the collector of spans; without it nothing is exported.
+const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
+
 /// Prefix of event fields in the journal, followed by `_`.
 const JOURNAL_PREFIX: &str = "ECOD";
 
-/// Starts the log. A service's log is read by machines, a tool's by people. `RUST_LOG` overrides `level`.
-pub(super) fn start(format: LogFormat, is_service: bool, level: &str) {
+/// Starts the log. A service's log is read by machines, a tool's by people. `RUST_LOG` overrides `level`. Spans are not
+/// logged: a line has the fields of its event only. Keep the result until the program ends.
+pub fn start(format: LogFormat, is_service: bool, level: &str) -> Option<Export> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let (layer, problem) = match resolved(format, is_service) {
         LogFormat::Journal => match journal() {
@@ -46,10 +55,27 @@ pub(super) fn start(format: LogFormat, is_service: bool, level: &str) {
         LogFormat::Json => (json(), None),
         LogFormat::Text | LogFormat::Auto => (text(), None),
     };
-    tracing_subscriber::registry().with(layer.with_filter(filter)).init();
+    let events = filter_fn(|metadata| metadata.is_event()).with_max_level_hint(LevelFilter::TRACE);
+    let mut layers = vec![layer.with_filter(filter.and(events)).boxed()];
+    let exported = if is_service { export(&mut layers) } else { Ok(None) };
+    tracing_subscriber::registry().with(layers).init();
     if let Some(error) = problem {
         tracing::warn!(%error, "cannot reach the journal, logging to standard error");
     }
+    exported.unwrap_or_else(|error| {
+        tracing::warn!(%error, "cannot export spans");
+        None
+    })
+}
+
+/// Adds the export of spans if the environment names a collector.
+fn export(layers: &mut Vec<AnyLayer>) -> anyhow::Result<Option<Export>> {
+    if std::env::var_os(ENDPOINT).is_none_or(|endpoint| endpoint.is_empty()) {
+        return Ok(None);
+    }
+    let (export, layer) = Export::start()?;
+    layers.push(layer.boxed());
+    Ok(Some(export))
 }
 
 fn resolved(format: LogFormat, is_service: bool) -> LogFormat {
@@ -67,6 +93,17 @@ fn stderr_is_journal() -> bool {
     std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))
 }
 
+/// An export that this program was built without.
+#[cfg(not(feature = "otel"))]
+pub enum Export {}
+
+#[cfg(not(feature = "otel"))]
+impl Export {
+    fn start() -> anyhow::Result<(Self, AnyLayer)> {
+        anyhow::bail!("{ENDPOINT} is set, but the program was built without the feature `otel`")
+    }
+}
+
 type AnyLayer = Box<dyn Layer<Registry> + Send + Sync>;
 
 fn text() -> AnyLayer {
@@ -74,13 +111,7 @@ fn text() -> AnyLayer {
 }
 
 fn json() -> AnyLayer {
-    tracing_subscriber::fmt::layer()
-        .json()
-        .flatten_event(true)
-        .with_current_span(false)
-        .with_span_list(false)
-        .with_writer(stderr)
-        .boxed()
+    tracing_subscriber::fmt::layer().json().flatten_event(true).with_writer(stderr).boxed()
 }
 
 fn journal() -> std::io::Result<AnyLayer> {

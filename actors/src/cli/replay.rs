@@ -90,8 +90,11 @@ fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> 
     rounds.finish()
 }
 
-/// The cell that a configuration file describes.
-pub(super) fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
+/// The cell that a configuration file describes; without a file, an open one.
+///
+/// # Errors
+/// When the file cannot be used.
+pub fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
     let Some(path) = path else { return Ok(ReplayConfig::default()) };
     let node = NodeConfig::load_cell(path).map_err(Failure::usage)?;
     let default = ReplayConfig::default();

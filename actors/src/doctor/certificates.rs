@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::Finding;
 use crate::node::config::NodeConfig;
 use crate::platform::clock;
-use crate::transport::pki::{Credentials, CredentialsError, Identity};
+use crate::transport::pki::{CertificateSubject, Credentials, CredentialsError};
 
 /// Remaining validity below which a certificate should be replaced.
 const SOON: Duration = Duration::from_secs(30 * 86_400);
@@ -39,13 +39,13 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
             return Some(Finding::broken(check, error.to_string(), fix));
         }
     };
-    let identity: &Identity = &current.identity;
+    let identity: &CertificateSubject = &current.identity;
     let left = identity.expires().since(clock::now());
     let shown = format!("for {}, {} days left", identity.name(), left.as_secs() / 86_400);
     let is_public = std::fs::metadata(&files.key).is_ok_and(|metadata| metadata.permissions().mode() & 0o077 != 0);
     Some(if left.is_zero() {
         Finding::broken(check, "expired", format!("`ecod-node pki issue {name}` creates a new one"))
-    } else if config.may_lead() && !identity.serves() {
+    } else if config.may_lead() && !identity.may_serve() {
         Finding::broken(check, "for role cav, which never leads", "issue one with `--role auto` or `--role edge`")
     } else if is_public {
         Finding::doubtful(

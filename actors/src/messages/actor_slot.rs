@@ -3,7 +3,10 @@
 use std::fmt;
 use std::sync::{Arc, PoisonError, RwLock};
 
-use ractor::{ActorRef, Message};
+use ecod::leadership::timers::ANSWER_STEP;
+use ractor::rpc::CallResult;
+use ractor::{ActorRef, Message, RpcReplyPort};
+use tokio::time::timeout;
 
 /// Address of an actor that survives the actor's restarts. The supervisor sets each new run. A message to an empty
 /// slot is dropped, as it would be by an actor that has just ended.
@@ -25,6 +28,27 @@ impl<M: Message> ActorSlot<M> {
     /// Sends to the present run; false when the slot is empty or the actor has just ended.
     pub fn send(&self, message: M) -> bool {
         self.get().is_some_and(|actor| actor.cast(message).is_ok())
+    }
+
+    /// The answer of the present run, if it comes within so many times [`ANSWER_STEP`]. A stop of the whole node takes up
+    /// one step only.
+    pub(crate) async fn ask<T: Send + 'static>(
+        &self,
+        question: impl FnOnce(RpcReplyPort<T>) -> M,
+        steps: usize,
+    ) -> Option<T> {
+        let actor = self.get()?;
+        let answer = actor.call(question, None);
+        tokio::pin!(answer);
+        for _ in 0..steps {
+            if let Ok(answered) = timeout(ANSWER_STEP, &mut answer).await {
+                return match answered.ok()? {
+                    CallResult::Success(value) => Some(value),
+                    CallResult::Timeout | CallResult::SenderError => None,
+                };
+            }
+        }
+        None
     }
 }
 
@@ -88,5 +112,53 @@ pub(crate) mod listening {
         let slot = ActorSlot::default();
         slot.set(Actor::spawn(None, Listener(PhantomData), sender).await.unwrap().0);
         (slot, receiver)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use ecod::leadership::timers::ANSWER_STEPS;
+    use ractor::{Actor, ActorProcessingErr};
+
+    use super::*;
+    use crate::messages::broker::BrokerMessage;
+    use crate::transport::broker::BrokerHealth;
+
+    /// Answers a moment after the whole process was stopped.
+    struct Held;
+
+    impl Actor for Held {
+        type Msg = BrokerMessage;
+        type State = ();
+        type Arguments = ();
+
+        async fn pre_start(&self, _: ActorRef<BrokerMessage>, (): ()) -> Result<(), ActorProcessingErr> {
+            Ok(())
+        }
+
+        async fn handle(
+            &self,
+            _: ActorRef<BrokerMessage>,
+            message: BrokerMessage,
+            (): &mut (),
+        ) -> Result<(), ActorProcessingErr> {
+            let BrokerMessage::Health { reply } = message else { return Ok(()) };
+            // On a runtime of one thread nothing else goes on either.
+            std::thread::sleep(Duration::from_millis(1500));
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            reply.send(BrokerHealth::Stopped)?;
+            Ok(())
+        }
+    }
+
+    #[tokio::test]
+    async fn an_actor_that_was_stopped_with_the_node_is_still_waited_for() {
+        let slot = ActorSlot::default();
+        let (actor, _) = Actor::spawn(None, Held, ()).await.unwrap();
+        slot.set(actor);
+        let answer = slot.ask(|reply| BrokerMessage::Health { reply }, ANSWER_STEPS).await;
+        assert_eq!(answer, Some(BrokerHealth::Stopped));
     }
 }

@@ -6,22 +6,22 @@ use ractor::RpcReplyPort;
 
 use crate::transport::broker::{BrokerError, BrokerHealth};
 
-/// What the broker's actor is asked to do.
+/// Requests to the broker's actor.
 #[derive(Debug)]
 pub enum BrokerMessage {
-    /// Listen on an address, port 0 for a free one; the answer is the bound address. A running broker is moved there.
+    /// Listen on an address, with port 0 on a free port. A running broker is moved there.
     Start {
-        /// Where to listen.
+        /// The address to listen on.
         address: SocketAddr,
         /// Gets the bound address.
         reply: RpcReplyPort<Result<SocketAddr, BrokerError>>,
     },
-    /// Disconnect all clients and stop listening; the answer says that the port is free.
+    /// Disconnect all clients and stop listening.
     Stop {
-        /// Answered when done.
+        /// Answered once the port is free.
         reply: RpcReplyPort<()>,
     },
-    /// Tell whether the broker serves.
+    /// Query the state of the broker.
     Health {
         /// Gets the state.
         reply: RpcReplyPort<BrokerHealth>,

@@ -8,69 +8,69 @@ use ractor::RpcReplyPort;
 
 use crate::transport::mqtt::{BrokerAddress, LinkEvent, LinkState, Subscriber};
 
-/// What the gateway is asked to do.
+/// Requests to the gateway.
 pub enum GatewayMessage {
     /// Keep links to exactly these brokers; links that stay are not touched.
     SetBrokers {
         /// The brokers, in no particular order.
         addresses: Vec<BrokerAddress>,
     },
-    /// Take reports from these brokers only, on links made from now on; until told, a candidate takes them from all.
+    /// Subscribe to reports on these brokers only, for new connections. Before it, a candidate does so on all brokers.
     SetReportBrokers {
-        /// Brokers to which all vehicles send.
+        /// Brokers to which all vehicles publish.
         addresses: Vec<BrokerAddress>,
     },
-    /// Take reports from every broker, to be looked at, or no longer so; whoever wants them asks again from time to
-    /// time, as a gateway that is started anew has forgotten it.
+    /// Subscribe to reports on every broker for display, or end that. It is repeated from time to time, as a restarted
+    /// gateway has forgotten it.
     WatchReports {
         /// Whether they are wanted.
         wanted: bool,
     },
-    /// Hand messages to another subscriber from now on, such as after a receiver's restart.
+    /// Replace the subscriber, such as after a receiver's restart.
     SetSubscriber {
         /// The new subscriber.
         subscriber: Subscriber,
     },
-    /// Send this vehicle's report; the node also takes it in-process.
+    /// Publish this vehicle's report, also in-process.
     PublishReport {
-        /// What it is for.
+        /// The kind of evidence.
         kind: ReportKind,
         /// The report.
         report: Arc<ObjectReport>,
     },
-    /// Send the map of a round to all, this node included.
+    /// Publish the map of a round, also in-process.
     PublishMap {
         /// The map.
         map: Arc<GlobalMap>,
     },
-    /// Send the verdicts of a round to all, this node included.
+    /// Publish the verdicts of a round, also in-process.
     PublishVerdicts {
         /// The verdicts.
         verdicts: Arc<Verdicts>,
     },
-    /// Send reputations to all, this node included; brokers keep them for latecomers.
+    /// Publish reputations, retained, also in-process.
     PublishReputations {
         /// The reputations.
         reputations: Arc<Reputations>,
     },
-    /// Send evidence to the other candidates.
+    /// Publish evidence to the other candidates.
     PublishShare {
         /// The evidence.
         share: LedgerShare,
     },
-    /// Replace what this node says about itself, now and on every later connection.
+    /// Replace this node's status, now and on every later connection.
     PublishStatus {
         /// The status.
         status: NodeStatus,
     },
-    /// Tell how every link is.
+    /// Query the state of every link.
     Links {
         /// Gets the state by broker.
         reply: RpcReplyPort<BTreeMap<BrokerAddress, LinkState>>,
     },
-    /// News from a link's own task.
+    /// An event of a link's own task.
     LinkChanged {
-        /// The news.
+        /// The event.
         event: LinkEvent,
     },
 }

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use ecod::names::NodeName;
 use ractor::RpcReplyPort;
 
-/// What the membership is asked to do.
+/// Requests to the membership.
 #[derive(Debug)]
 pub enum MembershipMessage {
     /// Send a datagram to a node, once and without waiting; it may be lost.
@@ -16,16 +16,16 @@ pub enum MembershipMessage {
         /// At most [`MAX_PAYLOAD_BYTES`].
         payload: Bytes,
     },
-    /// Tell where the node gossips: the bound address, which may be unspecified.
+    /// Query the bound address, which may be unspecified.
     Address {
         /// Gets the answer.
         reply: RpcReplyPort<SocketAddr>,
     },
-    /// Greet these addresses too; sent by the membership to itself.
+    /// Greet these addresses; sent by the membership to itself.
     SetSeeds {
         /// The seeds, resolved.
         addresses: Vec<SocketAddr>,
     },
-    /// Take the datagrams that wait, and do what is due; sent by the membership to itself.
+    /// Process waiting datagrams and due timers; sent by the membership to itself.
     Wake,
 }

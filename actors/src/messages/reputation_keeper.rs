@@ -31,7 +31,7 @@ pub enum ReputationKeeperMessage {
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     },
     /// Publish nothing more.
-    StandBy,
+    StepDown,
     /// Take in another candidate's evidence.
     Merge {
         /// The share and when it came.

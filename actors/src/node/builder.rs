@@ -1,12 +1,14 @@
 //! How the parts of a node are made, connected, started and stopped.
 
 mod arguments;
-mod elected;
 
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use ecod::leadership::Leadership;
+use ecod::leadership::node::Input;
+use ecod::leadership::round_filter::PublisherFilter;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::vote::VoteMode;
@@ -32,7 +34,6 @@ use crate::actors::reputation_keeper::{ReputationKeeper, SharedBook};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
-use crate::messages::leadership::Leadership;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
@@ -42,7 +43,8 @@ use crate::observe::recorder::ImageRecorder;
 use crate::observe::recorder::LogSender;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
-use crate::transport::broker::{BrokerError, EmbeddedBroker, Guard};
+use crate::telemetry::spans::Spans;
+use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
@@ -64,8 +66,6 @@ pub(super) struct NodeBuilder {
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
-    /// The highest term that the election knows.
-    term: watch::Sender<u64>,
     live_state: Arc<LiveState>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<String>>,
@@ -99,7 +99,6 @@ impl NodeBuilder {
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
-            term: watch::Sender::default(),
             live_state: Arc::default(),
             dashboard_address: watch::Sender::new(None),
             failed,
@@ -112,6 +111,10 @@ impl NodeBuilder {
 
     pub(super) fn counters(&self) -> Arc<Counters> {
         Arc::clone(&self.counters)
+    }
+
+    fn spans(&self) -> Spans {
+        Spans::new(self.config.cell.clone(), self.name.clone())
     }
 
     pub(super) fn newest(&self) -> Newest {
@@ -180,7 +183,7 @@ impl NodeBuilder {
             ActorKind::Gateway => {
                 let started = Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
                 let id = slot(&self.slots.gateway, started)?;
-                self.slots.election.send(LeaderElectionMessage::NoteGatewayRestart);
+                self.slots.election.send(LeaderElectionMessage::Note { input: Input::GatewayRestarted });
                 Ok(id)
             }
             ActorKind::Follower => {
@@ -195,7 +198,7 @@ impl NodeBuilder {
             ActorKind::Fuser => {
                 let started = Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
                 let id = slot(&self.slots.fuser, started)?;
-                self.slots.election.send(LeaderElectionMessage::NoteFuserRestart);
+                self.slots.election.send(LeaderElectionMessage::Note { input: Input::FuserRestarted });
                 Ok(id)
             }
             ActorKind::LeaderElection => {
@@ -221,7 +224,8 @@ impl NodeBuilder {
             ActorKind::Detector => {
                 let images = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
-                let arguments = crate::node::camera::detector(&self.config, projector, images, self.counters());
+                let (counters, spans) = (self.counters(), self.spans());
+                let arguments = crate::node::camera::detector(&self.config, projector, images, counters, spans);
                 let arguments = arguments.map_err(in_full)?;
                 slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }
@@ -289,9 +293,9 @@ impl NodeBuilder {
             (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
             (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
         }
-        let (topics, elected) = (Topics::new(&self.config.cell), elected::rule(self.leadership()));
+        let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
         let (limits, counters) = (self.config.mqtt.limits(), self.counters());
-        EmbeddedBroker::guarded(config, Guard { credentials, topics, limits, elected, counters })
+        EmbeddedBroker::protected(config, AccessPolicy { credentials, topics, limits, elected, counters })
     }
 
     /// The membership comes back at the address it had, as the broker does.
@@ -322,6 +326,15 @@ fn slot<M: Message>(
     let id = actor.get_id();
     slot.set(actor);
     Ok(id)
+}
+
+/// The rule of the node's own broker: who may publish for all.
+fn publish_rule(leadership: watch::Receiver<Leadership>) -> LeaderCheck {
+    let filter = Mutex::<PublisherFilter>::default();
+    Arc::new(move |name| {
+        let mut filter = filter.lock().unwrap_or_else(PoisonError::into_inner);
+        filter.may_publish(name, &leadership.borrow(), clock::now())
+    })
 }
 
 /// Why an actor did not start, without the framework's own words around it.

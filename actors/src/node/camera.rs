@@ -15,6 +15,7 @@ use crate::messages::projector::ProjectorMessage;
 use crate::node::config::NodeConfig;
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::Counters;
+use crate::telemetry::spans::Spans;
 
 /// A node without a camera was asked for what only a camera gives.
 #[derive(Debug, thiserror::Error)]
@@ -56,6 +57,7 @@ pub fn detector(
     projector: ActorSlot<ProjectorMessage>,
     images: Option<ImageRecorder>,
     counters: Arc<Counters>,
+    spans: Spans,
 ) -> anyhow::Result<DetectorArguments> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let source = camera.source.clone();
@@ -70,5 +72,6 @@ pub fn detector(
         projector,
         images,
         counters,
+        spans,
     })
 }

@@ -9,8 +9,8 @@ use std::path::PathBuf;
 
 use ecod::aggregator::FusionConfig;
 use ecod::config::ConfigError;
-use ecod::election::ElectionConfig;
 use ecod::landmark::{Landmark, LandmarkConfig};
+use ecod::leadership::election::ElectionConfig;
 use ecod::names::NodeName;
 use ecod::wire::Role;
 use figment::Figment;

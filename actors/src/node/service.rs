@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use sd_notify::NotifyState;
 
-use crate::observe::readiness::Readiness;
+use ecod::leadership::readiness::Readiness;
 
 /// The service manager of this process.
 #[derive(Debug)]

@@ -1,31 +1,45 @@
 //! A log as one page: who led, how late and how steadily rounds came, who saw what, who is trusted, what was lost.
 //!
-//! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`].
+//! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`]. A [`Section`] adds to the page.
 
-mod accuracy;
 mod losses;
 mod page;
 mod plot;
 mod series;
-pub(crate) mod tracks;
 
 use std::collections::BTreeMap;
+use std::fmt::Debug;
 use std::path::Path;
 
 use ecod::epoch::Epoch;
-use ecod::eval::tracks::{TrackEvaluation, TrackTruth};
-use ecod::eval::{Evaluation, Truth};
-use ecod::landmark::{Landmark, LandmarkIndex};
 use ecod::names::NodeName;
 use ecod::replay::FusedLine;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, ReportKind, Reputations, Verdicts};
+
+pub use page::{drawing, section, table};
+pub use plot::bars;
 
 use crate::observe::recorder::{
     CounterReading, LeadershipChange, LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName,
 };
 use losses::Losses;
 use series::Samples;
+
+/// An additional section of the page, made from what the log holds, in its order.
+pub trait Section: Debug {
+    /// Takes the beginning of a file: whose log it is, under which configuration.
+    fn identity(&mut self, identity: &LogIdentity);
+
+    /// Takes a vehicle's report.
+    fn report(&mut self, kind: ReportKind, report: &ObjectReport);
+
+    /// Takes a map or verdicts.
+    fn round(&mut self, round: &FusedLine);
+
+    /// The section as HTML; [`section`], [`table`], [`drawing`] and [`bars`] make it look like the others.
+    fn html(&self) -> String;
+}
 
 /// What is gathered of a log; by default, nothing yet.
 #[derive(Debug, Default)]
@@ -43,8 +57,7 @@ pub struct Report {
     entries: u64,
     reputations: BTreeMap<NodeName, Samples>,
     losses: Losses,
-    evaluation: Option<Evaluation>,
-    tracks: Option<TrackEvaluation>,
+    sections: Vec<Box<dyn Section>>,
 }
 
 /// The rounds of one kind as the recording node took them.
@@ -81,16 +94,10 @@ struct Vehicle {
 }
 
 impl Report {
-    /// Judges maps and verdicts by what stands at each location.
+    /// A page that begins with this section.
     #[must_use]
-    pub fn judged_by(self, truth: Truth) -> Self {
-        Self { evaluation: Some(Evaluation::new(truth)), ..self }
-    }
-
-    /// Judges the objects of maps by where they really were.
-    #[must_use]
-    pub fn judged_by_tracks(self, truth: TrackTruth) -> Self {
-        Self { tracks: Some(TrackEvaluation::new(truth)), ..self }
+    pub fn with_section(section: impl Section + 'static) -> Self {
+        Self { sections: vec![Box::new(section)], ..Self::default() }
     }
 
     /// Takes in a file; what cannot be used is named on the page and left out.
@@ -134,13 +141,7 @@ impl Report {
         {
             self.problems.push(format!("logs of {} and {} are mixed", known.node, identity.node));
         }
-        // Each file may have been written under another configuration.
-        if let Some(evaluation) = self.evaluation.take() {
-            let landmarks: Vec<_> = identity.landmarks.iter().map(Landmark::from).collect();
-            let gate = identity.fusion.pace.gate();
-            let evaluation = evaluation.with_landmarks(LandmarkIndex::new(landmarks, gate.radius_m), gate);
-            self.evaluation = Some(evaluation.with_synonyms(identity.fusion.vote.synonyms.clone()));
-        }
+        self.sections.iter_mut().for_each(|section| section.identity(identity));
     }
 
     fn message(&mut self, message: &LogMessage) {
@@ -168,9 +169,7 @@ impl Report {
 
     fn report(&mut self, topic: &str, at: Timestamp, report: &ObjectReport) {
         let kind = if topic.starts_with("vote_") { ReportKind::VoteDetections } else { ReportKind::Detections };
-        if let Some(evaluation) = &mut self.evaluation {
-            evaluation.report(kind, report);
-        }
+        self.sections.iter_mut().for_each(|section| section.report(kind, report));
         let vehicle = self.vehicles.entry(report.node.clone()).or_default();
         vehicle.reports += 1;
         vehicle.objects += report.objects.len() as u64;
@@ -188,12 +187,7 @@ impl Report {
                 self.vehicles.entry(node.clone()).or_default().contributed += 1;
             }
         }
-        if let Some(tracks) = &mut self.tracks {
-            tracks.map(&map);
-        }
-        if let Some(evaluation) = &mut self.evaluation {
-            evaluation.fused(&FusedLine::Map(map));
-        }
+        self.round(&FusedLine::Map(map));
     }
 
     fn verdicts(&mut self, at: Timestamp, verdicts: Verdicts) {
@@ -201,9 +195,11 @@ impl Report {
         if self.maps.count == 0 {
             self.reign(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
         }
-        if let Some(evaluation) = &mut self.evaluation {
-            evaluation.fused(&FusedLine::Verdicts(verdicts));
-        }
+        self.round(&FusedLine::Verdicts(verdicts));
+    }
+
+    fn round(&mut self, round: &FusedLine) {
+        self.sections.iter_mut().for_each(|section| section.round(round));
     }
 
     fn reputations(&mut self, at: Timestamp, reputations: &Reputations) {

@@ -1,4 +1,4 @@
-//! The node's clock: Unix microseconds that never go backwards.
+//! The node's clock. It never goes backwards.
 
 use std::sync::OnceLock;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -6,12 +6,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use ecod::time::Timestamp;
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
-/// The present time.
+/// The present time in Unix microseconds.
 ///
-/// The wall clock is read once, at the first call; from then on time passes by the monotonic clock that goes on while
-/// the machine is suspended. A step of the wall clock after that (NTP's first synchronisation, a daylight change by
-/// hand) is therefore not followed until the node restarts; aggregators estimate each vehicle's offset, so that a
-/// constant error up to their `max_clock_offset_s` does not matter to them.
+/// The wall clock is read once, at the first call. From then on time passes by the monotonic clock that includes
+/// suspension. A later step of the wall clock, such as by NTP's first synchronisation, takes effect at the next restart.
+/// Aggregators estimate each vehicle's offset, so that a constant error up to `max_clock_offset_s` does no harm.
 pub fn now() -> Timestamp {
     static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();
     let (started, wall) = ANCHOR.get_or_init(|| {

@@ -1,10 +1,10 @@
-//! A place for the latest value: a new one replaces one that nobody took.
+//! A channel of one value: a new one replaces one that was not taken.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::Notify;
 
-/// Hands the latest value from a producing thread to one consumer; values that were replaced are counted.
+/// Hands the latest value from a producing thread to one consumer, and counts replaced values.
 #[derive(Debug)]
 pub struct LatestSlot<T> {
     state: Mutex<State<T>>,
@@ -25,7 +25,7 @@ impl<T> Default for LatestSlot<T> {
 }
 
 impl<T> LatestSlot<T> {
-    /// Puts a value in; one that is still there is dropped and counted as skipped.
+    /// Stores a value. One that was not taken is dropped and counted as skipped.
     pub fn put(&self, value: T) {
         let mut state = self.lock();
         state.skipped += u64::from(state.value.replace(value).is_some());
@@ -33,14 +33,13 @@ impl<T> LatestSlot<T> {
         self.changed.notify_one();
     }
 
-    /// Says that no further value will come; one that is still there can be taken.
+    /// Ends the channel. A value that was not taken can still be taken.
     pub fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_one();
     }
 
-    /// Takes the latest value, waiting for one; `None` once closed and empty. Nothing is lost when the wait is
-    /// cancelled.
+    /// Waits for the latest value and takes it; `None` once closed and empty. Cancelling the wait loses nothing.
     pub async fn take(&self) -> Option<T> {
         loop {
             if let Some(value) = self.try_take() {
@@ -58,7 +57,7 @@ impl<T> LatestSlot<T> {
         self.lock().value.take()
     }
 
-    /// Values that were replaced before anyone took them.
+    /// Number of replaced values.
     pub fn skipped(&self) -> u64 {
         self.lock().skipped
     }

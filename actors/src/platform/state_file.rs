@@ -1,20 +1,21 @@
-//! A file that survives crashes: it holds the last state written whole, or the one before, never a mixture.
+//! State files that survive crashes: they hold the last complete state or the one before, never a mixture.
 
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use ecod::names::NodeName;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// Where one kind of state of a node is kept.
+/// File of one kind of state of a node.
 #[derive(Debug, Clone)]
 pub struct StateFile {
     path: PathBuf,
 }
 
-/// A larger file is not one of ours.
+/// Maximum length of a state file in bytes.
 const MAX_BYTES: u64 = 64 * 1024 * 1024;
 
 impl StateFile {
@@ -23,12 +24,12 @@ impl StateFile {
         Self { path: directory.join(format!("{cell}.{node}.{what}.json")) }
     }
 
-    /// Where the state is.
+    /// The file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What was written last, if it is there, whole and `is_ours`; anything else is set aside with a warning.
+    /// The state written last, if it is complete and `is_ours`. Any other content is set aside with a warning.
     pub fn load<T: DeserializeOwned>(&self, is_ours: impl FnOnce(&T) -> bool) -> Option<T> {
         let mut bytes = Vec::new();
         let read = File::open(&self.path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
@@ -51,20 +52,27 @@ impl StateFile {
         None
     }
 
-    /// Replaces the state; after `Ok` it survives a loss of power.
+    /// Replaces the state. After `Ok` it survives a loss of power.
     ///
     /// # Errors
-    /// When the directory or disk does not take it; the state before is still there then.
+    /// When the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
-        let directory = self.path.parent().unwrap_or(Path::new("."));
-        fs::create_dir_all(directory)?;
-        let temporary = self.path.with_extension("tmp");
-        let mut file = File::create(&temporary)?;
-        file.write_all(&serde_json::to_vec(state)?)?;
-        file.sync_all()?;
-        fs::rename(&temporary, &self.path)?;
-        File::open(directory)?.sync_all()
+        fs::create_dir_all(self.path.parent().unwrap_or(Path::new(".")))?;
+        replace_file(&self.path, &serde_json::to_vec(state)?, 0o666)
     }
+}
+
+/// Replaces a file atomically, with permissions `mode` less the process's umask. After `Ok` it survives a loss of power.
+///
+/// # Errors
+/// When the directory or disk refuses it; the file before is then still there.
+pub(crate) fn replace_file(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
+    let temporary = path.with_extension("tmp");
+    let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(mode).open(&temporary)?;
+    file.write_all(bytes)?;
+    file.sync_all()?;
+    fs::rename(&temporary, path)?;
+    File::open(path.parent().unwrap_or(Path::new(".")))?.sync_all()
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Rates that are not exceeded: of one source, or of each of many.
+//! Rate limits: of one source, or of each of many.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -6,73 +6,83 @@ use std::time::Duration;
 
 use ecod::time::Timestamp;
 
-/// Allows a burst, then a steady rate.
+/// Allows a burst, then one per interval.
 #[derive(Debug, Clone)]
-pub(crate) struct Throttle {
-    left: u32,
+pub(crate) struct TokenBucket {
+    tokens: u32,
     burst: u32,
     interval: Duration,
-    filled: Timestamp,
+    refilled_at: Timestamp,
 }
 
-impl Throttle {
+impl TokenBucket {
     pub(crate) fn new(burst: u32, interval: Duration, now: Timestamp) -> Self {
-        Self { left: burst, burst, interval, filled: now }
+        Self { tokens: burst, burst, interval, refilled_at: now }
     }
 
-    /// Whether a whole burst would be allowed now.
-    pub(crate) fn is_rested(&self, now: Timestamp) -> bool {
-        now.since(self.filled) >= self.interval * self.burst.saturating_sub(self.left)
+    /// Whether a whole burst is allowed now.
+    pub(crate) fn is_full(&self, now: Timestamp) -> bool {
+        now.since(self.refilled_at) >= self.interval * self.burst.saturating_sub(self.tokens)
     }
 
-    /// Whether one more is allowed now.
+    /// Takes a token; false when there is none.
     pub(crate) fn allow(&mut self, now: Timestamp) -> bool {
-        let earned = now.since(self.filled).as_micros() / self.interval.as_micros().max(1);
+        let earned = now.since(self.refilled_at).as_micros() / self.interval.as_micros().max(1);
         let earned = u32::try_from(earned).unwrap_or(u32::MAX);
-        self.filled =
-            if self.left.saturating_add(earned) >= self.burst { now } else { self.filled + self.interval * earned };
-        self.left = self.left.saturating_add(earned).min(self.burst);
-        let allowed = self.left > 0;
-        self.left = self.left.saturating_sub(1);
+        self.refilled_at = if self.tokens.saturating_add(earned) >= self.burst {
+            now
+        } else {
+            self.refilled_at + self.interval * earned
+        };
+        self.tokens = self.tokens.saturating_add(earned).min(self.burst);
+        let allowed = self.tokens > 0;
+        self.tokens = self.tokens.saturating_sub(1);
         allowed
     }
 }
 
-/// Allows every source as many messages a second, and as many at once after a second of silence.
+/// Token buckets by source, all with the same rate.
 #[derive(Debug)]
-pub(crate) struct Throttles<K> {
-    per_second: u32,
-    sources: BTreeMap<K, Throttle>,
+pub(crate) struct KeyedThrottle<K> {
+    burst: u32,
+    interval: Duration,
+    sources: BTreeMap<K, TokenBucket>,
 }
 
-/// Most sources that are remembered. While as many are busy at a time, further ones are not allowed anything.
+/// Maximum sources with a bucket. While as many are busy, further sources are allowed nothing.
 const MAX_SOURCES: usize = 8192;
 
-impl<K: Ord + Clone> Throttles<K> {
-    pub(crate) fn new(per_second: u32) -> Self {
-        Self { per_second: per_second.max(1), sources: BTreeMap::new() }
+impl<K: Ord + Clone> KeyedThrottle<K> {
+    pub(crate) fn new(burst: u32, interval: Duration) -> Self {
+        Self { burst, interval, sources: BTreeMap::new() }
     }
 
-    /// Whether the source is allowed one more message now.
+    /// As many messages per second as in a burst.
+    pub(crate) fn per_second(count: u32) -> Self {
+        Self::new(count.max(1), Duration::from_secs(1) / count.max(1))
+    }
+
+    /// Takes a token of a source; false when there is none.
     pub(crate) fn allow(&mut self, source: &K, now: Timestamp) -> bool {
         if let Some(throttle) = self.sources.get_mut(source) {
             return throttle.allow(now);
         }
         if self.sources.len() >= MAX_SOURCES {
-            self.sources.retain(|_, throttle| !throttle.is_rested(now));
+            self.sources.retain(|_, throttle| !throttle.is_full(now));
         }
         if self.sources.len() >= MAX_SOURCES {
             return false;
         }
-        let mut throttle = Throttle::new(self.per_second, Duration::from_secs(1) / self.per_second, now);
+        let mut throttle = TokenBucket::new(self.burst, self.interval, now);
         let allowed = throttle.allow(now);
         self.sources.insert(source.clone(), throttle);
         allowed
     }
 }
 
-/// What counts as one source: an IPv4 address, or the network of an IPv6 host, which has 2⁶⁴ addresses to choose from.
-pub(crate) fn source(address: IpAddr) -> IpAddr {
+/// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴ addresses to choose
+/// from.
+pub(crate) fn host_network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V4(v4) => IpAddr::V4(v4),
         IpAddr::V6(v6) => IpAddr::V6((u128::from(v6) >> 64 << 64).into()),
@@ -85,7 +95,7 @@ mod tests {
 
     #[test]
     fn one_source_does_not_use_up_what_another_has() {
-        let mut throttles = Throttles::new(10);
+        let mut throttles = KeyedThrottle::per_second(10);
         let mut allowed =
             |source, ms: u64| (0..1000).filter(|_| throttles.allow(&source, Timestamp(ms * 1000))).count();
         assert_eq!([allowed("a", 0), allowed("b", 0), allowed("a", 500), allowed("b", 5000)], [10, 10, 5, 10]);
@@ -93,7 +103,7 @@ mod tests {
 
     #[test]
     fn sources_that_rest_make_room() {
-        let mut throttles = Throttles::new(10);
+        let mut throttles = KeyedThrottle::per_second(10);
         assert!((0..MAX_SOURCES).all(|source| throttles.allow(&source, Timestamp(0))));
         assert!(!throttles.allow(&MAX_SOURCES, Timestamp(0)));
         assert!(throttles.allow(&MAX_SOURCES, Timestamp(1_000_000)));
@@ -101,7 +111,7 @@ mod tests {
 
     #[test]
     fn a_burst_is_allowed_then_a_rate() {
-        let mut throttle = Throttle::new(3, Duration::from_millis(10), Timestamp(0));
+        let mut throttle = TokenBucket::new(3, Duration::from_millis(10), Timestamp(0));
         let mut allowed = |ms: u64| (0..100).filter(|_| throttle.allow(Timestamp(ms * 1000))).count();
         assert_eq!([allowed(0), allowed(5), allowed(10), allowed(35), allowed(10_000)], [3, 0, 1, 2, 3]);
     }

@@ -2,31 +2,30 @@
 
 #![deny(clippy::indexing_slicing)]
 
-mod admission;
+mod connect_packet;
+mod connection_throttle;
 mod embedded;
-mod gate;
-mod holder;
-mod login;
+mod frontend;
+mod heartbeat;
 mod permissions;
-mod pulse;
+mod principal;
+mod publish_throttle;
 mod retained;
-mod throttle;
 use std::net::SocketAddr;
 
-pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, Mqtt};
-pub use gate::Guard;
 #[cfg(fuzzing)]
-pub use login::read_login;
-pub use permissions::Elected;
+pub use connect_packet::read_connect_packet;
+pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
+pub use frontend::AccessPolicy;
+pub use permissions::LeaderCheck;
 
-/// Whether the broker serves.
+/// State of an embedded broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BrokerHealth {
     /// Not started, or stopped.
     Stopped,
-    /// Accepts clients at this address.
+    /// Serves clients at this address.
     Serving(SocketAddr),
-    /// Was started, but has ended by itself or hangs; a node without its broker must not lead. The actor ends with this
-    /// answer.
+    /// Has ended by itself or hangs. The actor ends with this answer, and the node must not lead meanwhile.
     Dead,
 }

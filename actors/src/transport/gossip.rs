@@ -2,20 +2,20 @@
 
 #![deny(clippy::indexing_slicing)]
 
-pub(crate) mod answers;
 pub(crate) mod config;
 pub(crate) mod counters;
 pub(crate) mod frame;
 #[cfg(fuzzing)]
 pub mod fuzzing;
-pub(crate) mod gossip;
 pub(crate) mod key;
 pub(crate) mod machine;
 pub(crate) mod node_id;
 pub(crate) mod replay_window;
+pub(crate) mod reply_throttle;
 pub(crate) mod seeds;
 pub(crate) mod sessions;
 pub(crate) mod socket;
+pub(crate) mod swim;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
@@ -40,30 +40,30 @@ pub const MAX_PAYLOAD_BYTES: usize = 1200;
 pub struct Member {
     /// Its name.
     pub name: NodeName,
-    /// When it started, in Unix microseconds by its own clock.
+    /// Time of its start in Unix microseconds, by its own clock.
     pub run: u64,
-    /// Where it gossips.
+    /// Address of its gossip socket.
     pub gossip: SocketAddr,
-    /// Where its broker can be reached, if it has one.
+    /// Address of its broker, if it has one.
     pub broker: Option<SocketAddr>,
     /// The role it was started with.
     pub role: Role,
 }
 
-/// What the membership found out.
+/// An event of the membership.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum MembershipEvent {
-    /// A node is there, or a new run of it.
+    /// A node is alive, or a new run of it.
     Alive {
         /// The node.
         member: Member,
     },
-    /// A node does not answer; it is given up unless it does so soon.
+    /// A node does not answer. It is declared down unless it answers soon.
     Suspected {
         /// The node.
         name: NodeName,
     },
-    /// A node is gone.
+    /// A node is down.
     Down {
         /// The node.
         name: NodeName,
@@ -73,21 +73,21 @@ pub enum MembershipEvent {
         /// The node as it is now.
         member: Member,
     },
-    /// A datagram came.
+    /// A datagram arrived.
     Received {
         /// The authenticated sender.
         from: NodeName,
-        /// What it sent.
+        /// The payload.
         payload: Bytes,
-        /// When it came, by this node's clock.
+        /// Time of arrival by this node's clock.
         received_at: Timestamp,
     },
-    /// Two running nodes use one name, perhaps that of this node; only the later started one is heard.
+    /// Two running nodes have one name, perhaps this node's. Only the later started one is accepted.
     NameTaken {
         /// The name.
         name: NodeName,
     },
 }
 
-/// Takes events on the membership's own task: it must not wait.
+/// Callback for events. It runs on the membership's own task and must not block.
 pub type EventSink = Arc<dyn Fn(MembershipEvent) + Send + Sync>;

@@ -1,8 +1,8 @@
 //! Who may look.
 
 use ecod::wire::Role;
+use ecod_actors::platform::secret::Secret;
 use ecod_actors::telemetry::counters::Event;
-use ecod_actors::transport::mqtt::Secret;
 
 use crate::cell::{config, start};
 use crate::http::{get, get_with};

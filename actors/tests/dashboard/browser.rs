@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
-use ecod_actors::transport::mqtt::Secret;
+use ecod_actors::platform::secret::Secret;
 
 use crate::cell::{self, Stray, Vehicles, config};
 use crate::http::Events;

@@ -117,7 +117,7 @@ fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
         Event::FrameDetected,
     ];
     let left_out: BTreeSet<_> =
-        Event::ALL.into_iter().filter(|event| !USUAL.contains(event)).map(Event::as_str).collect();
+        Event::ALL.iter().filter(|event| !USUAL.contains(event)).map(|event| event.as_str()).collect();
     let page = include_str!("../../src/observe/dashboard/page/tables.js");
     let drops = page.split_once("const DROPS = {").and_then(|(_, rest)| rest.split_once("};")).unwrap().0;
     let shown =

@@ -6,9 +6,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use ecod::landmark::LandmarkConfig;
+use ecod::leadership::Leadership;
 use ecod::names::NodeName;
 use ecod::wire::Role;
-use ecod_actors::messages::leadership::Leadership;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use tempfile::TempDir;

@@ -10,10 +10,10 @@ mod record;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::{Duration, Instant};
 
+use ecod::leadership::Position;
 use ecod::wire::Role;
-use ecod_actors::messages::leadership::Position;
 use ecod_actors::node::config::NodeConfig;
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 
 use cell::Cell;
 use path::Path;

@@ -10,7 +10,7 @@ use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::telemetry::counters::Counters;
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{
     BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, Security, SubscriptionRole,
 };
@@ -48,8 +48,8 @@ pub(crate) struct Node {
 
 impl Node {
     /// A node whose links are up.
-    pub(crate) async fn join(node: &str, part: SubscriptionRole, mqtt: MqttConfig, brokers: &[&BrokerAddress]) -> Self {
-        let mut node = Self::start(node, part, mqtt).await;
+    pub(crate) async fn join(node: &str, role: SubscriptionRole, mqtt: MqttConfig, brokers: &[&BrokerAddress]) -> Self {
+        let mut node = Self::start(node, role, mqtt).await;
         node.send(GatewayMessage::SetBrokers { addresses: brokers.iter().copied().cloned().collect() });
         for _ in brokers {
             node.link(LinkState::Up).await;
@@ -57,13 +57,13 @@ impl Node {
         node
     }
 
-    pub(crate) async fn start(node: &str, part: SubscriptionRole, mqtt: MqttConfig) -> Self {
+    pub(crate) async fn start(node: &str, role: SubscriptionRole, mqtt: MqttConfig) -> Self {
         let (sender, deliveries) = mpsc::unbounded_channel();
         let counters = Arc::new(Counters::default());
         let status = NodeStatus { epoch: 1, ..NodeStatus::starting(name(node), Uuid::new_v4(), Role::Auto, "0.1.0") };
         let arguments = GatewayArguments {
             cell: name("test"),
-            part,
+            role,
             status: status.clone(),
             mqtt,
             security: Security::default(),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ecod::wire::{Encoding, GlobalMap, LandmarkState, RejectReason};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::telemetry::counters::Event;
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, MqttConfig, SubscriptionRole};
 
 use crate::cell::{LOOPBACK, Node, Stranger, embedded, map, name, topic, until};

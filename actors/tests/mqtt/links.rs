@@ -4,11 +4,10 @@ use std::time::{Duration, Instant};
 
 use ecod::wire::Encoding;
 use ecod_actors::messages::gateway::GatewayMessage;
+use ecod_actors::platform::secret::Secret;
 use ecod_actors::telemetry::counters::Event;
-use ecod_actors::transport::broker::Mqtt;
-use ecod_actors::transport::mqtt::{
-    BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, Secret, SubscriptionRole,
-};
+use ecod_actors::transport::broker::MqttBroker;
+use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, SubscriptionRole};
 use tokio::task::JoinHandle;
 
 use crate::cell::{LOOPBACK, Node, embedded, map, name, until};

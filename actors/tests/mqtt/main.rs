@@ -9,4 +9,3 @@ mod large;
 mod links;
 mod mosquitto;
 mod status;
-mod two_hop;

@@ -3,7 +3,7 @@
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::telemetry::counters::Event;
-use ecod_actors::transport::broker::Mqtt;
+use ecod_actors::transport::broker::MqttBroker;
 use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, SubscriptionRole};
 
 use crate::cell::{LOOPBACK, Node, Stranger, embedded, topic, until};

@@ -8,7 +8,6 @@ mod live;
 #[cfg(feature = "camera")]
 mod pictures;
 mod python;
-mod report;
 
 use std::collections::BTreeMap;
 use std::process::Command;

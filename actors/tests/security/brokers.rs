@@ -9,7 +9,7 @@ use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::telemetry::counters::{Counters, Event};
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::transport::broker::{AccessPolicy, BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, LinkState, SubscriptionRole};
 use ecod_actors::transport::pki::Credentials;
 use ractor::Actor;
@@ -22,14 +22,14 @@ use crate::fixture::{Cell, DAY, SOON, node};
 /// A second broker of the cell.
 fn stolen(cell: &mut Cell) -> (EmbeddedBroker, BrokerAddress) {
     let files = cell.pki.issue("stolen", Role::Auto, DAY);
-    let guard = Guard {
+    let guard = AccessPolicy {
         credentials: Some(Arc::new(Credentials::load(&files, &node("stolen")).unwrap())),
         topics: Topics::new(&node("lot")),
         limits: Default::default(),
         elected: Arc::new(|_| true),
         counters: Arc::default(),
     };
-    let mut broker = EmbeddedBroker::guarded(BrokerConfig::default(), guard);
+    let mut broker = EmbeddedBroker::protected(BrokerConfig::default(), guard);
     let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
     (broker, address.into())
 }
@@ -45,7 +45,7 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
     let counters = Arc::<Counters>::default();
     let arguments = GatewayArguments {
         cell: node("lot"),
-        part: SubscriptionRole::Follower,
+        role: SubscriptionRole::Follower,
         status: NodeStatus::starting(node("gauss"), Uuid::now_v7(), Role::Cav, "0.1.0"),
         mqtt: config.mqtt.clone(),
         security: config.security().unwrap(),

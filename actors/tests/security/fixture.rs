@@ -8,12 +8,16 @@ use ecod::names::NodeName;
 use ecod::wire::{Limits, Role, Topics};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::{Counters, Event};
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Guard, Mqtt};
-use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
+use ecod_actors::transport::broker::{AccessPolicy, BrokerConfig, EmbeddedBroker, MqttBroker};
+use ecod_actors::transport::pki::{Authority, BROKER_NAME, Credentials, TlsConfig};
 use rumqttc::{AsyncClient, EventLoop, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
 use rustls::ClientConfig;
+use rustls::pki_types::ServerName;
 use tempfile::TempDir;
+use tokio::net::{TcpSocket, TcpStream};
 use tokio::time::{Instant, sleep, timeout};
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
 use uuid::Uuid;
 
 pub(crate) const DAY: Duration = Duration::from_secs(86_400);
@@ -64,6 +68,25 @@ pub(crate) fn client_config(name: &str, files: &TlsConfig) -> Arc<ClientConfig> 
     Arc::clone(&Credentials::load(files, &node(name)).unwrap().current().client)
 }
 
+/// Another host than the honest ones, as far as a broker can see.
+const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
+
+pub(crate) async fn knock(broker: SocketAddr) -> TcpStream {
+    knock_from(ELSEWHERE, broker).await
+}
+
+pub(crate) async fn knock_from(address: Ipv4Addr, broker: SocketAddr) -> TcpStream {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.bind((address, 0).into()).unwrap();
+    socket.connect(broker).await.unwrap()
+}
+
+pub(crate) async fn secure(cell: &mut Cell, stream: TcpStream) -> TlsStream<TcpStream> {
+    let files = cell.pki.issue("gauss", Role::Auto, DAY);
+    let name = ServerName::try_from(BROKER_NAME).unwrap();
+    TlsConnector::from(client_config("gauss", &files)).connect(name, stream).await.unwrap()
+}
+
 /// An edge's broker, which `edge` is elected to use, and two honest clients.
 pub(crate) struct Cell {
     pub(crate) pki: Pki,
@@ -86,7 +109,7 @@ impl Cell {
         let edge = pki.issue("edge", Role::Edge, DAY);
         let euclid = pki.issue("euclid", Role::Cav, DAY);
         let counters = Arc::<Counters>::default();
-        let guard = Guard {
+        let guard = AccessPolicy {
             credentials: Some(Arc::new(Credentials::load(&edge, &node("edge")).unwrap())),
             topics: Topics::new(&node("lot")),
             limits: Limits { payload_bytes: MAX_REPORT, ..Limits::default() },
@@ -101,7 +124,7 @@ impl Cell {
             ..BrokerConfig::default()
         };
         adjust(&mut config);
-        let mut broker = EmbeddedBroker::guarded(config, guard);
+        let mut broker = EmbeddedBroker::protected(config, guard);
         let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
         let mut edge = Client::new(address, "edge", &client_config("edge", &edge));
         edge.log_in().await.unwrap();

@@ -9,36 +9,14 @@ use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::broker::BrokerConfig;
-use ecod_actors::transport::pki::BROKER_NAME;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rustls::pki_types::ServerName;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpSocket, TcpStream};
 use tokio::time::timeout;
-use tokio_rustls::TlsConnector;
-use tokio_rustls::client::TlsStream;
 
-use crate::fixture::{Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, node};
-
-/// Another host than the honest ones, as far as a broker can see.
-const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
-
-async fn knock(broker: SocketAddr) -> TcpStream {
-    knock_from(ELSEWHERE, broker).await
-}
-
-async fn knock_from(address: Ipv4Addr, broker: SocketAddr) -> TcpStream {
-    let socket = TcpSocket::new_v4().unwrap();
-    socket.bind((address, 0).into()).unwrap();
-    socket.connect(broker).await.unwrap()
-}
-
-async fn secure(cell: &mut Cell, stream: TcpStream) -> TlsStream<TcpStream> {
-    let files = cell.pki.issue("gauss", Role::Auto, DAY);
-    let name = ServerName::try_from(BROKER_NAME).unwrap();
-    TlsConnector::from(client_config("gauss", &files)).connect(name, stream).await.unwrap()
-}
+use crate::fixture::{
+    Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, knock, knock_from, node, secure,
+};
 
 /// Waits until the other side has closed, whatever came before.
 async fn closed(stream: &mut (impl AsyncReadExt + Unpin)) {
@@ -234,10 +212,10 @@ async fn limits_hold_on_loopback_as_they_come() {
 async fn limits_hold_without_certificates_too() {
     use ecod::wire::Topics;
     use ecod_actors::telemetry::counters::Counters;
-    use ecod_actors::transport::broker::{EmbeddedBroker, Guard, Mqtt};
+    use ecod_actors::transport::broker::{AccessPolicy, EmbeddedBroker, MqttBroker};
 
     let counters = Arc::<Counters>::default();
-    let guard = Guard {
+    let guard = AccessPolicy {
         credentials: None,
         topics: Topics::new(&node("lot")),
         limits: Default::default(),
@@ -245,7 +223,7 @@ async fn limits_hold_without_certificates_too() {
         counters: Arc::clone(&counters),
     };
     let config = BrokerConfig { handshake_timeout_ms: 300, ..BrokerConfig::default() };
-    let mut broker = EmbeddedBroker::guarded(config, guard);
+    let mut broker = EmbeddedBroker::protected(config, guard);
     let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
     let mut silent = knock(address).await;
     closed(&mut silent).await;

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
 use ecod::wire::{Role, Topics};
-use ecod_actors::transport::broker::{BrokerConfig, BrokerHealth, EmbeddedBroker, Guard, Mqtt};
+use ecod_actors::transport::broker::{AccessPolicy, BrokerConfig, BrokerHealth, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::pki::Credentials;
 use tokio::time::{sleep, timeout};
 
@@ -17,7 +17,7 @@ async fn a_broker_that_hangs_is_found_dead_and_not_waited_for() {
     let files = pki.issue("edge", Role::Edge, DAY);
     let (release, held) = mpsc::channel::<()>();
     let held = Mutex::new(held);
-    let guard = Guard {
+    let guard = AccessPolicy {
         credentials: Some(Arc::new(Credentials::load(&files, &node("edge")).unwrap())),
         topics: Topics::new(&node("lot")),
         limits: Default::default(),
@@ -25,7 +25,7 @@ async fn a_broker_that_hangs_is_found_dead_and_not_waited_for() {
         elected: Arc::new(move |_| held.lock().unwrap().recv().is_ok()),
         counters: Arc::default(),
     };
-    let mut broker = EmbeddedBroker::guarded(BrokerConfig::default(), guard);
+    let mut broker = EmbeddedBroker::protected(BrokerConfig::default(), guard);
     let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
     let mut edge = Client::new(address, "edge", &client_config("edge", &files));
     edge.log_in().await.unwrap();

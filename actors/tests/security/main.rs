@@ -8,3 +8,4 @@ mod floods;
 mod frames;
 mod hung;
 mod payloads;
+mod topics;

@@ -7,8 +7,8 @@ use ecod::landmark::LandmarkConfig;
 use ecod::wire::{RejectReason, Role};
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, Mqtt};
-use ecod_actors::transport::mqtt::Secret;
+use ecod_actors::platform::secret::Secret;
+use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::time::{Instant, sleep, timeout};
 

@@ -40,7 +40,7 @@ impl Voters {
             NodeStatus::starting(NodeName::from_static("voters"), Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell: NodeName::from_static(CELL),
-            part: SubscriptionRole::Follower,
+            role: SubscriptionRole::Follower,
             status,
             mqtt: MqttConfig::default(),
             security: Security::default(),

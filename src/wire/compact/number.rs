@@ -1,4 +1,4 @@
-//! How numbers are rounded and written.
+//! Written forms of numbers.
 
 use minicbor::data::Type;
 use minicbor::decode::{self, Decoder};
@@ -6,29 +6,29 @@ use minicbor::encode::{self, Encoder, Write};
 
 use super::Form;
 
-/// Positions, held in metres: whole millimetres.
+/// A position in metres, written in whole millimetres.
 pub(crate) struct Millimetres;
 
-/// What needs no more than 11 significant bits, 0.05 %, such as confidences, speeds and sizes.
+/// A number with 11 significant bits (0.05 %), such as a confidence, speed or size.
 pub(crate) struct Half;
 
-/// What needs 24 significant bits, such as the direction of a camera.
+/// A number with 24 significant bits, such as the direction of a camera.
 pub(crate) struct Single;
 
-/// Covariances `[xx, xy, yy]` to 11 significant bits: variances are rounded up and the covariance towards zero, so that
-/// no certainty is gained and the matrix stays one.
-pub(crate) struct Spread;
+/// A covariance `[xx, xy, yy]` with 11 significant bits. Variances are rounded up and the covariance towards zero, so
+/// that no certainty is gained and the matrix stays positive semi-definite.
+pub(crate) struct CovarianceForm;
 
-/// Largest number of millimetres that is written as an integer; what is beyond is no position anyway.
+/// Largest number of millimetres that is written as an integer; no position is beyond.
 const MAX_MILLIMETRES: f64 = (1u64 << 53) as f64;
 
-/// Magnitudes that a half has with all its bits.
+/// Magnitudes of normal half-precision numbers.
 const HALF: std::ops::RangeInclusive<f64> = 6.103_515_625e-5..=65_504.0;
 
-/// Magnitudes that a single has with all its bits.
+/// Magnitudes of normal single-precision numbers.
 const SINGLE: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
 
-/// Bits of a double's fraction that a half and a single have not.
+/// Bits of a double's fraction beyond those of a half and of a single.
 const BEYOND_HALF: u64 = (1 << 42) - 1;
 const BEYOND_SINGLE: u64 = (1 << 29) - 1;
 
@@ -63,7 +63,7 @@ impl Form<f64> for Single {
     }
 }
 
-impl Form<[f64; 3]> for Spread {
+impl Form<[f64; 3]> for CovarianceForm {
     fn encode<C, W: Write>(
         [xx, xy, yy]: &[f64; 3],
         e: &mut Encoder<W>,
@@ -104,19 +104,19 @@ enum Rounding {
 }
 
 impl Rounding {
-    /// Clears the bits of the fraction that are in `beyond`.
+    /// Rounds to a fraction without the bits in `beyond`.
     fn apply(self, value: f64, beyond: u64) -> f64 {
         let carry = match self {
             Self::Nearest => beyond / 2 + 1,
             Self::AwayFromZero => beyond,
             Self::TowardsZero => 0,
         };
-        // What runs over goes into the exponent, as it should.
+        // A carry out of the fraction correctly increments the exponent.
         f64::from_bits((value.to_bits() + carry) & !beyond)
     }
 }
 
-/// Whether the number is one of those that take a single byte.
+/// Whether the number is an integer of a single byte.
 fn is_short(value: f64) -> bool {
     value.fract() == 0.0 && (-24.0..24.0).contains(&value)
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use ecod::aggregator::FusionConfig;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::wire::SCHEMA_VERSION;
 
@@ -10,7 +11,6 @@ use super::*;
 use crate::actors::follower::{Follower, FollowerArguments};
 use crate::messages::actor_slot::listening;
 use crate::messages::follower::FollowerMessage;
-use crate::messages::leadership::{Leadership, Position};
 use crate::messages::newest::Newest;
 
 fn epoch(term: u64, leader: &'static str) -> Epoch {
@@ -31,52 +31,58 @@ fn global_map(Epoch { term, leader }: Epoch, round: u64) -> Arc<GlobalMap> {
     })
 }
 
-fn map(epoch: Epoch, round: u64) -> FollowerMessage {
+fn spans() -> Spans {
+    Spans::new(NodeName::from_static("lot"), NodeName::from_static("gauss"))
+}
+
+fn map(epoch: Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
     let map = global_map(epoch, round);
-    FollowerMessage::TakeMap { delivery: Delivery::local(Incoming::Map(map), Timestamp(round)) }
+    FollowerMessage::TakeMap { delivery: Delivery::local(Incoming::Map(map), received_at) }
 }
 
 #[tokio::test]
 async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
-    let elected = Leadership { position: Position::Following, epoch: Some(epoch(7, "edge")), standby: None };
-    for leadership in [elected, Leadership::default()] {
-        let (fuser, mut told) = listening::slot().await;
+    let elected = Leadership { position: Position::Following, epoch: Some(epoch(7, "edge")), standby: None, term: 7 };
+    let seeking = Leadership { term: 7, ..Leadership::default() };
+    for leadership in [elected, seeking] {
+        let ((fuser, mut told), newest) = (listening::slot().await, Newest::default());
         let arguments = FollowerArguments {
-            newest: Newest::default(),
+            newest: newest.clone(),
             log: None,
             recording: LogSender::default(),
-            least_term: 0,
-            term: watch::channel(7).1,
-            leadership: watch::channel(leadership.clone()).1,
+            saved_term: 0,
+            leadership: tokio::sync::watch::channel(leadership.clone()).1,
             election: ActorSlot::default(),
             fuser: fuser.clone(),
             counters: Arc::default(),
+            spans: spans(),
         };
         let (follower, _) = Actor::spawn(None, Follower, arguments).await.unwrap();
         for round in 1..=3 {
-            follower.cast(map(epoch(7, "edge"), round)).unwrap();
-            follower.cast(map(epoch(u64::MAX, "gauss"), round)).unwrap();
+            follower.cast(map(epoch(7, "edge"), round, Timestamp(round))).unwrap();
+            follower.cast(map(epoch(u64::MAX, "gauss"), round, Timestamp(round))).unwrap();
         }
+        // The filter believes who goes on publishing; a new leader does not go on from that.
+        follower.cast(map(epoch(u64::MAX, "gauss"), 4, Timestamp(600_000))).unwrap();
         follower.drain_and_wait(None).await.unwrap();
         fuser.get().unwrap().drain_and_wait(None).await.unwrap();
 
         let mut fuser = FuserState::new(FuserArguments {
-            aggregator: Aggregator::standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
-            term: watch::channel(7).1,
+            aggregator: Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
             intake: Intake::default(),
             newest: None,
             recording: LogSender::default(),
             gateway: ActorSlot::default(),
             keeper: ActorSlot::default(),
             counters: Arc::default(),
+            spans: spans(),
         });
         let mut maps = 0;
         while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {
             fuser.take_map(map, received_at);
             maps += 1;
         }
-        // The gate believes who goes on publishing while nobody leads; the fuser does not.
-        fuser.take_map(global_map(epoch(u64::MAX, "gauss"), 4), Timestamp(4));
+        assert_eq!(newest.map.borrow().as_ref().map(|newest| newest.map.epoch), Some(u64::MAX));
         let kept = fuser.last_map.map(|(map, _)| (map.epoch, map.round));
         assert_eq!((kept, maps), (Some((7, 3)), 3), "{leadership:?}");
     }

@@ -1,392 +1,207 @@
-//! From what happens in a node to the election's inputs, and from its effects to the node's parts.
+//! From messages to the inputs of the node's leadership, and from its effects to the node's parts.
 
-use crate::messages::leader_election::{HealthSample, LeaderElectionMessage};
-use crate::messages::leadership::Leadership;
-
-mod effects;
-mod members;
-
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
 
-use ecod::election::{Election, ElectionMessage, Health, Input};
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
+use ecod::leadership::election::{ElectionMessage, Health};
+use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
+use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::time::Timestamp;
-use ecod::wire::{NodeState, NodeStatus, Role};
-use ractor::{ActorProcessingErr, ActorRef};
+use ecod::wire::Encoding;
+use ractor::ActorRef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tracing::field::display;
-use uuid::Uuid;
 
-use super::health::{self, HealthMonitor};
-use super::routes::{Brokers, Routes};
-use super::terms::{TermWriter, saved_term};
-use super::{LeaderElectionArguments, Parts};
+use super::term_writer::{TermWriter, saved_term};
+use super::{LeaderElectionArguments, Parts, probe};
+use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::messages::membership::MembershipMessage;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::clock;
-use crate::telemetry::counters::Counters;
-use crate::transport::gossip::{Member, MembershipEvent};
-use crate::transport::mqtt::{BrokerAddress, LinkState};
+use crate::telemetry::counters::{Counters, Event};
+use crate::transport::gossip::{Member, MembershipEvent, is_of_this_machine};
 
-/// The election, what it was told last, and what came of it.
+/// The node's leadership, and where its effects go.
 pub struct ElectionDriver {
-    election: Election,
-    name: NodeName,
-    role: Role,
+    machine: LeadershipNode,
     terms: TermWriter,
-    round_period: Duration,
-    members: BTreeMap<NodeName, Member>,
-    /// Members on other machines, which do not reach a broker on this one's loopback.
-    elsewhere: BTreeSet<NodeName>,
-    /// Nodes that the membership gave up a moment ago, their brokers, and until when those may prove them gone.
-    departed: BTreeMap<NodeName, (BrokerAddress, Timestamp)>,
-    all_members: watch::Receiver<Vec<Member>>,
-    /// Since when the membership does not know of a member: it was started anew.
-    missing_since: Option<Timestamp>,
+    members: watch::Receiver<Vec<Member>>,
     own_broker: watch::Receiver<Option<SocketAddr>>,
-    monitor: HealthMonitor,
-    health: Health,
-    routes: Routes,
-    /// The last living run of each node, as brokers tell it.
-    runs: HashMap<NodeName, Uuid>,
-    status: NodeStatus,
-    told_out_of_reach: bool,
-    /// Whether the gateway knows the status.
-    status_told: bool,
-    /// The epoch of the last round, which a node without word from the election says it follows.
-    taken: Option<Epoch>,
-    preparing: Option<Preparing>,
     parts: Parts,
     leadership: watch::Sender<Leadership>,
-    /// The highest term known.
-    term: watch::Sender<u64>,
     counters: Arc<Counters>,
+    /// The deadline for which the timer is set.
     alarm: Timestamp,
     timer: Option<AbortHandle>,
-    drained: bool,
     myself: ActorRef<LeaderElectionMessage>,
 }
 
-/// A handover to this node under way.
-#[derive(Debug)]
-struct Preparing {
-    leader: NodeName,
-    since: Timestamp,
-    has_state: bool,
-}
-
-/// How long vehicles are given to connect to a broker that is about to be the leader's.
-const CONNECT_TIME: Duration = Duration::from_millis(300);
-
-/// How long the old leader's state is waited for.
-const STATE_PATIENCE: Duration = Duration::from_millis(1000);
-
-/// Time between two looks at what a handover waits for.
-const PREPARE_STEP: Duration = Duration::from_millis(50);
-
-/// Most nodes whose runs are remembered: brokers may tell of any number of names.
-const MAX_RUNS: usize = 4096;
-
-/// A timer later than this was overslept; what waits in the sockets is then dealt with first, for as long as below.
-const OVERSLEPT: Duration = Duration::from_millis(20);
-const DRAIN_TIME: Duration = Duration::from_millis(10);
-
 impl ElectionDriver {
     pub(super) fn new(arguments: LeaderElectionArguments, myself: ActorRef<LeaderElectionMessage>) -> Self {
-        let LeaderElectionArguments { config, status, term_file, plane, parts, leadership, term, counters, .. } =
+        let LeaderElectionArguments { settings, term_file, mut own_broker, members, parts, leadership, counters } =
             arguments;
-        let (name, role) = (status.node.clone(), config.role);
-        // A run of this actor before may have led in the term of the watch, and there may be no disk that tells.
-        let told = leadership.borrow().epoch.as_ref().map_or(0, |epoch| epoch.term.saturating_add(1));
-        let least_term = saved_term(term_file.as_ref()).max(told);
+        let saved_term = saved_term(term_file.as_ref());
+        own_broker.mark_changed();
+        let machine = LeadershipNode::new(settings, saved_term, &leadership.borrow(), clock::now());
         Self {
-            election: Election::new(config, name.clone(), least_term, clock::now()),
-            name,
-            role,
+            machine,
             terms: TermWriter::new(term_file),
-            round_period: arguments.round_period,
-            members: BTreeMap::new(),
-            elsewhere: BTreeSet::new(),
-            departed: BTreeMap::new(),
-            all_members: arguments.members,
-            missing_since: None,
-            own_broker: arguments.own_broker,
-            monitor: HealthMonitor::new(clock::now()),
-            health: Health::default(),
-            routes: Routes::new(plane),
-            runs: HashMap::new(),
-            taken: status.aggregator.clone().map(|aggregator| Epoch::new(status.epoch, aggregator)),
-            status,
-            told_out_of_reach: false,
-            status_told: false,
-            preparing: None,
+            members,
+            own_broker,
             parts,
             leadership,
-            term,
             counters,
             alarm: Timestamp(u64::MAX),
             timer: None,
-            drained: false,
             myself,
         }
     }
 
-    pub(super) async fn take_event(&mut self, event: MembershipEvent) -> Result<(), ActorProcessingErr> {
-        match event {
-            MembershipEvent::Alive { member } => self.meet(member).await,
-            MembershipEvent::Changed { member } => {
-                self.place(member);
-                self.update_health().await
-            }
-            MembershipEvent::Suspected { name } => self.feed(Input::PeerSuspected { peer: name }).await,
-            MembershipEvent::Down { name } => {
-                self.part_with(&name);
-                self.feed(Input::PeerDown { peer: name }).await
-            }
+    pub(super) async fn take_event(&mut self, event: MembershipEvent) {
+        let input = match event {
+            MembershipEvent::Alive { member } => Input::MemberAlive { member: as_seen(&member) },
+            MembershipEvent::Changed { member } => Input::MemberChanged { member: as_seen(&member) },
+            MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
+            MembershipEvent::Down { name } => Input::MemberDown { name },
             MembershipEvent::Received { from, payload, .. } => match ElectionMessage::decode(&payload) {
-                Ok(message) if message.from == from => self.feed(Input::Receive { message }).await,
-                Ok(message) => {
-                    tracing::debug!(%from, claimed = %message.from, "election message in another's name dropped");
-                    Ok(())
-                }
+                Ok(message) => Input::Receive { from, message },
                 Err(reason) => {
                     self.counters.reject(reason);
-                    tracing::debug!(%from, %reason, "election message dropped");
-                    Ok(())
+                    return tracing::debug!(%from, %reason, "election message dropped");
                 }
             },
             MembershipEvent::NameTaken { name } => {
-                tracing::error!(%name, "two nodes have this name; the election cannot tell them apart");
-                Ok(())
+                return tracing::error!(%name, "two nodes have this name; the election cannot tell them apart");
+            }
+        };
+        self.handle(input).await;
+    }
+
+    /// Hands in what happened, and carries out what comes of it before anything else happens.
+    pub(super) async fn handle(&mut self, input: Input) {
+        if input == Input::Wake {
+            self.alarm = Timestamp(u64::MAX);
+        }
+        let mut inputs = VecDeque::from([input]);
+        if self.own_broker.has_changed().unwrap_or(false) {
+            inputs.push_front(Input::OwnBroker { address: *self.own_broker.borrow_and_update() });
+        }
+        while let Some(input) = inputs.pop_front() {
+            for effect in self.machine.handle(input, clock::now()) {
+                inputs.extend(self.carry_out(effect).await);
             }
         }
+        self.set_timer();
     }
 
-    pub(super) async fn take_link(
-        &mut self,
-        broker: &BrokerAddress,
-        link: LinkState,
-    ) -> Result<(), ActorProcessingErr> {
-        let gone = self.monitor.note_link(broker, link);
-        self.update_health().await?;
-        // A broker that belongs to no node says nothing about any.
-        if gone && self.routes.plane().external.as_ref() != Some(broker) {
-            for peer in self.nodes_at(broker) {
-                tracing::info!(%peer, %broker, "process is gone");
-                self.feed(Input::PeerGone { peer }).await?;
+    /// Gives up the lead, and waits until the disk has the last term.
+    pub(super) async fn leave(&mut self) {
+        self.handle(Input::Leave).await;
+        self.terms.wait_for(u64::MAX).await;
+    }
+
+    /// Does what the leadership wants; returns what it is to be told at once.
+    async fn carry_out(&mut self, effect: Effect) -> Option<Input> {
+        match effect {
+            Effect::PersistTerm { term } => self.terms.save(term),
+            Effect::Send { to, message } => {
+                let payload = message.encode(Encoding::Cbor).into();
+                self.parts.membership.send(MembershipMessage::Send { to, payload });
             }
-        }
-        Ok(())
-    }
-
-    /// Where all use one broker, its word that the leader's connection broke is the quickest news of the leader's end.
-    pub(super) async fn take_status(&mut self, status: &NodeStatus) -> Result<(), ActorProcessingErr> {
-        let peer = status.node.clone();
-        if status.state != NodeState::Offline {
-            if self.runs.len() < MAX_RUNS || self.runs.contains_key(&peer) {
-                self.runs.insert(peer, status.id);
+            Effect::TellLeadership { leadership } => self.tell(leadership),
+            Effect::Lead { epoch, first_round, first } => {
+                let term = self.terms.wait_for(epoch.term).await;
+                tracing::info!(%epoch, first_round, ?first, ?term, "leading");
+                self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, first });
             }
-            return Ok(());
-        }
-        let ended = self.runs.remove(&peer) == Some(status.id);
-        if ended && !self.routes.plane().embedded && self.election.leader() == Some(&peer) {
-            tracing::info!(%peer, "connection of the leader broke");
-            self.feed(Input::PeerGone { peer }).await?;
-        }
-        Ok(())
-    }
-
-    /// Rounds of other epochs than the election's own prove nothing: whoever reaches a broker can publish some.
-    pub(super) async fn note_round(&mut self, epoch: Epoch, round: u64) -> Result<(), ActorProcessingErr> {
-        if self.election.epoch() == Some(&epoch) {
-            self.feed(Input::Round { epoch: epoch.clone(), round }).await?;
-        }
-        self.taken = Some(epoch);
-        Ok(())
-    }
-
-    pub(super) fn note_state(&mut self, from: &NodeName) {
-        if let Some(preparing) = self.preparing.as_mut().filter(|preparing| preparing.leader == *from) {
-            preparing.has_state = true;
-        }
-    }
-
-    /// A fuser that was started anew does not lead: the leadership is over.
-    pub(super) async fn note_fuser_restart(&mut self) -> Result<(), ActorProcessingErr> {
-        if self.election.is_leading() {
-            self.set_health(Health { fuser: false, ..self.health }).await?;
-        }
-        Ok(())
-    }
-
-    pub(super) async fn note_gateway_restart(&mut self) -> Result<(), ActorProcessingErr> {
-        self.routes.forget();
-        self.monitor.forget_links();
-        self.status_told = false;
-        self.update_health().await
-    }
-
-    pub(super) async fn note_health(&mut self, sample: HealthSample) -> Result<(), ActorProcessingErr> {
-        self.monitor.note_probe(sample);
-        self.update_health().await
-    }
-
-    pub(super) async fn check_health(&mut self) -> Result<(), ActorProcessingErr> {
-        if self.role != Role::Cav {
-            self.monitor.look(&self.counters, clock::now());
-            health::probe(&self.parts, self.myself.clone());
-            self.update_health().await?;
-        }
-        // Events from before this actor's start went nowhere, nor does a membership started anew tell of whom it lost.
-        let members = self.all_members.borrow().clone();
-        for peer in self.long_missing(&members) {
-            self.part_with(&peer);
-            self.feed(Input::PeerDown { peer }).await?;
-        }
-        for member in members {
-            if self.members.get(&member.name).is_none_or(|known| known.run != member.run) {
-                self.meet(member).await?;
+            Effect::HoldRound => {
+                self.parts.fuser.send(FuserMessage::HoldRound);
             }
+            Effect::StopPublishing { epoch } => {
+                tracing::info!(%epoch, "no longer leading");
+                self.parts.fuser.send(FuserMessage::StopPublishing);
+            }
+            Effect::SetLinks { links } => {
+                self.parts.gateway.send(GatewayMessage::SetReportBrokers { addresses: links.report_brokers });
+                self.parts.gateway.send(GatewayMessage::SetBrokers { addresses: links.brokers });
+            }
+            Effect::PublishStatus { status } => {
+                self.parts.gateway.send(GatewayMessage::PublishStatus { status });
+            }
+            Effect::SendSnapshot { to } => {
+                self.parts.keeper.send(ReputationKeeperMessage::SendSnapshot { to });
+            }
+            Effect::Look => {
+                return Some(Input::Looked {
+                    rounds_closed: self.counters.events(Event::RoundDue),
+                    load_percent: probe::load_percent().unwrap_or(0),
+                    members: self.members.borrow().iter().map(as_seen).collect(),
+                });
+            }
+            Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
+            Effect::Log { notice } => log(notice),
         }
-        Ok(())
+        None
     }
 
-    pub(super) async fn check_prepared(&mut self) -> Result<(), ActorProcessingErr> {
-        let Some(preparing) = &self.preparing else { return Ok(()) };
-        let waited = clock::now().since(preparing.since);
-        let complete = waited >= CONNECT_TIME && (preparing.has_state || waited >= STATE_PATIENCE);
-        if complete && self.health.is_fit() {
-            self.preparing = None;
-            return self.feed(Input::Prepared).await;
-        }
-        self.myself.send_after(PREPARE_STEP, || LeaderElectionMessage::CheckPrepared);
-        Ok(())
-    }
-
-    pub(super) async fn wake(&mut self) -> Result<(), ActorProcessingErr> {
-        let now = clock::now();
-        if now.since(self.alarm) > OVERSLEPT && !self.drained {
-            self.drained = true;
-            self.timer = None;
-            self.set_timer(DRAIN_TIME);
-            return Ok(());
-        }
-        self.drained = false;
-        self.alarm = Timestamp(u64::MAX);
-        let effects = self.election.tick(now);
-        self.carry_out(effects).await
-    }
-
-    /// Gives up the lead, if this node has it, so that the next one need not find out.
-    pub(super) async fn leave(&mut self) -> Result<(), ActorProcessingErr> {
-        self.feed(Input::Leave).await?;
-        self.terms.settle(u64::MAX).await;
-        Ok(())
-    }
-
-    /// Makes links, status, watch and timer what the election says now.
-    pub(super) fn reflect(&mut self) {
-        let leadership = self.tell_leadership();
-        self.reflect_links(&leadership);
-        self.reflect_status(&leadership);
-        let due = self.election.next_deadline();
-        if due != self.alarm && !self.drained {
-            self.alarm = due;
-            self.set_timer(due.since(clock::now()));
-        }
-    }
-
-    /// Makes the watch what the election says now.
-    fn tell_leadership(&self) -> Leadership {
-        let term = self.election.term();
-        self.term.send_if_modified(|known| std::mem::replace(known, term) != term);
-        let leadership = Leadership::of(&self.election, &self.name);
-        if *self.leadership.borrow() != leadership {
-            let Leadership { position, epoch, standby } = &leadership;
+    /// Shows the leadership; a change of the highest known term alone wakes nobody.
+    fn tell(&self, leadership: Leadership) {
+        let Leadership { position, epoch, standby, .. } = leadership.clone();
+        let has_moved = self.leadership.send_if_modified(|known| {
+            let has_moved = (known.position, &known.epoch, &known.standby) != (position, &epoch, &standby);
+            *known = leadership;
+            has_moved
+        });
+        if has_moved {
             let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
             tracing::info!(?position, epoch, standby, "leadership");
-            self.leadership.send_replace(leadership.clone());
-        }
-        leadership
-    }
-
-    fn reflect_links(&mut self, leadership: &Leadership) {
-        let broker = |name: Option<&NodeName>| match name {
-            Some(name) if *name == self.name => self.own_broker.borrow().map(BrokerAddress::from),
-            Some(name) => self.members.get(name)?.broker.map(BrokerAddress::from),
-            None => None,
-        };
-        let own = broker(Some(&self.name));
-        let brokers = match leadership.leader() {
-            Some(leader) => Brokers { own, leader: broker(Some(leader)), standby: broker(leadership.standby.as_ref()) },
-            None => Brokers { own, ..self.routes.brokers().clone() },
-        };
-        if let Some(addresses) = self.routes.update(brokers, clock::now()) {
-            let own = self.routes.brokers().own.iter().chain(&self.routes.plane().external).cloned().collect();
-            self.parts.gateway.send(GatewayMessage::SetReportBrokers { addresses: own });
-            self.parts.gateway.send(GatewayMessage::SetBrokers { addresses });
         }
     }
 
-    fn reflect_status(&mut self, leadership: &Leadership) {
-        let epoch = leadership.leader().and(leadership.epoch.as_ref()).or(self.taken.as_ref());
-        let state = if leadership.is_leading() { NodeState::Aggregating } else { NodeState::Following };
-        let status = NodeStatus {
-            state,
-            epoch: epoch.map_or(0, |epoch| epoch.term),
-            aggregator: epoch.map(|epoch| epoch.leader.clone()),
-            fit: (self.role != Role::Cav).then(|| self.health.is_fit()),
-            ..self.status.clone()
-        };
-        if status != self.status || !self.status_told {
-            self.status = status.clone();
-            self.status_told = true;
-            self.parts.gateway.send(GatewayMessage::PublishStatus { status });
+    fn set_timer(&mut self) {
+        let due = self.machine.next_deadline();
+        if due == self.alarm {
+            return;
         }
-    }
-
-    async fn meet(&mut self, member: Member) -> Result<(), ActorProcessingErr> {
-        let peer = member.name.clone();
-        self.place(member);
-        self.feed(Input::PeerAlive { peer }).await?;
-        self.update_health().await
-    }
-
-    async fn update_health(&mut self) -> Result<(), ActorProcessingErr> {
-        let (plane, brokers) = (self.routes.plane(), self.routes.brokers());
-        let no_other = self.election.is_leading() && self.election.standby().is_none();
-        let health = self.monitor.health(plane, brokers, no_other, self.round_period);
-        let is_reached = self.is_reached(no_other);
-        self.set_health(Health { broker: health.broker && is_reached, ..health }).await
-    }
-
-    async fn set_health(&mut self, health: Health) -> Result<(), ActorProcessingErr> {
-        if self.role == Role::Cav || health == self.health {
-            return Ok(());
-        }
-        let Health { broker, fuser, gateway, .. } = health;
-        match (self.health.is_fit(), health.is_fit()) {
-            (false, true) => tracing::info!("fit to lead"),
-            (true, false) => tracing::warn!(broker, fuser, gateway, "not fit to lead"),
-            _ => {}
-        }
-        self.health = health;
-        self.feed(Input::Health { health }).await
-    }
-
-    async fn feed(&mut self, input: Input) -> Result<(), ActorProcessingErr> {
-        let effects = self.election.handle(input, clock::now());
-        self.carry_out(effects).await
-    }
-
-    fn set_timer(&mut self, after: Duration) {
-        let timer = self.myself.send_after(after, || LeaderElectionMessage::Wake);
+        self.alarm = due;
+        let wake = || LeaderElectionMessage::Note { input: Input::Wake };
+        let timer = self.myself.send_after(due.since(clock::now()), wake);
         if let Some(superseded) = self.timer.replace(timer.abort_handle()) {
             superseded.abort();
+        }
+    }
+}
+
+/// A member as the node's leadership wants to know it.
+fn as_seen(member: &Member) -> node::Member {
+    node::Member {
+        name: member.name.clone(),
+        run: member.run,
+        broker: member.broker.map(BrokerAddress::from),
+        is_on_this_machine: is_of_this_machine(member.gossip.ip()),
+    }
+}
+
+fn log(notice: Notice) {
+    match notice {
+        Notice::Fit => tracing::info!("fit to lead"),
+        Notice::Unfit { health: Health { broker, fuser, gateway, .. } } => {
+            tracing::warn!(broker, fuser, gateway, "not fit to lead");
+        }
+        Notice::OutOfReach { members } => tracing::warn!(
+            ?members,
+            "other machines do not reach this node's broker: it does not lead; give the nodes certificates in [tls], \
+             or set broker.allow_plaintext, or an external mqtt.broker that is there"
+        ),
+        Notice::ProcessGone { peer, broker } => tracing::info!(%peer, %broker, "process is gone"),
+        Notice::LeaderDisconnected { peer } => tracing::info!(%peer, "connection of the leader broke"),
+        Notice::Preparing { leader } => tracing::info!(%leader, "preparing to take over"),
+        Notice::Misattributed { from, claimed } => {
+            tracing::debug!(%from, %claimed, "election message in another's name dropped");
         }
     }
 }

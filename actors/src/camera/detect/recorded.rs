@@ -10,7 +10,7 @@
 
 use std::path::{Path, PathBuf};
 
-use ecod::detection::{Detection, detections_in};
+use ecod::detection::{Detection, parse_detections};
 use serde::{Deserialize, Serialize};
 
 use super::{Detect, DetectError};
@@ -85,7 +85,7 @@ impl Detect for RecordedDetector {
 }
 
 fn read_line(path: &Path, line: usize, text: &str) -> Result<Vec<Detection>, RecordingError> {
-    detections_in(text).map_err(|reason| RecordingError::Malformed { path: path.to_owned(), line, reason })
+    parse_detections(text).map_err(|reason| RecordingError::Malformed { path: path.to_owned(), line, reason })
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use anyhow::anyhow;
 use ecod::landmark::Landmark;
-use ecod::replay::{FusedLine, JournalEntry, Replay, ReplayConfig, Rerun};
+use ecod::replay::{FusedLine, JournalEntry, JournalReplay, Replay, ReplayConfig};
 use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
 
 use super::{Failure, RoundWriter, print_summary};
@@ -18,7 +18,7 @@ const LIMITS: Limits = Limits { payload_bytes: 1 << 28, map_bytes: 1 << 28, obje
 /// Way of replaying a log.
 enum ReplayEngine {
     /// From the aggregator's journal.
-    Journal(Box<Rerun>),
+    Journal(Box<JournalReplay>),
     /// From reports by their time of receipt.
     Reports(Box<Replay>),
 }
@@ -131,7 +131,7 @@ impl<'a> LogReplay<'a> {
             (Some(engine), _) => engine,
             (None, SchemaName::JournalEntry) => {
                 let ReplayConfig { fusion, landmarks, .. } = self.config();
-                ReplayEngine::Journal(Box::new(Rerun::new(fusion, landmarks)))
+                ReplayEngine::Journal(Box::new(JournalReplay::new(fusion, landmarks)))
             }
             (None, _) => ReplayEngine::Reports(Box::new(Replay::new(self.config()))),
         };
@@ -187,7 +187,7 @@ fn end(replay: Replay) -> Vec<FusedLine> {
     lines
 }
 
-fn print_rerun(rerun: &Rerun) {
+fn print_rerun(rerun: &JournalReplay) {
     let summary = rerun.summary();
     let used = summary.reports - summary.rejected.values().sum::<u64>();
     eprintln!("{} reports, {used} used, {} written", summary.reports, summary.written);

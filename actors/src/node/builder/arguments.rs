@@ -4,9 +4,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
-use ecod::election::ElectionConfig;
 use ecod::epoch::Epoch;
 use ecod::landmark::Landmark;
+use ecod::leadership::Position;
+use ecod::leadership::election::ElectionConfig;
+use ecod::leadership::node::{Input, NodeSettings};
 use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
@@ -22,10 +24,10 @@ use crate::actors::reputation_keeper::ReputationKeeperArguments;
 use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
-use crate::messages::leadership::Position;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::ActorSlots;
 use crate::node::config::NodeConfig;
+use crate::node::slots::ActorKind;
 use crate::observe::dashboard::{LandmarkFacts, NodeFacts, NodeSources};
 use crate::observe::readiness::{Vitals, patience};
 use crate::observe::recorder::{LogIdentity, LogItem};
@@ -59,7 +61,7 @@ impl NodeBuilder {
     pub(super) fn gateway_arguments(&self) -> GatewayArguments {
         GatewayArguments {
             cell: self.config.cell.clone(),
-            part: self.gateway_part(),
+            role: self.gateway_part(),
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
             security: self.security.clone(),
@@ -137,12 +139,14 @@ impl NodeBuilder {
                 }
                 Incoming::Ledger(share) => {
                     recording.send(at, LogItem::Share(Arc::clone(share)));
-                    election.send(LeaderElectionMessage::NoteState { from: share.node.clone() });
+                    let input = Input::EvidenceReceived { from: share.node.clone() };
+                    election.send(LeaderElectionMessage::Note { input });
                     keeper.send(ReputationKeeperMessage::Merge { delivery })
                 }
                 Incoming::Link { broker, state } => {
                     recording.send(at, LogItem::Link(broker.clone(), *state));
-                    election.send(LeaderElectionMessage::LinkChanged { broker: broker.clone(), state: *state })
+                    let input = Input::LinkChanged { broker: broker.clone(), state: *state };
+                    election.send(LeaderElectionMessage::Note { input })
                 }
                 Incoming::Status { status, .. } => {
                     recording.send(at, LogItem::Status(Arc::clone(status)));
@@ -157,12 +161,12 @@ impl NodeBuilder {
             newest: self.newest.clone(),
             log: self.config.map_log.clone(),
             recording: self.recording.clone(),
-            least_term: saved_term(self.state_file("term").as_ref()).saturating_sub(1),
-            term: self.term.subscribe(),
+            saved_term: saved_term(self.state_file("term").as_ref()),
             leadership: self.leadership(),
             election: self.slots.election.clone(),
             fuser: self.slots.fuser.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 
@@ -177,7 +181,6 @@ impl NodeBuilder {
             newest: self.newest.reputations.subscribe(),
             members: self.members(),
             leadership: self.leadership(),
-            term: self.term.subscribe(),
             gateway: self.slots.gateway.clone(),
             fuser: self.slots.fuser.clone(),
             counters: self.counters(),
@@ -188,34 +191,36 @@ impl NodeBuilder {
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
         let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
-        let mut aggregator = Aggregator::standby(fusion, landmarks, now);
+        let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
         self.recording.send(now, LogItem::Journal(JournalEvent::Start { ledger }));
         FuserArguments {
             aggregator,
-            term: self.term.subscribe(),
             recording: self.recording.clone(),
             intake: self.intake.clone(),
             newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
             counters: self.counters(),
+            spans: self.spans(),
         }
     }
 
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
         let ActorSlots { membership, gateway, fuser, keeper, broker, .. } = self.slots.clone();
         LeaderElectionArguments {
-            config: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+            settings: NodeSettings {
+                election: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+                plane: self.config.data_plane(),
+                round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
+                keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
+                status: self.status(),
+            },
             term_file: self.state_file("term"),
-            round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
-            plane: self.config.data_plane(),
-            status: self.status(),
             own_broker: self.broker_address(),
             members: self.members(),
             parts: Parts { membership, gateway, fuser, keeper, broker },
             leadership: self.leadership.clone(),
-            term: self.term.clone(),
             counters: self.counters(),
         }
     }
@@ -296,7 +301,7 @@ mod tests {
     #[test]
     fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
         use ecod::aggregator::Algorithms::{Both, Pace};
-        use ecod::tracks::TracksMode::{Auto, Off, On};
+        use ecod::tracking::TracksMode::{Auto, Off, On};
         let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
         for (algorithms, mode, landmarks, expected) in [
             (Both, Off, vec![], true),

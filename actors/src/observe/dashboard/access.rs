@@ -8,7 +8,7 @@ use base64::prelude::{BASE64_URL_SAFE_NO_PAD, Engine};
 use ecod::names::NodeName;
 use ring::hmac;
 
-use crate::transport::mqtt::Secret;
+use crate::platform::secret::Secret;
 
 /// Decides which requests are answered.
 #[derive(Debug)]

@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
-use crate::transport::mqtt::Secret;
+use crate::platform::secret::Secret;
 
 /// A node's web page, metrics and health.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::oneshot;
 
-use crate::platform::throttle::source;
+use crate::platform::throttle::host_network;
 
 /// Limits connections. A connection with an allowed request is kept until it is answered. When full, a new connection
 /// displaces the oldest other one of the address that has most of them.
@@ -64,7 +64,7 @@ impl ConnectionLimit {
         let number = open.next;
         open.next += 1;
         let (displace, displaced) = oneshot::channel();
-        open.by_number.insert(number, Connection { source: source(from), kept: false, _displace: displace });
+        open.by_number.insert(number, Connection { source: host_network(from), kept: false, _displace: displace });
         Some(Admitted { slot: ConnectionSlot { open: Arc::clone(&self.open), number }, displaced, displaces })
     }
 }

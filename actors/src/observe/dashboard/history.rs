@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::Reputations;
 use serde::Serialize;
 
 use super::snapshot::json;
-use crate::messages::leadership::{Leadership, Position};
 
 /// One leader's time in the lead, as this node saw it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -146,7 +146,7 @@ mod tests {
 
     fn led_by(leader: &'static str, term: u64) -> Leadership {
         let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
-        Leadership { position: Position::Following, epoch, standby: None }
+        Leadership { position: Position::Following, epoch, standby: None, term }
     }
 
     fn seconds(n: u64) -> Timestamp {

@@ -6,6 +6,7 @@
 use std::fmt;
 use std::sync::atomic::AtomicU64;
 
+use ecod::leadership::Position;
 use ecod::wire::ReportKind;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
@@ -17,7 +18,6 @@ use super::history::MAX_VEHICLES;
 use super::live_state::kind_label;
 use super::node_monitor::NodeMonitor;
 use super::process_metrics;
-use crate::messages::leadership::Position;
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, OTHERS, Shed, ShedReason};
 use crate::transport::mqtt::LinkState;
@@ -132,8 +132,8 @@ fn traffic(registry: &mut Registry, monitor: &NodeMonitor) {
     let rejected = snapshot.rejects.iter().map(|(reason, times)| (vec![("reason", (*reason).to_owned())], *times));
     counters(registry, "payloads_rejected", "Payloads that were not used, by reason", rejected);
     // Rates need a series that exists before its first increase.
-    let zeros = ShedReason::ALL.map(|reason| Shed { reason, source: OTHERS.to_owned(), times: 0 });
-    let shed = zeros.into_iter().chain(sources.counters.all_shed()).map(|Shed { reason, source, times }| {
+    let zeros = ShedReason::ALL.iter().map(|&reason| Shed { reason, source: OTHERS.to_owned(), times: 0 });
+    let shed = zeros.chain(sources.counters.all_shed()).map(|Shed { reason, source, times }| {
         (vec![("reason", reason.as_str().to_owned()), ("source", source)], times)
     });
     counters(registry, "shed", "Messages discarded under overload, by reason and source; bounded", shed);

@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::epoch::Epoch;
+use ecod::leadership::Position;
+use ecod::leadership::readiness::Readiness;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use tokio::sync::watch;
@@ -17,9 +19,8 @@ use super::node_sources::NodeSources;
 use super::response_cache::{CachedResponse, ResponseCache};
 use super::snapshot::{API_VERSION, LeadershipFacts, Snapshot, json, nodes};
 use crate::messages::gateway::GatewayMessage;
-use crate::messages::leadership::Position;
 use crate::messages::newest::Received;
-use crate::observe::readiness::{Probe, Readiness};
+use crate::observe::readiness::Probe;
 use crate::platform::clock;
 
 /// Source of all answers to browsers.

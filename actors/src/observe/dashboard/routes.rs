@@ -23,7 +23,7 @@ use super::node_monitor::NodeMonitor;
 use super::response_cache::ResponseCache;
 use super::snapshot::json;
 use crate::platform::clock;
-use crate::platform::throttle::Throttle;
+use crate::platform::throttle::TokenBucket;
 use crate::telemetry::counters::Event;
 
 /// State of all routes.
@@ -31,9 +31,9 @@ use crate::telemetry::counters::Event;
 pub(crate) struct HttpApi {
     monitor: Arc<NodeMonitor>,
     access: AccessPolicy,
-    answers: Mutex<Throttle>,
+    answers: Mutex<TokenBucket>,
     /// Separate, so that requests without access leave the rate of those with access alone.
-    refusals: Mutex<Throttle>,
+    refusals: Mutex<TokenBucket>,
     metrics: ResponseCache<Result<Bytes, fmt::Error>>,
     landmarks: Bytes,
     max_viewers: usize,
@@ -51,7 +51,7 @@ const METRICS_MIN_AGE: Duration = Duration::from_millis(100);
 impl HttpApi {
     /// At most half of the connections carry live snapshots.
     pub(crate) fn new(monitor: Arc<NodeMonitor>, access: AccessPolicy, max_connections: usize) -> Self {
-        let throttle = || Mutex::new(Throttle::new(BURST, REQUEST_INTERVAL, clock::now()));
+        let throttle = || Mutex::new(TokenBucket::new(BURST, REQUEST_INTERVAL, clock::now()));
         Self {
             access,
             answers: throttle(),

@@ -2,6 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use ecod::leadership::readiness::Readiness;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
@@ -9,9 +11,7 @@ use serde::Serialize;
 
 use super::live_state::{LatestReport, MAX_SHOWN, ReportedStatus};
 use super::node_sources::{NodeFacts, NodeSources};
-use crate::messages::leadership::{Leadership, Position};
 use crate::messages::newest::Received;
-use crate::observe::readiness::Readiness;
 use crate::telemetry::counters::CounterSnapshot;
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::{BrokerAddress, LinkState};

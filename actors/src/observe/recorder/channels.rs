@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 
 use ecod::epoch::Epoch;
+use ecod::leadership::{Leadership, Position};
 use ecod::names::NodeName;
 use ecod::replay::JournalEntry;
 use ecod::time::Timestamp;
@@ -16,7 +17,6 @@ use serde::{Deserialize, Serialize};
 
 use super::foxglove;
 use super::viewer_schema::schema_of;
-use crate::messages::leadership::{Leadership, Position};
 
 /// Lists every schema once: its name in the code, its message, its name in the log.
 macro_rules! schemas {

@@ -5,11 +5,11 @@ use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use ecod::epoch::Epoch;
+use ecod::leadership::Leadership;
 use ecod::replay::JournalEvent;
 use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
 
-use crate::messages::leadership::Leadership;
 use crate::telemetry::counters::{CounterSnapshot, Counters, Event};
 use crate::transport::mqtt::{BrokerAddress, LinkState};
 

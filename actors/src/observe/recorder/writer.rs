@@ -152,7 +152,7 @@ impl LogWriter {
             LogItem::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
                 (aggregator_state.leads, aggregator_state.next_round) = (Some(epoch.clone()), *first_round);
             }
-            LogItem::Journal(JournalEvent::Command(Command::StandBy)) => aggregator_state.leads = None,
+            LogItem::Journal(JournalEvent::Command(Command::StepDown)) => aggregator_state.leads = None,
             LogItem::Round(round) => aggregator_state.next_round = round.saturating_add(1),
             _ => {}
         }

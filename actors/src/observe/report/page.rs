@@ -7,7 +7,7 @@ use ecod::time::Timestamp;
 
 use super::plot::{Axis, Curve, Plot, bars, class};
 use super::series::{distribution, quantile};
-use super::{Report, Rounds, accuracy};
+use super::{Report, Rounds};
 
 /// How finely time is shown.
 const PARTS: usize = 700;
@@ -17,9 +17,9 @@ const MOST_CURVES: usize = 12;
 
 /// Writes the page.
 pub(super) fn write(report: &Report) -> String {
+    let added: String = report.sections.iter().map(|section| section.html()).collect();
     let sections = [
-        accuracy::of_locations(report),
-        accuracy::of_tracks(report),
+        added,
         leadership(report),
         latency(report),
         gaps(report),
@@ -207,7 +207,8 @@ fn shown(plot: &Plot<'_>) -> String {
     format!("<figure>\n{}<ul class=\"legend\">\n{keys}</ul>\n</figure>\n", drawing(&plot.draw()))
 }
 
-pub(super) fn drawing(picture: &str) -> String {
+/// A picture, as wide as the page allows.
+pub fn drawing(picture: &str) -> String {
     format!("<div class=\"drawing\">{picture}</div>\n")
 }
 
@@ -219,11 +220,13 @@ fn quantiles(name: &str, values: &[f64]) -> Vec<String> {
     [name.to_owned(), values.len().to_string()].into_iter().chain(shares.map(ms)).collect()
 }
 
-pub(super) fn section(title: &str, about: &str, content: &str) -> String {
+/// A section under its title and a sentence about it.
+pub fn section(title: &str, about: &str, content: &str) -> String {
     format!("<section>\n<h2>{title}</h2>\n<p>{about}</p>\n{content}</section>\n")
 }
 
-pub(super) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
+/// Rows under a header.
+pub fn table(head: &[&str], rows: &[Vec<String>]) -> String {
     let mut text = String::new();
     let cell = |text: &mut String, tag: &str, content: &str| {
         // Writing to a string does not fail.

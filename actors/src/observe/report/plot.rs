@@ -132,7 +132,7 @@ impl Scale {
 }
 
 /// Shares in percent as bars.
-pub(super) fn bars(title: &str, shares: &[(String, f64)]) -> String {
+pub fn bars(title: &str, shares: &[(String, f64)]) -> String {
     let height = BAR * shares.len() as f64 + 8.0;
     let (left, width) = (160.0, WIDTH - 160.0 - 60.0);
     let mut picture = picture(title, height);

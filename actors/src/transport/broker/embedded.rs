@@ -1,11 +1,11 @@
-//! The embedded broker: rmqtt on a thread of its own, in a node behind a gate.
+//! The embedded broker: rmqtt on a thread of its own, behind a [`BrokerFrontend`] in a node.
 
+use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
-use std::{fmt, io};
 
 use ecod::config::{ConfigError, check_range};
 use rmqtt::context::ServerContext;
@@ -17,29 +17,30 @@ use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
-use super::gate::{Gate, Guard};
-use super::pulse::{PULSE, Pulse};
+use super::frontend::{AccessPolicy, BrokerFrontend};
+use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
+use super::permissions::Permissions;
+use super::publish_throttle::PublishThrottle;
 use super::retained::RetainedMessages;
-use super::throttle::ClientThrottle;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 
 /// An MQTT broker that lives inside the process.
-pub trait Mqtt: Send + fmt::Debug {
+pub trait MqttBroker: Send {
     /// Listens on `address`, port 0 for a free one, and returns the bound address; clients may connect at once.
     ///
     /// # Errors
     /// [`BrokerError`] names the address; nothing is left running.
     fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError>;
 
-    /// Disconnects all clients and frees the port before it returns; nothing happens when not started. Retained
-    /// messages are lost. A broker that hangs is left to itself after a moment, and may keep its port.
+    /// Disconnects all clients and frees the port before it returns; without effect when not started. Retained messages
+    /// are lost. A broker that hangs is abandoned after a moment and may keep its port.
     fn stop(&mut self);
 
-    /// Whether it serves.
+    /// State of the broker.
     fn health(&self) -> BrokerHealth;
 
-    /// Stops and starts again at the address it is bound to, empty; `fallback` is for a broker that does not run.
+    /// Stops it and starts it at the address where it serves, or else at `fallback`. Retained messages are lost.
     ///
     /// # Errors
     /// As [`Mqtt::start`]; the broker is then stopped.
@@ -53,26 +54,26 @@ pub trait Mqtt: Send + fmt::Debug {
     }
 }
 
-/// Why the embedded broker does not run; nothing was left behind.
+/// An error at the start of the embedded broker; nothing is left running.
 #[derive(Debug, thiserror::Error)]
 pub enum BrokerError {
     /// It is already running.
     #[error("broker already serves at {0}")]
     Running(SocketAddr),
-    /// The address cannot be listened on: busy, not this machine's, or not permitted.
+    /// The address is busy, not this machine's, or not permitted.
     #[error("broker cannot listen on {address}: {reason}")]
     Bind {
-        /// The address asked for.
+        /// The requested address.
         address: SocketAddr,
-        /// What the operating system said.
+        /// The operating system's error.
         reason: String,
     },
-    /// The operating system gave no thread or event queue.
+    /// The operating system refused a thread or event queue.
     #[error("broker for {address} cannot get a thread: {source}")]
     Thread {
-        /// The address asked for.
+        /// The requested address.
         address: SocketAddr,
-        /// What the operating system said.
+        /// The operating system's error.
         source: io::Error,
     },
 }
@@ -81,37 +82,36 @@ pub enum BrokerError {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BrokerConfig {
-    /// Largest MQTT packet in bytes; default what `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` need. A client that
-    /// sends more is cut off. Larger admits the packets of others, smaller bounds the memory that a stranger can take.
+    /// Largest MQTT packet in bytes; default: as `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` need. A client that
+    /// sends a larger one is cut off. Trade-off: larger admits other programs' packets, smaller saves memory in attacks.
     pub max_packet_bytes: Option<u32>,
-    /// Most clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
+    /// Maximum clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
     pub max_clients: usize,
-    /// Most clients at a time of one certificate or, without certificates, of one address other than this machine's; default
-    /// 32. A node has one or two, and one for each observer beside it; a cell behind address translation needs as many for
-    /// each node.
+    /// Maximum clients at a time of one certificate, or of one remote address without certificates; default 32. A node
+    /// has one or two, and one for each observer. A cell behind address translation needs as many for each node.
     pub max_clients_each: usize,
-    /// Most messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
+    /// Maximum messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
     /// then gets is old. Each of them may be as large as the largest packet.
     pub max_waiting: usize,
-    /// Most topics with a retained message; default 8192: one for each node's status and one for the reputations.
+    /// Maximum topics with a retained message; default 8192: one for each node's status and one for the reputations.
     pub max_retained: usize,
-    /// Most bytes of all retained messages together; default 67108864. A status has some hundred, reputations some
-    /// hundred for each vehicle. What is beyond is passed on and not kept.
+    /// Maximum bytes of all retained messages together; default 67108864. A status has some hundred bytes, reputations
+    /// some hundred for each vehicle. Messages beyond it are forwarded and not retained.
     pub max_retained_bytes: usize,
-    /// Whether the broker may listen on others than loopback addresses without `[tls]`; default false. Whoever reaches
-    /// it then reads everything and may say anything in anybody's name.
+    /// Whether the broker may listen on other than loopback addresses without `[tls]`; default false. Every host that
+    /// reaches it can then read everything and publish in any name.
     pub allow_plaintext: bool,
-    /// Milliseconds within which a client must have shown its certificate and logged in; default 5000. Shorter frees
-    /// its place sooner, longer admits slow boards and lossy networks.
+    /// Time limit of the TLS handshake and login in ms; default 5000. Trade-off: shorter frees places sooner, longer
+    /// admits slow boards and lossy networks.
     pub handshake_timeout_ms: u64,
-    /// Connections that one address may make at once; default 64. A cell behind address translation needs two or more
-    /// for each node.
+    /// Burst of connections of one address; default 64. A cell behind address translation needs two or more for each
+    /// node.
     pub connect_burst: u32,
-    /// Connections per second that one address may make after that; default 10.
+    /// Connections per second of one address after the burst; default 10.
     pub connects_per_s: u32,
-    /// Most messages a second of one certificate or, without certificates, of one address, or of one client of this
-    /// machine, and at once after a second of silence; default 1000. What is beyond is passed on to nobody and counted.
-    /// A node sends some tens; more lets a flood take the others' time.
+    /// Maximum messages per second of one certificate; without certificates, of one address or local client; default
+    /// 1000. The same number is the burst. Further messages are dropped and counted. A node sends some tens per second.
+    /// Trade-off: more lets a flood take the others' time.
     pub max_messages_hz: u32,
 }
 
@@ -158,41 +158,54 @@ impl BrokerConfig {
 #[derive(Default)]
 pub struct EmbeddedBroker {
     config: BrokerConfig,
-    guard: Option<Guard>,
+    policy: Option<AccessPolicy>,
     counters: Arc<Counters>,
-    running: Option<Running>,
+    running: Option<RunningBroker>,
 }
 
 #[derive(Debug)]
-struct Running {
+struct RunningBroker {
     address: SocketAddr,
     stop: oneshot::Sender<()>,
     thread: JoinHandle<()>,
     /// Closed when the thread has ended.
     ended: mpsc::Receiver<()>,
-    pulse: Mutex<Pulse>,
+    heartbeat: Mutex<ThreadHeartbeat>,
 }
 
-/// Largest packet of a broker that was not told of a cell's limits: the default maps and their topics.
+/// Largest packet in bytes without a configured limit: the default maps and their topics.
 const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
 
-/// How long connections may take to end when the broker stops; beyond it their thread is left to end by itself.
+/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
+const MAX_TOPIC_LEVELS: usize = 32;
+
+/// Maximum length of a topic or filter in bytes.
+const MAX_TOPIC_BYTES: usize = 512;
+
+/// Maximum subscriptions of one client.
+const MAX_SUBSCRIPTIONS: usize = 256;
+
+/// Whether rmqtt can hold a topic or filter.
+pub(super) fn is_topic_bounded(topic: &str) -> bool {
+    topic.len() <= MAX_TOPIC_BYTES && topic.split('/').count() <= MAX_TOPIC_LEVELS
+}
+
+/// Time for connections to end when the broker stops. Afterwards their tasks are abandoned.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// How long the broker's thread is waited for.
+/// Time for the broker's thread to end.
 const END_TIMEOUT: Duration = Duration::from_millis(1500);
 
 impl EmbeddedBroker {
-    /// A broker that is not started and has no gate: whoever reaches it is let in.
+    /// A broker without a frontend, not started: every client may log in.
     pub fn new(config: BrokerConfig) -> Self {
-        Self { config, guard: None, counters: Arc::default(), running: None }
+        Self { config, policy: None, counters: Arc::default(), running: None }
     }
 
-    /// A broker that is not started, behind a gate: clients show certificates, if the guard has any, and strangers are
-    /// limited.
-    pub fn guarded(config: BrokerConfig, guard: Guard) -> Self {
-        let counters = Arc::clone(&guard.counters);
-        Self { config, guard: Some(guard), counters, running: None }
+    /// A broker behind a frontend with an access policy, not started.
+    pub fn protected(config: BrokerConfig, policy: AccessPolicy) -> Self {
+        let counters = Arc::clone(&policy.counters);
+        Self { config, policy: Some(policy), counters, running: None }
     }
 
     fn listener(&self, address: SocketAddr) -> Builder {
@@ -205,11 +218,12 @@ impl EmbeddedBroker {
             .max_packet_size(self.config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
             .max_connections(self.config.max_clients)
             .max_mqueue_len(self.config.max_waiting)
+            .max_subscriptions(MAX_SUBSCRIPTIONS)
             .handshake_timeout(Duration::from_secs(5))
     }
 }
 
-impl Mqtt for EmbeddedBroker {
+impl MqttBroker for EmbeddedBroker {
     fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError> {
         if let Some(running) = &self.running {
             return Err(BrokerError::Running(running.address));
@@ -218,14 +232,14 @@ impl Mqtt for EmbeddedBroker {
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = mpsc::channel();
         let (ending, ended) = mpsc::channel();
-        let pulse = Pulse::default();
-        let plan = Plan {
+        let heartbeat = ThreadHeartbeat::default();
+        let plan = ThreadSetup {
             address,
             listener: self.listener(address),
             config: self.config.clone(),
-            guard: self.guard.clone(),
+            policy: self.policy.clone(),
             counters: Arc::clone(&self.counters),
-            beats: pulse.beats(),
+            beats: heartbeat.beats(),
         };
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
@@ -238,19 +252,18 @@ impl Mqtt for EmbeddedBroker {
         let bound = match outcome {
             Ok(bound) => bound,
             Err(error) => {
-                // Its last act was to send the error; nothing is left to wait for but its end.
                 if thread.join().is_err() {
                     tracing::error!(%address, "broker's thread panicked");
                 }
                 return Err(error);
             }
         };
-        self.running = Some(Running { address: bound, stop, thread, ended, pulse: Mutex::new(pulse) });
+        self.running = Some(RunningBroker { address: bound, stop, thread, ended, heartbeat: Mutex::new(heartbeat) });
         Ok(bound)
     }
 
     fn stop(&mut self) {
-        let Some(Running { address, stop, thread, ended, .. }) = self.running.take() else { return };
+        let Some(RunningBroker { address, stop, thread, ended, .. }) = self.running.take() else { return };
         let told = stop.send(()).is_ok();
         if ended.recv_timeout(END_TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
             tracing::error!(%address, "broker hangs and is left to itself");
@@ -262,15 +275,15 @@ impl Mqtt for EmbeddedBroker {
     fn health(&self) -> BrokerHealth {
         match &self.running {
             None => BrokerHealth::Stopped,
-            Some(running) if running.thread.is_finished() || running.hangs() => BrokerHealth::Dead,
+            Some(running) if running.thread.is_finished() || running.has_stopped() => BrokerHealth::Dead,
             Some(running) => BrokerHealth::Serving(running.address),
         }
     }
 }
 
-impl Running {
-    fn hangs(&self) -> bool {
-        self.pulse.lock().unwrap_or_else(PoisonError::into_inner).is_lost(clock::now())
+impl RunningBroker {
+    fn has_stopped(&self) -> bool {
+        self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).has_stopped(clock::now())
     }
 }
 
@@ -280,37 +293,29 @@ impl Drop for EmbeddedBroker {
     }
 }
 
-impl fmt::Debug for EmbeddedBroker {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("EmbeddedBroker").field("running", &self.running).finish_non_exhaustive()
-    }
-}
-
-/// What the broker's thread is to do.
-struct Plan {
+/// Arguments of the broker's thread.
+struct ThreadSetup {
     address: SocketAddr,
     listener: Builder,
     config: BrokerConfig,
-    guard: Option<Guard>,
+    policy: Option<AccessPolicy>,
     counters: Arc<Counters>,
-    /// Counts on while the thread does not hang.
+    /// Counter that the thread increments while it does not hang.
     beats: Arc<AtomicU64>,
 }
 
-/// The broker's thread. A tokio runtime must not be dropped where the caller's async code runs, so that it is made
-/// here.
-fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
+/// Body of the broker's thread. It owns the tokio runtime, which must not be dropped within the caller's async code.
+fn serve(plan: ThreadSetup, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
     let (address, beats) = (plan.address, Arc::clone(&plan.beats));
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(source) => {
-            // The caller waits for nothing else and cannot be gone.
             ready.send(Err(BrokerError::Thread { address, source })).unwrap_or_default();
             return;
         }
     };
     runtime.block_on(async {
-        let (server, gate, bound) = match prepare(plan).await {
+        let (server, frontend, bound) = match prepare(plan).await {
             Ok(prepared) => prepared,
             Err(error) => {
                 let reason = error.root_cause().to_string();
@@ -319,13 +324,13 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
         };
         ready.send(Ok(bound)).unwrap_or_default();
         let admitting = async {
-            match gate {
-                Some(gate) => gate.run().await,
+            match frontend {
+                Some(frontend) => frontend.run().await,
                 None => std::future::pending().await,
             }
         };
         let beating = async {
-            let mut ticks = tokio::time::interval(PULSE);
+            let mut ticks = tokio::time::interval(HEARTBEAT_INTERVAL);
             loop {
                 ticks.tick().await;
                 beats.fetch_add(1, Ordering::Relaxed);
@@ -334,38 +339,38 @@ fn serve(plan: Plan, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stop
         tokio::select! {
             () = beating => {}
             ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
-            () = admitting => tracing::error!("gate ended by itself"),
+            () = admitting => tracing::error!("frontend ended by itself"),
             _ = stopped => {}
         }
     });
     runtime.shutdown_timeout(STOP_TIMEOUT);
 }
 
-/// Opens the sockets: rmqtt's own is the public one, or behind the gate's.
-async fn prepare(plan: Plan) -> rmqtt::Result<(MqttServer, Option<Gate>, SocketAddr)> {
-    let Plan { address, listener, config, guard, counters, .. } = plan;
+/// Opens the sockets. rmqtt's own is public without a frontend, and else on loopback.
+async fn prepare(plan: ThreadSetup) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr)> {
+    let ThreadSetup { address, listener, config, policy, counters, .. } = plan;
     let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
-    let listener = match &guard {
-        // Without anonymous clients, the hooks are asked about each.
+    let listener = match &policy {
+        // Without anonymous clients, rmqtt asks the hooks about each login.
         Some(_) => listener.laddr(behind).allow_anonymous(false),
-        None => listener,
+        None => listener.max_topic_levels(MAX_TOPIC_LEVELS),
     };
     let listener = listener.bind().and_then(Listener::tcp)?;
     let own = listener.local_addr()?;
-    // rmqtt's own overload check refuses clients by the whole machine's load; a vehicle's camera would trip it.
+    // rmqtt's own overload check looks at the whole machine's load, which a vehicle's camera would exceed.
     let context = ServerContext::new().busy_check_enable(false).build().await;
     *context.extends.retain_mut().await = Box::new(RetainedMessages::new(&config));
-    let (gate, bound) = match &guard {
-        Some(guard) => {
+    let (frontend, bound) = match &policy {
+        Some(policy) => {
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
-            let gate = Gate::new(public, own, guard, &config);
-            gate.permissions(guard).install(&context).await;
-            (Some(gate), bound)
+            let frontend = BrokerFrontend::new(public, own, policy, &config);
+            Permissions { principals: frontend.principals(), policy: policy.clone() }.install(&context).await;
+            (Some(frontend), bound)
         }
         None => (None, own),
     };
-    let passes = gate.as_ref().map(Gate::passes).unwrap_or_default();
-    ClientThrottle::new(config.max_messages_hz, passes, counters).install(&context).await;
-    Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), gate, bound))
+    let principals = frontend.as_ref().map(BrokerFrontend::principals).unwrap_or_default();
+    PublishThrottle::new(config.max_messages_hz, principals, counters).install(&context).await;
+    Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), frontend, bound))
 }

@@ -1,91 +1,93 @@
-//! Who may say what through the embedded broker: hooks of rmqtt that look at the certificate behind a connection.
+//! Permissions at the embedded broker: hooks of rmqtt that check the principal of a connection.
 //!
-//! | topic | who |
+//! | topic | may publish |
 //! |---|---|
-//! | `detections/N`, `vote_detections/N` | whoever has the certificate of `N` |
+//! | `detections/N`, `vote_detections/N` | the certificate of `N` |
 //! | `ledger/N` | the same, if `N` may lead |
-//! | `nodes/N`, `nodes/N--…` | whoever has the certificate of `N`; observers share it |
-//! | `global_detections`, `global_verdicts`, `reputations` | who is elected; while nobody is, who may lead |
+//! | `nodes/N`, `nodes/N--…` | the certificate of `N`, which its observers share |
+//! | `global_detections`, `global_verdicts`, `reputations` | the leader; without a leader, nodes that may lead |
 //! | anything else | nobody |
 //!
-//! Only statuses and reputations may be retained: what comes late of the rest is worth nothing. Everyone with a
-//! certificate of the cell may read everything.
+//! Only statuses and reputations may be retained: other messages are worthless when late. Everyone with a certificate
+//! of the cell may read everything. Topics and filters are bounded in length and in levels.
 
-use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
 use ecod::names::NodeName;
-use ecod::wire::{Limits, Topic, Topics};
+use ecod::wire::{Limits, Topic};
+use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
-use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult};
+use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, SubscribeAclResult, TopicFilter};
 
-use super::holder::{Holder, Passes};
-use crate::telemetry::counters::{Counters, Event};
+use super::AccessPolicy;
+use super::embedded::is_topic_bounded;
+use super::principal::{Principal, PrincipalRegistry};
+use crate::telemetry::counters::Event;
 use crate::transport::mqtt::ENVELOPE_BYTES;
-use crate::transport::pki::Identity;
+use crate::transport::pki::CertificateSubject;
 
-/// Tells whether a node may speak for all: whether it is the elected one.
-pub type Elected = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
+/// Decides whether a node may publish maps, verdicts and reputations.
+pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 
-/// What the hooks need to know.
+/// Hooks of rmqtt that check logins, messages and filters.
 #[derive(Clone)]
 pub(super) struct Permissions {
-    pub(super) passes: Passes,
-    pub(super) topics: Topics,
-    pub(super) limits: Limits,
-    pub(super) elected: Elected,
-    pub(super) counters: Arc<Counters>,
-}
-
-impl fmt::Debug for Permissions {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Permissions").finish_non_exhaustive()
-    }
+    pub(super) principals: PrincipalRegistry,
+    pub(super) policy: AccessPolicy,
 }
 
 impl Permissions {
-    /// Has rmqtt ask before it lets anybody log in or publish.
+    /// Registers the hooks.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
-        register.add(Type::ClientAuthenticate, Box::new(self.clone())).await;
-        register.add(Type::MessagePublishCheckAcl, Box::new(self)).await;
+        use Type::{ClientAuthenticate, ClientSubscribeCheckAcl, ClientUnsubscribe, MessagePublishCheckAcl};
+        for hook in [ClientAuthenticate, MessagePublishCheckAcl, ClientSubscribeCheckAcl, ClientUnsubscribe] {
+            register.add(hook, Box::new(self.clone())).await;
+        }
         register.start().await;
     }
 
     /// Whether the connection may log in under this client id with this last will.
-    fn admits(&self, info: &ConnectInfo) -> bool {
-        // Without a pass it went past the gate: another process of this machine found the port behind it.
-        let Some(holder) = self.passes.holder(info.id().remote_addr) else { return false };
+    fn allows_login(&self, info: &ConnectInfo) -> bool {
+        // Unregistered: a local process that connected past the frontend.
+        let Some(principal) = self.principals.principal(info.id().remote_addr) else { return false };
         let may_say = |will: LastWill<'_>| {
             let (topic, retain, bytes) = match will {
                 LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
                 LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
             };
-            self.allows(&holder, topic, retain, bytes)
+            self.allows(&principal, topic, retain, bytes)
         };
-        let is_own = |identity: &Arc<Identity>| holder.is_nameless || may_be_called(identity, info.client_id());
-        holder.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
+        let is_own = |identity: &Arc<CertificateSubject>| {
+            principal.has_generated_id || may_use_client_id(identity, info.client_id())
+        };
+        principal.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
     }
 
-    fn permits(&self, address: Option<SocketAddr>, publish: &Publish) -> bool {
-        let allows = |holder: Holder| self.allows(&holder, &publish.topic, publish.retain, publish.payload.len());
-        self.passes.holder(address).is_some_and(allows)
+    fn allows_publish(&self, address: Option<SocketAddr>, publish: &Publish) -> bool {
+        let allows =
+            |principal: Principal| self.allows(&principal, &publish.topic, publish.retain, publish.payload.len());
+        self.principals.principal(address).is_some_and(allows)
     }
 
-    /// Whether the holder may say something on a topic. Without a certificate anybody may say anything, but not more
-    /// than the topic's receivers take, nor what is not to be retained.
-    fn allows(&self, holder: &Holder, topic: &str, retain: bool, bytes: usize) -> bool {
-        let topic = self.topics.parse(topic);
-        let most = topic.as_ref().map_or(self.limits.payload_bytes, |topic| max_bytes(topic, &self.limits));
-        bytes <= most + ENVELOPE_BYTES
+    /// Whether a principal may publish on a topic. Without certificates every topic is allowed, within its limits of size
+    /// and retention.
+    fn allows(&self, principal: &Principal, topic: &str, retain: bool, bytes: usize) -> bool {
+        if !is_topic_bounded(topic) {
+            return false;
+        }
+        let topic = self.policy.topics.parse(topic);
+        let limits = &self.policy.limits;
+        let limit = topic.as_ref().map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
+        bytes <= limit + ENVELOPE_BYTES
             && (!retain || topic.as_ref().is_some_and(is_state))
-            && holder
+            && principal
                 .identity
                 .as_ref()
-                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.elected)))
+                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.policy.elected)))
     }
 }
 
@@ -93,21 +95,30 @@ impl Permissions {
 impl Handler for Permissions {
     async fn hook(&self, parameter: &Parameter, _earlier: Option<HookResult>) -> ReturnType {
         let answer = match parameter {
-            Parameter::ClientAuthenticate(info) => HookResult::AuthResult(if self.admits(info) {
+            Parameter::ClientAuthenticate(info) => HookResult::AuthResult(if self.allows_login(info) {
                 AuthResult::Allow(false, None)
             } else {
-                self.counters.count(Event::ClientDenied);
-                tracing::debug!(client = %info.client_id(), "login in another's name refused");
+                self.policy.counters.count(Event::ClientDenied);
+                tracing::debug!(client = %info.client_id(), "login refused");
                 AuthResult::NotAuthorized
             }),
             Parameter::MessagePublishCheckAcl(session, publish) => {
-                HookResult::PublishAclResult(if self.permits(session.id.remote_addr, publish) {
+                HookResult::PublishAclResult(if self.allows_publish(session.id.remote_addr, publish) {
                     PublishAclResult::allow()
                 } else {
-                    self.counters.count(Event::ClientDenied);
+                    self.policy.counters.count(Event::ClientDenied);
                     tracing::debug!(client = %session.id.client_id, topic = %publish.topic, "message refused");
                     PublishAclResult::rejected(false, None)
                 })
+            }
+            Parameter::ClientSubscribeCheckAcl(_, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
+                self.policy.counters.count(Event::ClientDenied);
+                HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
+            }
+            // An UNSUBACK cannot refuse. Such a filter is never subscribed, so that there is nothing to end.
+            Parameter::ClientUnsubscribe(_, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
+                self.policy.counters.count(Event::ClientDenied);
+                HookResult::TopicFilter(Some(TopicFilter::default()))
             }
             _ => return (true, None),
         };
@@ -115,7 +126,7 @@ impl Handler for Permissions {
     }
 }
 
-/// What receivers take of the topic: nobody but the elected has maps to send.
+/// Largest payload that receivers of the topic accept, in bytes.
 fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     match topic {
         Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) | Topic::Nodes(_) => limits.payload_bytes,
@@ -123,68 +134,70 @@ fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     }
 }
 
-/// Whether the topic's last message is kept for latecomers.
+/// Whether the topic's last message may be retained.
 fn is_state(topic: &Topic) -> bool {
     matches!(topic, Topic::Nodes(_) | Topic::Reputations)
 }
 
-fn may_publish(identity: &Identity, topic: &Topic, elected: &Elected) -> bool {
+fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderCheck) -> bool {
     match topic {
         Topic::Detections(node) | Topic::VoteDetections(node) => identity.name() == node,
-        Topic::Ledger(node) => identity.serves() && identity.name() == node,
-        Topic::Nodes(node) => identity.speaks_for(node.as_str()),
+        Topic::Ledger(node) => identity.may_serve() && identity.name() == node,
+        Topic::Nodes(node) => identity.may_act_as(node.as_str()),
         Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => {
-            identity.serves() && elected(identity.name())
+            identity.may_serve() && elected(identity.name())
         }
     }
 }
 
-/// A second connection of one client id ends the first: nobody may take another's. A node's is its name and its run.
-fn may_be_called(identity: &Identity, client_id: &str) -> bool {
+/// Whether a client id is the name and run of this node or of its observer. A connection ends an earlier one with the
+/// same client id, so that foreign ids are refused.
+fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
     let is_run = |text: &str| text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
-    client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.speaks_for(name))
+    client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.may_act_as(name))
 }
 
 #[cfg(test)]
 mod tests {
     use std::time::Duration;
 
-    use ecod::wire::Role;
+    use ecod::wire::{Role, Topics};
 
     use super::*;
     use crate::platform::clock;
     use crate::transport::pki::Authority;
 
-    fn identity(name: &'static str, role: Role) -> Identity {
+    fn identity(name: &'static str, role: Role) -> CertificateSubject {
         let (directory, name) = (tempfile::tempdir().unwrap(), NodeName::from_static(name));
         let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
         authority.issue(&name, role, Duration::from_secs(60), clock::now()).unwrap();
         let pem = std::fs::read(authority.files_of(&name).0).unwrap();
-        Identity::of(&x509_parser::pem::parse_x509_pem(&pem).unwrap().1.contents).unwrap()
+        CertificateSubject::of(&x509_parser::pem::parse_x509_pem(&pem).unwrap().1.contents).unwrap()
     }
 
-    fn anyone() -> Holder {
-        Holder::new(None, [10, 0, 0, 1].into(), false)
+    fn anyone() -> Principal {
+        Principal::new(None, [10, 0, 0, 1].into(), false)
     }
 
-    fn with(identity: &Identity) -> Holder {
-        Holder::new(Some(identity.clone()), [10, 0, 0, 1].into(), false)
+    fn with(identity: &CertificateSubject) -> Principal {
+        Principal::new(Some(identity.clone()), [10, 0, 0, 1].into(), false)
     }
 
     fn permissions() -> Permissions {
-        Permissions {
-            passes: Passes::default(),
+        let policy = AccessPolicy {
+            credentials: None,
             topics: Topics::new(&NodeName::from_static("lot")),
             limits: Limits { payload_bytes: 1000, map_bytes: 5000, ..Limits::default() },
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::default(),
-        }
+        };
+        Permissions { principals: PrincipalRegistry::default(), policy }
     }
 
     #[test]
     fn everyone_speaks_for_itself_and_the_elected_for_all() {
         let permissions = permissions();
-        let allows = |identity: &Identity, topic: &str| {
+        let allows = |identity: &CertificateSubject, topic: &str| {
             permissions.allows(&with(identity), &format!("ecod/v1/lot/{topic}"), false, 0)
         };
         let (edge, euclid) = (identity("edge", Role::Edge), identity("euclid", Role::Auto));
@@ -216,13 +229,14 @@ mod tests {
         let edge = with(&identity("edge", Role::Edge));
         let streams =
             ["detections/edge", "vote_detections/edge", "ledger/edge", "global_detections", "global_verdicts"];
-        for holder in [edge, anyone()] {
-            let allows = |topic: &str, retain| permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), retain, 0);
+        for principal in [edge, anyone()] {
+            let allows =
+                |topic: &str, retain| permissions.allows(&principal, &format!("ecod/v1/lot/{topic}"), retain, 0);
             for topic in streams {
                 assert!(allows(topic, false) && !allows(topic, true), "{topic}");
             }
             assert!(allows("nodes/edge", true) && allows("reputations", true));
-            assert!(!permissions.allows(&holder, "elsewhere", true, 0));
+            assert!(!permissions.allows(&principal, "elsewhere", true, 0));
         }
         assert!(permissions.allows(&anyone(), "elsewhere", false, 0), "without certificates anybody may say anything");
     }
@@ -230,9 +244,9 @@ mod tests {
     #[test]
     fn a_report_is_not_as_large_as_a_map() {
         let permissions = permissions();
-        for holder in [with(&identity("edge", Role::Edge)), anyone()] {
+        for principal in [with(&identity("edge", Role::Edge)), anyone()] {
             let allows = |topic: &str, bytes| {
-                permissions.allows(&holder, &format!("ecod/v1/lot/{topic}"), false, bytes + ENVELOPE_BYTES)
+                permissions.allows(&principal, &format!("ecod/v1/lot/{topic}"), false, bytes + ENVELOPE_BYTES)
             };
             for topic in ["detections/edge", "vote_detections/edge", "ledger/edge", "nodes/edge"] {
                 assert!(allows(topic, 1000) && !allows(topic, 1001), "{topic}");
@@ -249,11 +263,11 @@ mod tests {
         let euclid = identity("euclid", Role::Auto);
         let run = "0123456789abcdef0123456789abcdef";
         for good in [format!("euclid-{run}"), format!("euclid--top-7-{run}")] {
-            assert!(may_be_called(&euclid, &good), "{good}");
+            assert!(may_use_client_id(&euclid, &good), "{good}");
         }
         let others = [format!("edge-{run}"), format!("euclid-2-{run}"), "euclid".into(), "edge".into(), String::new()];
         for bad in others.into_iter().chain([run.to_owned()]) {
-            assert!(!may_be_called(&euclid, &bad), "{bad}");
+            assert!(!may_use_client_id(&euclid, &bad), "{bad}");
         }
     }
 }

@@ -9,17 +9,18 @@ use rmqtt::types::{Retain, TopicFilter, TopicName};
 use tokio::sync::Mutex;
 
 use super::BrokerConfig;
+use super::embedded::is_topic_bounded;
 use crate::transport::pki::OBSERVER_MARK;
 
-/// A bounded number of retained messages and of their bytes.
+/// Retained messages, bounded in number and in bytes.
 pub(super) struct RetainedMessages {
     storage: DefaultRetainStorage,
-    register: Mutex<Register>,
+    register: Mutex<RetainedIndex>,
 }
 
 impl RetainedMessages {
     pub(super) fn new(config: &BrokerConfig) -> Self {
-        let register = Register {
+        let register = RetainedIndex {
             kept: BTreeMap::new(),
             bytes: 0,
             max_topics: config.max_retained,
@@ -40,20 +41,21 @@ impl RetainStorage for RetainedMessages {
         false
     }
 
-    // `_listener_expiry` is the listener's bound on queued messages; a retained status holds until it is replaced,
-    // unless its publisher says otherwise (MQTT 5).
+    // `_listener_expiry` is for queued messages. A retained status is valid until it is replaced, or until the expiry
+    // that its publisher set (MQTT 5).
     async fn set(&self, topic: &TopicName, message: Retain, _listener_expiry: Option<Duration>) -> rmqtt::Result<()> {
         let properties = message.publish.properties.as_ref();
         let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));
         let (now, bytes) = (Instant::now(), message.publish.payload.len());
         let mut register = self.register.lock().await;
-        let has_room = bytes == 0 || register.keep(topic, bytes, expiry.map(|expiry| now + expiry), now);
+        let has_room = is_topic_bounded(topic)
+            && (bytes == 0 || register.keep(topic, bytes, expiry.map(|expiry| now + expiry), now));
         let has_pruned = register.pruned == Some(now);
         if has_pruned {
             self.storage.remove_expired_messages().await;
         }
         if !has_room {
-            // Not for each: whoever fills the store is not to fill the log.
+            // Not for each message: a flood must not fill the log.
             if has_pruned {
                 tracing::warn!(%topic, bytes, "retained messages refused");
             }
@@ -78,15 +80,15 @@ impl RetainStorage for RetainedMessages {
     }
 }
 
-/// Most observers of one certificate whose statuses are kept.
+/// Maximum observers of one certificate whose statuses are retained.
 const MAX_OBSERVERS: usize = 64;
 
-/// Least time between two looks for messages that have expired.
-const PRUNE: Duration = Duration::from_secs(1);
+/// Minimum time between two searches for expired messages.
+const PRUNE_INTERVAL: Duration = Duration::from_secs(1);
 
-/// What is kept, by topic: its bytes and until when, if it expires.
+/// Bytes and expiry of each retained topic.
 #[derive(Debug)]
-struct Register {
+struct RetainedIndex {
     kept: BTreeMap<String, (usize, Option<Instant>)>,
     bytes: usize,
     max_topics: usize,
@@ -94,10 +96,11 @@ struct Register {
     pruned: Option<Instant>,
 }
 
-impl Register {
-    /// Notes a message in the place of its topic's last, if there is room for it.
+impl RetainedIndex {
+    /// Records a message in place of its topic's last; false when there is no room.
     fn keep(&mut self, topic: &str, bytes: usize, until: Option<Instant>, now: Instant) -> bool {
-        if !self.has_room(topic, bytes) && self.pruned.is_none_or(|pruned| now.duration_since(pruned) >= PRUNE) {
+        if !self.has_room(topic, bytes) && self.pruned.is_none_or(|pruned| now.duration_since(pruned) >= PRUNE_INTERVAL)
+        {
             self.pruned = Some(now);
             self.kept.retain(|_, (_, until)| until.is_none_or(|until| until > now));
             self.bytes = self.kept.values().map(|(bytes, _)| bytes).sum();
@@ -121,12 +124,12 @@ impl Register {
         self.bytes - before.unwrap_or(&0) + bytes <= self.max_bytes && (before.is_some() || !is_crowded())
     }
 
-    /// How many topics there are of observers that share the certificate of this one.
+    /// Number of topics of observers that share a certificate with this topic's observer.
     fn observers_beside(&self, topic: &str) -> usize {
         let name = topic.rfind('/').map_or(0, |slash| slash + 1);
         let mark = topic.get(name..).and_then(|name| name.find(OBSERVER_MARK));
-        let Some(holder) = mark.and_then(|mark| topic.get(..name + mark + OBSERVER_MARK.len())) else { return 0 };
-        self.kept.range(holder.to_owned()..).take_while(|(topic, _)| topic.starts_with(holder)).count()
+        let Some(principal) = mark.and_then(|mark| topic.get(..name + mark + OBSERVER_MARK.len())) else { return 0 };
+        self.kept.range(principal.to_owned()..).take_while(|(topic, _)| topic.starts_with(principal)).count()
     }
 }
 
@@ -134,8 +137,8 @@ impl Register {
 mod tests {
     use super::*;
 
-    fn register(max_topics: usize, max_bytes: usize) -> Register {
-        Register { kept: BTreeMap::new(), bytes: 0, max_topics, max_bytes, pruned: None }
+    fn register(max_topics: usize, max_bytes: usize) -> RetainedIndex {
+        RetainedIndex { kept: BTreeMap::new(), bytes: 0, max_topics, max_bytes, pruned: None }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use std::time::Duration;
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
-use crate::transport::mqtt::Secret;
+use crate::platform::secret::Secret;
 
 /// UDP port on which a node gossips unless told otherwise.
 pub const DEFAULT_PORT: u16 = 17_884;

@@ -1,10 +1,13 @@
-//! What came and went on the gossip socket, counted.
+//! Counters of the gossip socket.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Something that happened to a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+use strum::{IntoStaticStr, VariantArray};
+
+/// An event of one frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case")]
 pub enum FrameEvent {
     /// Sent.
     Sent,
@@ -12,67 +15,37 @@ pub enum FrameEvent {
     SendFailed,
     /// Not sent: the addressee is not known, or not yet.
     NoSession,
-    /// Came in, from whomever.
+    /// Received from any address.
     Received,
     /// Longer than any frame.
     Oversized,
-    /// Not a frame, or a body that says nothing.
+    /// Not a frame, or a body that cannot be decoded.
     Malformed,
     /// Of another cell.
     WrongCell,
     /// Not sealed with the cell's key for this node.
     BadSeal,
-    /// Taken before, or too late, or the answer to nothing asked lately.
+    /// Received before, too late, or an answer without a recent request.
     Replayed,
-    /// Sealed well, from a session that is not established: a handshake is begun.
+    /// Authentic, from a session that is not established: starts a handshake.
     Unestablished,
-    /// From a node whose name belongs to one that started later.
+    /// From a node whose name a later started node has.
     Superseded,
-    /// Speaks for another node than the one that sealed it.
+    /// Gossip in the name of another node than its sender.
     NameMismatch,
-    /// Would have been answered, but too many were lately.
+    /// Not answered: too many were answered lately.
     Throttled,
-    /// From a node beyond the most that are known at a time.
+    /// From a node beyond `membership.max_peers`.
     TooManyPeers,
 }
 
 impl FrameEvent {
-    /// All of them, for snapshots.
-    pub const ALL: [Self; 14] = [
-        Self::Sent,
-        Self::SendFailed,
-        Self::NoSession,
-        Self::Received,
-        Self::Oversized,
-        Self::Malformed,
-        Self::WrongCell,
-        Self::BadSeal,
-        Self::Replayed,
-        Self::Unestablished,
-        Self::Superseded,
-        Self::NameMismatch,
-        Self::Throttled,
-        Self::TooManyPeers,
-    ];
+    /// All events.
+    pub const ALL: &'static [Self] = Self::VARIANTS;
 
-    /// The label of its counter.
+    /// The label of the event's counter.
     pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Sent => "sent",
-            Self::SendFailed => "send_failed",
-            Self::NoSession => "no_session",
-            Self::Received => "received",
-            Self::Oversized => "oversized",
-            Self::Malformed => "malformed",
-            Self::WrongCell => "wrong_cell",
-            Self::BadSeal => "bad_seal",
-            Self::Replayed => "replayed",
-            Self::Unestablished => "unestablished",
-            Self::Superseded => "superseded",
-            Self::NameMismatch => "name_mismatch",
-            Self::Throttled => "throttled",
-            Self::TooManyPeers => "too_many_peers",
-        }
+        self.into()
     }
 }
 
@@ -81,20 +54,20 @@ impl FrameEvent {
 pub struct FrameCounters([AtomicU64; FrameEvent::ALL.len()]);
 
 impl FrameCounters {
-    /// Counts one.
+    /// Counts one event.
     #[expect(clippy::indexing_slicing, reason = "there is a place for every event")]
     pub fn count(&self, event: FrameEvent) {
         self.0[event as usize].fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How often it happened.
+    /// Occurrences of an event.
     #[expect(clippy::indexing_slicing, reason = "there is a place for every event")]
     pub fn get(&self, event: FrameEvent) -> u64 {
         self.0[event as usize].load(Ordering::Relaxed)
     }
 
-    /// All counts by label, zeros too.
+    /// All counts by label, zeros included.
     pub fn snapshot(&self) -> BTreeMap<&'static str, u64> {
-        FrameEvent::ALL.map(|event| (event.as_str(), self.get(event))).into()
+        FrameEvent::ALL.iter().map(|event| (event.as_str(), self.get(*event))).collect()
     }
 }

@@ -1,4 +1,4 @@
-//! Frames: what a datagram of the membership looks like.
+//! Frames: the format of the membership's datagrams.
 //!
 //! ```text
 //!  0      2        3     4       8                24         32
@@ -14,33 +14,34 @@ use ecod::names::NodeName;
 use serde::{Deserialize, Serialize};
 
 use super::MAX_PAYLOAD_BYTES;
-use super::key::{Cookie, Seal, SessionId};
+use super::counters::FrameEvent;
+use super::key::{Cookie, FrameCipher, SessionId};
 use super::node_id::NodeId;
 
 /// Bytes before the sealed body.
-pub(crate) const HEAD_BYTES: usize = 32;
+pub(crate) const HEADER_BYTES: usize = 32;
 
 /// Longest frame in bytes.
-pub(crate) const MAX_FRAME_BYTES: usize = HEAD_BYTES + MAX_PAYLOAD_BYTES + SEAL_BYTES;
+pub(crate) const MAX_FRAME_BYTES: usize = HEADER_BYTES + MAX_PAYLOAD_BYTES + SEAL_BYTES;
 
 const SEAL_BYTES: usize = 16;
 const MAGIC: [u8; 2] = [0xec, 0x0d];
 const VERSION: u8 = 1;
 
-/// What a frame holds.
+/// Content of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
-    /// A greeting to whom it may concern, sealed for everybody.
+pub(crate) enum FrameKind {
+    /// A greeting, sealed for all nodes of the cell.
     Hello = 1,
     /// A step of the handshake that establishes a session.
     Handshake = 2,
-    /// Words of the gossip protocol.
+    /// A message of the SWIM protocol.
     Gossip = 3,
-    /// A datagram of the node's other parts.
+    /// A datagram of the node's other actors.
     Payload = 4,
 }
 
-/// A node greets; another challenges it; each proves that it is there now by returning the other's cookie:
+/// A step of the handshake. Each side proves that it is reachable now by returning the other's cookie:
 ///
 /// ```text
 /// A ── Hello ─────────────────────────────────────▶ all, or a seed
@@ -50,116 +51,108 @@ pub(crate) enum Kind {
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Handshake {
-    /// "Show that you are there."
+    /// Asks the greeter to prove that it is reachable.
     Challenge {
-        /// To be returned.
+        /// Cookie to be returned.
         cookie: Cookie,
-        /// Who asks.
+        /// Name of the challenger.
         name: NodeName,
     },
-    /// "I am; show that you are."
+    /// Proves it, and asks the same of the challenger.
     Proof {
         /// The challenger's cookie.
         echo: Cookie,
-        /// To be returned.
+        /// Cookie to be returned.
         cookie: Cookie,
-        /// Who proves.
-        word: Word,
+        /// Identity of the prover.
+        introduction: Introduction,
     },
-    /// "I am too."
+    /// Proves the challenger's reachability; ends the handshake.
     Accept {
         /// The prover's cookie.
         echo: Cookie,
-        /// Who accepts.
-        word: Word,
+        /// Identity of the accepter.
+        introduction: Introduction,
     },
 }
 
-/// What two nodes tell each other when they meet.
+/// Information that two nodes exchange in the handshake.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct Word {
+pub(crate) struct Introduction {
     /// The sender.
     pub(crate) id: NodeId,
-    /// Where the sender sees the receiver.
+    /// Address at which the sender sees the receiver.
     pub(crate) seen_at: SocketAddr,
-    /// What the sender knows of the receiver's name.
-    pub(crate) standing: NameStanding,
+    /// Other claims to the receiver's name that the sender knows.
+    pub(crate) claim: NameClaim,
 }
 
-/// What is known of a name besides who just proved to bear it.
+/// Other claims to the name of a node that has just proven its reachability.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) enum NameStanding {
-    /// Nothing that is in the way.
+pub(crate) enum NameClaim {
+    /// No other claim.
     Free,
-    /// A later life of that name is over: only one after it will be believed.
+    /// A node of that name with this `life` is down. Only a greater `life` is accepted.
     After(u64),
-    /// A node that started later bears it.
+    /// A later started node has the name.
     Taken,
 }
 
 /// A greeting.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Hello {
-    /// Who greets.
+    /// Name of the sender.
     pub(crate) name: NodeName,
 }
 
-/// The open part of a frame.
+/// The part of a frame that is authenticated and not encrypted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Head {
-    pub(crate) kind: Kind,
+pub(crate) struct FrameHeader {
+    pub(crate) kind: FrameKind,
     pub(crate) sender: SessionId,
     pub(crate) counter: u64,
 }
 
-/// A frame that is no frame of this cell.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum HeadError {
-    Oversized,
-    Malformed,
-    WrongCell,
-}
-
-impl Head {
+impl FrameHeader {
     /// Reads the head of a frame; its body is what follows [`HEAD_BYTES`].
-    pub(crate) fn read(frame: &[u8], cell: [u8; 4]) -> Result<Self, HeadError> {
+    pub(crate) fn read(frame: &[u8], cell: [u8; 4]) -> Result<Self, FrameEvent> {
         if frame.len() > MAX_FRAME_BYTES {
-            return Err(HeadError::Oversized);
+            return Err(FrameEvent::Oversized);
         }
-        let Some((head, _)) = frame.split_first_chunk::<HEAD_BYTES>().filter(|(_, body)| body.len() >= SEAL_BYTES)
+        let Some((head, _)) = frame.split_first_chunk::<HEADER_BYTES>().filter(|(_, body)| body.len() >= SEAL_BYTES)
         else {
-            return Err(HeadError::Malformed);
+            return Err(FrameEvent::Malformed);
         };
         let [m0, m1, version, kind, c0, c1, c2, c3, rest @ ..] = head;
         if [*m0, *m1] != MAGIC || *version != VERSION {
-            return Err(HeadError::Malformed);
+            return Err(FrameEvent::Malformed);
         }
         let kind = match kind {
-            1 => Kind::Hello,
-            2 => Kind::Handshake,
-            3 => Kind::Gossip,
-            4 => Kind::Payload,
-            _ => return Err(HeadError::Malformed),
+            1 => FrameKind::Hello,
+            2 => FrameKind::Handshake,
+            3 => FrameKind::Gossip,
+            4 => FrameKind::Payload,
+            _ => return Err(FrameEvent::Malformed),
         };
         if [*c0, *c1, *c2, *c3] != cell {
-            return Err(HeadError::WrongCell);
+            return Err(FrameEvent::WrongCell);
         }
         let (Some(&sender), Some(&counter)) = (rest.first_chunk(), rest.last_chunk()) else {
-            return Err(HeadError::Malformed);
+            return Err(FrameEvent::Malformed);
         };
         Ok(Self { kind, sender, counter: u64::from_be_bytes(counter) })
     }
 
-    /// Writes a whole frame.
-    pub(crate) fn write(&self, cell: [u8; 4], body: &[u8], seal: &Seal) -> Vec<u8> {
-        let mut frame = Vec::with_capacity(HEAD_BYTES + body.len() + SEAL_BYTES);
+    /// Writes a whole frame, sealed.
+    pub(crate) fn write(&self, cell: [u8; 4], body: &[u8], seal: &FrameCipher) -> Vec<u8> {
+        let mut frame = Vec::with_capacity(HEADER_BYTES + body.len() + SEAL_BYTES);
         frame.extend_from_slice(&MAGIC);
         frame.extend_from_slice(&[VERSION, self.kind as u8]);
         frame.extend_from_slice(&cell);
         frame.extend_from_slice(&self.sender);
         frame.extend_from_slice(&self.counter.to_be_bytes());
         frame.extend_from_slice(body);
-        seal.close(self.counter, &mut frame, HEAD_BYTES);
+        seal.close(self.counter, &mut frame, HEADER_BYTES);
         frame
     }
 }

@@ -10,9 +10,9 @@ use ecod::time::Timestamp;
 use ecod::wire::Role;
 
 use super::config::MembershipConfig;
-use super::frame::{Head, Kind};
-use super::key::{CellKey, EVERYBODY, SessionId};
-use super::machine::{Machine, Output, Setup};
+use super::frame::{FrameHeader, FrameKind};
+use super::key::{BROADCAST, CellKey, SessionId};
+use super::machine::{GossipMachine, GossipOutput, GossipSetup};
 use super::node_id::NodeId;
 
 const OWN: SessionId = [2; 16];
@@ -22,7 +22,7 @@ const KEY: &str = "0101010101010101010101010101010101010101010101010101010101010
 
 /// A node that has met a peer, whose frames can then say anything.
 pub struct Listener {
-    own: Machine,
+    own: GossipMachine,
     key: CellKey,
     now: Timestamp,
     /// Frames of the peer that were forged; beyond those that it sent itself.
@@ -42,8 +42,10 @@ impl Listener {
                 }
                 while let Some(output) = machine.poll() {
                     match output {
-                        Output::Send { frame, .. } | Output::Multicast { frame } => under_way.push_back((index, frame)),
-                        Output::Tell(_) => (),
+                        GossipOutput::Send { frame, .. } | GossipOutput::Multicast { frame } => {
+                            under_way.push_back((index, frame))
+                        }
+                        GossipOutput::Tell(_) => (),
                     }
                 }
             }
@@ -69,13 +71,13 @@ impl Listener {
     /// Takes a body under the peer's seal.
     pub fn hear_sealed(&mut self, kind: u8, body: &[u8]) {
         let (kind, to) = match kind % 4 {
-            0 => (Kind::Hello, EVERYBODY),
-            1 => (Kind::Handshake, OWN),
-            2 => (Kind::Gossip, OWN),
-            _ => (Kind::Payload, OWN),
+            0 => (FrameKind::Hello, BROADCAST),
+            1 => (FrameKind::Handshake, OWN),
+            2 => (FrameKind::Gossip, OWN),
+            _ => (FrameKind::Payload, OWN),
         };
         self.forged += 1;
-        let head = Head { kind, sender: PEERS, counter: self.forged };
+        let head = FrameHeader { kind, sender: PEERS, counter: self.forged };
         let frame = head.write(self.key.tag(), body, &self.key.seal(&PEERS, &to));
         self.hear(&frame);
     }
@@ -96,7 +98,7 @@ fn key() -> CellKey {
     CellKey::new(KEY, &NodeName::from_static("lot-1"))
 }
 
-fn machine(name: &'static str, session: SessionId, now: Timestamp) -> Machine {
+fn machine(name: &'static str, session: SessionId, now: Timestamp) -> GossipMachine {
     let own = NodeId {
         name: NodeName::from_static(name),
         run: now.micros(),
@@ -105,8 +107,8 @@ fn machine(name: &'static str, session: SessionId, now: Timestamp) -> Machine {
         gossip: SocketAddr::from((Ipv4Addr::UNSPECIFIED, 17_884)),
         broker: None,
     };
-    let setup = Setup { own, key: key(), session, secret: [7; 32], seed: 3, counters: Arc::default() };
-    Machine::new(setup, &MembershipConfig::default(), now)
+    let setup = GossipSetup { own, key: key(), session, secret: [7; 32], seed: 3, counters: Arc::default() };
+    GossipMachine::new(setup, &MembershipConfig::default(), now)
 }
 
 fn address(index: usize) -> SocketAddr {

@@ -1,4 +1,4 @@
-//! The cell's key and what is derived from it.
+//! The cell's key, and the keys derived from it.
 
 use std::num::NonZeroU32;
 
@@ -10,10 +10,10 @@ use super::config::MembershipConfig;
 /// One run of a node's membership, drawn at random.
 pub(crate) type SessionId = [u8; 16];
 
-/// In place of the receiver's session in frames for everybody.
-pub(crate) const EVERYBODY: SessionId = [0; 16];
+/// Receiver in frames for all nodes of the cell.
+pub(crate) const BROADCAST: SessionId = [0; 16];
 
-/// What all nodes of a cell share, and what keys of single frames are derived from.
+/// The secret that all nodes of a cell share. All other keys are derived from it.
 pub(crate) struct CellKey {
     root: hkdf::Prk,
     tag: [u8; 4],
@@ -38,7 +38,7 @@ pub enum KeyError {
     },
 }
 
-/// Whether the key that the configuration names can be used.
+/// Checks that the configured key can be used.
 ///
 /// # Errors
 /// [`KeyError`] when the key file cannot be used.
@@ -55,8 +55,8 @@ pub(crate) fn payload_key(config: &MembershipConfig, cell: &NodeName) -> Result<
 }
 
 impl CellKey {
-    /// Reads the key that the configuration names. Without one, the cell's name is the key, which keeps cells apart and
-    /// nobody out.
+    /// Reads the configured key. Without one the key is derived from the cell's name, which separates cells and gives
+    /// no protection.
     ///
     /// # Errors
     /// [`KeyError`] when the key file cannot be used.
@@ -75,16 +75,16 @@ impl CellKey {
     /// Takes 64 hexadecimal digits as they are and stretches any other text.
     pub(crate) fn new(text: &str, cell: &NodeName) -> Self {
         let mut secret = [0; 32];
-        if !decode_hex(text, &mut secret) && !text.is_empty() {
+        if hex::decode_to_slice(text, &mut secret).is_err() && !text.is_empty() {
             let salt = [b"ecod gossip 1 ", cell.as_str().as_bytes()].concat();
-            pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, STRETCHING, &salt, text.as_bytes(), &mut secret);
+            pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, PBKDF2_ROUNDS, &salt, text.as_bytes(), &mut secret);
         }
         let root = hkdf::Salt::new(hkdf::HKDF_SHA256, cell.as_str().as_bytes()).extract(&secret);
         let hash = digest::digest(&digest::SHA256, cell.as_str().as_bytes());
         Self { root, tag: hash.as_ref().first_chunk().copied().unwrap_or_default() }
     }
 
-    /// Signs payloads that go through brokers of others.
+    /// The key that signs payloads sent through external brokers.
     #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
     pub(crate) fn payload_key(&self) -> hmac::Key {
         let info: [&[u8]; 1] = [b"ecod payload 1"];
@@ -92,25 +92,25 @@ impl CellKey {
         key.expect("HKDF gives as much as a hash's length")
     }
 
-    /// Tells frames of other cells; no secret.
+    /// Public tag in every frame that tells cells apart.
     pub(crate) fn tag(&self) -> [u8; 4] {
         self.tag
     }
 
-    /// The key of frames from one session to another. With the sender's frame counter as nonce, no two frames share
-    /// both.
+    /// The cipher of frames from one session to another. The sender's frame counter is the nonce, so that no two frames
+    /// share key and nonce.
     #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
-    pub(crate) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> Seal {
+    pub(crate) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> FrameCipher {
         let info: [&[u8]; 3] = [b"ecod frame 1", sender, receiver];
         let key = self.root.expand(&info, &aead::CHACHA20_POLY1305).map(aead::UnboundKey::from);
-        Seal(aead::LessSafeKey::new(key.expect("HKDF gives as much as a cipher's key")))
+        FrameCipher(aead::LessSafeKey::new(key.expect("HKDF gives as much as a cipher's key")))
     }
 }
 
-/// Seals and opens the frames of one direction between two sessions.
-pub(crate) struct Seal(aead::LessSafeKey);
+/// Encrypts and decrypts the frames of one direction between two sessions.
+pub(crate) struct FrameCipher(aead::LessSafeKey);
 
-impl Seal {
+impl FrameCipher {
     /// Encrypts what follows the first `head` bytes of the frame, and authenticates all of it.
     #[expect(clippy::expect_used, reason = "the cipher seals 256 GiB, a datagram has 64 KiB")]
     pub(crate) fn close(&self, counter: u64, frame: &mut Vec<u8>, head: usize) {
@@ -120,7 +120,7 @@ impl Seal {
         frame.append(&mut body);
     }
 
-    /// The body of a frame, if nothing of it was changed.
+    /// The decrypted body of a frame, if the frame is authentic.
     pub(crate) fn open(&self, counter: u64, head: &[u8], body: &[u8]) -> Option<Vec<u8>> {
         let mut body = body.to_vec();
         let length = self.0.open_in_place(nonce(counter), aead::Aad::from(head), &mut body).ok()?.len();
@@ -129,42 +129,31 @@ impl Seal {
     }
 }
 
-/// Makes proofs of reachability that need not be remembered: whoever returns one has received it.
-pub(crate) struct CookieJar(hmac::Key);
+/// Issues cookies without storing them, as MACs over address and time.
+pub(crate) struct CookieFactory(hmac::Key);
 
-/// Proof that its bearer received what was sent to it lately.
+/// Proof of reachability: a node that returns a cookie has received it.
 pub(crate) type Cookie = [u8; 16];
 
-impl CookieJar {
+impl CookieFactory {
     pub(crate) fn new(secret: &[u8; 32]) -> Self {
         Self(hmac::Key::new(hmac::HMAC_SHA256, secret))
     }
 
     /// The cookie for a session at an address during one slot of time.
-    pub(crate) fn bake(&self, session: &SessionId, address: std::net::SocketAddr, slot: u64) -> Cookie {
+    pub(crate) fn issue(&self, session: &SessionId, address: std::net::SocketAddr, slot: u64) -> Cookie {
         let text = format!("{slot} {address}");
         let tag = hmac::sign(&self.0, &[&session[..], text.as_bytes()].concat());
         tag.as_ref().first_chunk().copied().unwrap_or_default()
     }
 }
 
-/// Rounds that stretch a passphrase: about 50 ms on a small board's core for the owner, and for every guess.
-const STRETCHING: NonZeroU32 = NonZeroU32::new(100_000).expect("not zero");
+/// Rounds of PBKDF2 for a passphrase: about 50 ms for each guess on a small board's core.
+const PBKDF2_ROUNDS: NonZeroU32 = NonZeroU32::new(100_000).expect("not zero");
 
 fn nonce(counter: u64) -> aead::Nonce {
     let [a, b, c, d, e, f, g, h] = counter.to_be_bytes();
     aead::Nonce::assume_unique_for_key([0, 0, 0, 0, a, b, c, d, e, f, g, h])
-}
-
-/// Whether the text is exactly the hexadecimal form of as many bytes.
-fn decode_hex(text: &str, bytes: &mut [u8]) -> bool {
-    let digits: Option<Vec<u8>> = text.chars().map(|c| c.to_digit(16).map(|digit| digit as u8)).collect();
-    let Some(digits) = digits.filter(|digits| digits.len() == 2 * bytes.len()) else { return false };
-    let (pairs, _) = digits.as_chunks();
-    for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
-        *byte = high << 4 | low;
-    }
-    true
 }
 
 #[cfg(test)]
@@ -199,10 +188,15 @@ mod tests {
 
     #[test]
     fn sixty_four_digits_are_the_key_itself() {
-        let mut bytes = [0; 32];
-        assert!(decode_hex(&"0aF1".repeat(16), &mut bytes));
-        assert_eq!(bytes[..4], [0x0a, 0xf1, 0x0a, 0xf1]);
-        assert!(!decode_hex(&"0".repeat(63), &mut bytes) && !decode_hex(&"g".repeat(64), &mut bytes));
+        let cell = NodeName::from_static("lot-1");
+        let digits = "0aF1".repeat(16);
+        let mut frame = b"headbody".to_vec();
+        CellKey::new(&digits, &cell).seal(&A, &B).close(1, &mut frame, 4);
+        let root = hkdf::Salt::new(hkdf::HKDF_SHA256, b"lot-1").extract(&[0x0a, 0xf1].repeat(16));
+        assert_eq!(open(&CellKey { root, tag: [0; 4] }, &A, &B, 1, &frame).as_deref(), Some(&b"body"[..]));
+        for other in [&digits[..63], &"g".repeat(64), &digits.to_lowercase()[..62]] {
+            assert_eq!(open(&CellKey::new(other, &cell), &A, &B, 1, &frame), None);
+        }
     }
 
     #[test]

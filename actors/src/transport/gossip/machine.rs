@@ -1,10 +1,10 @@
-//! The membership without socket and clock: what comes in, and what is to be sent and told.
+//! State machine of the membership: datagrams and time in, datagrams and events out. No socket, no clock.
 //!
 //! # Call order
 //!
 //! [`Machine::new`], then [`Machine::receive`] for every datagram, [`Machine::tick`] at [`Machine::next_deadline`], and
-//! the commands at any time; after each, [`Machine::poll`] until nothing is left. A caller that was held up hands in
-//! all datagrams that wait before it ticks; the time for which it was held up does not count.
+//! the commands at any time. After each, [`Machine::poll`] until nothing is left. A caller that was stalled hands in
+//! all datagrams that wait before it ticks; the time of the stall does not count.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::election::Clock;
+use ecod::leadership::election::AwakeClock;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use rand::{RngExt, SeedableRng};
@@ -20,77 +20,77 @@ use rand_chacha::ChaCha8Rng;
 
 use super::config::MembershipConfig;
 use super::counters::{FrameCounters, FrameEvent};
-use super::frame::{Kind, NameStanding, Word};
-use super::gossip::{Gossip, Rumour};
+use super::frame::{FrameKind, Introduction, NameClaim};
 use super::key::{CellKey, SessionId};
 use super::node_id::NodeId;
-use super::sessions::{Opened, Roster, Sessions};
+use super::sessions::{FrameContent, LocalView, Sessions};
+use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
 
-/// What the caller has to do.
+/// An action for the caller.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Output {
+pub(crate) enum GossipOutput {
     /// Send a datagram to a node.
     Send { to: SocketAddr, frame: Vec<u8> },
     /// Send a datagram to the multicast group.
     Multicast { frame: Vec<u8> },
-    /// Tell what was found out.
+    /// Deliver an event.
     Tell(MembershipEvent),
 }
 
-/// What a machine needs at its start.
-pub(crate) struct Setup {
+/// Arguments of [`GossipMachine::new`].
+pub(crate) struct GossipSetup {
     pub(crate) own: NodeId,
     pub(crate) key: CellKey,
-    /// New and unpredictable with every start.
+    /// Random for each start, and unpredictable.
     pub(crate) session: SessionId,
-    /// The same.
+    /// Secret of the cookies; random for each start.
     pub(crate) secret: [u8; 32],
-    /// For everything that need not be secret.
+    /// Seed of random numbers that need not be secret.
     pub(crate) seed: u64,
     pub(crate) counters: Arc<FrameCounters>,
 }
 
 /// The membership of one node.
-pub(crate) struct Machine {
+pub(crate) struct GossipMachine {
     sessions: Sessions,
-    gossip: Gossip,
-    clock: Clock,
+    gossip: Swim,
+    clock: AwakeClock,
     hello: Duration,
     hello_at: Timestamp,
-    hellos: u64,
+    hello_count: u64,
     seeds: Vec<SocketAddr>,
-    /// What waits for a session with its addressee.
-    waiting: HashMap<NodeName, Waiting>,
-    /// When a name was last reported as taken.
+    /// Frames that wait for a session with their addressee.
+    pending: HashMap<NodeName, PendingFrames>,
+    /// The name last reported as taken, and when.
     taken: Option<(NodeName, Timestamp)>,
-    /// Whether the node has to learn from others where it is seen.
+    /// Whether the node has to learn its address from others.
     learns_address: bool,
     left: bool,
     rng: ChaCha8Rng,
-    outputs: VecDeque<Output>,
+    outputs: VecDeque<GossipOutput>,
     counters: Arc<FrameCounters>,
 }
 
-struct Waiting {
+struct PendingFrames {
     since: Timestamp,
-    frames: Vec<(Kind, Vec<u8>)>,
+    frames: Vec<(FrameKind, Vec<u8>)>,
 }
 
-impl Machine {
-    pub(crate) fn new(setup: Setup, config: &MembershipConfig, now: Timestamp) -> Self {
-        let Setup { own, key, session, secret, seed, counters } = setup;
-        let clock = Clock::new(now, STALL);
+impl GossipMachine {
+    pub(crate) fn new(setup: GossipSetup, config: &MembershipConfig, now: Timestamp) -> Self {
+        let GossipSetup { own, key, session, secret, seed, counters } = setup;
+        let clock = AwakeClock::new(now, STALL);
         Self {
             learns_address: own.gossip.ip().is_unspecified(),
             sessions: Sessions::new(key, session, &secret, config.max_peers, Arc::clone(&counters), now),
-            gossip: Gossip::new(own, config, seed),
+            gossip: Swim::new(own, config, seed),
             clock,
             hello: config.hello(),
             hello_at: now,
-            hellos: 0,
+            hello_count: 0,
             seeds: Vec::new(),
-            waiting: HashMap::new(),
+            pending: HashMap::new(),
             taken: None,
             left: false,
             rng: ChaCha8Rng::seed_from_u64(seed.wrapping_add(1)),
@@ -99,12 +99,12 @@ impl Machine {
         }
     }
 
-    /// What the caller has to do next.
-    pub(crate) fn poll(&mut self) -> Option<Output> {
+    /// The next action for the caller.
+    pub(crate) fn poll(&mut self) -> Option<GossipOutput> {
         self.outputs.pop_front()
     }
 
-    /// When [`Self::tick`] is next needed, unless the node has left.
+    /// Time at which [`Self::tick`] is next needed; none after leaving.
     pub(crate) fn next_deadline(&self) -> Option<Timestamp> {
         (!self.left).then(|| self.clock.outside(self.due()))
     }
@@ -114,7 +114,7 @@ impl Machine {
         self.gossip.alive().values().map(|id| self.member(id)).collect()
     }
 
-    /// Takes a datagram.
+    /// Processes a datagram.
     pub(crate) fn receive(&mut self, datagram: &[u8], from: SocketAddr, now: Timestamp) {
         let at = self.advance(now);
         self.counters.count(FrameEvent::Received);
@@ -122,8 +122,8 @@ impl Machine {
             return;
         }
         let gossip = &self.gossip;
-        let roster = Roster { own: gossip.own(), known: &|name| gossip.known(name) };
-        let taken = match self.sessions.open(datagram, from, at, &roster) {
+        let view = LocalView { own: gossip.own(), known: &|name| gossip.known(name) };
+        let taken = match self.sessions.open(datagram, from, at, &view) {
             Ok(opened) => self.take(opened, from, at, now),
             Err(reason) => Err(reason),
         };
@@ -131,10 +131,10 @@ impl Machine {
             self.counters.count(reason);
             tracing::debug!(%from, reason = reason.as_str(), "gossip frame refused");
         }
-        self.spread(at);
+        self.flush_swim(at);
     }
 
-    /// Carries out what is due.
+    /// Runs the timers that are due.
     pub(crate) fn tick(&mut self, now: Timestamp) {
         let at = self.advance(now);
         if self.left {
@@ -142,70 +142,75 @@ impl Machine {
         }
         self.gossip.tick(at);
         if self.hello_at <= at {
-            self.greet_all();
+            self.send_hellos();
             self.schedule_hello(at);
         }
-        self.waiting.retain(|_, waiting| at.since(waiting.since) < PATIENCE);
-        self.spread(at);
+        self.pending.retain(|_, pending| at.since(pending.since) < SESSION_TIMEOUT);
+        self.flush_swim(at);
     }
 
-    /// Sends a datagram to a node, once; for a while to one that the gossip has given up as well, which may hear less than
-    /// those who send.
+    /// Sends a datagram to a node, once. A node that the gossip has just declared down is sent to for a while, too.
     pub(crate) fn send(&mut self, to: &NodeName, payload: &[u8], now: Timestamp) {
         let at = self.advance(now);
         let address = self.gossip.alive().get(to).map(|id| id.gossip).or_else(|| self.sessions.heard_at(to, at));
         match address {
-            Some(address) if !self.left => self.post(to, address, Kind::Payload, payload, at),
+            Some(address) if !self.left => self.send_or_queue(to, address, FrameKind::Payload, payload, at),
             _ => self.counters.count(FrameEvent::NoSession),
         }
     }
 
-    /// Addresses that are greeted besides the multicast group.
+    /// Replaces the addresses that are greeted besides the multicast group.
     pub(crate) fn set_seeds(&mut self, seeds: Vec<SocketAddr>) {
         if self.seeds != seeds {
-            self.hellos = 0;
+            self.hello_count = 0;
             self.hello_at = self.clock.now();
             self.seeds = seeds;
         }
     }
 
-    /// Says goodbye to all; nothing is sent or taken afterwards.
+    /// Tells all nodes that this one leaves. Afterwards nothing is sent or processed.
     pub(crate) fn leave(&mut self, now: Timestamp) {
         let at = self.advance(now);
         if !self.left {
             self.gossip.leave(at);
-            self.spread(at);
+            self.flush_swim(at);
             self.left = true;
         }
     }
 
-    fn take(&mut self, opened: Opened, from: SocketAddr, at: Timestamp, now: Timestamp) -> Result<(), FrameEvent> {
+    fn take(
+        &mut self,
+        opened: FrameContent,
+        from: SocketAddr,
+        at: Timestamp,
+        now: Timestamp,
+    ) -> Result<(), FrameEvent> {
         match opened {
-            Opened::Answer(frame) => self.outputs.push_back(Output::Send { to: from, frame }),
-            Opened::Met { word, answer, speaks } => {
+            FrameContent::Answer(frame) => self.outputs.push_back(GossipOutput::Send { to: from, frame }),
+            FrameContent::Met { introduction, answer, speaks } => {
                 let greeter = answer.is_none();
-                self.outputs.extend(answer.map(|frame| Output::Send { to: from, frame }));
-                self.meet(word, speaks, greeter, at);
+                self.outputs.extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
+                self.meet(introduction, speaks, greeter, at);
             }
-            Opened::Gossip { from, body } => self.gossip.receive(&from, &body, at)?,
-            Opened::Payload { from, body } => {
+            FrameContent::Gossip { from, body } => self.gossip.receive(&from, &body, at)?,
+            FrameContent::Payload { from, body } => {
                 let event = MembershipEvent::Received { from, payload: Bytes::from(body), received_at: now };
-                self.outputs.push_back(Output::Tell(event));
+                self.outputs.push_back(GossipOutput::Tell(event));
             }
-            Opened::Stranger => self.greet(from, at),
-            Opened::NameTaken(name) => self.report_taken(name, at),
-            Opened::Nothing => (),
+            FrameContent::Stranger => self.send_hello(from, at),
+            FrameContent::NameTaken(name) => self.report_taken(name, at),
+            FrameContent::Nothing => (),
         }
         Ok(())
     }
 
-    /// A node has proven that it is there: take what it says of this one, and get to know it.
-    fn meet(&mut self, word: Word, speaks: bool, greeter: bool, at: Timestamp) {
-        let Word { id, seen_at, standing } = word;
-        match standing {
-            NameStanding::Free => (),
-            NameStanding::After(life) => self.gossip.outlive(life, at),
-            NameStanding::Taken => self.report_taken(self.gossip.own().name.clone(), at),
+    /// Processes the handshake of an admitted node: its knowledge of this node, then its identity.
+    fn meet(&mut self, introduction: Introduction, speaks: bool, greeter: bool, at: Timestamp) {
+        let Introduction { id, seen_at, claim } = introduction;
+        match claim {
+            NameClaim::Free => (),
+            NameClaim::After(life) => self.gossip.start_life_after(life, at),
+            NameClaim::Taken => self.report_taken(self.gossip.own().name.clone(), at),
         }
         let own = self.gossip.own().gossip.ip();
         if self.learns_address && (own.is_unspecified() || own.is_loopback() && !seen_at.ip().is_loopback()) {
@@ -214,8 +219,8 @@ impl Machine {
         if !speaks {
             return self.report_taken(id.name, at);
         }
-        for (kind, body) in self.waiting.remove(&id.name).map(|waiting| waiting.frames).unwrap_or_default() {
-            self.post(&id.name, seen_at, kind, &body, at);
+        for (kind, body) in self.pending.remove(&id.name).map(|pending| pending.frames).unwrap_or_default() {
+            self.send_or_queue(&id.name, seen_at, kind, &body, at);
         }
         let alive = self.gossip.known(&id.name).is_some_and(|known| known.alive && known.life >= id.life);
         if greeter || !alive {
@@ -223,64 +228,64 @@ impl Machine {
         }
     }
 
-    /// Sends what the gossip wants to be sent, and tells what it found out.
-    fn spread(&mut self, at: Timestamp) {
+    /// Sends SWIM's messages and delivers its events.
+    fn flush_swim(&mut self, at: Timestamp) {
         while let Some(rumour) = self.gossip.poll() {
             let event = match rumour {
-                Rumour::Send { to, body } => {
-                    self.post(&to.name, to.gossip, Kind::Gossip, &body, at);
+                SwimOutput::Send { to, body } => {
+                    self.send_or_queue(&to.name, to.gossip, FrameKind::Gossip, &body, at);
                     continue;
                 }
-                Rumour::Alive(id) => {
-                    if self.sessions.outdate(&id.name, id.run, at) {
-                        self.greet(id.gossip, at);
+                SwimOutput::Alive(id) => {
+                    if self.sessions.end_earlier_run(&id.name, id.run, at) {
+                        self.send_hello(id.gossip, at);
                     }
                     MembershipEvent::Alive { member: self.member(&id) }
                 }
-                Rumour::Changed(id) => MembershipEvent::Changed { member: self.member(&id) },
-                Rumour::Suspected(name) => MembershipEvent::Suspected { name },
-                Rumour::Down(name) => MembershipEvent::Down { name },
+                SwimOutput::Changed(id) => MembershipEvent::Changed { member: self.member(&id) },
+                SwimOutput::Suspected(name) => MembershipEvent::Suspected { name },
+                SwimOutput::Down(name) => MembershipEvent::Down { name },
             };
-            self.outputs.push_back(Output::Tell(event));
+            self.outputs.push_back(GossipOutput::Tell(event));
         }
     }
 
-    /// Sends to a node, or keeps a little until there is a session with it.
-    fn post(&mut self, to: &NodeName, address: SocketAddr, kind: Kind, body: &[u8], at: Timestamp) {
+    /// Sends to a node, or queues a few frames until there is a session with it.
+    fn send_or_queue(&mut self, to: &NodeName, address: SocketAddr, kind: FrameKind, body: &[u8], at: Timestamp) {
         if let Some((to, frame)) = self.sessions.seal(to, kind, body) {
-            return self.outputs.push_back(Output::Send { to, frame });
+            return self.outputs.push_back(GossipOutput::Send { to, frame });
         }
-        if !self.waiting.contains_key(to) {
-            if self.waiting.len() >= MAX_WAITING || address.ip().is_unspecified() {
+        if !self.pending.contains_key(to) {
+            if self.pending.len() >= MAX_PENDING || address.ip().is_unspecified() {
                 return self.counters.count(FrameEvent::NoSession);
             }
-            self.waiting.insert(to.clone(), Waiting { since: at, frames: Vec::new() });
-            self.greet(address, at);
+            self.pending.insert(to.clone(), PendingFrames { since: at, frames: Vec::new() });
+            self.send_hello(address, at);
         }
-        match self.waiting.get_mut(to) {
-            Some(waiting) if waiting.frames.len() < MAX_WAITING_FRAMES => waiting.frames.push((kind, body.to_vec())),
+        match self.pending.get_mut(to) {
+            Some(pending) if pending.frames.len() < MAX_PENDING_FRAMES => pending.frames.push((kind, body.to_vec())),
             _ => self.counters.count(FrameEvent::NoSession),
         }
     }
 
-    fn greet(&mut self, to: SocketAddr, at: Timestamp) {
-        if self.sessions.may_greet(at) {
+    fn send_hello(&mut self, to: SocketAddr, at: Timestamp) {
+        if self.sessions.may_send_hello(at) {
             let frame = self.sessions.hello(self.gossip.own());
-            self.outputs.push_back(Output::Send { to, frame });
+            self.outputs.push_back(GossipOutput::Send { to, frame });
         }
     }
 
-    /// Greets all seeds that do not belong to a living node, so that one that returns hears of the cell before it takes
-    /// itself to be alone, and the group, which in company is greeted less often.
-    fn greet_all(&mut self) {
+    /// Greets all seeds that do not belong to a living node, so that a returning seed hears of its cell before it leads
+    /// on its own. Greets the multicast group too, less often once other nodes are alive.
+    fn send_hellos(&mut self) {
         let frame = self.sessions.hello(self.gossip.own());
         let known: Vec<_> = self.members().iter().map(|member| member.gossip).collect();
         let missing = self.seeds.iter().filter(|seed| !known.contains(seed));
-        self.outputs.extend(missing.map(|seed| Output::Send { to: *seed, frame: frame.clone() }));
-        if self.gossip.alive().is_empty() || self.hellos.is_multiple_of(COMPANY_FACTOR) {
-            self.outputs.push_back(Output::Multicast { frame });
+        self.outputs.extend(missing.map(|seed| GossipOutput::Send { to: *seed, frame: frame.clone() }));
+        if self.gossip.alive().is_empty() || self.hello_count.is_multiple_of(MULTICAST_EVERY) {
+            self.outputs.push_back(GossipOutput::Multicast { frame });
         }
-        self.hellos += 1;
+        self.hello_count += 1;
     }
 
     fn schedule_hello(&mut self, at: Timestamp) {
@@ -293,7 +298,7 @@ impl Machine {
         if !self.taken.as_ref().is_some_and(lately) {
             tracing::warn!(node = %name, "two running nodes have the same name");
             self.taken = Some((name.clone(), at));
-            self.outputs.push_back(Output::Tell(MembershipEvent::NameTaken { name }));
+            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::NameTaken { name }));
         }
     }
 
@@ -310,20 +315,20 @@ impl Machine {
     }
 }
 
-/// A timer later than this was stalled; only this much of the delay counts as time.
+/// Delay of a timer above which the process was stalled. Only this much of the delay counts as time.
 const STALL: Duration = Duration::from_millis(40);
 
-/// How long frames wait for a session before they are dropped.
-const PATIENCE: Duration = Duration::from_millis(200);
+/// Time for which frames wait for a session before they are dropped.
+const SESSION_TIMEOUT: Duration = Duration::from_millis(200);
 
-/// Most nodes for which frames wait, and most frames for each.
-const MAX_WAITING: usize = 64;
-const MAX_WAITING_FRAMES: usize = 4;
+/// Maximum nodes for which frames wait, and maximum frames of each.
+const MAX_PENDING: usize = 64;
+const MAX_PENDING_FRAMES: usize = 4;
 
-/// How much rarer greetings to the group are in company.
-const COMPANY_FACTOR: u64 = 10;
+/// Greetings of seeds for each greeting of the multicast group, once other nodes are alive.
+const MULTICAST_EVERY: u64 = 10;
 
-/// How often the same name is reported as taken.
+/// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What the gossip says of a node.
+//! Identity of a node in the gossip.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::Member;
 use super::socket::is_of_this_machine;
 
-/// A node at one time of its life. Of two with one name, the one with the later `life` is believed.
+/// Identity of a node. Of two with one name, the one with the greater `life` is accepted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct NodeId {
     pub(crate) name: NodeName,
@@ -24,8 +24,8 @@ pub(crate) struct NodeId {
 }
 
 impl NodeId {
-    /// The node as others are told, where it is seen at `address`. A broker on another machine's loopback is none:
-    /// there, this machine would find its own.
+    /// The node as other actors see it, at the `address` where it was seen. A broker on another machine's loopback
+    /// address is left out: this machine would find its own there.
     pub(crate) fn member(&self, address: Option<SocketAddr>) -> Member {
         let gossip = address.unwrap_or(self.gossip);
         let reached = |ip: IpAddr| if ip.is_unspecified() { gossip.ip() } else { ip };
@@ -39,7 +39,7 @@ impl NodeId {
 impl foca::Identity for NodeId {
     type Addr = NodeName;
 
-    /// The gossip renews its identity itself, and not too often.
+    /// Not used: [`Swim`](super::swim::Swim) limits how often it renews its identity.
     fn renew(&self) -> Option<Self> {
         None
     }

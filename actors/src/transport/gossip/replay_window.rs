@@ -1,20 +1,20 @@
-//! Which frames of a session were taken already.
+//! Replay protection by frame counters.
 
-/// Takes every frame counter once, as long as it is not far behind the highest.
+/// Accepts every frame counter once, and none that is 128 or more behind the highest.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ReplayWindow {
     highest: u64,
-    /// Bit n: the frame n before the highest was taken.
+    /// Bit n: the frame n before the highest was accepted.
     taken: u128,
 }
 
 impl ReplayWindow {
-    /// A window that takes only what was counted after `floor`.
+    /// A window that accepts only counters above `floor`.
     pub(crate) fn after(floor: u64) -> Self {
         Self { highest: floor, taken: u128::MAX }
     }
 
-    /// Whether the frame is new; it is not from now on.
+    /// Accepts a counter; false when it was accepted before or is too old.
     pub(crate) fn take(&mut self, counter: u64) -> bool {
         if let Some(ahead) = counter.checked_sub(self.highest).filter(|ahead| *ahead > 0) {
             self.taken = u32::try_from(ahead).ok().and_then(|ahead| self.taken.checked_shl(ahead)).unwrap_or(0) | 1;

@@ -1,4 +1,4 @@
-//! Keeps the addresses of the seeds.
+//! Resolution of the seeds' host names.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -7,9 +7,10 @@ use std::time::Duration;
 
 use tokio::net::lookup_host;
 
-/// Resolves the seeds anew for ever, sooner if one could not be resolved, and tells of them, until `tell` returns false. A seed that cannot
-/// be resolved is logged once, until it can, and keeps the addresses that it had: whoever answers for names may be gone
-/// with the network.
+/// Resolves the seeds again and again, sooner while one has failed, until `tell` returns false.
+///
+/// A seed that fails is logged once and keeps its addresses: the name server may be unreachable together with the
+/// network.
 pub(crate) async fn resolve(seeds: Vec<String>, ipv4: bool, tell: impl Fn(Vec<SocketAddr>) -> bool) {
     let mut retry = RETRY_MIN;
     let mut unresolved = BTreeSet::new();

@@ -1,9 +1,9 @@
-//! With whom this node shares keys, and the handshake that comes before.
+//! Authenticated sessions with other nodes, and the handshake that establishes them. No clock, no socket.
 //!
-//! Nothing in here reads a clock or a socket. A session is one run of a node's membership; frames between two sessions
-//! have keys of their own, so that a frame recorded before either restarted, or meant for another, opens nowhere. The
-//! sender's counter never repeats in a session and the receiver takes each once. A session is admitted only when its
-//! bearer has just returned a cookie baked for it: a recorded handshake admits nobody.
+//! A session is one run of a node's membership. Each pair of sessions has keys of its own: a frame that was recorded
+//! before a restart, or meant for another node, does not decrypt. The sender's counter never repeats in a session, and
+//! the receiver accepts each value once. A node is admitted only when it returns a cookie just issued to its address: a
+//! recorded handshake admits nobody.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -15,78 +15,78 @@ use ecod::time::Timestamp;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::answers::Answers;
 use super::counters::{FrameCounters, FrameEvent};
-use super::frame::{HEAD_BYTES, Handshake, Head, HeadError, Hello, Kind, NameStanding, Word};
-use super::key::{CellKey, Cookie, CookieJar, EVERYBODY, Seal, SessionId};
+use super::frame::{FrameHeader, FrameKind, HEADER_BYTES, Handshake, Hello, Introduction, NameClaim};
+use super::key::{BROADCAST, CellKey, Cookie, CookieFactory, FrameCipher, SessionId};
 use super::node_id::NodeId;
 use super::replay_window::ReplayWindow;
-use crate::platform::throttle::Throttle;
+use super::reply_throttle::ReplyThrottle;
+use crate::platform::throttle::TokenBucket;
 
 /// All sessions of a node.
 pub(crate) struct Sessions {
     key: CellKey,
     own: SessionId,
-    cookies: CookieJar,
-    everybody: Seal,
-    /// The counter of the last frame sent, to whomever.
+    cookies: CookieFactory,
+    everybody: FrameCipher,
+    /// Counter of the last frame sent to any node.
     counter: u64,
-    peers: HashMap<SessionId, Peer>,
-    /// The session that speaks for a name.
-    speakers: HashMap<NodeName, SessionId>,
-    /// Answers to greetings, to challenges, and greetings of strangers.
-    challenges: Answers,
-    proofs: Answers,
-    greetings: Throttle,
+    peers: HashMap<SessionId, PeerSession>,
+    /// The session that is accepted for a name.
+    session_by_name: HashMap<NodeName, SessionId>,
+    /// Throttles of answers to greetings, of answers to challenges, and of own greetings.
+    challenges: ReplyThrottle,
+    proofs: ReplyThrottle,
+    greetings: TokenBucket,
     max_peers: usize,
     other_key_seen: bool,
     counters: Arc<FrameCounters>,
 }
 
-struct Peer {
+struct PeerSession {
     name: NodeName,
     run: u64,
     address: SocketAddr,
-    to: Seal,
-    from: Seal,
+    to: FrameCipher,
+    from: FrameCipher,
     window: ReplayWindow,
     heard: Timestamp,
-    /// Since when another session speaks for the name.
+    /// Time since which another session is accepted for the name.
     superseded: Option<Timestamp>,
 }
 
-/// What the gossip knows of a name.
+/// State of a name in the gossip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Known {
+pub(crate) struct KnownMember {
     pub(crate) life: u64,
     pub(crate) alive: bool,
 }
 
-/// This node and what its gossip knows, for a handshake.
-pub(crate) struct Roster<'a> {
+/// This node's identity and its gossip's knowledge, as input of a handshake.
+pub(crate) struct LocalView<'a> {
     pub(crate) own: &'a NodeId,
-    pub(crate) known: &'a dyn Fn(&NodeName) -> Option<Known>,
+    pub(crate) known: &'a dyn Fn(&NodeName) -> Option<KnownMember>,
 }
 
-/// What a frame turned out to be.
+/// Content of an authentic frame.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Opened {
-    /// A step of a handshake: this is the answer.
+pub(crate) enum FrameContent {
+    /// A step of a handshake, with the answer to send.
     Answer(Vec<u8>),
-    /// A node was admitted; it is told so by the answer, unless it knows.
+    /// A node was admitted. The answer tells it so, unless it knows already.
     Met {
-        word: Word,
+        introduction: Introduction,
         answer: Option<Vec<u8>>,
-        /// Whether its session speaks for its name.
+        /// Whether its session is accepted for its name.
         speaks: bool,
     },
-    /// Words of the gossip protocol.
+    /// A message of the SWIM protocol.
     Gossip { from: NodeName, body: Vec<u8> },
-    /// A datagram of the sender's other parts.
+    /// A datagram of the sender's other actors.
     Payload { from: NodeName, body: Vec<u8> },
-    /// A session that is not established speaks: greet it.
+    /// A frame of a session that is not established: greet its sender.
     Stranger,
-    /// Two running nodes bear this name.
+    /// Two running nodes have this name.
     NameTaken(NodeName),
     /// Nothing that needs an answer.
     Nothing,
@@ -102,78 +102,78 @@ impl Sessions {
         now: Timestamp,
     ) -> Self {
         Self {
-            everybody: key.seal(&own, &EVERYBODY),
+            everybody: key.seal(&own, &BROADCAST),
             key,
             own,
-            cookies: CookieJar::new(secret),
+            cookies: CookieFactory::new(secret),
             counter: 0,
             peers: HashMap::new(),
-            speakers: HashMap::new(),
-            challenges: Answers::new(now),
-            proofs: Answers::new(now),
-            greetings: Throttle::new(GREETINGS, STEADY, now),
+            session_by_name: HashMap::new(),
+            challenges: ReplyThrottle::new(now),
+            proofs: ReplyThrottle::new(now),
+            greetings: TokenBucket::new(HELLO_BURST, HELLO_INTERVAL, now),
             max_peers,
             other_key_seen: false,
             counters,
         }
     }
 
-    /// A greeting for whoever gets it.
+    /// A greeting frame for any node of the cell.
     pub(crate) fn hello(&mut self, own: &NodeId) -> Vec<u8> {
-        let head = self.head(Kind::Hello);
+        let head = self.head(FrameKind::Hello);
         head.write(self.key.tag(), &encode(&Hello { name: own.name.clone() }), &self.everybody)
     }
 
-    /// A frame for whoever speaks for a name, and where it goes.
-    pub(crate) fn seal(&mut self, to: &NodeName, kind: Kind, body: &[u8]) -> Option<(SocketAddr, Vec<u8>)> {
+    /// A frame for the node of a name, and its address.
+    pub(crate) fn seal(&mut self, to: &NodeName, kind: FrameKind, body: &[u8]) -> Option<(SocketAddr, Vec<u8>)> {
         let head = self.head(kind);
-        let peer = self.peers.get(self.speakers.get(to)?)?;
+        let peer = self.peers.get(self.session_by_name.get(to)?)?;
         Some((peer.address, head.write(self.key.tag(), body, &peer.to)))
     }
 
-    /// Where the speaker for a name is.
+    /// Address of the node of a name.
     pub(crate) fn address(&self, name: &NodeName) -> Option<SocketAddr> {
-        Some(self.peers.get(self.speakers.get(name)?)?.address)
+        Some(self.peers.get(self.session_by_name.get(name)?)?.address)
     }
 
-    /// Where the speaker for a name is, if it was heard lately.
+    /// Address of the node of a name, if it was heard lately.
     pub(crate) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
-        let peer = self.peers.get(self.speakers.get(name)?)?;
-        (now.since(peer.heard) < FORGET_AFTER).then_some(peer.address)
+        let peer = self.peers.get(self.session_by_name.get(name)?)?;
+        (now.since(peer.heard) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
     }
 
-    /// Whether a node may be greeted now that was heard of or from.
-    pub(crate) fn may_greet(&mut self, now: Timestamp) -> bool {
+    /// Whether a single node may be greeted now.
+    pub(crate) fn may_send_hello(&mut self, now: Timestamp) -> bool {
         self.greetings.allow(now) || self.throttled()
     }
 
-    /// Forgets who spoke for a name in an earlier run; whether it did.
-    pub(crate) fn outdate(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
-        let speaker = self.speakers.get(name).and_then(|session| self.peers.get_mut(session));
+    /// Ends the session of an earlier run of a node; false when there is none.
+    pub(crate) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
+        let speaker = self.session_by_name.get(name).and_then(|session| self.peers.get_mut(session));
         let Some(peer) = speaker.filter(|peer| peer.run != run) else { return false };
         peer.superseded = Some(now);
-        self.speakers.remove(name);
+        self.session_by_name.remove(name);
         true
     }
 
-    /// Takes a datagram. An error is junk, and changed nothing.
+    /// Processes a datagram. An error means junk, which changed nothing.
     pub(crate) fn open(
         &mut self,
         frame: &[u8],
         from: SocketAddr,
         now: Timestamp,
-        roster: &Roster<'_>,
-    ) -> Result<Opened, FrameEvent> {
-        let head = Head::read(frame, self.key.tag())?;
+        view: &LocalView<'_>,
+    ) -> Result<FrameContent, FrameEvent> {
+        let head = FrameHeader::read(frame, self.key.tag())?;
         if head.sender == self.own {
-            return if head.kind == Kind::Hello { Ok(Opened::Nothing) } else { Err(FrameEvent::Replayed) };
+            return if head.kind == FrameKind::Hello { Ok(FrameContent::Nothing) } else { Err(FrameEvent::Replayed) };
         }
         let Some(body) = self.unseal(&head, frame) else {
             self.note_other_key(head.kind, from);
             return Err(FrameEvent::BadSeal);
         };
-        if head.kind == Kind::Hello {
-            return self.greeted(&head, &decode(&body)?, from, now, roster);
+        if head.kind == FrameKind::Hello {
+            return self.handle_hello(&head, &decode(&body)?, from, now, view);
         }
         let known = self.peers.get_mut(&head.sender).map(|peer| {
             let new = peer.window.take(head.counter);
@@ -184,111 +184,115 @@ impl Sessions {
             return Err(FrameEvent::Replayed);
         }
         match head.kind {
-            Kind::Handshake => self.shake_hands(&head, decode(&body)?, from, now, roster),
+            FrameKind::Handshake => self.handle_handshake(&head, decode(&body)?, from, now, view),
             _ if known.is_none() => {
                 self.counters.count(FrameEvent::Unestablished);
-                Ok(Opened::Stranger)
+                Ok(FrameContent::Stranger)
             }
-            kind => self.hear(&head.sender, kind, body, now),
+            kind => self.handle_body(&head.sender, kind, body, now),
         }
     }
 
-    /// A greeting, which all with the key can read, is in another key: said once, as it goes on for ever.
-    fn note_other_key(&mut self, kind: Kind, from: SocketAddr) {
-        if kind == Kind::Hello && !std::mem::replace(&mut self.other_key_seen, true) {
-            tracing::warn!(%from, "a node of this cell has another key, or none; it is not heard");
+    /// Warns of a greeting under another key. Once only, as greetings are repeated for ever.
+    fn note_other_key(&mut self, kind: FrameKind, from: SocketAddr) {
+        if kind == FrameKind::Hello && !std::mem::replace(&mut self.other_key_seen, true) {
+            tracing::warn!(%from, "a node of this cell has another key, or none; its frames are ignored");
         }
     }
 
-    fn unseal(&self, head: &Head, frame: &[u8]) -> Option<Vec<u8>> {
-        let (open, sealed) = frame.split_at(HEAD_BYTES);
+    fn unseal(&self, head: &FrameHeader, frame: &[u8]) -> Option<Vec<u8>> {
+        let (open, sealed) = frame.split_at(HEADER_BYTES);
         match self.peers.get(&head.sender) {
-            _ if head.kind == Kind::Hello => self.key.seal(&head.sender, &EVERYBODY).open(head.counter, open, sealed),
+            _ if head.kind == FrameKind::Hello => {
+                self.key.seal(&head.sender, &BROADCAST).open(head.counter, open, sealed)
+            }
             Some(peer) => peer.from.open(head.counter, open, sealed),
             None => self.key.seal(&head.sender, &self.own).open(head.counter, open, sealed),
         }
     }
 
-    /// Whoever is known, alive and where it was needs no handshake; a greeting proves nothing else.
-    fn greeted(
+    /// Answers a greeting with a challenge. A known living node at its known address needs no handshake.
+    fn handle_hello(
         &mut self,
-        head: &Head,
+        head: &FrameHeader,
         hello: &Hello,
         from: SocketAddr,
         now: Timestamp,
-        roster: &Roster<'_>,
-    ) -> Result<Opened, FrameEvent> {
-        let speaks = self.speakers.get(&hello.name) == Some(&head.sender);
+        view: &LocalView<'_>,
+    ) -> Result<FrameContent, FrameEvent> {
+        let speaks = self.session_by_name.get(&hello.name) == Some(&head.sender);
         let there = self.peers.get(&head.sender).is_some_and(|peer| peer.address == from);
-        if speaks && there && (roster.known)(&hello.name).is_some_and(|known| known.alive) {
-            return Ok(Opened::Nothing);
+        if speaks && there && (view.known)(&hello.name).is_some_and(|known| known.alive) {
+            return Ok(FrameContent::Nothing);
         }
         if !self.challenges.allow(&head.sender, now) {
             self.throttled();
-            return Ok(Opened::Nothing);
+            return Ok(FrameContent::Nothing);
         }
-        let cookie = self.cookies.bake(&head.sender, from, slot(now));
-        let challenge = Handshake::Challenge { cookie, name: roster.own.name.clone() };
-        Ok(Opened::Answer(self.handshake(&head.sender, &challenge)))
+        let cookie = self.cookies.issue(&head.sender, from, slot(now));
+        let challenge = Handshake::Challenge { cookie, name: view.own.name.clone() };
+        Ok(FrameContent::Answer(self.handshake(&head.sender, &challenge)))
     }
 
-    fn shake_hands(
+    fn handle_handshake(
         &mut self,
-        head: &Head,
+        head: &FrameHeader,
         message: Handshake,
         from: SocketAddr,
         now: Timestamp,
-        roster: &Roster<'_>,
-    ) -> Result<Opened, FrameEvent> {
-        let (echo, cookie, word) = match message {
+        view: &LocalView<'_>,
+    ) -> Result<FrameContent, FrameEvent> {
+        let (echo, cookie, introduction) = match message {
             Handshake::Challenge { cookie: echo, name } => {
                 if !self.proofs.allow(&head.sender, now) {
                     self.throttled();
-                    return Ok(Opened::Nothing);
+                    return Ok(FrameContent::Nothing);
                 }
-                let cookie = self.cookies.bake(&head.sender, from, slot(now));
-                let over = (roster.known)(&name).filter(|known| !known.alive);
-                let standing = over.map_or(NameStanding::Free, |known| NameStanding::After(known.life));
-                let word = Word { id: roster.own.clone(), seen_at: from, standing };
-                return Ok(Opened::Answer(self.handshake(&head.sender, &Handshake::Proof { echo, cookie, word })));
+                let cookie = self.cookies.issue(&head.sender, from, slot(now));
+                let over = (view.known)(&name).filter(|known| !known.alive);
+                let claim = over.map_or(NameClaim::Free, |known| NameClaim::After(known.life));
+                let introduction = Introduction { id: view.own.clone(), seen_at: from, claim };
+                return Ok(FrameContent::Answer(
+                    self.handshake(&head.sender, &Handshake::Proof { echo, cookie, introduction }),
+                ));
             }
-            Handshake::Proof { echo, cookie, word } => (echo, Some(cookie), word),
-            Handshake::Accept { echo, word } => (echo, None, word),
+            Handshake::Proof { echo, cookie, introduction } => (echo, Some(cookie), introduction),
+            Handshake::Accept { echo, introduction } => (echo, None, introduction),
         };
         if !self.is_fresh(&head.sender, from, &echo, now) {
             return Err(FrameEvent::Replayed);
         }
-        if word.id.name == roster.own.name {
-            return Ok(Opened::NameTaken(word.id.name));
+        if introduction.id.name == view.own.name {
+            return Ok(FrameContent::NameTaken(introduction.id.name));
         }
-        let standing = self.admit(head, &word.id, from, now, (roster.known)(&word.id.name))?;
+        let claim = self.admit(head, &introduction.id, from, now, (view.known)(&introduction.id.name))?;
         let answer = cookie.map(|echo| {
-            let word = Word { id: roster.own.clone(), seen_at: from, standing };
-            self.handshake(&head.sender, &Handshake::Accept { echo, word })
+            let introduction = Introduction { id: view.own.clone(), seen_at: from, claim };
+            self.handshake(&head.sender, &Handshake::Accept { echo, introduction })
         });
-        Ok(Opened::Met { word, answer, speaks: standing != NameStanding::Taken })
+        Ok(FrameContent::Met { introduction, answer, speaks: claim != NameClaim::Taken })
     }
 
-    /// Whether the cookie was given to this session at this address a moment ago.
+    /// Whether the cookie was issued to this session at this address a moment ago.
     fn is_fresh(&self, session: &SessionId, from: SocketAddr, echo: &Cookie, now: Timestamp) -> bool {
         let slot = slot(now);
-        [slot, slot.wrapping_sub(1)].iter().any(|slot| self.cookies.bake(session, from, *slot) == *echo)
+        [slot, slot.wrapping_sub(1)].iter().any(|slot| self.cookies.issue(session, from, *slot) == *echo)
     }
 
-    /// Remembers a session that has just proven itself, and decides whether it speaks for its name.
+    /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
     fn admit(
         &mut self,
-        head: &Head,
+        head: &FrameHeader,
         id: &NodeId,
         address: SocketAddr,
         now: Timestamp,
-        known: Option<Known>,
-    ) -> Result<NameStanding, FrameEvent> {
-        let speaker = self.speakers.get(&id.name).copied();
-        let standing = match known {
-            Some(known) if known.alive && known.life > id.life && speaker != Some(head.sender) => NameStanding::Taken,
-            Some(known) if !known.alive && known.life >= id.life => NameStanding::After(known.life),
-            _ => NameStanding::Free,
+        known: Option<KnownMember>,
+    ) -> Result<NameClaim, FrameEvent> {
+        let speaker = self.session_by_name.get(&id.name).copied();
+        let claim = match known {
+            Some(known) if known.alive && known.life > id.life && speaker != Some(head.sender) => NameClaim::Taken,
+            Some(known) if !known.alive && known.life >= id.life => NameClaim::After(known.life),
+            _ => NameClaim::Free,
         };
         if !self.peers.contains_key(&head.sender) {
             self.make_room(now)?;
@@ -296,15 +300,18 @@ impl Sessions {
             let window = ReplayWindow::after(head.counter);
             let name = id.name.clone();
             let run = id.run;
-            self.peers.insert(head.sender, Peer { name, run, address, to, from, window, heard: now, superseded: None });
+            self.peers.insert(
+                head.sender,
+                PeerSession { name, run, address, to, from, window, heard: now, superseded: None },
+            );
         }
-        let taken = standing == NameStanding::Taken;
+        let taken = claim == NameClaim::Taken;
         if let Some(peer) = self.peers.get_mut(&head.sender) {
             peer.address = address;
             peer.superseded = taken.then_some(now);
         }
         if !taken {
-            self.speakers.insert(id.name.clone(), head.sender);
+            self.session_by_name.insert(id.name.clone(), head.sender);
             if let Some(former) = speaker.filter(|former| *former != head.sender)
                 && let Some(peer) = self.peers.get_mut(&former)
             {
@@ -313,42 +320,48 @@ impl Sessions {
         }
         let keep = |session: &SessionId| *session == head.sender || Some(*session) == speaker;
         self.peers.retain(|session, peer| peer.name != id.name || keep(session));
-        Ok(standing)
+        Ok(claim)
     }
 
-    /// Forgets whom it has not heard for longest, if for long enough, should there be too many.
+    /// Removes the longest idle session when there are too many and it is idle for long enough.
     fn make_room(&mut self, now: Timestamp) -> Result<(), FrameEvent> {
         if self.peers.len() < self.max_peers {
             return Ok(());
         }
         let silent = self.peers.iter().min_by_key(|(_, peer)| peer.heard).map(|(session, peer)| (*session, peer.heard));
-        let Some((session, _)) = silent.filter(|(_, heard)| now.since(*heard) >= FORGET_AFTER) else {
+        let Some((session, _)) = silent.filter(|(_, heard)| now.since(*heard) >= SESSION_IDLE_TIMEOUT) else {
             return Err(FrameEvent::TooManyPeers);
         };
         if let Some(peer) = self.peers.remove(&session)
-            && self.speakers.get(&peer.name) == Some(&session)
+            && self.session_by_name.get(&peer.name) == Some(&session)
         {
-            self.speakers.remove(&peer.name);
+            self.session_by_name.remove(&peer.name);
         }
         Ok(())
     }
 
-    fn hear(&self, session: &SessionId, kind: Kind, body: Vec<u8>, now: Timestamp) -> Result<Opened, FrameEvent> {
+    fn handle_body(
+        &self,
+        session: &SessionId,
+        kind: FrameKind,
+        body: Vec<u8>,
+        now: Timestamp,
+    ) -> Result<FrameContent, FrameEvent> {
         let Some(peer) = self.peers.get(session) else { return Err(FrameEvent::BadSeal) };
         let from = peer.name.clone();
         match peer.superseded {
-            Some(since) if now.since(since) > UNDERWAY => {
+            Some(since) if now.since(since) > MAX_TRANSIT => {
                 self.counters.count(FrameEvent::Superseded);
-                Ok(Opened::NameTaken(from))
+                Ok(FrameContent::NameTaken(from))
             }
             Some(_) => Err(FrameEvent::Superseded),
-            None if kind == Kind::Gossip => Ok(Opened::Gossip { from, body }),
-            None => Ok(Opened::Payload { from, body }),
+            None if kind == FrameKind::Gossip => Ok(FrameContent::Gossip { from, body }),
+            None => Ok(FrameContent::Payload { from, body }),
         }
     }
 
     fn handshake(&mut self, to: &SessionId, message: &Handshake) -> Vec<u8> {
-        let head = self.head(Kind::Handshake);
+        let head = self.head(FrameKind::Handshake);
         head.write(self.key.tag(), &encode(message), &self.key.seal(&self.own, to))
     }
 
@@ -357,33 +370,23 @@ impl Sessions {
         false
     }
 
-    fn head(&mut self, kind: Kind) -> Head {
+    fn head(&mut self, kind: FrameKind) -> FrameHeader {
         self.counter += 1;
-        Head { kind, sender: self.own, counter: self.counter }
+        FrameHeader { kind, sender: self.own, counter: self.counter }
     }
 }
 
-impl From<HeadError> for FrameEvent {
-    fn from(error: HeadError) -> Self {
-        match error {
-            HeadError::Oversized => Self::Oversized,
-            HeadError::Malformed => Self::Malformed,
-            HeadError::WrongCell => Self::WrongCell,
-        }
-    }
-}
+/// Burst of greetings to single nodes, and time until one more.
+const HELLO_BURST: u32 = 256;
+const HELLO_INTERVAL: Duration = Duration::from_millis(10);
 
-/// Most greetings of single nodes at once, and time until one more.
-const GREETINGS: u32 = 256;
-const STEADY: Duration = Duration::from_millis(10);
+/// Idle time after which a session may be replaced. It is then sent to only if the gossip holds the node alive.
+const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A session that has been silent for so long gives way to a new one, and is sent to only if the gossip holds it alive.
-const FORGET_AFTER: Duration = Duration::from_secs(10);
+/// Time for which frames of a node's earlier run may still arrive.
+const MAX_TRANSIT: Duration = Duration::from_millis(500);
 
-/// How long frames of a node that was restarted may be under way.
-const UNDERWAY: Duration = Duration::from_millis(500);
-
-/// A cookie is good during its slot of time and the next.
+/// Time slot of a cookie, which is valid in its slot and the next.
 fn slot(now: Timestamp) -> u64 {
     now.micros() / 2_000_000
 }

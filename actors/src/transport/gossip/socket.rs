@@ -1,4 +1,4 @@
-//! The sockets of the membership: one of its own, and one that all nodes of a machine share for greetings to the group.
+//! Sockets of the membership: the node's own, and the multicast socket that all nodes of a machine share.
 
 use std::io::{self, ErrorKind};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -36,7 +36,7 @@ impl GossipSocket {
         Ok(Self { own: UdpSocket::from_std(own).map_err(failed)?, group: OnceLock::new(), address })
     }
 
-    /// Joins the multicast group, if there is to be one. Without it, seeds have to do.
+    /// Joins the multicast group, if enabled.
     pub(crate) fn join(&self, config: &MulticastConfig) -> io::Result<()> {
         if let Some(group) = join(config, &self.own, self.address)? {
             // It is joined once.
@@ -45,12 +45,12 @@ impl GossipSocket {
         Ok(())
     }
 
-    /// Where the node gossips; the address may be unspecified.
+    /// The bound address, which may be unspecified.
     pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Waits until a datagram can be taken.
+    /// Waits until a datagram can be read.
     pub(crate) async fn readable(&self) -> io::Result<()> {
         match self.group.get() {
             None => self.own.readable().await,
@@ -61,13 +61,13 @@ impl GossipSocket {
         }
     }
 
-    /// Takes a datagram that waits.
+    /// Reads a datagram that waits.
     pub(crate) fn receive(&self, buffer: &mut [u8]) -> Option<(usize, SocketAddr)> {
         let sockets = [Some(&self.own), self.group.get().map(|(group, _)| group)];
         sockets.into_iter().flatten().find_map(|socket| socket.try_recv_from(buffer).ok())
     }
 
-    /// Sends a datagram, unless that takes waiting.
+    /// Sends a datagram, or fails when that would block.
     pub(crate) fn send(&self, frame: &[u8], to: SocketAddr) -> io::Result<()> {
         self.own.try_send_to(frame, to).map(drop)
     }
@@ -78,12 +78,12 @@ impl GossipSocket {
     }
 }
 
-/// Whether an address is this machine's own: one can listen there.
+/// Whether an address belongs to this machine: a socket can be bound to it.
 pub(crate) fn is_of_this_machine(ip: IpAddr) -> bool {
     ip.is_loopback() || ip.is_unspecified() || std::net::UdpSocket::bind((ip, 0)).is_ok()
 }
 
-/// Room for what comes in while the node is held up.
+/// Receive buffer for datagrams that arrive while the node is stalled, in bytes.
 const RECEIVE_BUFFER_BYTES: usize = 1 << 20;
 
 const UNKNOWN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);

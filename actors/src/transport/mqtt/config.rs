@@ -1,14 +1,14 @@
-//! How a node talks MQTT.
+//! Configuration of the MQTT connections.
 
-use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
+use ecod::leadership::BrokerAddress;
 use ecod::wire::{Encoding, Limits};
 use serde::{Deserialize, Serialize};
 
-use super::address::BrokerAddress;
+use crate::platform::secret::Secret;
 
 /// Protocol, credentials and limits of the MQTT connections.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -16,8 +16,8 @@ use super::address::BrokerAddress;
 pub struct MqttConfig {
     /// An external broker as `host:port`; default none: the brokers embedded in the nodes are used.
     pub broker: Option<BrokerAddress>,
-    /// Whether the embedded brokers are used beside an external one; default false. With it a cell goes on while the
-    /// external broker is gone, and every message takes two ways while it is there.
+    /// Whether the embedded brokers are used beside an external one; default false. Trade-off: the cell survives the loss
+    /// of the external broker, and every message is sent twice while it is there.
     pub fallback_to_embedded: bool,
     /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized packets away).
     pub version: MqttVersion,
@@ -25,40 +25,39 @@ pub struct MqttConfig {
     pub user: Option<String>,
     /// Password; default none. Never printed.
     pub password: Option<Secret>,
-    /// PEM file with the certificates of those who may have signed the external broker's; default none: it is spoken to
-    /// in plaintext. The host in `broker` must be a name in its certificate. A node with `[tls]` shows its own
-    /// certificate.
+    /// PEM file with the CAs of the external broker's certificate; default none: plaintext. The host in `broker` must be
+    /// a name in the certificate. A node with `[tls]` presents its own certificate.
     pub ca: Option<PathBuf>,
-    /// Whether payloads are signed by the cell's key, and others not taken; default false. For an external broker that
-    /// others use too; the same on every node. Programs that only look on have to skip the signature.
+    /// Whether payloads are signed with the cell's key and unsigned ones rejected; default false. For an external broker
+    /// that others use too. Must be the same on every node. Other subscribers have to skip the signature.
     pub sign: bool,
     /// How payloads are written: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a
     /// quarter of the bytes, rounded to millimetres and 0.05 %).
     pub encoding: Encoding,
-    /// Seconds of silence after which the broker is asked for a sign of life; default 5. Shorter notices a dead network
-    /// path sooner and costs packets. Not a failure detector: nodes watch each other by other means.
+    /// Keep-alive in seconds: silence after which the broker is pinged; default 5. Trade-off: shorter notices a dead
+    /// network path sooner and costs packets. Not the failure detector, which is the gossip.
     pub keep_alive_s: u16,
     /// Milliseconds within which a broker must accept a connection; default 2000.
     pub connect_timeout_ms: u64,
     /// Milliseconds before the first attempt to reconnect, doubled with every failure; default 50.
     pub retry_min_ms: u64,
-    /// Most milliseconds between attempts to reconnect; default 2000. Every wait is shortened by up to half at random,
-    /// so that a cell's vehicles do not return all at once.
+    /// Maximum milliseconds between attempts to reconnect; default 2000. A random part of up to half is taken off each
+    /// wait, so that a cell's vehicles do not return all at once.
     pub retry_max_ms: u64,
-    /// Most messages waiting to be sent on one link; default 64. When full, new ones are refused and counted.
+    /// Maximum messages that wait to be sent on one link; default 64. When full, new ones are refused and counted.
     pub send_queue: usize,
-    /// Most decoded messages that receivers may be behind; default 1024. When full, new ones are dropped and counted.
+    /// Maximum decoded messages that wait for their receivers; default 1024. When full, new ones are dropped and counted.
     pub inbox: usize,
-    /// Most reports a second of one vehicle and kind, shares of evidence of one candidate, and statuses of one node,
-    /// and at once after a second of silence; default 100. What is beyond is not decoded and counted by node. More lets
+    /// Maximum reports per second of one vehicle and kind, shares of evidence of one candidate, and statuses of one node;
+    /// default 100. The same number is the burst. Further ones are not decoded, and counted by node. Trade-off: more lets
     /// one node take the others' time.
     pub max_report_hz: u32,
     /// Largest report or status in bytes that is decoded; default 262144.
     pub max_payload_bytes: usize,
     /// Largest map, verdicts or reputations in bytes that are sent and decoded; default 8388608, 512 bytes for each of
-    /// 16,384 locations. Larger admits larger cells, smaller bounds what a stranger can make a node read.
+    /// 16,384 locations. Trade-off: larger admits larger cells, smaller bounds what an attacker can make a node read.
     pub max_map_bytes: usize,
-    /// Most objects, and most seen landmarks, in a report; default 1024.
+    /// Maximum objects, and maximum seen landmarks, in a report; default 1024.
     pub max_objects: usize,
 }
 
@@ -94,12 +93,12 @@ impl MqttConfig {
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let least_keep_alive_s = match self.version {
+        let min_keep_alive_s = match self.version {
             MqttVersion::V311 => 1.0,
-            // The client library takes no less.
+            // The minimum of the client library.
             MqttVersion::V5 => 5.0,
         };
-        check_range("keep_alive_s", f64::from(self.keep_alive_s), least_keep_alive_s, 3600.0)?;
+        check_range("keep_alive_s", f64::from(self.keep_alive_s), min_keep_alive_s, 3600.0)?;
         check_range("connect_timeout_ms", self.connect_timeout_ms as f64, 10.0, 60_000.0)?;
         check_range("retry_min_ms", self.retry_min_ms as f64, 1.0, 60_000.0)?;
         check_range("retry_max_ms", self.retry_max_ms as f64, self.retry_min_ms as f64, 600_000.0)?;
@@ -118,13 +117,12 @@ impl MqttConfig {
         Ok(())
     }
 
-    /// The bounds of what is decoded.
+    /// Limits of decoded messages.
     pub fn limits(&self) -> Limits {
         Limits { payload_bytes: self.max_payload_bytes, map_bytes: self.max_map_bytes, objects: self.max_objects }
     }
 
-    /// Largest packet in bytes that carries a payload within the limits. A link does not read a larger one: it is cut
-    /// and made anew.
+    /// Largest packet in bytes that carries a payload within the limits. A larger one cuts the link.
     pub fn max_packet_bytes(&self) -> usize {
         self.max_payload_bytes.max(self.max_map_bytes) + PACKET_OVERHEAD_BYTES
     }
@@ -141,7 +139,7 @@ impl MqttConfig {
 /// Room for a packet's header, topic and properties.
 const PACKET_OVERHEAD_BYTES: usize = 4096;
 
-/// Most that an MQTT packet can carry, 2²⁸ − 1, with room for the overhead.
+/// Maximum payload of an MQTT packet in bytes, 2²⁸ − 1, less room for the overhead.
 const MAX_PAYLOAD_BYTES: f64 = 268_000_000.0;
 
 /// A version of the MQTT protocol.
@@ -154,51 +152,6 @@ pub enum MqttVersion {
     /// MQTT 5.
     #[serde(rename = "5")]
     V5,
-}
-
-/// Text that shows in no log and no printed configuration.
-#[derive(Clone, PartialEq, Eq, Deserialize)]
-#[serde(try_from = "String")]
-pub struct Secret(String);
-
-/// What is shown in place of a secret.
-const HIDDEN: &str = "***";
-
-/// A secret that is only what is shown in place of one.
-#[derive(Debug, thiserror::Error)]
-#[error("`{HIDDEN}` stands for a secret that was not printed, give the secret itself")]
-pub struct HiddenSecret;
-
-impl TryFrom<String> for Secret {
-    type Error = HiddenSecret;
-
-    fn try_from(text: String) -> Result<Self, HiddenSecret> {
-        if text == HIDDEN { Err(HiddenSecret) } else { Ok(Self(text)) }
-    }
-}
-
-impl Secret {
-    /// Takes the text.
-    pub fn new(text: impl Into<String>) -> Self {
-        Self(text.into())
-    }
-
-    /// The text itself.
-    pub fn reveal(&self) -> &str {
-        &self.0
-    }
-}
-
-impl Serialize for Secret {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(HIDDEN)
-    }
-}
-
-impl fmt::Debug for Secret {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(HIDDEN)
-    }
 }
 
 #[cfg(test)]

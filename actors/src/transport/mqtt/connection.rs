@@ -1,4 +1,4 @@
-//! One MQTT connection, 3.1.1 or 5, to one broker; used once and never reconnected, so that nothing old is sent late.
+//! One MQTT connection, 3.1.1 or 5. It is never reconnected, so that no old message is sent late.
 
 use std::error::Error;
 use std::io;
@@ -6,22 +6,22 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::leadership::BrokerAddress;
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
 use rumqttc::v5::mqttbytes::QoS as QoS5;
 use rumqttc::{QoS as QoS4, TlsConfiguration, Transport, v5};
 use rustls::ClientConfig;
 
-use super::address::BrokerAddress;
 use super::config::{MqttConfig, MqttVersion};
 use crate::transport::pki::CredentialsError;
 
-/// How the broker is to treat a message: contract of the topics.
+/// QoS and retention of a message, as the topics' contract says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Handling {
-    /// QoS 0, not retained: the next one makes it worthless.
-    Stream,
-    /// QoS 1, retained: latecomers need it.
-    State,
+pub(crate) enum Retention {
+    /// QoS 0, not retained: the next message replaces it.
+    Transient,
+    /// QoS 1, retained: new subscribers need it.
+    Retained,
 }
 
 /// The sending half; never waits.
@@ -37,23 +37,23 @@ pub(crate) enum Connection {
     V5(Box<v5::EventLoop>),
 }
 
-/// What polling a connection yields.
+/// Result of polling a connection.
 pub(crate) enum Packet {
     /// The broker accepted the connection.
     Accepted,
-    /// A message on a topic, which may be no UTF-8.
+    /// A message. Its topic may be invalid UTF-8.
     Message { topic: Bytes, payload: Bytes },
-    /// This side's farewell is on its way.
-    Left,
-    /// The broker answered a subscription and refused some of its filters, by their place in it, with its reason.
-    Denied(Vec<(usize, String)>),
-    /// Something was sent.
+    /// DISCONNECT was sent.
+    Disconnected,
+    /// The broker refused filters of a subscription: index of each filter and reason.
+    SubscriptionRefused(Vec<(usize, String)>),
+    /// A packet was sent.
     Sent,
-    /// Something came in that only the protocol is concerned with.
+    /// Another packet of the protocol arrived.
     Other,
 }
 
-/// Why a connection ended.
+/// Reason for the end of a connection.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ConnectionError {
     #[error("{0}")]
@@ -61,28 +61,27 @@ pub(crate) enum ConnectionError {
     #[error("{0}")]
     V5(Box<v5::ConnectionError>),
     #[error("nothing within {0:?}")]
-    Silent(Duration),
+    Timeout(Duration),
     #[error("the broker's certificate is no longer valid: {0}")]
-    Distrusted(rustls::Error),
+    BrokerInvalidated(rustls::Error),
     #[error(transparent)]
     Credentials(#[from] Box<CredentialsError>),
 }
 
 impl ConnectionError {
-    /// Whether nothing listens there: the broker's process is gone.
+    /// Whether nothing listens at the address: the broker's process is gone.
     pub(crate) fn is_refused(&self) -> bool {
         let refused = |error: &io::Error| error.kind() == io::ErrorKind::ConnectionRefused;
         match self {
             Self::V311(error) => matches!(&**error, rumqttc::ConnectionError::Io(io) if refused(io)),
             Self::V5(error) => matches!(&**error, v5::ConnectionError::Io(io) if refused(io)),
-            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
+            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => false,
         }
     }
 
-    /// Why the broker took the connection and then refused the node, in its own words, or why this node does not trust
-    /// it.
+    /// The broker's reason for refusing the login, or this node's reason for not trusting the broker.
     pub(crate) fn refusal(&self) -> Option<String> {
-        if let Some(reason) = self.mistrust() {
+        if let Some(reason) = self.certificate_error() {
             return Some(reason);
         }
         match self {
@@ -94,17 +93,17 @@ impl ConnectionError {
                 v5::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
                 _ => None,
             },
-            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => None,
+            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => None,
         }
     }
 
-    /// What is wrong with one side's certificate.
-    fn mistrust(&self) -> Option<String> {
+    /// The error in one side's certificate.
+    fn certificate_error(&self) -> Option<String> {
         let mut next: Option<&(dyn Error + 'static)> = match self {
             Self::V311(error) => Some(&**error),
             Self::V5(error) => Some(&**error),
-            Self::Distrusted(error) => return Some(error.to_string()),
-            Self::Silent(_) | Self::Credentials(_) => None,
+            Self::BrokerInvalidated(error) => return Some(error.to_string()),
+            Self::Timeout(_) | Self::Credentials(_) => None,
         };
         while let Some(error) = next {
             let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
@@ -118,7 +117,7 @@ impl ConnectionError {
         None
     }
 
-    /// Whether a packet beyond [`MqttConfig::max_packet_bytes`] came in.
+    /// Whether a packet larger than [`MqttConfig::max_packet_bytes`] arrived.
     pub(crate) fn is_oversized(&self) -> bool {
         match self {
             Self::V311(error) => matches!(
@@ -134,24 +133,24 @@ impl ConnectionError {
                         | v5::StateError::IncomingPacketTooLarge { .. }
                 )
             ),
-            Self::Silent(_) | Self::Distrusted(_) | Self::Credentials(_) => false,
+            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => false,
         }
     }
 }
 
-/// What the broker says about this node when it falls silent.
+/// Message that the broker publishes when this node's connection breaks.
 #[derive(Debug, Clone)]
 pub(crate) struct LastWill {
     pub(crate) topic: String,
     pub(crate) payload: Bytes,
 }
 
-/// The will's payload of a node with this status.
-pub(crate) fn last_will(status: &NodeStatus, encoding: Encoding) -> Bytes {
-    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding).into()
+/// Payload of the last will of a node with this status.
+pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Vec<u8> {
+    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding)
 }
 
-/// Prepares a connection; the first poll makes it.
+/// Prepares a connection; the first poll connects.
 pub(crate) fn open(
     address: &BrokerAddress,
     client_id: &str,
@@ -165,7 +164,7 @@ pub(crate) fn open(
     network.set_connection_timeout(timeout_s);
     let login = config.user.as_deref().map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
     let port = address.port();
-    // The client library takes the host for the name in the broker's certificate, where brackets are none.
+    // The client library compares the host with the name in the certificate, which has no brackets.
     let host = if tls.is_some() { address.host().trim_matches(['[', ']']) } else { address.host() };
     let transport = tls.map(|tls| Transport::tls_with_config(TlsConfiguration::Rustls(tls)));
     let max_packet_bytes = config.max_packet_bytes();
@@ -213,8 +212,8 @@ pub(crate) fn open(
 
 impl Client {
     /// Queues a message; false when there is no room or the connection has ended.
-    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, handling: Handling) -> bool {
-        let retain = handling == Handling::State;
+    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
+        let retain = retention == Retention::Retained;
         match self {
             Self::V311(client) => {
                 let qos = if retain { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
@@ -243,7 +242,7 @@ impl Client {
         }
     }
 
-    /// Queues the end of subscriptions; false when there is no room for all.
+    /// Queues unsubscriptions; false when there is no room for all.
     pub(crate) fn unsubscribe(&self, filters: &[String]) -> bool {
         filters.iter().all(|filter| match self {
             Self::V311(client) => client.try_unsubscribe(filter).is_ok(),
@@ -251,7 +250,7 @@ impl Client {
         })
     }
 
-    /// Queues the farewell, after which the broker does not publish the last will; false when there is no room.
+    /// Queues DISCONNECT, after which the broker publishes no last will; false when there is no room.
     pub(crate) fn disconnect(&self) -> bool {
         match self {
             Self::V311(client) => client.try_disconnect().is_ok(),
@@ -261,9 +260,9 @@ impl Client {
 }
 
 impl Connection {
-    /// Sends and receives until there is something to tell; `patience` bounds the silence.
+    /// Sends and receives until there is a packet to report, for at most `patience`.
     pub(crate) async fn next(&mut self, patience: Duration) -> Result<Packet, ConnectionError> {
-        tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Silent(patience)))
+        tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Timeout(patience)))
     }
 
     async fn poll(&mut self) -> Result<Packet, ConnectionError> {
@@ -274,9 +273,11 @@ impl Connection {
                     Packet::Message { topic: publish.topic.into(), payload: publish.payload }
                 }
                 rumqttc::Event::Incoming(rumqttc::Packet::SubAck(answer)) => {
-                    denied(answer.return_codes, |code| matches!(code, rumqttc::SubscribeReasonCode::Success(_)))
+                    refused_filters(answer.return_codes, |code| {
+                        matches!(code, rumqttc::SubscribeReasonCode::Success(_))
+                    })
                 }
-                rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                rumqttc::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Disconnected,
                 rumqttc::Event::Outgoing(_) => Packet::Sent,
                 rumqttc::Event::Incoming(_) => Packet::Other,
             },
@@ -285,10 +286,10 @@ impl Connection {
                 v5::Event::Incoming(v5::Incoming::Publish(publish)) => {
                     Packet::Message { topic: publish.topic, payload: publish.payload }
                 }
-                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => denied(answer.return_codes, |code| {
+                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => refused_filters(answer.return_codes, |code| {
                     matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
                 }),
-                v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Left,
+                v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Disconnected,
                 v5::Event::Outgoing(_) => Packet::Sent,
                 v5::Event::Incoming(_) => Packet::Other,
             },
@@ -297,12 +298,12 @@ impl Connection {
 }
 
 /// The filters of a subscription that were refused.
-fn denied<C: std::fmt::Debug>(codes: Vec<C>, granted: impl Fn(&C) -> bool) -> Packet {
+fn refused_filters<C: std::fmt::Debug>(codes: Vec<C>, granted: impl Fn(&C) -> bool) -> Packet {
     let refused: Vec<_> = codes
         .into_iter()
         .enumerate()
         .filter(|(_, code)| !granted(code))
         .map(|(index, code)| (index, format!("{code:?}")))
         .collect();
-    if refused.is_empty() { Packet::Other } else { Packet::Denied(refused) }
+    if refused.is_empty() { Packet::Other } else { Packet::SubscriptionRefused(refused) }
 }

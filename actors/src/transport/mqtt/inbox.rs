@@ -1,8 +1,11 @@
-//! From a packet to a decoded message in a receiver's hands; junk ends here as a count.
+//! Incoming packets: signature, decoding, checks, throttles and delivery to the subscriber.
+//!
+//! A payload that cannot be used ends here as a count.
 
-use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::links::LinkState;
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
 use ecod::wire::{
@@ -12,21 +15,21 @@ use ecod::wire::{
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
 
-use super::address::BrokerAddress;
+use super::config::MqttConfig;
 use super::security::SigningKey;
 use crate::platform::clock;
-use crate::platform::throttle::Throttles;
+use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, Event, ShedReason};
 
 /// A checked message of the cell, or news about a link.
 ///
-/// The same message may arrive over several links. Who drops the second: the report window, by node and capture time;
-/// receivers of maps, verdicts and reputations, by epoch and round; a status says the same twice.
+/// The same message may arrive over several links. The report window drops the second report by node and capture time.
+/// Receivers of maps, verdicts and reputations drop it by epoch and round. A repeated status does no harm.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Incoming {
-    /// A vehicle's report; only candidates for aggregation get these, and nodes that watch.
+    /// A vehicle's report; for candidates and observers only.
     Report {
-        /// What it is for.
+        /// The kind of evidence.
         kind: ReportKind,
         /// The report, within the limits.
         report: Arc<ObjectReport>,
@@ -35,60 +38,47 @@ pub enum Incoming {
     Map(Arc<GlobalMap>),
     /// The verdicts of a round.
     Verdicts(Arc<Verdicts>),
-    /// Reputations, at once after connecting if the broker has some.
+    /// Reputations, right after connecting if the broker retains some.
     Reputations(Arc<Reputations>),
-    /// A part of another candidate's evidence; only candidates get these.
+    /// A share of another candidate's evidence; for candidates only.
     Ledger(Arc<LedgerShare>),
-    /// What another node says about itself, or its broker about it.
+    /// The status of another node, from itself or from its last will.
     Status {
         /// The status.
         status: Arc<NodeStatus>,
-        /// The broker that passed it on.
+        /// The broker that forwarded it.
         via: BrokerAddress,
     },
-    /// A link changed.
+    /// The state of a link changed.
     Link {
         /// The broker at its other end.
         broker: BrokerAddress,
-        /// How it is now.
+        /// The new state.
         state: LinkState,
     },
 }
 
-/// How a link is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LinkState {
-    /// Connected, subscribed, status published.
-    Up,
-    /// Connected, but nothing comes back of what is sent: the broker hangs, or its answers are lost.
-    Stalled,
-    /// Not connected; attempts go on.
-    Down,
-    /// Not connected and nothing listens there: the broker's process is gone. Attempts go on.
-    Refused,
-}
-
-/// A message on its way to a receiver. Dropping it makes room for another: keep it until it has been dealt with.
+/// A message on its way to a receiver. It occupies a place in the inbox until it is dropped: keep it until it is processed.
 #[derive(Debug)]
 pub struct Delivery {
     /// The message.
     pub message: Incoming,
-    /// When its packet was read from the socket, or when it was handed over in-process.
+    /// Time when its packet was read from the socket, or when it was delivered in-process.
     pub received_at: Timestamp,
     _place: Option<OwnedSemaphorePermit>,
 }
 
 impl Delivery {
-    /// What the node itself publishes or observes; its own pace bounds it.
+    /// A message of this node itself. It occupies no place: the node's own pace bounds it.
     pub(crate) fn local(message: Incoming, at: Timestamp) -> Self {
         Self { message, received_at: at, _place: None }
     }
 }
 
-/// Takes messages to their receivers, typically by sending to actors; runs on the link's task and must not block.
+/// Callback that takes messages to their receivers. It runs on the link's task and must not block.
 pub type Subscriber = Arc<dyn Fn(Delivery) + Send + Sync>;
 
-/// Decodes, counts and hands over; shared by the links of a gateway.
+/// Decodes, checks and delivers packets; shared by the links of a gateway.
 pub(crate) struct Inbox {
     node: NodeName,
     run: Uuid,
@@ -97,45 +87,50 @@ pub(crate) struct Inbox {
     signing: Option<SigningKey>,
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
-    places: Arc<Semaphore>,
-    reporters: [Mutex<Throttles<NodeName>>; ReportKind::COUNT],
-    sharers: Mutex<Throttles<NodeName>>,
-    tellers: Mutex<Throttles<NodeName>>,
+    /// Deliveries that receivers may still hold.
+    capacity: Arc<Semaphore>,
+    report_throttles: [NodeThrottle; ReportKind::COUNT],
+    ledger_throttle: NodeThrottle,
+    status_throttle: NodeThrottle,
 }
 
-/// What became of a packet, as far as the link has to act on it.
+type NodeThrottle = Mutex<KeyedThrottle<NodeName>>;
+
+/// The effect of a packet on its link.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Outcome {
+pub(crate) enum PacketOutcome {
+    /// None.
     Done,
-    /// The broker took this node for dead; it has to be told otherwise.
+    /// The broker published this node's last will: the link must publish the status again.
     DeclaredOffline,
-    /// The broker passed on this run's own status: it may publish there.
+    /// The broker returned this run's own status: the node may publish there.
     OwnStatus,
-    /// Another living run has this node's name.
+    /// Another run with this node's name is alive.
     Namesake(Uuid),
 }
 
 impl Inbox {
     pub(crate) fn new(
-        (node, run): (NodeName, Uuid),
+        own: &NodeStatus,
         topics: Topics,
-        (limits, signing): (Limits, Option<SigningKey>),
-        (places, max_report_hz): (usize, u32),
+        config: &MqttConfig,
+        signing: Option<SigningKey>,
         counters: Arc<Counters>,
         subscriber: Subscriber,
     ) -> Self {
+        let throttle = || Mutex::new(KeyedThrottle::per_second(config.max_report_hz));
         Self {
-            node,
-            run,
+            node: own.node.clone(),
+            run: own.id,
             topics,
-            limits,
+            limits: config.limits(),
             signing,
             counters,
             subscriber: RwLock::new(subscriber),
-            places: Arc::new(Semaphore::new(places)),
-            reporters: std::array::from_fn(|_| Mutex::new(Throttles::new(max_report_hz))),
-            sharers: Mutex::new(Throttles::new(max_report_hz)),
-            tellers: Mutex::new(Throttles::new(max_report_hz)),
+            capacity: Arc::new(Semaphore::new(config.inbox)),
+            report_throttles: std::array::from_fn(|_| throttle()),
+            ledger_throttle: throttle(),
+            status_throttle: throttle(),
         }
     }
 
@@ -143,47 +138,34 @@ impl Inbox {
         *self.subscriber.write().unwrap_or_else(PoisonError::into_inner) = subscriber;
     }
 
-    /// Deals with one packet of a broker; a payload that cannot be used is counted by its reason.
-    pub(crate) fn accept(&self, via: &BrokerAddress, topic: &[u8], payload: &[u8], received_at: Timestamp) -> Outcome {
+    /// Processes one packet of a broker. A payload that cannot be used is counted by its reason.
+    pub(crate) fn accept(
+        &self,
+        via: &BrokerAddress,
+        topic: &[u8],
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> PacketOutcome {
         self.counters.count(Event::Received);
-        match self.read(via, topic, payload, received_at) {
-            Ok(Read::Message(message)) => {
-                self.deliver(message, received_at);
-                Outcome::Done
-            }
-            Ok(Read::Echo) => {
-                self.counters.count(Event::Echo);
-                Outcome::Done
-            }
-            Ok(Read::Cleared | Read::Shed) => Outcome::Done,
-            Ok(Read::OwnDeath) => Outcome::DeclaredOffline,
-            Ok(Read::OwnStatus) => {
-                self.counters.count(Event::Echo);
-                Outcome::OwnStatus
-            }
-            Ok(Read::Namesake(run)) => {
-                self.counters.count(Event::NameConflict);
-                Outcome::Namesake(run)
-            }
-            Err(reason) => {
-                self.counters.reject(reason);
-                tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
-                Outcome::Done
-            }
-        }
+        self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
+            self.counters.reject(reason);
+            tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
+            PacketOutcome::Done
+        })
     }
 
-    /// Hands over a message that came from outside; dropped and counted when receivers are too far behind.
-    fn deliver(&self, message: Incoming, received_at: Timestamp) {
-        match Arc::clone(&self.places).try_acquire_owned() {
+    /// Delivers a message that this node itself publishes or observes.
+    pub(crate) fn deliver_local(&self, message: Incoming) {
+        self.hand_over(Delivery::local(message, clock::now()));
+    }
+
+    /// Delivers a message of a broker. Dropped and counted when receivers are too far behind.
+    fn deliver(&self, message: Incoming, received_at: Timestamp) -> PacketOutcome {
+        match Arc::clone(&self.capacity).try_acquire_owned() {
             Ok(place) => self.hand_over(Delivery { message, received_at, _place: Some(place) }),
             Err(_) => self.counters.count(Event::InboxFull),
         }
-    }
-
-    /// Hands over what this node itself publishes or observes.
-    pub(crate) fn deliver_local(&self, message: Incoming) {
-        self.hand_over(Delivery::local(message, clock::now()));
+        PacketOutcome::Done
     }
 
     fn hand_over(&self, delivery: Delivery) {
@@ -197,11 +179,11 @@ impl Inbox {
         topic: &[u8],
         payload: &[u8],
         received_at: Timestamp,
-    ) -> Result<Read, RejectReason> {
+    ) -> Result<PacketOutcome, RejectReason> {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
         let payload = match &self.signing {
-            // Nothing is what takes a retained message back; it says nothing that could be signed.
-            Some(key) if !payload.is_empty() => key.open(topic, payload).ok_or(RejectReason::BadSignature)?,
+            // An empty payload deletes a retained message. It carries nothing to sign.
+            Some(key) if !payload.is_empty() => key.verify(topic, payload).ok_or(RejectReason::BadSignature)?,
             _ => payload,
         };
         let message = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
@@ -209,19 +191,18 @@ impl Inbox {
             Topic::VoteDetections(node) => {
                 return self.read_report(ReportKind::VoteDetections, &node, payload, received_at);
             }
-            Topic::Ledger(node) if node == self.node => return Ok(Read::Echo),
+            Topic::Nodes(node) => return self.read_status(via, &node, payload, received_at),
+            Topic::Ledger(node) if node == self.node => return Ok(self.echo()),
             Topic::Ledger(node) => {
-                if !self.sharers.lock().unwrap_or_else(PoisonError::into_inner).allow(&node, received_at) {
-                    self.counters.shed(ShedReason::LedgerThrottled, node.as_str());
-                    return Ok(Read::Shed);
+                if self.is_shed(&self.ledger_throttle, ShedReason::LedgerThrottled, &node, received_at) {
+                    return Ok(PacketOutcome::Done);
                 }
                 Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?))
             }
-            Topic::Nodes(node) => return self.read_status(via, &node, payload, received_at),
             Topic::GlobalDetections => {
                 let map: GlobalMap = decode(payload, &self.limits)?;
                 if map.aggregator == self.node {
-                    return Ok(Read::Echo);
+                    return Ok(self.echo());
                 }
                 check_fused_at(map.fused_at_us, received_at)?;
                 Incoming::Map(Arc::new(map))
@@ -229,21 +210,21 @@ impl Inbox {
             Topic::GlobalVerdicts => {
                 let verdicts: Verdicts = decode(payload, &self.limits)?;
                 if verdicts.aggregator == self.node {
-                    return Ok(Read::Echo);
+                    return Ok(self.echo());
                 }
                 check_fused_at(verdicts.fused_at_us, received_at)?;
                 Incoming::Verdicts(Arc::new(verdicts))
             }
-            Topic::Reputations if payload.is_empty() => return Ok(Read::Cleared),
+            Topic::Reputations if payload.is_empty() => return Ok(PacketOutcome::Done),
             Topic::Reputations => {
                 let reputations: Reputations = decode(payload, &self.limits)?;
                 if reputations.aggregator.as_ref() == Some(&self.node) {
-                    return Ok(Read::Echo);
+                    return Ok(self.echo());
                 }
                 Incoming::Reputations(Arc::new(reputations))
             }
         };
-        Ok(Read::Message(message))
+        Ok(self.deliver(message, received_at))
     }
 
     fn read_report(
@@ -252,18 +233,16 @@ impl Inbox {
         node: &NodeName,
         payload: &[u8],
         received_at: Timestamp,
-    ) -> Result<Read, RejectReason> {
+    ) -> Result<PacketOutcome, RejectReason> {
         if *node == self.node {
-            return Ok(Read::Echo);
+            return Ok(self.echo());
         }
-        let mut reporters = self.reporters[kind as usize].lock().unwrap_or_else(PoisonError::into_inner);
-        if !reporters.allow(node, received_at) {
-            self.counters.shed(ShedReason::ReportThrottled, node.as_str());
-            return Ok(Read::Shed);
+        let throttle = &self.report_throttles[kind as usize];
+        if self.is_shed(throttle, ShedReason::ReportThrottled, node, received_at) {
+            return Ok(PacketOutcome::Done);
         }
-        drop(reporters);
         let report = Arc::new(decode_report(payload, node, &self.limits)?);
-        Ok(Read::Message(Incoming::Report { kind, report }))
+        Ok(self.deliver(Incoming::Report { kind, report }, received_at))
     }
 
     fn read_status(
@@ -272,47 +251,42 @@ impl Inbox {
         node: &NodeName,
         payload: &[u8],
         received_at: Timestamp,
-    ) -> Result<Read, RejectReason> {
-        if payload.is_empty() {
-            return Ok(Read::Cleared);
-        }
-        if !self.tellers.lock().unwrap_or_else(PoisonError::into_inner).allow(node, received_at) {
-            self.counters.shed(ShedReason::StatusThrottled, node.as_str());
-            return Ok(Read::Shed);
+    ) -> Result<PacketOutcome, RejectReason> {
+        if payload.is_empty() || self.is_shed(&self.status_throttle, ShedReason::StatusThrottled, node, received_at) {
+            return Ok(PacketOutcome::Done);
         }
         let status: NodeStatus = decode(payload, &self.limits)?;
         if status.node != *node {
             return Err(RejectReason::NodeMismatch);
         }
-        Ok(match (status.node == self.node, status.state) {
-            (true, NodeState::Offline) => Read::OwnDeath,
-            (true, NodeState::Following | NodeState::Aggregating) if status.id == self.run => Read::OwnStatus,
-            (true, NodeState::Following | NodeState::Aggregating) => Read::Namesake(status.id),
-            (false, _) => Read::Message(Incoming::Status { status: Arc::new(status), via: via.clone() }),
+        if status.node != self.node {
+            let status = Arc::new(status);
+            return Ok(self.deliver(Incoming::Status { status, via: via.clone() }, received_at));
+        }
+        Ok(if status.state == NodeState::Offline {
+            PacketOutcome::DeclaredOffline
+        } else if status.id == self.run {
+            self.counters.count(Event::Echo);
+            PacketOutcome::OwnStatus
+        } else {
+            self.counters.count(Event::NameConflict);
+            PacketOutcome::Namesake(status.id)
         })
     }
-}
 
-/// What a usable packet turned out to be.
-enum Read {
-    Message(Incoming),
-    /// More of a node than is taken.
-    Shed,
-    /// Published by this node.
-    Echo,
-    /// A retained message was removed.
-    Cleared,
-    /// This node's last will.
-    OwnDeath,
-    /// This run's status.
-    OwnStatus,
-    /// The status of another run of this name.
-    Namesake(Uuid),
-}
+    /// Counts a message that this node published itself.
+    fn echo(&self) -> PacketOutcome {
+        self.counters.count(Event::Echo);
+        PacketOutcome::Done
+    }
 
-impl fmt::Debug for Inbox {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Inbox").field("node", &self.node).finish_non_exhaustive()
+    /// Counts a message of a node that sends too many; false when there is still room for it.
+    fn is_shed(&self, throttle: &NodeThrottle, reason: ShedReason, node: &NodeName, at: Timestamp) -> bool {
+        let is_shed = !throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(node, at);
+        if is_shed {
+            self.counters.shed(reason, node.as_str());
+        }
+        is_shed
     }
 }
 
@@ -331,14 +305,10 @@ mod tests {
         counters: &Arc<Counters>,
         receiver: impl Fn(Delivery) + Send + Sync + 'static,
     ) -> Inbox {
-        Inbox::new(
-            (NodeName::from_static("edge"), Uuid::nil()),
-            Topics::new(&NodeName::from_static("lot")),
-            (Limits::default(), None),
-            (capacity, max_report_hz),
-            Arc::clone(counters),
-            Arc::new(receiver),
-        )
+        let own = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
+        let config = MqttConfig { inbox: capacity, max_report_hz, ..MqttConfig::default() };
+        let topics = Topics::new(&NodeName::from_static("lot"));
+        Inbox::new(&own, topics, &config, None, Arc::clone(counters), Arc::new(receiver))
     }
 
     fn broker() -> BrokerAddress {
@@ -375,7 +345,7 @@ mod tests {
         };
         let accept = |at| accept_from("gauss", at);
         for at in 1..=5 {
-            assert_eq!(accept(at), Outcome::Done);
+            assert_eq!(accept(at), PacketOutcome::Done);
         }
         assert_eq!(counters.events(Event::InboxFull), 3);
         assert_eq!(held.lock().unwrap().remove(0).received_at, Timestamp(1));

@@ -1,8 +1,12 @@
-//! The task that keeps one link to one broker: connects, reads, and connects anew.
+//! A link to one broker: its task connects, reads packets, and reconnects.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
+use ecod::leadership::BrokerAddress;
+use ecod::leadership::echo::EchoMonitor;
+use ecod::leadership::links::LinkState;
 use ecod::time::Timestamp;
 use ecod::wire::RejectReason;
 use rand::{RngExt, SeedableRng};
@@ -11,49 +15,47 @@ use rustls::ClientConfig;
 use tokio::task::{AbortHandle, JoinHandle};
 use uuid::Uuid;
 
-use super::address::BrokerAddress;
 use super::config::MqttConfig;
-use super::connection::{self, Client, ConnectionError, LastWill, Packet};
-use super::inbox::{Inbox, LinkState, Outcome};
+use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
+use super::hearing::Hearing;
+use super::inbox::{Inbox, PacketOutcome};
 use super::security::Security;
-use super::silence::{Hearing, Silence};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 
-/// Tells links apart, also an old and a new one to the same broker.
+/// Id of a link; a new link to the same broker has another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct LinkId(pub(crate) u64);
 
-/// What a link's task tells the gateway.
+/// A message of a link's task to the gateway.
 #[derive(Debug)]
 pub struct LinkEvent {
     pub(crate) link: LinkId,
-    pub(crate) news: LinkNews,
+    pub(crate) change: LinkChange,
 }
 
 #[derive(Debug)]
-pub(crate) enum LinkNews {
+pub(crate) enum LinkChange {
     /// The broker accepted the connection; nothing is subscribed yet.
     Accepted(Client),
-    /// The broker published the last will of this living node.
+    /// The broker published this node's last will, although it is alive.
     DeclaredOffline,
-    /// Another living run has this node's name.
+    /// Another run with this node's name is alive.
     Namesake(Uuid),
-    /// A broker that seemed stalled has sent something.
+    /// A stalled broker has sent a packet.
     Answered,
     /// Not connected; attempts go on.
     Lost(LinkState),
 }
 
-/// Takes the events of links; false once nobody takes them any more.
+/// Callback for the events of links; false once the gateway has ended.
 pub(crate) type LinkSink = Arc<dyn Fn(LinkEvent) -> bool + Send + Sync>;
 
-/// What all links of a gateway have in common.
-#[derive(Debug)]
+/// Settings and inbox that all links of a gateway share.
 pub(crate) struct LinkSetup {
     pub(crate) client_id: String,
     pub(crate) filters: Vec<String>,
-    /// The will of the next connection.
+    /// Last will of the next connection.
     pub(crate) will: Mutex<LastWill>,
     pub(crate) config: MqttConfig,
     pub(crate) security: Security,
@@ -62,14 +64,14 @@ pub(crate) struct LinkSetup {
     pub(crate) seed: u64,
 }
 
-/// A running link; dropping it cuts the connection, upon which the broker publishes the last will.
+/// A running link. Dropping it cuts the connection, and the broker publishes the last will.
 #[derive(Debug)]
 pub(crate) struct Link {
     pub(crate) broker: BrokerAddress,
     pub(crate) state: LinkState,
     pub(crate) client: Option<Client>,
     hearing: Arc<Hearing>,
-    silence: Silence,
+    echo: EchoMonitor,
     task: Option<JoinHandle<()>>,
     abort: AbortHandle,
 }
@@ -78,24 +80,29 @@ impl Link {
     pub(crate) fn spawn(id: LinkId, broker: BrokerAddress, setup: Arc<LinkSetup>, report: LinkSink) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
         let (hearing, at) = (Arc::<Hearing>::default(), broker.clone());
-        let task = Task { id, broker: at, setup, report, hearing, told: None, told_oversized: false };
+        let task =
+            Task { id, broker: at, setup, report, hearing, reported_refusal: None, has_reported_oversized: false };
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
-        let (abort, silence) = (task.abort_handle(), Silence::default());
-        Self { broker, state: LinkState::Down, client: None, hearing, silence, abort, task: Some(task) }
+        let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
+        Self { broker, state: LinkState::Down, client: None, hearing, echo, abort, task: Some(task) }
     }
 
-    /// Notes a message that the broker should pass back to this node, whether or not there was room for it; true when
-    /// the broker seems stalled.
+    /// Queues a message; false when there is no connection or no room.
+    pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
+        self.client.as_ref().is_some_and(|client| client.publish(topic, payload, retention))
+    }
+
+    /// Records a message whose echo is expected, even if there was no room to send it; true when the broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
-        let is_stalled = self.silence.note_sent(self.hearing.packets(), now);
+        let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
         if is_stalled {
             self.hearing.miss();
         }
         is_stalled
     }
 
-    /// Takes leave of the broker without a last will; what was queued before goes out first, within `patience`.
+    /// Sends the queued messages and DISCONNECT, so that there is no last will, within `patience`.
     pub(crate) async fn leave(mut self, patience: Duration) {
         let said = self.client.as_ref().is_some_and(Client::disconnect);
         if said
@@ -113,13 +120,13 @@ impl Drop for Link {
     }
 }
 
-/// Waits before the first attempts after a session broke, for the quickest word of whether the broker's process is
-/// gone: a process that ends may still have the port for a moment when its connections break.
-const BREAK_CHECKS: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
+/// Waits before the first attempts after a broken session. They find out soon whether the broker's process is gone: it
+/// may hold the port for a moment after its connections broke.
+const FIRST_RETRIES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
 
-/// A session shorter than this earns no such attempts, or a broker that ends every session would be tried without
-/// pause.
-const SHORTEST_USE: Duration = Duration::from_millis(200);
+/// Minimum length of a session that is followed by [`FIRST_RETRIES`]. Without it, a broker that ends every session would
+/// be tried without pause.
+const MIN_SESSION: Duration = Duration::from_millis(200);
 
 struct Task {
     id: LinkId,
@@ -127,17 +134,17 @@ struct Task {
     setup: Arc<LinkSetup>,
     report: LinkSink,
     hearing: Arc<Hearing>,
-    /// What the broker refused, as last told of.
-    told: Option<String>,
-    told_oversized: bool,
+    /// The refusal that was logged last.
+    reported_refusal: Option<String>,
+    has_reported_oversized: bool,
 }
 
 impl Task {
     async fn run(mut self, mut backoff: Backoff) {
-        // The first answer is waited for half as long: a session that outlived this was in use. One that ends sooner,
-        // such as by a retained packet beyond all bounds, must not be tried again at full speed.
+        // A session that outlived this was in use. One that ends sooner, such as by an oversized retained packet, must
+        // not be tried again at full speed.
         let in_use = 2 * self.setup.config.connect_timeout();
-        let mut checks = BREAK_CHECKS.iter();
+        let mut checks = FIRST_RETRIES.iter();
         loop {
             let begun = Instant::now();
             let error = match self.attempt().await {
@@ -147,45 +154,45 @@ impl Task {
             let state = if error.is_refused() { LinkState::Refused } else { LinkState::Down };
             tracing::debug!(broker = %self.broker, %error, "link lost");
             if let Some(reason) = error.refusal() {
-                self.tell_refusal(format!("{NOT_ADMITTED}: {reason}"));
+                self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }
             if error.is_oversized() {
                 self.setup.counters.reject(RejectReason::TooLarge);
-                if !std::mem::replace(&mut self.told_oversized, true) {
+                if !std::mem::replace(&mut self.has_reported_oversized, true) {
                     let limit = self.setup.config.max_packet_bytes();
                     tracing::warn!(broker = %self.broker, limit, "link lost to a packet that is too large; if it is \
                         retained it comes again and again: remove it, and have the broker limit its messages");
                 }
             }
-            if !self.tell(LinkNews::Lost(state)) {
+            if !self.tell(LinkChange::Lost(state)) {
                 return;
             }
             if begun.elapsed() > in_use {
                 backoff.reset();
             }
-            if begun.elapsed() > SHORTEST_USE {
-                checks = BREAK_CHECKS.iter();
+            if begun.elapsed() > MIN_SESSION {
+                checks = FIRST_RETRIES.iter();
             }
             let wait = checks.next().copied().unwrap_or_else(|| backoff.next_wait());
             tokio::time::sleep(wait).await;
         }
     }
 
-    /// One connection for as long as the broker's certificate is good.
+    /// One connection, for as long as the broker's certificate is valid.
     async fn attempt(&mut self) -> Result<(), ConnectionError> {
         let Some(trust) = self.setup.security.tls(&self.broker).map_err(Box::new)? else {
             return self.session(None).await;
         };
         tokio::select! {
             ended = self.session(Some(trust.client())) => ended,
-            error = trust.lost() => {
+            error = trust.invalidated() => {
                 self.setup.counters.count(Event::Disconnected);
-                Err(ConnectionError::Distrusted(error))
+                Err(ConnectionError::BrokerInvalidated(error))
             }
         }
     }
 
-    /// One connection from beginning to end; `Ok` after a farewell.
+    /// One connection from CONNECT to its end; `Ok` after DISCONNECT.
     async fn session(&mut self, tls: Option<Arc<ClientConfig>>) -> Result<(), ConnectionError> {
         let setup = Arc::clone(&self.setup);
         let LinkSetup { client_id, will, config, inbox, counters, .. } = &*setup;
@@ -195,12 +202,12 @@ impl Task {
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
         self.hearing.note();
-        self.told.take_if(|told| told.starts_with(NOT_ADMITTED));
-        if !self.tell(LinkNews::Accepted(client)) {
+        self.reported_refusal.take_if(|reported_refusal| reported_refusal.starts_with(NOT_ADMITTED));
+        if !self.tell(LinkChange::Accepted(client)) {
             return Ok(());
         }
-        // Pings alone make something come in every keep-alive; longer silence is a connection that hangs. What is sent
-        // is no sign of life, and a poll that takes longer was held up on this side.
+        // A working connection receives at least the answers to pings. Sent packets are no sign of life. A poll that
+        // takes longer than a keep-alive was stalled on this side.
         let patience = 2 * config.keep_alive();
         let mut silent = Duration::ZERO;
         let accepted = Instant::now();
@@ -215,62 +222,62 @@ impl Task {
             }
             silent = Duration::ZERO;
             if self.hearing.note() {
-                self.tell(LinkNews::Answered);
+                self.tell(LinkChange::Answered);
             }
             match packet {
                 Packet::Message { topic, payload } => {
                     match inbox.accept(&self.broker, &topic, &payload, clock::now()) {
-                        Outcome::DeclaredOffline => {
-                            self.tell(LinkNews::DeclaredOffline);
+                        PacketOutcome::DeclaredOffline => {
+                            self.tell(LinkChange::DeclaredOffline);
                         }
-                        Outcome::Namesake(run) => {
-                            self.tell(LinkNews::Namesake(run));
+                        PacketOutcome::Namesake(run) => {
+                            self.tell(LinkChange::Namesake(run));
                         }
-                        Outcome::OwnStatus => {
+                        PacketOutcome::OwnStatus => {
                             heard_itself = true;
-                            self.told.take_if(|told| told == NOT_HEARD);
+                            self.reported_refusal.take_if(|reported_refusal| reported_refusal == NOT_HEARD);
                         }
-                        Outcome::Done => {}
+                        PacketOutcome::Done => {}
                     }
                 }
-                Packet::Denied(refused) => {
+                Packet::SubscriptionRefused(refused) => {
                     let name = |(index, reason): (usize, String)| {
                         format!("{} ({reason})", setup.filters.get(index).map_or("?", String::as_str))
                     };
                     let refused: Vec<_> = refused.into_iter().map(name).collect();
-                    self.tell_refusal(format!("subscription refused: {}", refused.join(", ")));
+                    self.report_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
-                Packet::Left => return Ok(()),
+                Packet::Disconnected => return Ok(()),
                 Packet::Accepted | Packet::Sent | Packet::Other => {}
             }
-            if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.told.is_none() {
-                self.tell_refusal(NOT_HEARD.to_owned());
+            if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.reported_refusal.is_none() {
+                self.report_refusal(NOT_HEARD.to_owned());
             }
         }
     }
 
-    /// Warns of what the broker refuses, once per change.
-    fn tell_refusal(&mut self, refusal: String) {
-        if self.told.as_ref() != Some(&refusal) {
+    /// Warns of a refusal of the broker, once for each change.
+    fn report_refusal(&mut self, refusal: String) {
+        if self.reported_refusal.as_ref() != Some(&refusal) {
             tracing::warn!(broker = %self.broker, refusal, "broker refuses this node, check its password, certificate and permissions");
             self.setup.counters.count(Event::BrokerRefused);
-            self.told = Some(refusal);
+            self.reported_refusal = Some(refusal);
         }
     }
 
-    /// False when the gateway is gone.
-    fn tell(&self, news: LinkNews) -> bool {
-        (self.report)(LinkEvent { link: self.id, news })
+    /// Sends to the gateway; false when it has ended.
+    fn tell(&self, change: LinkChange) -> bool {
+        (self.report)(LinkEvent { link: self.id, change })
     }
 }
 
-/// A broker that wants other credentials.
+/// Prefix of refused logins.
 const NOT_ADMITTED: &str = "connection refused";
 
-/// A broker acknowledges what it does not permit; only the missing echo tells.
+/// Refusal that shows only by a missing echo: brokers acknowledge messages that they do not permit.
 const NOT_HEARD: &str = "this node's own status does not come back: publishing or subscribing to it is not permitted";
 
-/// Waits that double with every failure, shortened by up to half at random.
+/// Waits that double with every failure, each shortened by a random part of up to half.
 struct Backoff {
     least: Duration,
     most: Duration,

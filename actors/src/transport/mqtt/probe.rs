@@ -1,4 +1,4 @@
-//! Whether a broker takes this node, asked without being one of the cell.
+//! Test login at a broker.
 
 use uuid::Uuid;
 
@@ -7,11 +7,11 @@ use super::connection::{Packet, open};
 use super::{BrokerAddress, Security};
 use crate::transport::pki::OBSERVER_MARK;
 
-/// Connects as the configuration says, as an observer beside the node of this name, and leaves again. There is no last
-/// will: whatever becomes of this connection, nothing is said about anybody.
+/// Logs in as configured, as an observer of the node of this name, and disconnects. There is no last will, so that the
+/// cell notices nothing.
 ///
 /// # Errors
-/// Why the broker is not there or refuses, in words.
+/// The reason in words: the broker is not reachable or refuses.
 pub async fn probe(
     address: &BrokerAddress,
     node: &str,
@@ -30,7 +30,7 @@ pub async fn probe(
         }
     }
     if client.disconnect() {
-        while !matches!(connection.next(patience).await, Ok(Packet::Left) | Err(_)) {}
+        while !matches!(connection.next(patience).await, Ok(Packet::Disconnected) | Err(_)) {}
     }
     Ok(())
 }

@@ -1,45 +1,45 @@
-//! How links and payloads are protected.
+//! Protection of links by TLS, and of payloads by signatures.
 
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use ecod::leadership::BrokerAddress;
 use ecod::names::NodeName;
 use ring::hmac;
 
-use super::address::BrokerAddress;
 use super::config::MqttConfig;
 use crate::transport::gossip::{KeyError, MembershipConfig, payload_key};
 use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker};
 
-/// How links and payloads are protected; the default is not at all.
+/// Protection of links and payloads; by default there is none.
 #[derive(Debug, Clone, Default)]
 pub struct Security {
     /// The node's certificates, for the brokers of the cell.
     pub credentials: Option<Arc<Credentials>>,
-    external: Option<External>,
+    external: Option<ExternalBroker>,
     pub(crate) signing: Option<SigningKey>,
 }
 
-/// A broker that is none of the cell's, and who signed its certificate, if it has one.
+/// A broker outside the cell. Without `ca` it is reached in plaintext.
 #[derive(Debug, Clone)]
-struct External {
+struct ExternalBroker {
     address: BrokerAddress,
     ca: Option<PathBuf>,
 }
 
-/// Why links or payloads cannot be protected as configured.
+/// An error in the configured protection.
 #[derive(Debug, thiserror::Error)]
 pub enum SecurityError {
     /// The certificates cannot be used.
     #[error(transparent)]
     Credentials(#[from] CredentialsError),
-    /// The cell's key, by which payloads are signed, cannot be used.
+    /// The cell's key, which signs payloads, cannot be used.
     #[error("key `mqtt.sign`: {0}")]
     Key(#[from] KeyError),
 }
 
 impl Security {
-    /// Protection as configured; reads the certificates of the node `tls` names, and the key of the cell.
+    /// Reads the certificates of the node that `tls` names, and the key of the cell.
     ///
     /// # Errors
     /// [`SecurityError`] naming the file.
@@ -49,7 +49,7 @@ impl Security {
         (membership, cell): (&MembershipConfig, &NodeName),
     ) -> Result<Self, SecurityError> {
         let credentials = tls.map(|(files, name)| Credentials::load(files, name)).transpose()?.map(Arc::new);
-        let external = mqtt.broker.clone().map(|address| External { address, ca: mqtt.ca.clone() });
+        let external = mqtt.broker.clone().map(|address| ExternalBroker { address, ca: mqtt.ca.clone() });
         let signing = mqtt.sign.then(|| payload_key(membership, cell)).transpose()?;
         let security = Self { credentials, external, signing: signing.map(SigningKey) };
         if let Some(external) = &security.external {
@@ -58,67 +58,71 @@ impl Security {
         Ok(security)
     }
 
-    /// How to speak TLS to a broker, for one connection; none where it is spoken to in plaintext.
-    pub(crate) fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
+    /// TLS for one connection to a broker; `None` for plaintext.
+    ///
+    /// # Errors
+    /// When the credentials can no longer be used.
+    pub fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self.external.as_ref().filter(|external| external.address == *broker) {
-            Some(External { ca: Some(ca), .. }) => {
+            Some(ExternalBroker { ca: Some(ca), .. }) => {
                 let current = self.credentials.as_ref().map(|credentials| credentials.current());
                 external_broker(ca, current.as_deref()).map(Some)
             }
-            Some(External { ca: None, .. }) => Ok(None),
+            Some(ExternalBroker { ca: None, .. }) => Ok(None),
             None => Ok(self.credentials.as_ref().map(BrokerTrust::of_cell)),
         }
     }
 
-    /// The payload as it travels on a topic: signed where the cell signs.
-    pub(crate) fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
+    /// The payload as sent on a topic: in a signed envelope where the cell signs.
+    pub fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
         match &self.signing {
-            Some(key) => key.seal(topic, &payload),
+            Some(key) => key.sign(topic, &payload),
             None => payload,
         }
     }
 
-    /// Whether an envelope of another's making is shut, and one's own holds the payload; only built for the fuzz
-    /// targets.
+    /// Whether arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz targets.
     #[cfg(fuzzing)]
-    pub fn keeps_shut(&self, topic: &str, bytes: &[u8]) -> bool {
+    pub fn rejects_forgery(&self, topic: &str, bytes: &[u8]) -> bool {
         let Some(key) = &self.signing else { return false };
-        key.open(topic.as_bytes(), bytes).is_none()
-            && key.open(topic.as_bytes(), &key.seal(topic, bytes)) == Some(bytes)
+        key.verify(topic.as_bytes(), bytes).is_none()
+            && key.verify(topic.as_bytes(), &key.sign(topic, bytes)) == Some(bytes)
     }
 
-    /// Bytes before a payload that travels.
-    pub(crate) fn envelope_bytes(&self) -> usize {
+    /// Bytes that a signature adds to a payload.
+    pub fn envelope_bytes(&self) -> usize {
         if self.signing.is_some() { ENVELOPE_BYTES } else { 0 }
     }
 }
 
-/// Signs payloads for brokers that others use too: HMAC-SHA256 by a key that is derived from the cell's, over the
-/// length of the topic, the topic and the payload.
+/// Key that signs payloads for brokers which others use too.
+///
+/// The signature is HMAC-SHA256 over the length of the topic, the topic and the payload. The key is derived from the
+/// cell's key.
 ///
 /// ```text
 /// | ec | tag (32) | payload |
 /// ```
 ///
-/// No payload begins with the byte of the envelope: JSON is text, and CBOR's `ec` is a value that nobody may use.
+/// No payload begins with `ec`: JSON is text, and in CBOR that byte is a reserved value.
 #[derive(Debug, Clone)]
 pub(crate) struct SigningKey(hmac::Key);
 
 const MARK: u8 = 0xec;
 const TAG_BYTES: usize = 32;
 
-/// What a signature adds to a payload.
+/// Bytes that a signature adds to a payload.
 pub const ENVELOPE_BYTES: usize = 1 + TAG_BYTES;
 
 impl SigningKey {
     /// The payload in its envelope.
-    pub(crate) fn seal(&self, topic: &str, payload: &[u8]) -> Vec<u8> {
+    pub(crate) fn sign(&self, topic: &str, payload: &[u8]) -> Vec<u8> {
         let tag = hmac::sign(&self.0, &signed(topic.as_bytes(), payload));
         [&[MARK], tag.as_ref(), payload].concat()
     }
 
-    /// The payload of an envelope, if somebody who has the key sealed it for this topic.
-    pub(crate) fn open<'a>(&self, topic: &[u8], envelope: &'a [u8]) -> Option<&'a [u8]> {
+    /// The payload of an envelope that was signed with this key for this topic.
+    pub(crate) fn verify<'a>(&self, topic: &[u8], envelope: &'a [u8]) -> Option<&'a [u8]> {
         let (tag, payload) = envelope.strip_prefix(&[MARK])?.split_at_checked(TAG_BYTES)?;
         hmac::verify(&self.0, &signed(topic, payload), tag).ok()?;
         Some(payload)
@@ -138,25 +142,25 @@ mod tests {
 
     fn key(text: &str, cell: &'static str) -> SigningKey {
         let membership =
-            MembershipConfig { key: Some(crate::transport::mqtt::Secret::new(text)), ..MembershipConfig::default() };
+            MembershipConfig { key: Some(crate::platform::secret::Secret::new(text)), ..MembershipConfig::default() };
         SigningKey(payload_key(&membership, &NodeName::from_static(cell)).unwrap())
     }
 
     #[test]
     fn only_key_cell_topic_and_payload_of_the_sealing_open_an_envelope() {
         let key_of_cell = key("correct horse battery", "lot-1");
-        let envelope = key_of_cell.seal("a/b", b"payload");
-        assert_eq!(key_of_cell.open(b"a/b", &envelope), Some(&b"payload"[..]));
-        assert_eq!(key_of_cell.open(b"a/", &envelope), None);
-        assert_eq!(key("correct horse batterz", "lot-1").open(b"a/b", &envelope), None);
-        assert_eq!(key("correct horse battery", "lot-2").open(b"a/b", &envelope), None);
+        let envelope = key_of_cell.sign("a/b", b"payload");
+        assert_eq!(key_of_cell.verify(b"a/b", &envelope), Some(&b"payload"[..]));
+        assert_eq!(key_of_cell.verify(b"a/", &envelope), None);
+        assert_eq!(key("correct horse batterz", "lot-1").verify(b"a/b", &envelope), None);
+        assert_eq!(key("correct horse battery", "lot-2").verify(b"a/b", &envelope), None);
         for at in 0..envelope.len() {
             let mut changed = envelope.clone();
             changed[at] ^= 1;
-            assert_eq!(key_of_cell.open(b"a/b", &changed), None, "byte {at}");
+            assert_eq!(key_of_cell.verify(b"a/b", &changed), None, "byte {at}");
         }
         for bare in [&b"{}"[..], b"", &[MARK], &envelope[..TAG_BYTES]] {
-            assert_eq!(key_of_cell.open(b"a/b", bare), None);
+            assert_eq!(key_of_cell.verify(b"a/b", bare), None);
         }
     }
 }

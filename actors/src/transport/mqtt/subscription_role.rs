@@ -1,6 +1,6 @@
-//! Which topics a node takes.
+//! Topics that a node subscribes to.
 
-/// Which topics a node takes.
+/// Role of a node as a subscriber.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SubscriptionRole {
     /// Maps, verdicts, reputations and statuses.
@@ -11,13 +11,13 @@ pub enum SubscriptionRole {
     Candidate,
 }
 
-/// Where vehicles report.
+/// Filters of vehicles' reports, below the cell's root.
 pub(crate) const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
 
 impl SubscriptionRole {
-    /// All that the node may subscribe to. Reports come last: wherever they are left out, a level keeps its place, by
-    /// which a broker names it.
-    pub(crate) fn levels(self) -> &'static [&'static str] {
+    /// All filters of the role, below the cell's root. Reports come last: without them, the other filters keep their
+    /// index, by which a SUBACK refers to them.
+    pub(crate) fn filters(self) -> &'static [&'static str] {
         match self {
             Self::Follower => {
                 &["global_detections", "global_verdicts", "reputations", "nodes/+", "detections/+", "vote_detections/+"]

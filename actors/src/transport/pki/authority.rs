@@ -1,10 +1,8 @@
-//! The cell's certificate authority: a directory on one machine, which need not be one of the cell.
+//! The cell's certificate authority: a directory on one machine, which need not belong to the cell.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
+use std::{fs, io};
 
 use ecod::names::NodeName;
 use ecod::time::Timestamp;
@@ -17,6 +15,7 @@ use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 
 use super::{BROKER_NAME, OBSERVER_MARK};
+use crate::platform::state_file::replace_file;
 
 /// Days for which a node's certificate is valid unless told otherwise.
 pub const DEFAULT_DAYS: u32 = 365;
@@ -24,26 +23,26 @@ pub const DEFAULT_DAYS: u32 = 365;
 /// Days for which a CA is valid.
 const CA_DAYS: u32 = 3650;
 
-/// How far a certificate's beginning lies back: clocks of the cell may be behind.
+/// Time by which the validity of a certificate begins in the past, as clocks of the cell may be behind.
 const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
 
-/// The CA of one cell and all that it has issued.
+/// The CA of one cell and its register of certificates.
 #[derive(Debug)]
 pub struct Authority {
     directory: PathBuf,
-    register: Register,
+    register: IssuedCertificates,
 }
 
-/// Every certificate that was issued, in `issued.json`; the revocation list is made from it.
+/// Register of all issued certificates, in `issued.json`. The revocation list is made of it.
 #[derive(Debug, Serialize, Deserialize)]
-struct Register {
+struct IssuedCertificates {
     cell: NodeName,
     revision: u64,
-    issued: Vec<Issued>,
+    issued: Vec<IssuedCertificate>,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
-struct Issued {
+struct IssuedCertificate {
     node: NodeName,
     serial: String,
     expires_at_us: Timestamp,
@@ -51,7 +50,7 @@ struct Issued {
     revoked_at_us: Option<Timestamp>,
 }
 
-/// Why the authority did not do what it was asked to; what was there before is still there.
+/// An error of the authority; the files before it are still there.
 #[derive(Debug, thiserror::Error)]
 pub enum AuthorityError {
     /// A file could not be read or written.
@@ -59,29 +58,29 @@ pub enum AuthorityError {
     File {
         /// The file.
         path: PathBuf,
-        /// What the operating system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// There is no CA.
+    /// No CA in the directory.
     #[error("{0} has no CA: make one with `ecod-node pki init`")]
     Missing(PathBuf),
-    /// The directory has a CA already, whose certificates would all be worth nothing.
+    /// The directory has a CA already, whose certificates would become invalid.
     #[error("{0} has a CA already; a new one needs an empty directory")]
     Exists(PathBuf),
-    /// The register is not what this program writes.
+    /// The register cannot be read.
     #[error("{path} cannot be understood: {reason}")]
     Register {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The error.
         reason: String,
     },
-    /// Names with the mark belong to observers, and file names have to end somewhere.
+    /// The name contains the mark of observers.
     #[error("{0} cannot have a certificate: names of nodes have no `{OBSERVER_MARK}`")]
     Name(NodeName),
-    /// No valid certificate was issued for the node.
+    /// The node has no valid certificate.
     #[error("{0} has no certificate that could be revoked")]
-    Unknown(NodeName),
+    NotIssued(NodeName),
     /// A key or certificate could not be made.
     #[error("no certificate could be made: {0}")]
     Crypto(String),
@@ -114,10 +113,10 @@ impl Authority {
         let certificate = parameters.self_signed(&key)?;
         let secret = key.serialize_pem();
         write(&directory.join(CA), &certificate.pem())?;
-        let register = Register { cell: cell.clone(), revision: 0, issued: Vec::new() };
+        let register = IssuedCertificates { cell: cell.clone(), revision: 0, issued: Vec::new() };
         let mut authority = Self { directory: directory.into(), register };
         authority.save(&Issuer::from_ca_cert_pem(&certificate.pem(), key)?, now)?;
-        // Last: with the key there is a CA, and what is left of an attempt without it gives way to the next.
+        // Last: the key makes a CA complete. An attempt that failed before it can be repeated.
         write_secret(&directory.join(CA_KEY), &secret)?;
         Ok(authority)
     }
@@ -168,9 +167,9 @@ impl Authority {
         let key = KeyPair::generate()?;
         let issuer = self.issuer()?;
         let certificate = parameters.signed_by(&key, &issuer)?;
-        let serial = hex(serial.as_ref());
-        let issued = Issued { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
-        // Known before it exists, so that nothing can be valid that cannot be revoked.
+        let serial = hex::encode(serial.as_ref());
+        let issued = IssuedCertificate { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
+        // Registered before it exists, so that every valid certificate can be revoked.
         self.register.issued.push(issued);
         self.save(&issuer, now)?;
         let nodes = self.directory.join(NODES);
@@ -178,7 +177,7 @@ impl Authority {
         write(&nodes.join(format!("{node}.pem")), &certificate.pem())
     }
 
-    /// Revokes all certificates of a node and writes the list anew; tells how many they were.
+    /// Revokes all certificates of a node and rewrites the revocation list; returns their number.
     ///
     /// # Errors
     /// [`AuthorityError`] when there are none or the list cannot be written.
@@ -191,7 +190,7 @@ impl Authority {
             }
         }
         if revoked == 0 {
-            return Err(AuthorityError::Unknown(node.clone()));
+            return Err(AuthorityError::NotIssued(node.clone()));
         }
         self.save(&self.issuer()?, now)?;
         Ok(revoked)
@@ -207,7 +206,7 @@ impl Authority {
         self.directory.join(LIST)
     }
 
-    /// A node's certificate and its key, issued or not.
+    /// Paths of a node's certificate and key, issued or not.
     pub fn files_of(&self, node: &NodeName) -> (PathBuf, PathBuf) {
         let nodes = self.directory.join(NODES);
         (nodes.join(format!("{node}.pem")), nodes.join(format!("{node}.key")))
@@ -221,8 +220,8 @@ impl Authority {
     /// Writes the revocation list and then the register.
     fn save(&mut self, issuer: &Issuer<'_, KeyPair>, now: Timestamp) -> Result<(), AuthorityError> {
         self.register.revision += 1;
-        let revoked = |issued: &Issued| {
-            let serial = SerialNumber::from_slice(&unhex(&issued.serial));
+        let revoked = |issued: &IssuedCertificate| {
+            let serial = SerialNumber::from_slice(&hex::decode(&issued.serial).unwrap_or_default());
             let revocation_time = time(issued.revoked_at_us?).into();
             let reason_code = Some(RevocationReason::PrivilegeWithdrawn);
             Some(RevokedCertParams { serial_number: serial, revocation_time, reason_code, invalidity_date: None })
@@ -261,22 +260,13 @@ fn set_validity(parameters: &mut CertificateParams, now: Timestamp, valid: Durat
     parameters.not_after = time(now + valid).into();
 }
 
-/// 127 random bits: positive, and never the same twice.
+/// A random serial number of 127 bits, which is positive.
 fn draw_serial() -> Result<SerialNumber, AuthorityError> {
     let mut bytes = [0; 16];
     let drawn = SystemRandom::new().fill(&mut bytes);
     drawn.map_err(|_| AuthorityError::Crypto("the system gives no random numbers".into()))?;
     bytes[0] = bytes[0] & 0x7f | 0x40;
     Ok(SerialNumber::from_slice(&bytes))
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-fn unhex(text: &str) -> Vec<u8> {
-    let pairs = text.as_bytes().chunks(2);
-    pairs.filter_map(|pair| u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok()).collect()
 }
 
 fn read(path: &Path) -> Result<String, AuthorityError> {
@@ -291,16 +281,8 @@ fn write_secret(path: &Path, text: &str) -> Result<(), AuthorityError> {
     replace(path, text, 0o600)
 }
 
-/// Writes the file whole or leaves the one before.
 fn replace(path: &Path, text: &str, mode: u32) -> Result<(), AuthorityError> {
-    let beside = path.with_extension("new");
-    let written = || -> io::Result<()> {
-        let mut file: File = OpenOptions::new().write(true).create(true).truncate(true).mode(mode).open(&beside)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()?;
-        fs::rename(&beside, path)
-    };
-    written().map_err(|source| AuthorityError::File { path: path.into(), source })
+    replace_file(path, text.as_bytes(), mode).map_err(|source| AuthorityError::File { path: path.into(), source })
 }
 
 #[cfg(test)]
@@ -326,7 +308,7 @@ mod tests {
     #[test]
     fn a_ca_that_was_left_half_made_can_be_made_again() {
         let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
-        let obstacle = directory.path().join("issued.new");
+        let obstacle = directory.path().join("issued.tmp");
         fs::create_dir(&obstacle).unwrap();
         Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
         fs::remove_dir(&obstacle).unwrap();
@@ -344,10 +326,10 @@ mod tests {
         for _ in 0..2 {
             authority.issue(&edge, Role::Edge, days(1), clock::now()).unwrap();
         }
-        assert!(matches!(authority.revoke(&euclid, clock::now()), Err(AuthorityError::Unknown(_))));
+        assert!(matches!(authority.revoke(&euclid, clock::now()), Err(AuthorityError::NotIssued(_))));
         assert_eq!(authority.revoke(&edge, clock::now()).unwrap(), 2);
         let mut reopened = Authority::open(directory.path()).unwrap();
-        assert!(matches!(reopened.revoke(&edge, clock::now()), Err(AuthorityError::Unknown(_))));
+        assert!(matches!(reopened.revoke(&edge, clock::now()), Err(AuthorityError::NotIssued(_))));
         let observer = NodeName::from_static("edge--top");
         assert!(matches!(reopened.issue(&observer, Role::Cav, days(1), clock::now()), Err(AuthorityError::Name(_))));
     }

@@ -1,4 +1,4 @@
-//! Trust in a broker for as long as a connection to it lasts, not only in the handshake.
+//! Verification of a broker's certificate for as long as a connection lasts, not only in the handshake.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -8,86 +8,86 @@ use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, Server
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
 
-use super::{Credentials, Current};
+use super::{Credentials, LoadedCredentials};
 
-/// How one connection to a broker is made, and whether its certificate is still good.
+/// TLS of one connection to a broker, and the repeated verification of its certificate.
 #[derive(Debug)]
 pub struct BrokerTrust {
     client: Arc<ClientConfig>,
-    shown: Arc<Shown>,
+    recorded: Arc<RecordingVerifier>,
     verifier: Arc<WebPkiServerVerifier>,
-    /// Of a broker of the cell: where lists change.
-    changing: Option<(Arc<Credentials>, Arc<Current>)>,
+    /// Source of changed revocation lists, for a broker of the cell.
+    reloaded_from: Option<(Arc<Credentials>, Arc<LoadedCredentials>)>,
     checked: Instant,
 }
 
-/// Time between two looks at whether certificates have changed.
-const LOOK: Duration = Duration::from_secs(1);
+/// Time between two checks for changed files.
+const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Time between two checks of a certificate, for one that has expired.
-const RECHECK: Duration = Duration::from_secs(30);
+/// Time between two verifications of a certificate, which may have expired.
+const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
 
 impl BrokerTrust {
-    /// Trusts whom `verifier` trusts under `name`, or under the name by which it is connected to.
+    /// Trust by a verifier, for a certificate with `name`, or else with the host name of the connection.
     pub(super) fn new(
         client: &ClientConfig,
         verifier: Arc<WebPkiServerVerifier>,
         name: Option<ServerName<'static>>,
     ) -> Self {
-        let shown = Arc::new(Shown::new(Arc::clone(&verifier), name));
+        let recorded = Arc::new(RecordingVerifier::new(Arc::clone(&verifier), name));
         let mut client = client.clone();
-        client.dangerous().set_certificate_verifier(Arc::clone(&shown) as Arc<dyn ServerCertVerifier>);
-        Self { client: Arc::new(client), shown, verifier, changing: None, checked: Instant::now() }
+        client.dangerous().set_certificate_verifier(Arc::clone(&recorded) as Arc<dyn ServerCertVerifier>);
+        Self { client: Arc::new(client), recorded, verifier, reloaded_from: None, checked: Instant::now() }
     }
 
-    /// Trusts brokers of the cell, as the node's files say at the time.
+    /// Trust in brokers of the cell, by the present content of the node's files.
     pub fn of_cell(credentials: &Arc<Credentials>) -> Self {
         let current = credentials.current();
         let trust = Self::new(&current.client, Arc::clone(&current.brokers), Some(current.broker_name.clone()));
-        Self { changing: Some((Arc::clone(credentials), current)), ..trust }
+        Self { reloaded_from: Some((Arc::clone(credentials), current)), ..trust }
     }
 
-    /// How to connect, once.
+    /// TLS configuration for one connection.
     pub fn client(&self) -> Arc<ClientConfig> {
         Arc::clone(&self.client)
     }
 
-    /// Waits until the broker's certificate is not valid any more, and says why.
-    pub async fn lost(mut self) -> rustls::Error {
+    /// Waits until the broker's certificate is no longer valid; the result is the reason.
+    pub async fn invalidated(mut self) -> rustls::Error {
         loop {
-            tokio::time::sleep(LOOK).await;
-            if let Err(error) = self.look(Instant::now()) {
+            tokio::time::sleep(RELOAD_INTERVAL).await;
+            if let Err(error) = self.recheck(Instant::now()) {
                 return error;
             }
         }
     }
 
-    fn look(&mut self, now: Instant) -> Result<(), rustls::Error> {
+    fn recheck(&mut self, now: Instant) -> Result<(), rustls::Error> {
         let mut has_changed = false;
-        if let Some((credentials, known)) = &mut self.changing {
+        if let Some((credentials, known)) = &mut self.reloaded_from {
             let current = credentials.current();
             has_changed = !Arc::ptr_eq(&current, known);
             self.verifier = Arc::clone(&current.brokers);
             *known = current;
         }
-        if !has_changed && now.duration_since(self.checked) < RECHECK {
+        if !has_changed && now.duration_since(self.checked) < RECHECK_INTERVAL {
             return Ok(());
         }
         self.checked = now;
-        self.shown.check(&self.verifier)
+        self.recorded.check(&self.verifier)
     }
 }
 
-/// Verifies a broker's certificate and remembers it.
+/// Verifier that records the certificate of the broker.
 #[derive(Debug)]
-pub(super) struct Shown {
+pub(super) struct RecordingVerifier {
     verifier: Arc<WebPkiServerVerifier>,
-    /// The name that the certificate must bear; without one that by which the broker is connected to.
+    /// Name that the certificate must have; without it, the host name of the connection.
     name: Option<ServerName<'static>>,
     chain: Mutex<Option<(Vec<CertificateDer<'static>>, ServerName<'static>)>>,
 }
 
-impl Shown {
+impl RecordingVerifier {
     pub(super) fn new(verifier: Arc<WebPkiServerVerifier>, name: Option<ServerName<'static>>) -> Self {
         Self { verifier, name, chain: Mutex::default() }
     }
@@ -101,7 +101,7 @@ impl Shown {
     }
 }
 
-impl ServerCertVerifier for Shown {
+impl ServerCertVerifier for RecordingVerifier {
     fn verify_server_cert(
         &self,
         end_entity: &CertificateDer<'_>,
@@ -112,7 +112,8 @@ impl ServerCertVerifier for Shown {
     ) -> Result<ServerCertVerified, rustls::Error> {
         let name = self.name.as_ref().unwrap_or(name);
         let verified = self.verifier.verify_server_cert(end_entity, intermediates, name, ocsp_response, now)?;
-        let chain = [end_entity].into_iter().chain(intermediates).map(|shown| shown.clone().into_owned()).collect();
+        let chain =
+            [end_entity].into_iter().chain(intermediates).map(|recorded| recorded.clone().into_owned()).collect();
         *self.chain.lock().unwrap_or_else(PoisonError::into_inner) = Some((chain, name.to_owned()));
         Ok(verified)
     }
@@ -164,22 +165,22 @@ mod tests {
         let credentials = Arc::new(Credentials::load(&files, &euclid).unwrap());
         let connected = |broker: &NodeName| {
             let trust = BrokerTrust::of_cell(&credentials);
-            let shown = CertificateDer::from_pem_file(authority.files_of(broker).0).unwrap();
+            let recorded = CertificateDer::from_pem_file(authority.files_of(broker).0).unwrap();
             let name = ServerName::try_from(BROKER_NAME).unwrap();
-            trust.shown.verify_server_cert(&shown, &[], &name, &[], UnixTime::now()).unwrap();
+            trust.recorded.verify_server_cert(&recorded, &[], &name, &[], UnixTime::now()).unwrap();
             trust
         };
         let (mut brief_trust, mut edge_trust) = (connected(&brief), connected(&edge));
-        assert_eq!(brief_trust.look(Instant::now() + RECHECK), Ok(()));
+        assert_eq!(brief_trust.recheck(Instant::now() + RECHECK_INTERVAL), Ok(()));
         std::thread::sleep(Duration::from_millis(3100));
-        assert_eq!(brief_trust.look(Instant::now()), Ok(()), "looked at from time to time only");
-        let expired = brief_trust.look(Instant::now() + 2 * RECHECK);
+        assert_eq!(brief_trust.recheck(Instant::now()), Ok(()), "looked at from time to time only");
+        let expired = brief_trust.recheck(Instant::now() + 2 * RECHECK_INTERVAL);
         assert!(matches!(expired, Err(rustls::Error::InvalidCertificate(_))), "{expired:?}");
 
-        assert_eq!(edge_trust.look(Instant::now() + RECHECK), Ok(()));
+        assert_eq!(edge_trust.recheck(Instant::now() + RECHECK_INTERVAL), Ok(()));
         authority.revoke(&edge, clock::now()).unwrap();
-        std::thread::sleep(LOOK);
-        let revoked = edge_trust.look(Instant::now());
+        std::thread::sleep(RELOAD_INTERVAL);
+        let revoked = edge_trust.recheck(Instant::now());
         let why = rustls::Error::InvalidCertificate(rustls::CertificateError::Revoked);
         assert_eq!(revoked, Err(why), "at once when the list has changed");
     }

@@ -1,4 +1,4 @@
-//! Where a node's certificates are.
+//! Paths of a node's certificates.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ pub struct TlsConfig {
     pub certificate: PathBuf,
     /// The private key of the certificate. Only the node's user should be able to read it.
     pub key: PathBuf,
-    /// The CA's revocation list; default none: then a certificate is good until it expires.
+    /// The CA's revocation list; default none: a certificate is then valid until it expires.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub revocation_list: Option<PathBuf>,
 }

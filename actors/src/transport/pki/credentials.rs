@@ -1,4 +1,4 @@
-//! What one node holds: its certificate, and how it checks those of others.
+//! The certificates of one node, and the verifiers of others' certificates.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,62 +15,62 @@ use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::version::TLS13;
 use rustls::{ClientConfig, RootCertStore, ServerConfig};
 
-use super::broker_trust::Shown;
-use super::{BROKER_NAME, BrokerTrust, Identity, TlsConfig};
+use super::broker_trust::RecordingVerifier;
+use super::{BROKER_NAME, BrokerTrust, CertificateSubject, TlsConfig};
 
-/// The certificates of a node, read again when their files change.
+/// Certificates of a node, reloaded when their files change.
 #[derive(Debug)]
 pub struct Credentials {
     files: TlsConfig,
     node: NodeName,
-    kept: Mutex<Kept>,
+    cache: Mutex<CachedCredentials>,
 }
 
 #[derive(Debug)]
-struct Kept {
-    looked_at: Instant,
-    stamps: Vec<Option<(SystemTime, u64)>>,
-    current: Arc<Current>,
+struct CachedCredentials {
+    checked_at: Instant,
+    fingerprints: Vec<Option<(SystemTime, u64)>>,
+    current: Arc<LoadedCredentials>,
 }
 
-/// What the files held when they were read last.
+/// Content of the files, and the TLS configurations made of it.
 #[derive(Debug)]
-pub struct Current {
+pub struct LoadedCredentials {
     /// The node's own certificate.
-    pub identity: Identity,
-    /// How the node serves: TLS 1.3, clients show a certificate of the cell, sessions are not resumed, as a resumed one
-    /// would not be checked against the revocation list.
+    pub identity: CertificateSubject,
+    /// TLS of the node's own broker: version 1.3, client certificates of the cell, no resumption. A resumed session would
+    /// not be checked against the revocation list.
     pub server: Arc<ServerConfig>,
-    /// How the node connects to brokers of the cell.
+    /// TLS of connections to brokers of the cell.
     pub client: Arc<ClientConfig>,
-    /// Checks certificates of clients.
+    /// Verifier of clients' certificates.
     pub clients: Arc<dyn ClientCertVerifier>,
-    /// Checks certificates of brokers of the cell, which bear `broker_name` at whatever address they are.
+    /// Verifier of certificates of the cell's brokers, which have `broker_name` at any address.
     pub(super) brokers: Arc<WebPkiServerVerifier>,
     pub(super) broker_name: ServerName<'static>,
     certificates: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
 }
 
-/// Files that are no credentials of this node.
+/// An error in the files of a node's certificates.
 #[derive(Debug, thiserror::Error)]
 pub enum CredentialsError {
-    /// A file is not there, cannot be read, or is not PEM of the kind that it should be.
+    /// A file cannot be read, or is not PEM of the expected kind.
     #[error("key `{key}`: {path}: {reason}")]
     File {
         /// The configuration key that names the file.
         key: &'static str,
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
-    /// The certificate is another node's.
+    /// The certificate names another node.
     #[error("key `tls.certificate`: {path} is for {found}, this node is {node}")]
-    AnothersName {
+    WrongName {
         /// The file.
         path: PathBuf,
-        /// Whom it is for.
+        /// The node that it names.
         found: NodeName,
         /// This node.
         node: NodeName,
@@ -80,8 +80,8 @@ pub enum CredentialsError {
     Unusable(String),
 }
 
-/// Least time between two looks at the files.
-const LOOK: Duration = Duration::from_secs(1);
+/// Minimum time between two checks of the files.
+const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Credentials {
     /// Reads a node's files.
@@ -89,39 +89,38 @@ impl Credentials {
     /// # Errors
     /// [`CredentialsError`] naming the file.
     pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
-        let (stamps, current) = (stamps(files), Arc::new(read(files, node)?));
-        let kept = Mutex::new(Kept { looked_at: Instant::now(), stamps, current });
-        Ok(Self { files: files.clone(), node: node.clone(), kept })
+        let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
+        let cache = Mutex::new(CachedCredentials { checked_at: Instant::now(), fingerprints, current });
+        Ok(Self { files: files.clone(), node: node.clone(), cache })
     }
 
-    /// What the files hold now; what they held before if they have become unusable, which is logged.
-    pub fn current(&self) -> Arc<Current> {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        if kept.looked_at.elapsed() >= LOOK {
-            kept.looked_at = Instant::now();
-            let stamps = stamps(&self.files);
-            if stamps != kept.stamps {
-                kept.stamps = stamps;
+    /// The present content of the files. While they are unusable, which is logged, the content before.
+    pub fn current(&self) -> Arc<LoadedCredentials> {
+        let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        if cache.checked_at.elapsed() >= RELOAD_INTERVAL {
+            cache.checked_at = Instant::now();
+            let fingerprints = fingerprints(&self.files);
+            if fingerprints != cache.fingerprints {
+                cache.fingerprints = fingerprints;
                 match read(&self.files, &self.node) {
                     Ok(current) => {
                         tracing::info!("certificates read again");
-                        kept.current = Arc::new(current);
+                        cache.current = Arc::new(current);
                     }
                     Err(error) => tracing::warn!(%error, "changed certificates not used"),
                 }
             }
         }
-        Arc::clone(&kept.current)
+        Arc::clone(&cache.current)
     }
 }
 
-/// How a node connects to a broker that is none of the cell's, and goes on trusting it: its certificate must be signed
-/// by one of those in `ca` and bear the name under which it is configured. The node shows its own certificate, if it
-/// has one.
+/// Trust in a broker outside the cell. Its certificate must be signed by a CA in `ca` and have the configured host name.
+/// The node presents its own certificate, if it has one.
 ///
 /// # Errors
 /// [`CredentialsError`] naming the file.
-pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, CredentialsError> {
+pub fn external_broker(ca: &Path, own: Option<&LoadedCredentials>) -> Result<BrokerTrust, CredentialsError> {
     let roots = Arc::new(roots("mqtt.ca", ca)?);
     let verifier = server_verifier(Arc::clone(&roots), Vec::new())?;
     let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
@@ -133,7 +132,7 @@ pub fn external_broker(ca: &Path, own: Option<&Current>) -> Result<BrokerTrust, 
     Ok(BrokerTrust::new(&client, verifier, None))
 }
 
-fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError> {
+fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, CredentialsError> {
     let roots = Arc::new(roots("tls.ca", &files.ca)?);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
     let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
@@ -141,10 +140,11 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
     let lists = files.revocation_list.as_deref().map(lists).transpose()?.unwrap_or_default();
     let own =
         certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
-    let identity = Identity::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
-    if !identity.speaks_for(node.as_str()) {
+    let identity =
+        CertificateSubject::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
+    if !identity.may_act_as(node.as_str()) {
         let (path, found) = (files.certificate.clone(), identity.name().clone());
-        return Err(CredentialsError::AnothersName { path, found, node: node.clone() });
+        return Err(CredentialsError::WrongName { path, found, node: node.clone() });
     }
     let clients = client_verifier(&roots, &lists)?;
     let mut server = ServerConfig::builder_with_provider(crypto())
@@ -162,12 +162,15 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<Current, CredentialsError>
         .with_protocol_versions(&[&TLS13])
         .map_err(unusable)?
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(Shown::new(Arc::clone(&brokers), Some(broker_name.clone()))))
+        .with_custom_certificate_verifier(Arc::new(RecordingVerifier::new(
+            Arc::clone(&brokers),
+            Some(broker_name.clone()),
+        )))
         .with_client_auth_cert(certificates.clone(), key.clone_key())
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
     let (server, client) = (Arc::new(server), Arc::new(client));
-    Ok(Current { identity, server, client, clients, brokers, broker_name, certificates, key })
+    Ok(LoadedCredentials { identity, server, client, clients, brokers, broker_name, certificates, key })
 }
 
 fn client_verifier(
@@ -207,7 +210,7 @@ fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsErr
     Ok(roots)
 }
 
-/// A file without a list in it, such as one half copied, is not a list of nobody.
+/// Reads revocation lists. A file without any, such as one copied by half, is an error and not an empty list.
 fn lists(path: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
     let key = "tls.revocation_list";
     let lists = pem(key, path)?;
@@ -232,8 +235,8 @@ fn unusable(error: rustls::Error) -> CredentialsError {
     CredentialsError::Unusable(error.to_string())
 }
 
-/// Time of change and length of each file: enough to tell that it was replaced.
-fn stamps(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
+/// Modification time and length of each file, which change when it is replaced.
+fn fingerprints(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
     let stamp = |path: &PathBuf| {
         let facts = fs::metadata(path).ok()?;
         Some((facts.modified().ok()?, facts.len()))
@@ -265,10 +268,10 @@ mod tests {
             let error = Credentials::load(&files, &edge).unwrap_err().to_string();
             assert!(error.starts_with("key `tls.revocation_list`: ") && error.contains("copied.pem"), "{error}");
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(RELOAD_INTERVAL);
         assert!(Arc::ptr_eq(&credentials.current(), &before), "still checked against the list before");
         fs::copy(authority.revocation_list(), &list).unwrap();
-        std::thread::sleep(LOOK);
+        std::thread::sleep(RELOAD_INTERVAL);
         assert!(!Arc::ptr_eq(&credentials.current(), &before), "and against the next");
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::Ipv4Addr;
 
-use ecod::election::ElectionConfig;
+use ecod::leadership::election::ElectionConfig;
 use ecod::wire::Role;
 use proptest::prelude::*;
 
@@ -26,7 +26,7 @@ struct Cell {
 }
 
 struct Node {
-    machine: Machine,
+    machine: GossipMachine,
     events: Vec<MembershipEvent>,
     stopped: bool,
 }
@@ -75,8 +75,8 @@ impl Cell {
         self.rng.fill(&mut session);
         let key = CellKey::new(key, &NodeName::from_static("lot-1"));
         let seed = self.rng.random();
-        let setup = Setup { own, key, session, secret: [7; 32], seed, counters: Arc::default() };
-        let machine = Machine::new(setup, &MembershipConfig::default(), self.now);
+        let setup = GossipSetup { own, key, session, secret: [7; 32], seed, counters: Arc::default() };
+        let machine = GossipMachine::new(setup, &MembershipConfig::default(), self.now);
         self.nodes.insert(node, Node { machine, events: Vec::new(), stopped: false });
     }
 
@@ -111,12 +111,12 @@ impl Cell {
         for (index, node) in &mut self.nodes {
             while let Some(output) = node.machine.poll() {
                 match output {
-                    Output::Send { to, frame } => sent.push((*index, to, frame)),
-                    Output::Multicast { frame } if self.multicast => {
+                    GossipOutput::Send { to, frame } => sent.push((*index, to, frame)),
+                    GossipOutput::Multicast { frame } if self.multicast => {
                         sent.extend(all.iter().map(|to| (*index, address(*to), frame.clone())));
                     }
-                    Output::Multicast { .. } => (),
-                    Output::Tell(event) => node.events.push(event),
+                    GossipOutput::Multicast { .. } => (),
+                    GossipOutput::Tell(event) => node.events.push(event),
                 }
             }
         }
@@ -494,7 +494,7 @@ proptest! {
         node.machine.tick(now);
         prop_assert_eq!(node.machine.members(), members);
         while let Some(output) = node.machine.poll() {
-            prop_assert!(!matches!(output, Output::Tell(_)), "{:?}", output);
+            prop_assert!(!matches!(output, GossipOutput::Tell(_)), "{:?}", output);
         }
     }
 }

@@ -11,7 +11,7 @@ struct End {
     sessions: Sessions,
     id: NodeId,
     address: SocketAddr,
-    known: Option<Known>,
+    known: Option<KnownMember>,
 }
 
 impl End {
@@ -24,15 +24,15 @@ impl End {
         Self { sessions, id, address, known: None }
     }
 
-    fn open(&mut self, frame: &[u8], from: SocketAddr, now: Timestamp) -> Result<Opened, FrameEvent> {
+    fn open(&mut self, frame: &[u8], from: SocketAddr, now: Timestamp) -> Result<FrameContent, FrameEvent> {
         let known = self.known;
-        self.sessions.open(frame, from, now, &Roster { own: &self.id, known: &|_| known })
+        self.sessions.open(frame, from, now, &LocalView { own: &self.id, known: &|_| known })
     }
 }
 
-fn answer(opened: Result<Opened, FrameEvent>) -> Vec<u8> {
+fn answer(opened: Result<FrameContent, FrameEvent>) -> Vec<u8> {
     match opened {
-        Ok(Opened::Answer(frame) | Opened::Met { answer: Some(frame), .. }) => frame,
+        Ok(FrameContent::Answer(frame) | FrameContent::Met { answer: Some(frame), .. }) => frame,
         other => panic!("no answer but {other:?}"),
     }
 }
@@ -43,7 +43,7 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
     let challenge = answer(b.open(&hello, a.address, NOW));
     let proof = answer(a.open(&challenge, b.address, NOW));
     let accept = answer(b.open(&proof, a.address, NOW));
-    assert!(matches!(a.open(&accept, b.address, NOW), Ok(Opened::Met { answer: None, speaks: true, .. })));
+    assert!(matches!(a.open(&accept, b.address, NOW), Ok(FrameContent::Met { answer: None, speaks: true, .. })));
     [hello, challenge, proof, accept]
 }
 
@@ -51,9 +51,9 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
 fn introduced_nodes_understand_each_other_once() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
     introduce(&mut a, &mut b);
-    let (to, frame) = a.sessions.seal(&b.id.name, Kind::Payload, b"hi").unwrap();
+    let (to, frame) = a.sessions.seal(&b.id.name, FrameKind::Payload, b"hi").unwrap();
     assert_eq!(to, b.address);
-    let heard = Opened::Payload { from: a.id.name.clone(), body: b"hi".to_vec() };
+    let heard = FrameContent::Payload { from: a.id.name.clone(), body: b"hi".to_vec() };
     assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::Replayed));
     assert_eq!(a.open(&frame, b.address, NOW), Err(FrameEvent::Replayed), "sent back");
@@ -71,7 +71,7 @@ fn recorded_handshakes_admit_nobody() {
         }
     }
     let mut restarted = End::new("b", 3);
-    assert!(matches!(restarted.open(&hello, a.address, NOW), Ok(Opened::Answer(_))), "at most a challenge");
+    assert!(matches!(restarted.open(&hello, a.address, NOW), Ok(FrameContent::Answer(_))), "at most a challenge");
     assert_eq!(restarted.open(&proof, a.address, NOW), Err(FrameEvent::BadSeal));
     assert!(restarted.sessions.peers.is_empty());
 }
@@ -92,9 +92,9 @@ fn a_proof_from_elsewhere_or_too_late_is_none() {
 fn frames_of_strangers_cause_a_greeting_and_count() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
     introduce(&mut a, &mut b);
-    let (_, frame) = a.sessions.seal(&b.id.name, Kind::Gossip, b"news").unwrap();
+    let (_, frame) = a.sessions.seal(&b.id.name, FrameKind::Gossip, b"news").unwrap();
     b.sessions.peers.clear();
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(Opened::Stranger));
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(FrameContent::Stranger));
     assert_eq!(b.sessions.counters.get(FrameEvent::Unestablished), 1);
 }
 
@@ -135,9 +135,9 @@ proptest! {
     fn sealed_junk_changes_nothing(kind in 1u8..=4, body in prop::collection::vec(any::<u8>(), 0..200)) {
         let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
         introduce(&mut a, &mut b);
-        let kind = [Kind::Hello, Kind::Handshake, Kind::Gossip, Kind::Payload][usize::from(kind) - 1];
+        let kind = [FrameKind::Hello, FrameKind::Handshake, FrameKind::Gossip, FrameKind::Payload][usize::from(kind) - 1];
         let head = a.sessions.head(kind);
-        let seal = if kind == Kind::Hello { &a.sessions.everybody } else { &a.sessions.peers[&[2; 16]].to };
+        let seal = if kind == FrameKind::Hello { &a.sessions.everybody } else { &a.sessions.peers[&[2; 16]].to };
         let frame = head.write(a.sessions.key.tag(), &body, seal);
         let _ = b.open(&frame, a.address, NOW);
         prop_assert_eq!(b.sessions.peers.len(), 1);

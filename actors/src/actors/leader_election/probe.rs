@@ -1,0 +1,38 @@
+//! Questions to a node's parts, asked without waiting.
+
+use ecod::leadership::health::HealthSample;
+use ecod::leadership::node::Input;
+use ecod::leadership::timers::ANSWER_STEPS;
+use ractor::{ActorRef, ActorStatus};
+
+use super::Parts;
+use crate::messages::broker::BrokerMessage;
+use crate::messages::gateway::GatewayMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+use crate::transport::broker::BrokerHealth;
+
+/// Asks broker, gateway and fuser, and tells the election when they have answered.
+pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
+    let (broker, gateway) = (parts.broker.clone(), parts.gateway.clone());
+    let fuser_runs = parts.fuser.get().is_some_and(|fuser| fuser.get_status() == ActorStatus::Running);
+    tokio::spawn(async move {
+        let (health, links) = tokio::join!(
+            broker.ask(|reply| BrokerMessage::Health { reply }, ANSWER_STEPS),
+            gateway.ask(|reply| GatewayMessage::Links { reply }, ANSWER_STEPS),
+        );
+        let broker_serves = matches!(health, Some(BrokerHealth::Serving(_)));
+        let sample = HealthSample { broker_serves, links, fuser_runs };
+        let input = Input::PartsAnswered { sample };
+        if election.cast(LeaderElectionMessage::Note { input }).is_err() {
+            tracing::debug!("the election ended before its parts answered");
+        }
+    });
+}
+
+/// The load of the last minute on all processors, 0 to 100 %; nothing where the system does not tell.
+pub(super) fn load_percent() -> Option<u8> {
+    let text = std::fs::read_to_string("/proc/loadavg").ok()?;
+    let load: f64 = text.split_whitespace().next()?.parse().ok()?;
+    let processors = std::thread::available_parallelism().ok()?.get() as f64;
+    Some((load / processors * 100.0).clamp(0.0, 100.0) as u8)
+}

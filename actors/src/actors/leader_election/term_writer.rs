@@ -1,0 +1,154 @@
+//! The highest term on disk.
+
+use ecod::leadership::timers::DISK_TIMEOUT;
+use tokio::sync::watch;
+
+use crate::platform::state_file::StateFile;
+
+/// Writer of terms that does not hold up its caller: a leader whose disk takes long must go on beating.
+///
+/// The election hands terms in before they are needed. Only a node that is about to lead in a term waits for the disk's
+/// answer, [`DISK_TIMEOUT`] at most. A disk that fails or hangs stops no leader.
+#[derive(Debug)]
+pub(super) struct TermWriter {
+    wanted: watch::Sender<u64>,
+    answer: watch::Receiver<Answer>,
+    has_disk: bool,
+    /// The disk's last answer when it was found to hang.
+    hung_at: Option<Answer>,
+}
+
+/// The disk's answer to the last term that was handed to it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+struct Answer {
+    term: u64,
+    is_saved: bool,
+}
+
+/// Whether a term is kept, should the node restart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum TermState {
+    /// It is on disk.
+    Saved,
+    /// The disk refused it.
+    Refused,
+    /// The disk has not answered.
+    Unanswered,
+    /// There is no disk.
+    NoDisk,
+}
+
+/// The highest term that an earlier run of the node knew; 0 without any.
+pub fn saved_term(file: Option<&StateFile>) -> u64 {
+    file.and_then(|file| file.load(|_| true)).unwrap_or(0)
+}
+
+impl TermWriter {
+    /// A writer that ends, with what it was handed last on disk, after it is dropped; without a file it does nothing.
+    pub(super) fn new(file: Option<StateFile>) -> Self {
+        let (wanted, terms) = watch::channel(0);
+        let (answers, answer) = watch::channel(Answer::default());
+        let has_disk = file.is_some();
+        if let Some(file) = file {
+            tokio::spawn(write_all(file, terms, answers));
+        }
+        Self { wanted, answer, has_disk, hung_at: None }
+    }
+
+    /// Has a term written some time soon.
+    pub(super) fn save(&self, term: u64) {
+        self.wanted.send_replace(term);
+    }
+
+    /// Waits for the disk's answer to `term`, or to the last term handed in if that is lower. A disk that was found to hang
+    /// is not waited for again until it answers something.
+    pub(super) async fn wait_for(&mut self, term: u64) -> TermState {
+        let term = term.min(*self.wanted.borrow());
+        if !self.has_disk {
+            return TermState::NoDisk;
+        }
+        let before = *self.answer.borrow();
+        if before.term < term && self.hung_at == Some(before) {
+            return TermState::Unanswered;
+        }
+        let answered = self.answer.wait_for(|answer| answer.term >= term);
+        let answered = tokio::time::timeout(DISK_TIMEOUT, answered).await.ok().and_then(Result::ok);
+        match answered.map(|answer| answer.is_saved) {
+            Some(true) => TermState::Saved,
+            Some(false) => TermState::Refused,
+            None => {
+                tracing::warn!(term, "term not saved, the disk does not answer");
+                self.hung_at = Some(before);
+                TermState::Unanswered
+            }
+        }
+    }
+}
+
+async fn write_all(file: StateFile, mut terms: watch::Receiver<u64>, answers: watch::Sender<Answer>) {
+    let mut is_failing = false;
+    while terms.changed().await.is_ok() {
+        let term = *terms.borrow_and_update();
+        let writer = file.clone();
+        let written = tokio::task::spawn_blocking(move || writer.save(&term)).await;
+        let written = written.map_err(std::io::Error::other).flatten();
+        match &written {
+            Ok(()) if is_failing => tracing::info!(path = %file.path().display(), "term saved again"),
+            Err(error) if !is_failing => {
+                tracing::warn!(path = %file.path().display(), %error, "term not saved");
+            }
+            Ok(()) | Err(_) => {}
+        }
+        is_failing = written.is_err();
+        answers.send_replace(Answer { term, is_saved: !is_failing });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use ecod::names::NodeName;
+
+    use super::*;
+
+    fn file(directory: &Path) -> StateFile {
+        StateFile::new(directory, &NodeName::from_static("lot-1"), &NodeName::from_static("edge"), "term")
+    }
+
+    #[tokio::test]
+    async fn a_term_that_was_waited_for_is_on_disk() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut writer = TermWriter::new(Some(file(directory.path())));
+        for term in 1..20 {
+            writer.save(term);
+            assert_eq!(writer.wait_for(term).await, TermState::Saved);
+            assert_eq!(saved_term(Some(&file(directory.path()))), term);
+        }
+    }
+
+    #[tokio::test]
+    async fn a_disk_that_fails_holds_nobody_up() {
+        let directory = tempfile::tempdir().unwrap();
+        let occupied = directory.path().join("occupied");
+        std::fs::write(&occupied, b"").unwrap();
+        let mut writer = TermWriter::new(Some(file(&occupied)));
+        writer.save(3);
+        assert_eq!(writer.wait_for(3).await, TermState::Refused);
+        let mut without = TermWriter::new(None);
+        without.save(3);
+        assert_eq!(without.wait_for(3).await, TermState::NoDisk);
+    }
+
+    #[tokio::test]
+    async fn a_disk_that_hangs_is_waited_for_once() {
+        let (wanted, _terms) = watch::channel(3);
+        let (_answers, answer) = watch::channel(Answer::default());
+        let mut writer = TermWriter { wanted, answer, has_disk: true, hung_at: None };
+        let begun = tokio::time::Instant::now();
+        assert_eq!(writer.wait_for(3).await, TermState::Unanswered);
+        assert!(begun.elapsed() >= DISK_TIMEOUT);
+        let again = tokio::time::timeout(DISK_TIMEOUT / 2, writer.wait_for(3)).await;
+        assert_eq!(again, Ok(TermState::Unanswered));
+    }
+}

@@ -1,0 +1,300 @@
+//! Public side of the embedded broker: TLS, connection limits, and the principal of each client.
+//!
+//! ```text
+//! client ── TCP ──> admission ── TLS ──> CONNECT within time and size ──> loopback ──> rmqtt
+//!                    by source     certificate of the cell                registered with its principal
+//! ```
+//!
+//! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore listens on a free
+//! loopback port, and accepts only connections that the frontend has registered.
+
+use std::io;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::wire::{Limits, Topics};
+use rustls::pki_types::{CertificateDer, UnixTime};
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio::sync::{Semaphore, watch};
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout, timeout_at};
+use tokio_io_timeout::TimeoutStream;
+use tokio_rustls::TlsAcceptor;
+
+use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
+use super::permissions::LeaderCheck;
+use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
+use super::{BrokerConfig, connect_packet};
+use crate::platform::clock;
+use crate::telemetry::counters::{Counters, Event};
+use crate::transport::pki::{CertificateSubject, Credentials, LoadedCredentials};
+
+/// Rules of access to an embedded broker.
+#[derive(Clone)]
+pub struct AccessPolicy {
+    /// The node's certificates. Without them every client may log in and publish anything, within limits.
+    pub credentials: Option<Arc<Credentials>>,
+    /// The cell's topics.
+    pub topics: Topics,
+    /// Largest payloads that the cell's nodes accept.
+    pub limits: Limits,
+    /// Decides which node may publish maps, verdicts and reputations.
+    pub elected: LeaderCheck,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// Public side of a broker.
+pub(super) struct BrokerFrontend {
+    listener: TcpListener,
+    shared: Arc<FrontendState>,
+    current: Option<watch::Sender<Arc<LoadedCredentials>>>,
+    throttle: ConnectionThrottle,
+}
+
+struct FrontendState {
+    credentials: Option<Arc<Credentials>>,
+    principals: PrincipalRegistry,
+    /// Address of rmqtt's own listener.
+    behind: SocketAddr,
+    places: Arc<Semaphore>,
+    quota: ConnectionQuota,
+    handshake_timeout: Duration,
+    counters: Arc<Counters>,
+}
+
+/// Time between two checks for changed certificate files.
+const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Time between two checks of connected clients for expired certificates.
+const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
+
+/// Pause after `accept` failed, such as for lack of file descriptors.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
+
+/// Time after which a client that reads nothing is cut off.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(15);
+
+/// Time to deliver the rest to a client that has ended its side.
+const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
+
+impl BrokerFrontend {
+    /// A frontend on a listener, for a broker that listens at `behind`.
+    pub(super) fn new(listener: TcpListener, behind: SocketAddr, policy: &AccessPolicy, config: &BrokerConfig) -> Self {
+        let interval = Duration::from_secs(1) / config.connects_per_s;
+        let current = policy.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
+        let shared = FrontendState {
+            credentials: policy.credentials.clone(),
+            principals: PrincipalRegistry::default(),
+            behind,
+            places: Arc::new(Semaphore::new(config.max_clients)),
+            quota: ConnectionQuota::new(config.max_clients_each),
+            handshake_timeout: Duration::from_millis(config.handshake_timeout_ms),
+            counters: Arc::clone(&policy.counters),
+        };
+        Self {
+            listener,
+            shared: Arc::new(shared),
+            current,
+            throttle: ConnectionThrottle::new(config.connect_burst, interval, clock::now()),
+        }
+    }
+
+    /// Principals of the forwarded connections.
+    pub(super) fn principals(&self) -> PrincipalRegistry {
+        self.shared.principals.clone()
+    }
+
+    /// Accepts clients; never ends.
+    pub(super) async fn run(self) {
+        let mut looks = interval(RELOAD_INTERVAL);
+        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut checked = Instant::now();
+        loop {
+            tokio::select! {
+                accepted = self.listener.accept() => match accepted {
+                    Ok((stream, from)) => self.admit(stream, from),
+                    Err(error) => {
+                        tracing::debug!(%error, "connection not accepted");
+                        sleep(ACCEPT_PAUSE).await;
+                    }
+                },
+                _ = looks.tick() => self.look(&mut checked),
+            }
+        }
+    }
+
+    fn admit(&self, stream: TcpStream, from: SocketAddr) {
+        // With certificates even local clients are told apart.
+        let is_local = self.current.is_none() && from.ip().to_canonical().is_loopback();
+        let origin = if is_local { Origin::Local } else { Origin::Remote(from.ip()) };
+        let Some(slot) = self.throttle.admit(origin, clock::now()) else {
+            self.shared.counters.count(Event::ClientThrottled);
+            return;
+        };
+        let (shared, current) = (Arc::clone(&self.shared), self.current.as_ref().map(watch::Sender::subscribe));
+        tokio::spawn(async move {
+            if let Err(turned_away) = shared.serve(stream, from, current, slot).await {
+                turned_away.event().into_iter().for_each(|event| shared.counters.count(event));
+                tracing::debug!(%from, %turned_away, "client turned away");
+            }
+        });
+    }
+
+    /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
+    fn look(&self, checked: &mut Instant) {
+        let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) else { return };
+        let current = credentials.current();
+        if checked.elapsed() >= RECHECK_INTERVAL || !Arc::ptr_eq(&current, &sender.borrow()) {
+            *checked = Instant::now();
+            sender.send_replace(current);
+        }
+    }
+}
+
+/// Reason for which a client was refused or cut off.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ClientRejection {
+    #[error("left without a word, as nodes do that only test the port")]
+    Left,
+    #[error("no login in time")]
+    TimedOut,
+    #[error("no login before many newer connections of its address")]
+    Evicted,
+    #[error("not trusted: {0}")]
+    Untrusted(String),
+    #[error("not an MQTT login")]
+    Malformed,
+    #[error("as many clients as allowed are connected")]
+    Full,
+    #[error("as many clients as allowed are connected of this certificate or address")]
+    Crowded,
+    #[error("connection lost: {0}")]
+    Lost(#[from] io::Error),
+    #[error("certificate no longer valid: {0}")]
+    CertificateInvalidated(rustls::Error),
+}
+
+impl ClientRejection {
+    fn event(&self) -> Option<Event> {
+        match self {
+            Self::Left => None,
+            Self::TimedOut => Some(Event::ClientTimedOut),
+            Self::Evicted => Some(Event::ClientThrottled),
+            Self::Untrusted(_) => Some(Event::ClientUntrusted),
+            Self::Malformed | Self::Lost(_) => Some(Event::ClientMalformed),
+            Self::Full | Self::Crowded => Some(Event::ClientsFull),
+            Self::CertificateInvalidated(_) => Some(Event::ClientExpelled),
+        }
+    }
+}
+
+type Stream = Pin<Box<dyn Duplex>>;
+
+trait Duplex: AsyncRead + AsyncWrite + Send {}
+
+impl<T: AsyncRead + AsyncWrite + Send> Duplex for T {}
+
+impl FrontendState {
+    /// Serves one client from its first byte to its last.
+    async fn serve(
+        &self,
+        stream: TcpStream,
+        from: SocketAddr,
+        current: Option<watch::Receiver<Arc<LoadedCredentials>>>,
+        mut slot: LoginSlot,
+    ) -> Result<(), ClientRejection> {
+        stream.set_nodelay(true)?;
+        let mut stream = Box::pin(TimeoutStream::new(stream));
+        stream.as_mut().set_write_timeout_pinned(Some(WRITE_TIMEOUT));
+        let login = async {
+            if !matches!(stream.get_ref().peek(&mut [0]).await, Ok(1)) {
+                return Err(ClientRejection::Left);
+            }
+            let (mut stream, certificates) = match &current {
+                Some(current) => {
+                    let server = Arc::clone(&current.borrow().server);
+                    secure(stream, server).await?
+                }
+                None => (stream as Stream, Vec::new()),
+            };
+            let connect = connect_packet::read(&mut stream).await?;
+            Ok((stream, certificates, connect))
+        };
+        let login = tokio::select! {
+            login = timeout_at(Instant::now() + self.handshake_timeout, login) => login.unwrap_or(Err(ClientRejection::TimedOut)),
+            () = slot.evicted() => Err(ClientRejection::Evicted),
+        };
+        let (stream, certificates, connect) = login?;
+        let identity = certificates.first().map(|certificate| CertificateSubject::of(certificate)).transpose();
+        let identity = identity.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
+        let principal = Principal::new(identity, from.ip(), connect.has_generated_id);
+        let _part = self.quota.take(&principal).ok_or(ClientRejection::Crowded)?;
+        let _place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| ClientRejection::Full)?;
+
+        let socket = TcpSocket::new_v4()?;
+        socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
+        // Registered before rmqtt can ask for it, and until the port may be reused.
+        let _pass = self.principals.register(socket.local_addr()?, principal);
+        let mut behind = socket.connect(self.behind).await?;
+        behind.set_nodelay(true)?;
+        behind.write_all(&connect.packet).await?;
+        let _visit = slot.log_in();
+        tokio::select! {
+            () = relay(stream, behind) => Ok(()),
+            error = certificate_invalidated(current, &certificates) => Err(ClientRejection::CertificateInvalidated(error)),
+        }
+    }
+}
+
+/// The TLS handshake and the client's certificates.
+async fn secure(
+    stream: Pin<Box<TimeoutStream<TcpStream>>>,
+    server: Arc<rustls::ServerConfig>,
+) -> Result<(Stream, Vec<CertificateDer<'static>>), ClientRejection> {
+    let accepted = TlsAcceptor::from(server).accept(stream).await;
+    let stream = accepted.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
+    let certificates = stream.get_ref().1.peer_certificates().map(|chain| chain.to_vec());
+    let certificates = certificates.ok_or_else(|| ClientRejection::Untrusted("no certificate".into()))?;
+    Ok((Box::pin(stream), certificates))
+}
+
+/// Forwards bytes until either side ends. The rest for a client that has left is sent for a moment longer.
+async fn relay(client: Stream, broker: TcpStream) {
+    let (mut from_client, mut to_client) = tokio::io::split(client);
+    let (mut from_broker, mut to_broker) = broker.into_split();
+    let up = async {
+        let copied = tokio::io::copy(&mut from_client, &mut to_broker).await;
+        (copied.is_ok(), to_broker.shutdown().await.is_ok())
+    };
+    let down = async {
+        let copied = tokio::io::copy(&mut from_broker, &mut to_client).await;
+        (copied.is_ok(), to_client.shutdown().await.is_ok())
+    };
+    tokio::pin!(up, down);
+    tokio::select! {
+        ended = &mut down => tracing::trace!(?ended, "the broker ended the connection"),
+        ended = &mut up => {
+            let rest = timeout(FAREWELL_TIMEOUT, down).await;
+            tracing::trace!(?ended, ?rest, "the client ended the connection");
+        }
+    }
+}
+
+/// Waits until the client's certificate is no longer valid; the result is the reason.
+async fn certificate_invalidated(
+    current: Option<watch::Receiver<Arc<LoadedCredentials>>>,
+    certificates: &[CertificateDer<'static>],
+) -> rustls::Error {
+    if let (Some(mut current), Some((own, chain))) = (current, certificates.split_first()) {
+        while current.changed().await.is_ok() {
+            let verifier = Arc::clone(&current.borrow_and_update().clients);
+            if let Err(error) = verifier.verify_client_cert(own, chain, UnixTime::now()) {
+                return error;
+            }
+        }
+    }
+    std::future::pending().await
+}

@@ -1,0 +1,60 @@
+//! Detection of a broker thread that hangs.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use ecod::time::Timestamp;
+
+/// Heartbeat of a thread, checked from time to time.
+#[derive(Debug, Default)]
+pub(super) struct ThreadHeartbeat {
+    beats: Arc<AtomicU64>,
+    seen: u64,
+    checked_at: Timestamp,
+    missed: u32,
+}
+
+/// Time between two beats, and minimum time between two checks that count.
+pub(super) const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(200);
+
+/// Consecutive checks without a beat after which the thread hangs: some five seconds. Checks are counted instead of time,
+/// so that a stop of the whole process does not count.
+const MAX_MISSED_CHECKS: u32 = 25;
+
+impl ThreadHeartbeat {
+    /// The counter that the thread increments.
+    pub(super) fn beats(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.beats)
+    }
+
+    /// Checks the thread; true when it hangs.
+    pub(super) fn has_stopped(&mut self, now: Timestamp) -> bool {
+        let beats = self.beats.load(Ordering::Relaxed);
+        if beats != self.seen {
+            (self.seen, self.checked_at, self.missed) = (beats, now, 0);
+        } else if now.since(self.checked_at) >= HEARTBEAT_INTERVAL {
+            (self.checked_at, self.missed) = (now, self.missed + 1);
+        }
+        self.missed >= MAX_MISSED_CHECKS
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thread_hangs_when_it_misses_many_looks_in_a_row() {
+        let mut heartbeat = ThreadHeartbeat::default();
+        let beats = heartbeat.beats();
+        let mut lost_at = |from_ms: u64, step_ms: u64| {
+            beats.fetch_add(1, Ordering::Relaxed);
+            (1..200).map(|n| from_ms + n * step_ms).find(|ms| heartbeat.has_stopped(Timestamp(ms * 1000)))
+        };
+        let after = |from: u64, at: Option<u64>| at.map(|at| at - from);
+        assert_eq!(after(10_000, lost_at(10_000, 250)), Some(26 * 250));
+        assert_eq!(after(100_000, lost_at(100_000, 10)), None, "many looks at once are few");
+        assert_eq!(after(200_000, lost_at(200_000, 60_000)), Some(26 * 60_000), "a stopped process looks at nothing");
+    }
+}

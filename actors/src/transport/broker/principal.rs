@@ -1,0 +1,148 @@
+//! The principal behind each connection, and the quotas of principals.
+
+use std::collections::HashMap;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+
+use rmqtt::types::ClientId;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use crate::platform::throttle::host_network;
+use crate::transport::pki::CertificateSubject;
+
+/// Authenticated party of a connection: a node by its certificate, or else a host by its address.
+#[derive(Debug, Clone)]
+pub(super) struct Principal {
+    /// Absent without certificates.
+    pub(super) identity: Option<Arc<CertificateSubject>>,
+    /// Key under which its connections and messages count together. Absent for local clients without certificates: a
+    /// whole cell may run on this machine.
+    quota_key: Option<Arc<str>>,
+    /// Whether the broker draws the client id.
+    pub(super) has_generated_id: bool,
+}
+
+impl Principal {
+    pub(super) fn new(identity: Option<CertificateSubject>, from: IpAddr, has_generated_id: bool) -> Self {
+        let quota_key = match &identity {
+            Some(identity) => Some(identity.name().as_str().into()),
+            None if from.to_canonical().is_loopback() => None,
+            None => Some(host_network(from).to_string().into()),
+        };
+        Self { identity: identity.map(Arc::new), quota_key, has_generated_id }
+    }
+}
+
+/// Key under which messages are counted.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum QuotaKey {
+    /// The node, or the address.
+    Principal(Arc<str>),
+    /// The client id, for clients without a quota key.
+    Client(ClientId),
+}
+
+impl QuotaKey {
+    pub(super) fn as_str(&self) -> &str {
+        match self {
+            Self::Principal(principal) => principal,
+            Self::Client(client) => client,
+        }
+    }
+}
+
+/// Principals of the connections that the frontend forwards, by the frontend's local address.
+#[derive(Debug, Clone, Default)]
+pub(super) struct PrincipalRegistry(Arc<RwLock<HashMap<SocketAddr, Principal>>>);
+
+/// Entry of one connection in the registry; removed when dropped.
+pub(super) struct Registration {
+    principals: PrincipalRegistry,
+    address: SocketAddr,
+}
+
+impl PrincipalRegistry {
+    pub(super) fn register(&self, address: SocketAddr, principal: Principal) -> Registration {
+        self.0.write().unwrap_or_else(PoisonError::into_inner).insert(address, principal);
+        Registration { principals: self.clone(), address }
+    }
+
+    pub(super) fn principal(&self, address: Option<SocketAddr>) -> Option<Principal> {
+        self.0.read().unwrap_or_else(PoisonError::into_inner).get(&address?).cloned()
+    }
+
+    /// Key under which the messages of a client count.
+    pub(super) fn quota_key(&self, address: Option<SocketAddr>, client: &ClientId) -> QuotaKey {
+        let principals = self.0.read().unwrap_or_else(PoisonError::into_inner);
+        let quota_key = address.and_then(|address| principals.get(&address)?.quota_key.clone());
+        quota_key.map_or_else(|| QuotaKey::Client(client.clone()), QuotaKey::Principal)
+    }
+}
+
+impl Drop for Registration {
+    fn drop(&mut self) {
+        self.principals.0.write().unwrap_or_else(PoisonError::into_inner).remove(&self.address);
+    }
+}
+
+/// Limit of simultaneous connections of each principal.
+#[derive(Debug)]
+pub(super) struct ConnectionQuota {
+    limit: usize,
+    connections: Mutex<HashMap<Arc<str>, Arc<Semaphore>>>,
+}
+
+/// The place of one connection, free when dropped. Connections that do not count hold none.
+pub(super) type ConnectionPermit = Option<OwnedSemaphorePermit>;
+
+impl ConnectionQuota {
+    pub(super) fn new(limit: usize) -> Self {
+        Self { limit, connections: Mutex::default() }
+    }
+
+    /// A place for one more connection of the principal, if there is one left.
+    pub(super) fn take(&self, principal: &Principal) -> Option<ConnectionPermit> {
+        let Some(quota_key) = &principal.quota_key else { return Some(None) };
+        let mut connections = self.connections.lock().unwrap_or_else(PoisonError::into_inner);
+        connections.retain(|_, places| places.available_permits() < self.limit);
+        let places = connections.entry(Arc::clone(quota_key)).or_insert_with(|| Arc::new(Semaphore::new(self.limit)));
+        Arc::clone(places).try_acquire_owned().ok().map(Some)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(address: &str) -> Principal {
+        Principal::new(None, address.parse().unwrap(), false)
+    }
+
+    #[test]
+    fn connections_of_one_address_are_few_and_this_machines_are_not() {
+        let quota = ConnectionQuota::new(2);
+        let take = |address: &str| quota.take(&at(address));
+        let held = [take("10.0.0.1"), take("::ffff:10.0.0.1")];
+        assert!(held.iter().all(Option::is_some) && take("10.0.0.1").is_none());
+        assert!(take("10.0.0.2").is_some(), "another's share is its own");
+        let here: Vec<_> = (0..100).map_while(|_| take("127.0.0.1")).collect();
+        assert_eq!(here.len(), 100);
+        drop(held);
+        assert!(take("10.0.0.1").is_some() && take("10.0.0.3").is_some());
+        assert_eq!(quota.connections.lock().unwrap().len(), 1, "who has left is forgotten");
+    }
+
+    #[test]
+    fn messages_count_by_principal_whatever_the_client_calls_itself() {
+        let principals = PrincipalRegistry::default();
+        let port = |port| SocketAddr::from(([127, 0, 0, 1], port));
+        let holders = ["10.0.0.1", "10.0.0.1", "10.0.0.2", "127.0.0.1", "127.0.0.1"].map(at);
+        let _issued: Vec<_> =
+            (1..).zip(holders).map(|(n, principal)| principals.register(port(n), principal)).collect();
+        let quota_key = |n: u16| principals.quota_key(Some(port(n)), &ClientId::from(format!("client-{n}")));
+        assert_eq!(quota_key(1), quota_key(2));
+        assert_ne!(quota_key(1), quota_key(3));
+        assert_ne!(quota_key(4), quota_key(5), "this machine's are told apart by their names");
+        assert_eq!(quota_key(6), QuotaKey::Client("client-6".into()), "and those behind no frontend");
+    }
+}

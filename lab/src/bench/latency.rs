@@ -1,0 +1,83 @@
+//! Distribution of latencies.
+
+use std::time::Instant;
+
+use hdrhistogram::Histogram;
+use serde::Serialize;
+
+use super::two_hop::latencies;
+
+/// Answers of a cell with their latencies.
+#[derive(Debug, Clone)]
+pub struct Latencies {
+    /// Nanoseconds. What never came back counts with the time for which it was waited.
+    pub histogram: Histogram<u64>,
+    /// Answers that never came.
+    pub missing: u64,
+}
+
+/// Latencies of one kind of answer.
+#[derive(Debug, Clone, Default)]
+pub struct Answers {
+    /// As maps.
+    pub map: Latencies,
+    /// As verdicts; empty where nobody votes.
+    pub verdict: Latencies,
+}
+
+/// Quantiles of a distribution.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Quantiles {
+    /// Median in microseconds.
+    pub p50_us: f64,
+    /// 99 of 100 take at most as many microseconds.
+    pub p99_us: f64,
+    /// 999 of 1000 take at most as many microseconds.
+    pub p999_us: f64,
+    /// Number of answers.
+    pub n: u64,
+    /// Number of answers that never came.
+    pub missing: u64,
+}
+
+impl Default for Latencies {
+    fn default() -> Self {
+        Self { histogram: latencies(), missing: 0 }
+    }
+}
+
+impl Latencies {
+    /// Takes those of another run in.
+    pub fn add(&mut self, other: &Self) {
+        // Both have the same bounds.
+        self.histogram.add(&other.histogram).unwrap_or_default();
+        self.missing += other.missing;
+    }
+
+    /// Takes in one answer that was due, or the time for which it was waited.
+    pub(super) fn take(&mut self, due: Instant, arrival: Option<Instant>, waited_until: Instant) {
+        self.missing += u64::from(arrival.is_none());
+        let taken = arrival.unwrap_or(waited_until).saturating_duration_since(due);
+        self.histogram.saturating_record(u64::try_from(taken.as_nanos()).unwrap_or(u64::MAX));
+    }
+
+    /// Usual quantiles of the distribution.
+    pub fn quantiles(&self) -> Quantiles {
+        let micros = |quantile| self.histogram.value_at_quantile(quantile) as f64 / 1000.0;
+        Quantiles {
+            p50_us: micros(0.5),
+            p99_us: micros(0.99),
+            p999_us: micros(0.999),
+            n: self.histogram.len(),
+            missing: self.missing,
+        }
+    }
+}
+
+impl Answers {
+    /// Takes those of another run in.
+    pub fn add(&mut self, other: &Self) {
+        self.map.add(&other.map);
+        self.verdict.add(&other.verdict);
+    }
+}

@@ -1,0 +1,63 @@
+//! The command line of `ecod-lab`.
+
+mod bench;
+mod columns;
+mod demo;
+mod eval;
+mod report;
+mod testbed;
+
+use std::fs;
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use clap::{Parser, Subcommand};
+use ecod_actors::cli::{LogFormat, exit, start_log};
+use serde::Serialize;
+
+/// Measures and shows a cell of ECOD; its nodes are the program `ecod-node`, which lies beside this one.
+#[derive(Debug, Parser)]
+#[command(name = "ecod-lab", version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    /// Form of the log; RUST_LOG sets what is in it
+    #[arg(long, global = true, value_enum, value_name = "FORM", default_value_t)]
+    log_format: LogFormat,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run a whole cell on this machine, as separate processes, and print what it saw
+    Demo(demo::DemoArguments),
+    /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
+    Testbed(testbed::TestbedArguments),
+    /// Measure a live cell under simulated vehicles: latency beside the bare broker, capacity, costs
+    Bench(bench::BenchArguments),
+    /// Write one page about a log, as `ecod-node report`, judged by what is true
+    Report(report::ReportArguments),
+    /// Judge the output of a replay by what is true
+    Eval(eval::EvalArguments),
+}
+
+/// Runs the program with the process's arguments.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    start_log(cli.log_format, false, "warn");
+    let outcome = match cli.command {
+        Command::Demo(arguments) => demo::run(&arguments),
+        Command::Testbed(arguments) => testbed::run(&arguments),
+        Command::Bench(arguments) => bench::run(&arguments),
+        Command::Report(arguments) => report::run(&arguments),
+        Command::Eval(arguments) => eval::run(&arguments),
+    };
+    exit("ecod-lab", outcome)
+}
+
+/// Writes JSON for programs.
+fn write_json(path: &Path, value: &impl Serialize) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string_pretty(value)?;
+    text.push('\n');
+    fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}

@@ -1,0 +1,40 @@
+//! `ecod-lab report`: a log as one page, judged by what is true.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use clap::Args;
+use ecod_actors::cli::{Failure, PageArguments, page};
+use ecod_actors::observe::report::Report;
+
+use crate::eval::Truth;
+use crate::eval::tracks::TrackTruth;
+use crate::report::{judged_by, judged_by_tracks};
+
+/// Flags of `report`.
+#[derive(Debug, Args)]
+pub(super) struct ReportArguments {
+    #[command(flatten)]
+    page: PageArguments,
+    /// What really stands at each location (JSON, or CSV with the columns item,truth), or where all objects were (JSON)
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+}
+
+pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
+    let truth = arguments.truth.as_deref();
+    let report = truth.map_or_else(|| Ok(Report::default()), judged).map_err(Failure::usage)?;
+    page(&arguments.page, report, truth, "ecod-lab")
+}
+
+/// A report that judges by the truth in this file.
+fn judged(path: &Path) -> anyhow::Result<Report> {
+    let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let truth = || format!("truth {}", path.display());
+    Ok(if TrackTruth::is_in(&text) {
+        judged_by_tracks(TrackTruth::parse(&text).with_context(truth)?)
+    } else {
+        judged_by(Truth::parse(&text).with_context(truth)?)
+    })
+}

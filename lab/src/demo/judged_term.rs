@@ -1,0 +1,106 @@
+//! Terms of a cell's leaders, and how long its vehicles waited at each change.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use ecod::epoch::Epoch;
+use ecod::time::Timestamp;
+use ecod::wire::GlobalMap;
+use ecod_actors::messages::newest::ReceivedMap;
+
+use crate::testbed::score::SpotScore;
+use crate::testbed::{Scene, Testbed};
+
+/// A leadership as the vehicles saw it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct JudgedTerm {
+    /// Leader and term.
+    pub epoch: Epoch,
+    /// When the first vehicle took the first map.
+    pub from: Timestamp,
+    /// When the last vehicle took the last map.
+    pub until: Timestamp,
+    /// Longest time that a vehicle waited from the last map of another leader to the first of this one; none when there
+    /// was no other.
+    pub gap: Option<Duration>,
+    /// Accuracy of the maps.
+    pub score: SpotScore,
+}
+
+/// All leaderships in the order of their terms, from what each vehicle took in its order.
+pub(super) fn judged_terms<'a>(
+    testbed: &Testbed,
+    scene: &Scene,
+    vehicles: impl IntoIterator<Item = &'a [ReceivedMap]>,
+) -> Vec<JudgedTerm> {
+    let mut terms: BTreeMap<Epoch, (JudgedTerm, BTreeMap<u64, &GlobalMap>)> = BTreeMap::new();
+    for maps in vehicles {
+        let mut before: Option<(Epoch, Timestamp)> = None;
+        for ReceivedMap { received_at, map } in maps {
+            let epoch = Epoch::new(map.epoch, map.aggregator.clone());
+            let waited = before.filter(|(last, _)| *last != epoch).map(|(_, at)| received_at.since(at));
+            let (term, rounds) = terms.entry(epoch.clone()).or_insert_with(|| {
+                let (from, until) = (*received_at, *received_at);
+                (
+                    JudgedTerm { epoch: epoch.clone(), from, until, gap: None, score: SpotScore::default() },
+                    BTreeMap::new(),
+                )
+            });
+            term.from = term.from.min(*received_at);
+            term.until = term.until.max(*received_at);
+            term.gap = term.gap.max(waited);
+            rounds.insert(map.round, map);
+            before = Some((epoch, *received_at));
+        }
+    }
+    let judged = |(mut term, rounds): (JudgedTerm, BTreeMap<u64, &GlobalMap>)| {
+        rounds.values().for_each(|map| term.score.judge(testbed, scene, map));
+        term
+    };
+    terms.into_values().map(judged).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ecod::names::NodeName;
+    use ecod::wire::SCHEMA_VERSION;
+
+    use super::*;
+
+    const SCENES: &str = include_str!("../../../examples/testbed/pace_setup1.json");
+
+    fn taken(leader: &str, epoch: u64, round: u64, at_ms: u64) -> ReceivedMap {
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::new(leader).unwrap(),
+            epoch,
+            round,
+            fused_at_us: Timestamp(at_ms * 1000),
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+            pose_corrections: Default::default(),
+        };
+        ReceivedMap { received_at: Timestamp(at_ms * 1000), map: Arc::new(map) }
+    }
+
+    #[test]
+    fn the_gap_of_a_term_is_that_of_the_vehicle_that_waited_longest() {
+        let testbed = Testbed::from_json(SCENES).unwrap();
+        let quick = [taken("edge", 1, 1, 0), taken("edge", 1, 2, 100), taken("euclid", 2, 3, 210)];
+        let slow = [taken("edge", 1, 1, 5), taken("euclid", 2, 4, 320), taken("edge", 3, 5, 400)];
+        let terms = judged_terms(&testbed, &testbed.scenes[0], [&quick[..], &slow[..]]);
+        let told = |term: &JudgedTerm| {
+            let (from, until) = (term.from.micros() / 1000, term.until.micros() / 1000);
+            (term.epoch.to_string(), from, until, term.gap.map(|gap| gap.as_millis()))
+        };
+        let expected = [
+            ("edge@1".to_owned(), 0, 100, None),
+            ("euclid@2".to_owned(), 210, 320, Some(315)),
+            ("edge@3".to_owned(), 400, 400, Some(80)),
+        ];
+        assert_eq!(terms.iter().map(told).collect::<Vec<_>>(), expected);
+    }
+}

@@ -1,0 +1,248 @@
+//! Accuracy of maps and verdicts, beside majority vote and every vehicle alone.
+//!
+//! An item is one location for as long as its truth stays the same. It is judged by the last label that was given for
+//! it in that time, `null` if there was none; where nothing stands, by the last entry. Beside this, every entry of
+//! every line counts in [`Scores::rounds`]. Baselines need the reports: all votes on an item count alike, a vehicle
+//! alone is the majority of its own votes, ties count as the chance of drawing the right label among the first.
+//!
+//! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines, [`Evaluation::report`] with
+//! every report, in any order; then [`Evaluation::result`].
+
+pub mod tracks;
+mod truth;
+mod votes;
+
+use std::collections::BTreeMap;
+
+use ecod::landmark::{LandmarkGate, LandmarkIndex};
+use ecod::names::{Label, LandmarkId, NodeName};
+use ecod::replay::FusedLine;
+use ecod::time::Timestamp;
+use ecod::wire::{ObjectReport, ReportKind};
+use serde::Serialize;
+
+pub use truth::{Truth, TruthError};
+pub use votes::VehicleScores;
+
+use truth::Span;
+use votes::Votes;
+
+/// A location and the position of a span among its truths.
+type Item = (LandmarkId, usize);
+
+/// Result of an evaluation.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EvalResult {
+    /// Of maps; absent without any map or PACE report.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pace: Option<Scores>,
+    /// Of verdicts; absent without any verdict or VOTE report.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vote: Option<Scores>,
+}
+
+/// Accuracy of one algorithm. Shares are percentages; `None` where nothing could be judged.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Scores {
+    /// Maps, or sets of verdicts, that were read.
+    pub lines: u64,
+    /// Items that were judged: all that the truth names and that a line could speak of.
+    pub items: u64,
+    /// Right items of all; one without a label counts as wrong unless nothing stands there.
+    pub accuracy_pct: Option<f64>,
+    /// Items at which something stands and a label was given, of all at which something stands.
+    pub coverage_pct: Option<f64>,
+    /// Right items of those that were given a label.
+    pub labelled_accuracy_pct: Option<f64>,
+    /// Every entry of every line.
+    pub rounds: RoundScores,
+    /// Expected accuracy of the majority of all votes; with reports only.
+    pub majority_accuracy_pct: Option<f64>,
+    /// Every vehicle alone; with reports only.
+    pub vehicles: BTreeMap<NodeName, VehicleScores>,
+    /// Confusion matrix by item, correct labels included.
+    pub confusion: Vec<ConfusionCell>,
+}
+
+/// Entries of all lines.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct RoundScores {
+    /// Entries whose truth is known.
+    pub entries: u64,
+    /// Right ones.
+    pub right: u64,
+    /// Right ones in percent.
+    pub accuracy_pct: Option<f64>,
+}
+
+/// One cell of a confusion matrix.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ConfusionCell {
+    /// The first accepted label; null where nothing stands.
+    pub truth: Option<Label>,
+    /// Label that was given; null for none.
+    pub said: Option<Label>,
+    /// Items.
+    pub count: u64,
+}
+
+/// Takes a replay's output and its reports apart; see the module.
+#[derive(Debug, Clone)]
+pub struct Evaluation {
+    truth: Truth,
+    cell: Option<(LandmarkIndex, LandmarkGate)>,
+    synonyms: BTreeMap<Label, Label>,
+    pace: Tally,
+    vote: Tally,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Tally {
+    lines: u64,
+    rounds: RoundScores,
+    /// By item the last label given, and the last entry.
+    last: BTreeMap<Item, Last>,
+    votes: Votes,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Last {
+    labelled: Option<Label>,
+    entry: Option<Label>,
+}
+
+impl Scores {
+    /// The shares of a summary's row in percent: accuracy, coverage, accuracy where labelled, that of all lines, and of
+    /// the majority.
+    pub fn shares_pct(&self) -> [Option<f64>; 5] {
+        let Self { accuracy_pct, coverage_pct, labelled_accuracy_pct, rounds, majority_accuracy_pct, .. } = self;
+        [*accuracy_pct, *coverage_pct, *labelled_accuracy_pct, rounds.accuracy_pct, *majority_accuracy_pct]
+    }
+}
+
+impl Evaluation {
+    /// Nothing read yet.
+    pub fn new(truth: Truth) -> Self {
+        Self { truth, cell: None, synonyms: BTreeMap::new(), pace: Tally::default(), vote: Tally::default() }
+    }
+
+    /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
+    #[must_use]
+    pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: LandmarkGate) -> Self {
+        self.cell = Some((landmarks, gate));
+        self
+    }
+
+    /// Translates votes by the cell's synonyms, as VOTE does where a location has none of its own.
+    #[must_use]
+    pub fn with_synonyms(mut self, synonyms: BTreeMap<Label, Label>) -> Self {
+        self.synonyms = synonyms;
+        self
+    }
+
+    /// Judges one line of output.
+    pub fn fused(&mut self, line: &FusedLine) {
+        match line {
+            FusedLine::Map(map) => {
+                let entries = map.landmarks.iter().map(|state| (&state.id, state.label.as_ref()));
+                self.pace.judge(&self.truth, map.fused_at_us, entries);
+            }
+            FusedLine::Verdicts(verdicts) => {
+                let entries = verdicts.verdicts.iter().map(|verdict| (&verdict.landmark, verdict.label.as_ref()));
+                self.vote.judge(&self.truth, verdicts.fused_at_us, entries);
+            }
+        }
+    }
+
+    /// Counts one report's votes, at the time of its capture.
+    pub fn report(&mut self, kind: ReportKind, report: &ObjectReport) {
+        let (votes, synonyms) = match kind {
+            ReportKind::Detections => (&mut self.pace.votes, None),
+            ReportKind::VoteDetections => (&mut self.vote.votes, Some(&self.synonyms)),
+        };
+        for object in &report.objects {
+            let place = self.cell.as_ref().and_then(|(landmarks, gate)| votes::place(object, landmarks, gate));
+            let Some(id) = object.landmark.as_ref().or(place.map(|landmark| &landmark.id)) else { continue };
+            let synonym = place.and_then(|place| place.synonym(&object.label));
+            let label = synonym.or_else(|| synonyms?.get(&object.label)).unwrap_or(&object.label);
+            if let Some((span, truth)) = self.truth.at(id, report.captured_at_us) {
+                votes.count(&report.node, (id.clone(), span), label, self.truth.accepts(truth, Some(label)));
+            }
+        }
+    }
+
+    /// The figures so far.
+    pub fn result(&self) -> EvalResult {
+        EvalResult { pace: self.pace.scores(&self.truth), vote: self.vote.scores(&self.truth) }
+    }
+}
+
+impl Tally {
+    fn judge<'a>(
+        &mut self,
+        truth: &Truth,
+        at: Timestamp,
+        entries: impl Iterator<Item = (&'a LandmarkId, Option<&'a Label>)>,
+    ) {
+        self.lines += 1;
+        for (id, label) in entries {
+            let Some((number, span)) = truth.at(id, at) else { continue };
+            self.rounds.entries += 1;
+            self.rounds.right += u64::from(truth.accepts(span, label));
+            let last = self.last.entry((id.clone(), number)).or_default();
+            last.entry = label.cloned();
+            if label.is_some() {
+                last.labelled = label.cloned();
+            }
+        }
+    }
+
+    fn scores(&self, truth: &Truth) -> Option<Scores> {
+        if self.lines == 0 && self.votes.is_empty() {
+            return None;
+        }
+        let (mut items, mut right, mut labelled, mut labelled_right) = (0, 0, 0, 0);
+        let (mut standing, mut covered) = (0, 0);
+        let mut confusion: BTreeMap<(Option<Label>, Option<Label>), u64> = BTreeMap::new();
+        for (id, number, span) in truth.spans() {
+            let said = self.last.get(&(id.clone(), number)).and_then(|last| last.said(truth, span));
+            let is_right = u64::from(truth.accepts(span, said));
+            items += 1;
+            right += is_right;
+            if said.is_some() {
+                labelled += 1;
+                labelled_right += is_right;
+            }
+            if !truth.accepts(span, None) {
+                standing += 1;
+                covered += u64::from(said.is_some());
+            }
+            *confusion.entry((span.name().cloned(), said.cloned())).or_default() += 1;
+        }
+        let entry = |((truth, said), count)| ConfusionCell { truth, said, count };
+        Some(Scores {
+            lines: self.lines,
+            items,
+            accuracy_pct: percent(right as f64, items),
+            coverage_pct: percent(covered as f64, standing),
+            labelled_accuracy_pct: percent(labelled_right as f64, labelled),
+            rounds: RoundScores { accuracy_pct: percent(self.rounds.right as f64, self.rounds.entries), ..self.rounds },
+            majority_accuracy_pct: self.votes.majority_accuracy_pct(truth),
+            vehicles: self.votes.vehicles(truth),
+            confusion: confusion.into_iter().map(entry).collect(),
+        })
+    }
+}
+
+impl Last {
+    fn said(&self, truth: &Truth, span: &Span) -> Option<&Label> {
+        if truth.accepts(span, None) { self.entry.as_ref() } else { self.labelled.as_ref() }
+    }
+}
+
+fn percent(part: f64, whole: u64) -> Option<f64> {
+    (whole > 0).then(|| 100.0 * part / whole as f64)
+}
+
+#[cfg(test)]
+mod tests;

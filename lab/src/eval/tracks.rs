@@ -1,0 +1,258 @@
+//! Accuracy of the objects of maps: detection, localisation and identity against a truth that moves.
+//!
+//! An object of a map can be taken for a true one of the same label that is near enough. Detection is judged by average
+//! precision at four distances and by the best F1; then, at a threshold on the confidence, by MODA and MODP, CLEAR MOT,
+//! IDF1 and HOTA. Definitions and sources stand with each part; `docs/evaluation.md` has them together.
+//!
+//! Call [`TrackEvaluation::map`] with every map of a replay, in order, then [`TrackEvaluation::result`]. Output of
+//! other programs is judged by [`score`].
+
+mod clear;
+mod hota;
+mod identity;
+mod matching;
+mod precision;
+#[cfg(test)]
+mod tests;
+mod truth;
+
+use std::collections::BTreeMap;
+
+use ecod::names::Label;
+use ecod::time::Timestamp;
+use ecod::wire::GlobalMap;
+use hashbrown::HashMap;
+use nalgebra::Point2;
+use serde::Serialize;
+use uuid::Uuid;
+
+pub use truth::{TrackTruth, TrackTruthError};
+
+use super::percent;
+
+/// Distances in metres at which average precision is given.
+pub const AP_DISTANCES_M: [f64; 4] = [0.5, 1.0, 2.0, 4.0];
+
+/// Distance in metres up to which an object can be taken for a true one, in all but average precision and HOTA.
+pub const MATCH_DISTANCE_M: f64 = 2.0;
+
+/// Distance in metres at which two places are no longer similar at all; HOTA averages over distances below it. At half
+/// of it the similarity 1 − d/d₀ is 0.5, the usual threshold, at [`MATCH_DISTANCE_M`].
+pub const ZERO_DISTANCE_M: f64 = 2.0 * MATCH_DISTANCE_M;
+
+/// Confidence from which an object counts when nobody chooses.
+pub const DEFAULT_THRESHOLD: f64 = 0.5;
+
+/// Share of a frame period that a map may be from a frame. Half of it would leave frames without a map wherever rounds
+/// jitter about the middle between two frames; a whole one would not see that a map is missing.
+const REACH: f64 = 0.75;
+
+/// One moment: what stood where, and what was said.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Frame {
+    /// True objects, each id once.
+    pub truth: Vec<TrueObject>,
+    /// Objects of the map, each id once.
+    pub said: Vec<SaidObject>,
+}
+
+/// An object that was there.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrueObject {
+    /// Its identity; small numbers, they count places in tables.
+    pub id: u32,
+    /// Its class.
+    pub label: Label,
+    /// Its centre in metres.
+    pub position: Point2<f64>,
+}
+
+/// An object that was said to be there.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SaidObject {
+    /// The identity it was given; small numbers, they count places in tables.
+    pub id: u32,
+    /// The class it was given.
+    pub label: Label,
+    /// Confidence that it is there; only the order matters to average precision.
+    pub score: f64,
+    /// Its centre in metres.
+    pub position: Point2<f64>,
+}
+
+/// Result of an evaluation. Shares are percentages; `None` where nothing could be judged.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TrackScores {
+    /// Frames of the truth.
+    pub frames: u64,
+    /// Those with a map; all objects of the others are missed.
+    pub frames_with_map: u64,
+    /// True objects, each in every frame.
+    pub objects: u64,
+    /// Objects that were said, whatever their confidence, in the frames.
+    pub said: u64,
+    /// Average precision at [`AP_DISTANCES_M`], the mean over the classes of the truth.
+    pub ap_pct: [Option<f64>; AP_DISTANCES_M.len()],
+    /// Average precision at [`AP_DISTANCES_M`] of every class.
+    pub class_ap_pct: BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]>,
+    /// Greatest F1 at [`MATCH_DISTANCE_M`] over all thresholds, all classes together.
+    pub best_f1_pct: Option<f64>,
+    /// At the threshold of the greatest F1.
+    pub at_best_f1: ThresholdScores,
+    /// At [`DEFAULT_THRESHOLD`].
+    pub at_default: ThresholdScores,
+}
+
+/// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes
+/// together.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ThresholdScores {
+    /// The threshold.
+    pub threshold: f64,
+    /// Objects said that were taken for a true one.
+    pub matches: u64,
+    /// Objects said that were not.
+    pub false_alarms: u64,
+    /// True objects that none was taken for.
+    pub misses: u64,
+    /// Times that a true object was given another identity than before.
+    pub id_switches: u64,
+    /// Detection accuracy 1 − (misses + false alarms) / objects; below zero with many false alarms.
+    pub moda_pct: Option<f64>,
+    /// Detection precision, mean of 1 − d/[`MATCH_DISTANCE_M`] over the matches.
+    pub modp_pct: Option<f64>,
+    /// Tracking accuracy 1 − (misses + false alarms + switches) / objects.
+    pub mota_pct: Option<f64>,
+    /// Mean distance of the matches in metres.
+    pub motp_m: Option<f64>,
+    /// F1 of identities that are one to one over the whole time.
+    pub idf1_pct: Option<f64>,
+    /// Higher order tracking accuracy.
+    pub hota_pct: Option<f64>,
+    /// Its part of detection.
+    pub deta_pct: Option<f64>,
+    /// Its part of association.
+    pub assa_pct: Option<f64>,
+    /// Mean similarity of what it matched.
+    pub loca_pct: Option<f64>,
+}
+
+/// Judges frames that follow each other in time.
+pub fn score(frames: &[Frame]) -> TrackScores {
+    let count = |of: fn(&Frame) -> usize| frames.iter().map(|frame| of(frame) as u64).sum();
+    let class_ap_pct = precision::by_class(frames);
+    let mean = |place: usize| {
+        let all: Vec<f64> = class_ap_pct.values().filter_map(|ap| ap[place]).collect();
+        percent(all.iter().sum::<f64>() / 100.0, all.len() as u64)
+    };
+    let best = precision::best_f1(frames);
+    TrackScores {
+        frames: frames.len() as u64,
+        frames_with_map: frames.len() as u64,
+        objects: count(|frame| frame.truth.len()),
+        said: count(|frame| frame.said.len()),
+        ap_pct: std::array::from_fn(mean),
+        class_ap_pct,
+        best_f1_pct: best.map(|best| 100.0 * best.f1),
+        at_best_f1: at_threshold(frames, best.map_or(DEFAULT_THRESHOLD, |best| best.threshold)),
+        at_default: at_threshold(frames, DEFAULT_THRESHOLD),
+    }
+}
+
+fn at_threshold(frames: &[Frame], threshold: f64) -> ThresholdScores {
+    let kept = |frame: &Frame| {
+        let said = frame.said.iter().filter(|said| said.score >= threshold).cloned().collect();
+        Frame { truth: frame.truth.clone(), said }
+    };
+    let frames: Vec<Frame> = frames.iter().map(kept).collect();
+    let clear = clear::judge(&frames);
+    let identity = identity::judge(&frames);
+    let hota = hota::judge(&frames);
+    let objects = clear.matches + clear.misses;
+    let wrong = (clear.misses + clear.false_alarms) as f64;
+    let share = |part: f64| (objects > 0).then_some(100.0 * part);
+    let motp_m = (clear.matches > 0).then(|| clear.distance_sum_m / clear.matches as f64);
+    ThresholdScores {
+        threshold,
+        matches: clear.matches,
+        false_alarms: clear.false_alarms,
+        misses: clear.misses,
+        id_switches: clear.id_switches,
+        moda_pct: percent(objects as f64 - wrong, objects),
+        modp_pct: motp_m.map(|mean| 100.0 * (1.0 - mean / MATCH_DISTANCE_M)),
+        mota_pct: percent(objects as f64 - wrong - clear.id_switches as f64, objects),
+        motp_m,
+        idf1_pct: share(identity.f1()),
+        hota_pct: share(hota.hota),
+        deta_pct: share(hota.deta),
+        assa_pct: share(hota.assa),
+        loca_pct: share(hota.loca),
+    }
+}
+
+/// Takes the maps of a replay apart; see the module.
+///
+/// A map says what stands where at its `fused_at_us`. A frame is judged by the map nearest in time, the later of two as
+/// near, if it is within three quarters of a frame period, the median of the truth; and by where the true objects were
+/// at the time of the map, on a straight line between the two frames about it. Without a map, all objects of a frame
+/// are missed.
+#[derive(Debug, Clone)]
+pub struct TrackEvaluation {
+    truth: TrackTruth,
+    reach_us: i64,
+    /// By frame, the nearest map so far.
+    maps: Vec<Option<(Timestamp, Vec<SaidObject>)>>,
+    ids: HashMap<Uuid, u32>,
+}
+
+impl TrackEvaluation {
+    /// Nothing read yet.
+    pub fn new(truth: TrackTruth) -> Self {
+        let reach_us = (REACH * truth.period_us() as f64) as i64;
+        Self { maps: vec![None; truth.frames().len()], truth, reach_us, ids: HashMap::new() }
+    }
+
+    /// Takes the next map.
+    pub fn map(&mut self, map: &GlobalMap) {
+        let ids = &mut self.ids;
+        let said = map.objects.iter().map(|object| {
+            let fresh = ids.len() as u32;
+            SaidObject {
+                id: *ids.entry(object.id).or_insert(fresh),
+                label: object.label.clone(),
+                score: object.confidence,
+                position: Point2::new(object.x_m, object.y_m),
+            }
+        });
+        let said: Vec<SaidObject> = said.collect();
+        self.said(map.fused_at_us, &said);
+    }
+
+    /// Takes what was said, in any other way, to be there at a time.
+    pub fn said(&mut self, at: Timestamp, said: &[SaidObject]) {
+        let frames = self.truth.frames();
+        let first = frames.partition_point(|frame| at.micros_from(frame.at) > self.reach_us);
+        let near = frames[first..].iter().take_while(|frame| frame.at.micros_from(at) <= self.reach_us);
+        for (frame, nearest) in near.zip(&mut self.maps[first..]) {
+            let distance = |time: Timestamp| frame.at.micros_from(time).abs();
+            if nearest.as_ref().is_none_or(|(other, _)| distance(*other) >= distance(at)) {
+                *nearest = Some((at, said.to_owned()));
+            }
+        }
+    }
+
+    /// The figures.
+    pub fn result(self) -> TrackScores {
+        let with_map = self.maps.iter().flatten().count() as u64;
+        let frames: Vec<Frame> = self
+            .maps
+            .into_iter()
+            .enumerate()
+            .map(|(number, map)| match map {
+                Some((at, said)) => Frame { truth: self.truth.at(number, at), said },
+                None => Frame { truth: self.truth.frames()[number].objects.clone(), said: Vec::new() },
+            })
+            .collect();
+        TrackScores { frames_with_map: with_map, ..score(&frames) }
+    }
+}

@@ -1,0 +1,53 @@
+//! The best one-to-one matching of what was said with what is true.
+
+use ecod::association::{Candidate, assign};
+
+use super::{Frame, SaidObject, TrueObject};
+
+/// A true object and one that was said, by their places in a frame or in a table of identities.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Pair {
+    pub(super) truth: usize,
+    pub(super) said: usize,
+    /// Similarity of the pair, or its distance.
+    pub(super) value: f64,
+}
+
+/// Distance in metres if one may be taken for the other.
+pub(super) fn distance_m(truth: &TrueObject, said: &SaidObject, limit_m: f64) -> Option<f64> {
+    let distance_m = (truth.position - said.position).norm();
+    (distance_m <= limit_m && truth.label == said.label).then_some(distance_m)
+}
+
+/// All pairs of a frame within `limit_m`, with their distance.
+pub(super) fn near_pairs(frame: &Frame, limit_m: f64) -> Vec<Pair> {
+    let mut pairs = Vec::new();
+    for (said, object) in frame.said.iter().enumerate() {
+        let of_said = frame.truth.iter().enumerate().filter_map(|(truth, candidate)| {
+            distance_m(candidate, object, limit_m).map(|value| Pair { truth, said, value })
+        });
+        pairs.extend(of_said);
+    }
+    pairs
+}
+
+/// The one-to-one choice of pairs whose values have the greatest sum; pairs worth nothing are never chosen.
+pub(super) fn best(pairs: &[Pair]) -> Vec<Pair> {
+    assign(pairs.iter().copied().filter(|pair| pair.benefit() > 0).collect(), |_, _| None)
+}
+
+impl Candidate for Pair {
+    fn row(&self) -> u32 {
+        self.truth as u32
+    }
+
+    fn column(&self) -> u32 {
+        self.said as u32
+    }
+
+    /// The value in units of 2⁻³².
+    fn benefit(&self) -> i64 {
+        const UNIT: f64 = (1i64 << 32) as f64;
+        (self.value * UNIT) as i64
+    }
+}

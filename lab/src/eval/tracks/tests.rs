@@ -1,0 +1,169 @@
+use ecod::geometry::Covariance;
+use ecod::names::NodeName;
+use ecod::wire::{FusedObject, SCHEMA_VERSION};
+
+use super::matching::Pair;
+use super::*;
+
+fn truth(id: u32, x: f64) -> TrueObject {
+    TrueObject { id, label: "car".into(), position: Point2::new(x, 0.0) }
+}
+
+fn said(id: u32, x: f64, score: f64) -> SaidObject {
+    SaidObject { id, label: "car".into(), score, position: Point2::new(x, 0.0) }
+}
+
+fn near(found: Option<f64>, expected: f64) {
+    assert!(found.is_some_and(|found| (found - expected).abs() < 1e-9), "{found:?} is not {expected}");
+}
+
+#[test]
+fn what_is_perfect_is_a_hundred_percent() {
+    let frame = |at: f64| Frame {
+        truth: vec![truth(0, at), truth(1, 10.0 + at)],
+        said: vec![said(5, 10.0 + at, 0.9), said(6, at, 0.8)],
+    };
+    let scores = score(&[frame(0.0), frame(1.0), frame(2.0)]);
+    scores.ap_pct.iter().chain([&scores.best_f1_pct]).for_each(|share| near(*share, 100.0));
+    assert_eq!(scores.at_best_f1.threshold, 0.8);
+    for at in [scores.at_best_f1, scores.at_default] {
+        let shares =
+            [at.moda_pct, at.modp_pct, at.mota_pct, at.idf1_pct, at.hota_pct, at.deta_pct, at.assa_pct, at.loca_pct];
+        shares.into_iter().for_each(|share| near(share, 100.0));
+        assert_eq!((at.matches, at.false_alarms, at.misses, at.id_switches), (6, 0, 0, 0));
+    }
+}
+
+#[test]
+fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
+    let silent = score(&[Frame { truth: vec![truth(0, 0.0)], said: vec![] }]);
+    assert_eq!((silent.ap_pct, silent.best_f1_pct), ([Some(0.0); 4], None));
+    let at = silent.at_default;
+    assert_eq!((at.misses, at.moda_pct, at.mota_pct, at.modp_pct), (1, Some(0.0), Some(0.0), None));
+    assert_eq!((at.idf1_pct, at.hota_pct), (Some(0.0), Some(0.0)));
+    let empty = score(&[Frame { truth: vec![], said: vec![said(0, 0.0, 0.9)] }]);
+    assert_eq!((empty.ap_pct, empty.best_f1_pct, empty.at_default.hota_pct), ([None; 4], None, None));
+    assert_eq!(empty.at_default.false_alarms, 1);
+}
+
+/// Two objects in one frame; of three said the best and the last are right: precision 1, 1/2, 2/3 at recall 1/2, 1/2,
+/// 1.
+#[test]
+fn average_precision_is_that_worked_out_by_hand() {
+    let frame = Frame {
+        truth: vec![truth(0, 0.0), truth(1, 20.0)],
+        said: vec![said(0, 0.3, 0.9), said(1, 50.0, 0.8), said(2, 21.5, 0.7)],
+    };
+    let scores = score(&[frame]);
+    near(scores.ap_pct[0], 50.0);
+    near(scores.ap_pct[1], 50.0);
+    near(scores.ap_pct[2], 100.0 * (0.5 + 0.5 * 2.0 / 3.0));
+    near(scores.best_f1_pct, 80.0);
+    assert_eq!(scores.at_best_f1.threshold, 0.7);
+    near(scores.at_best_f1.moda_pct, 50.0);
+    near(scores.at_best_f1.modp_pct, 100.0 * (0.85 + 0.25) / 2.0);
+    near(scores.at_best_f1.motp_m, 0.9);
+}
+
+#[test]
+fn equal_confidences_enter_together() {
+    let frame = |wrong_first: bool| {
+        let mut said = vec![said(0, 0.0, 0.5), said(1, 50.0, 0.5)];
+        if wrong_first {
+            said.reverse();
+        }
+        Frame { truth: vec![truth(0, 0.0)], said }
+    };
+    let [one, other] = [false, true].map(|wrong_first| score(&[frame(wrong_first)]).ap_pct[0]);
+    assert_eq!((one, other), (Some(50.0), Some(50.0)));
+}
+
+#[test]
+fn another_label_is_another_object() {
+    let mut frame =
+        Frame { truth: vec![truth(0, 0.0), truth(1, 9.0)], said: vec![said(0, 0.0, 0.9), said(1, 9.0, 0.9)] };
+    frame.truth[1].label = "person".into();
+    let scores = score(&[frame]);
+    assert_eq!(scores.class_ap_pct.len(), 2);
+    near(scores.class_ap_pct[&Label::new_static("person")][3], 0.0);
+    near(scores.class_ap_pct[&Label::new_static("car")][3], 50.0);
+    near(scores.ap_pct[3], 25.0);
+    assert_eq!((scores.at_default.matches, scores.at_default.false_alarms), (1, 1));
+}
+
+/// One object over four frames, two with one identity and two with another.
+#[test]
+fn one_switch_costs_what_it_should() {
+    let frame = |id| Frame { truth: vec![truth(0, 0.0)], said: vec![said(id, 0.0, 0.9)] };
+    let at = score(&[frame(1), frame(1), frame(2), frame(2)]).at_default;
+    assert_eq!(at.id_switches, 1);
+    near(at.moda_pct, 100.0);
+    near(at.mota_pct, 75.0);
+    near(at.idf1_pct, 100.0 * 2.0 * 2.0 / 8.0);
+    near(at.deta_pct, 100.0);
+    near(at.assa_pct, 50.0);
+    near(at.hota_pct, 100.0 * 0.5f64.sqrt());
+}
+
+/// A pair that goes on keeps its match although another is nearer now.
+#[test]
+fn a_match_is_kept_while_it_is_near_enough() {
+    let frames = [
+        Frame { truth: vec![truth(0, 0.0)], said: vec![said(1, 0.0, 0.9)] },
+        Frame { truth: vec![truth(0, 0.0)], said: vec![said(1, 1.9, 0.9), said(2, 0.1, 0.9)] },
+        Frame { truth: vec![truth(0, 0.0)], said: vec![said(1, 2.1, 0.9), said(2, 0.1, 0.9)] },
+    ];
+    let switches = |frames: &[Frame]| score(frames).at_default.id_switches;
+    assert_eq!((switches(&frames[..2]), switches(&frames)), (0, 1));
+}
+
+#[test]
+fn the_matching_has_the_greatest_sum_however_many_contest() {
+    let pair = |truth, said, value| Pair { truth, said, value };
+    let pairs = [
+        pair(0, 0, 0.9),
+        pair(0, 1, 0.8),
+        pair(1, 0, 0.8), // 0.8 + 0.8 beats 0.9
+        pair(5, 9, 0.1),
+        pair(6, 9, 0.4),
+        pair(7, 9, 0.3), // more true than said
+        pair(8, 20, 0.0),
+    ];
+    let mut chosen: Vec<_> = matching::best(&pairs).iter().map(|pair| (pair.truth, pair.said)).collect();
+    chosen.sort_unstable();
+    assert_eq!(chosen, [(0, 1), (1, 0), (6, 9)]);
+}
+
+fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
+    let covariance = Covariance::isotropic(1.0);
+    let object = |&(id, x_m): &(u128, f64)| FusedObject::new(Uuid::from_u128(id), "car", 0.9, x_m, 0.0, covariance);
+    GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: NodeName::from_static("edge"),
+        epoch: 1,
+        round: at,
+        fused_at_us: Timestamp(at),
+        oldest_capture_us: None,
+        landmarks: Vec::new(),
+        objects: objects.iter().map(object).collect(),
+        pose_corrections: BTreeMap::new(),
+    }
+}
+
+/// An object at ten metres a frame, judged by maps about the frames, with one lost.
+#[test]
+fn a_frame_is_judged_by_the_nearest_map_at_the_time_of_the_map() {
+    let frames: Vec<_> = (0..6)
+        .map(|n| serde_json::json!({"t_us": n * 100, "objects": [{"id": 1, "label": "car", "x_m": n * 10, "y_m": 0}]}))
+        .collect();
+    let truth = TrackTruth::parse(&serde_json::json!({ "frames": frames }).to_string()).unwrap();
+    let mut evaluation = TrackEvaluation::new(truth);
+    for (at, x) in [(0, 0.0), (40, 99.0), (130, 13.0), (170, 17.0), (330, 33.0), (330, 33.5)] {
+        evaluation.map(&map(at, &[(7, x)]));
+    }
+    let scores = evaluation.result();
+    assert_eq!((scores.frames, scores.frames_with_map, scores.objects, scores.said), (6, 5, 6, 5));
+    let at = scores.at_default;
+    assert_eq!((at.matches, at.misses), (5, 1), "{scores:?}");
+    near(at.motp_m, (0.5 + 0.5) / 5.0);
+}

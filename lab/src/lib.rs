@@ -1,0 +1,23 @@
+//! The laboratory of ECOD: tools that measure and show a cell. None of them runs on a vehicle.
+//!
+//! ```text
+//! traffic   generated towns: reports and truth
+//! eval      accuracy of maps, verdicts and objects by what is true
+//! testbed   recorded scenes: geometry, renderer, virtual-time trials   (uses eval)
+//! report    the page about a log, judged                              (uses eval)
+//! bench     load on a live cell                                       (starts ecod-node)
+//! demo      a whole cell on this machine                              (uses testbed, starts ecod-node)
+//! cli       the program ecod-lab
+//! ```
+
+#![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+#![cfg_attr(not(test), deny(clippy::string_slice))]
+
+pub mod bench;
+pub mod cli;
+pub mod demo;
+pub mod eval;
+pub mod node_process;
+pub mod report;
+pub mod testbed;
+pub mod traffic;

@@ -1,0 +1,168 @@
+//! A node as a process of its own.
+
+use std::fs::{self, File};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use anyhow::{Context, bail, ensure};
+use ecod_actors::node::config::NodeConfig;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use tokio::process::{Child, Command};
+
+/// A running `ecod-node`; killed when dropped.
+#[derive(Debug)]
+pub struct NodeProcess {
+    name: String,
+    program: PathBuf,
+    file: PathBuf,
+    log: PathBuf,
+    child: Child,
+    starts: u32,
+    killed: bool,
+}
+
+/// Time that a node may take to stop.
+const STOP_TIMEOUT: Duration = Duration::from_secs(5);
+
+impl NodeProcess {
+    /// Writes the node's configuration to the directory and starts it; its log goes there too.
+    ///
+    /// # Errors
+    /// When a file cannot be written or the program cannot be run.
+    pub fn start(program: &Path, config: &NodeConfig, directory: &Path) -> anyhow::Result<Self> {
+        let name = config.name.as_ref().map_or_else(|| "node".to_owned(), ToString::to_string);
+        let (file, log) = (directory.join(format!("{name}.toml")), directory.join(format!("{name}.log")));
+        let text = toml::to_string(config).context("the configuration cannot be written as TOML")?;
+        fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))?;
+        File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
+        let child = spawn(program, &file, &log)?;
+        Ok(Self { name, program: program.into(), file, log, child, starts: 1, killed: false })
+    }
+
+    /// Starts the node again, with its configuration; the log goes on.
+    ///
+    /// # Errors
+    /// When the program cannot be run.
+    pub fn restart(&mut self) -> anyhow::Result<()> {
+        self.child = spawn(&self.program, &self.file, &self.log)?;
+        self.starts += 1;
+        self.killed = false;
+        Ok(())
+    }
+
+    /// SIGKILL: the node has no time for farewells.
+    ///
+    /// # Errors
+    /// When the operating system refuses.
+    pub async fn kill(&mut self) -> anyhow::Result<()> {
+        self.killed = true;
+        self.child.kill().await.with_context(|| format!("cannot kill node {}", self.name))
+    }
+
+    /// True if it was killed and not started again.
+    pub fn is_killed(&self) -> bool {
+        self.killed
+    }
+
+    /// Number of times that the node was started.
+    pub fn starts(&self) -> u32 {
+        self.starts
+    }
+
+    /// Looks whether it still runs.
+    ///
+    /// # Errors
+    /// When the process has ended by itself, with the last line of its log.
+    pub fn check(&mut self) -> anyhow::Result<()> {
+        if !self.killed
+            && let Some(status) = self.child.try_wait()?
+        {
+            let log = fs::read_to_string(&self.log).unwrap_or_default();
+            let last = log.lines().last().unwrap_or("nothing logged");
+            bail!("node {} ended with {status}: {last}", self.name);
+        }
+        Ok(())
+    }
+
+    /// The process's number, while it runs.
+    pub fn pid(&self) -> Option<u32> {
+        self.child.id()
+    }
+
+    /// Asks the node to stop, and makes it stop when it does not.
+    pub async fn stop(&mut self) {
+        let pid = self.child.id().and_then(|pid| i32::try_from(pid).ok()).map(Pid::from_raw);
+        if let Some(Err(error)) = pid.map(|pid| kill(pid, Signal::SIGTERM)) {
+            tracing::warn!(node = self.name, %error, "node not asked to stop");
+        }
+        if tokio::time::timeout(STOP_TIMEOUT, self.child.wait()).await.is_err() {
+            tracing::warn!(node = self.name, "node did not stop in time");
+            if let Err(error) = self.child.kill().await {
+                tracing::warn!(node = self.name, %error, "node not killed");
+            }
+        }
+    }
+}
+
+/// The program `ecod-node` that lies beside this program.
+///
+/// # Errors
+/// When there is none.
+pub fn node_program() -> anyhow::Result<PathBuf> {
+    node_beside(&std::env::current_exe().context("this program cannot be found")?)
+}
+
+/// The program `ecod-node` that lies beside `program`.
+///
+/// # Errors
+/// When there is none.
+pub fn node_beside(program: &Path) -> anyhow::Result<PathBuf> {
+    let node = program.with_file_name("ecod-node");
+    let profile = if cfg!(debug_assertions) { "" } else { " --release" };
+    ensure!(node.is_file(), "there is no {}: build it by `cargo build{profile} --bin ecod-node`", node.display());
+    Ok(node)
+}
+
+/// A TCP address on which nothing listens now.
+///
+/// # Errors
+/// When loopback has no free port.
+pub fn free_address() -> anyhow::Result<SocketAddr> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port on loopback")?;
+    Ok(listener.local_addr()?)
+}
+
+fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
+    let output = File::options().append(true).open(log);
+    let output = output.with_context(|| format!("cannot write {}", log.display()))?;
+    let mut command = Command::new(program);
+    // The node is what its file says, whatever the environment says to others.
+    for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+        command.env_remove(key);
+    }
+    command
+        .args(["--log-format", "text", "--config"])
+        .arg(file)
+        // The pipe is never written to; it closes with this process, however that ends, and so ends the node.
+        .arg("--stop-at-eof")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(output)
+        .kill_on_drop(true)
+        .spawn()
+        .with_context(|| format!("cannot start {}", program.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_without_a_node_beside_it_says_how_to_get_one() {
+        let error = node_beside(Path::new("/no/such/ecod-lab")).unwrap_err().to_string();
+        assert!(error.contains("/no/such/ecod-node") && error.contains("--bin ecod-node`"), "{error}");
+    }
+}

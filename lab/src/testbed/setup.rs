@@ -1,0 +1,153 @@
+//! The configuration of the testbed's nodes: one set of parameters for every scene.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use ecod::aggregator::{Algorithms, FusionConfig};
+use ecod::camera::Mount;
+use ecod::landmark::{LandmarkConfig, LandmarkIndex};
+use ecod::names::NodeName;
+use ecod::pace::PaceConfig;
+use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
+use ecod::round::RoundConfig;
+use ecod::view::ViewConfig;
+use ecod::window::WindowConfig;
+use ecod::wire::Role;
+use ecod_actors::camera::config::{CameraConfig, MountConfig, OpticsConfig};
+use ecod_actors::camera::detect::DetectorConfig;
+use ecod_actors::camera::detect::placard::PlacardConfig;
+use ecod_actors::camera::frame_source::SourceConfig;
+use ecod_actors::camera::frame_source::capture::CaptureConfig;
+use ecod_actors::camera::lens::Lens;
+use ecod_actors::camera::perception::{Perception, VehicleCamera};
+use ecod_actors::camera::vehicle_pose::PoseConfig;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::observe::dashboard::DashboardConfig;
+use ecod_actors::transport::gossip::{MembershipConfig, MulticastConfig};
+
+use crate::testbed::{Cav, Placard, Scene, Testbed};
+
+/// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
+const GATE_M: f64 = 0.032;
+
+/// For how many frames a report counts at the least, as far as [`MAX_AGE_S`] allows.
+const FRAMES_REMEMBERED: f64 = 3.0;
+/// The most seconds that a report may count.
+const MAX_AGE_S: f64 = 3600.0;
+
+/// The edge's configuration: role, known locations and fusion.
+pub fn edge(testbed: &Testbed, scene: &Scene) -> NodeConfig {
+    NodeConfig { name: Some(unused_name(scene, "edge")), role: Role::Edge, ..cell(testbed, scene) }
+}
+
+/// The wanted name, or the first of `name-2`, `name-3` … that no vehicle of the scene has.
+pub fn unused_name(scene: &Scene, wanted: &'static str) -> NodeName {
+    let numbered = (2..).map(|n| NodeName::new(format!("{wanted}-{n}")));
+    let mut names = std::iter::once(Ok(NodeName::from_static(wanted))).chain(numbered).filter_map(Result::ok);
+    let unused = names.find(|name| scene.cavs.iter().all(|cav| cav.name != *name));
+    unused.unwrap_or(NodeName::from_static(wanted))
+}
+
+/// A vehicle's configuration, with its frames from `source`.
+pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) -> NodeConfig {
+    let (placard, intrinsics) = (&testbed.placard, &testbed.camera.intrinsics);
+    let half_angle = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
+    let camera = CameraConfig {
+        source,
+        capture: CaptureConfig::default(),
+        optics: OpticsConfig {
+            calibration: None,
+            width_px: intrinsics.width,
+            height_px: intrinsics.height,
+            horizontal_fov_deg: 2.0 * half_angle(intrinsics.width, intrinsics.fx).to_degrees(),
+            vertical_fov_deg: 2.0 * half_angle(intrinsics.height, intrinsics.fy).to_degrees(),
+        },
+        mount: MountConfig::default(),
+        detector: DetectorConfig::Placard(PlacardConfig::default()),
+        projection: projection(placard),
+        view: view(placard),
+        votes: false,
+    };
+    NodeConfig {
+        name: Some(cav.name.clone()),
+        role: Role::Cav,
+        pose: PoseConfig {
+            x_m: cav.pose.position.x,
+            y_m: cav.pose.position.y,
+            heading_deg: cav.pose.heading_rad.to_degrees(),
+            listen: None,
+        },
+        camera: Some(camera),
+        ..cell(testbed, scene)
+    }
+}
+
+/// A vehicle's way from detections to reports.
+pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
+    let gate = fusion(testbed).pace.gate();
+    let vehicle_camera = VehicleCamera {
+        node: cav.name.clone(),
+        pose: cav.pose,
+        mount: Mount::default(),
+        lens: Lens::ideal(testbed.camera.intrinsics),
+        landmarks: Arc::new(LandmarkIndex::new(scene.landmarks(&testbed.placard), gate.radius_m)),
+    };
+    Perception::new(vehicle_camera, projection(&testbed.placard), view(&testbed.placard), gate)
+}
+
+/// Fusion of reports: a round for every frame, which counts until some more have come.
+pub fn fusion(testbed: &Testbed) -> FusionConfig {
+    let period_s = testbed.camera.capture_interval.as_secs_f64();
+    let (mut window, mut pace) = (WindowConfig::default(), PaceConfig::default());
+    (pace.gate_m, pace.position_floor_m) = (GATE_M, 0.01);
+    pace.max_age_s = pace.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
+    window.max_age_s = window.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
+    FusionConfig {
+        algorithms: Algorithms::Pace,
+        round: RoundConfig { period_s, ..RoundConfig::default() },
+        pace,
+        window,
+        ..FusionConfig::default()
+    }
+}
+
+/// Poses are known to two millimetres, corners to half a pixel.
+fn projection(placard: &Placard) -> ProjectionConfig {
+    ProjectionConfig {
+        sizes: ObjectSizes { default: Some(ObjectSize::square(placard.qr_width_m)), ..ObjectSizes::default() },
+        pixel_sigma_px: 0.5,
+        heading_sigma_rad: 0.002,
+        position_sigma_m: 0.002,
+        floor_m: 0.002,
+        ..ProjectionConfig::default()
+    }
+}
+
+/// A spot counts as looked at where a plate would be read in most frames.
+fn view(placard: &Placard) -> ViewConfig {
+    ViewConfig {
+        target_width_m: placard.qr_width_m,
+        min_target_px: 30.0,
+        max_yaw_rad: 66f64.to_radians(),
+        occluder_width_m: placard.card_width_m,
+        ..ViewConfig::default()
+    }
+}
+
+/// Configuration that all nodes of the cell share. They gossip on loopback, where they meet no other cell of this machine,
+/// and serve no page.
+fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
+    let membership = MembershipConfig {
+        bind: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
+        multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+        ..MembershipConfig::default()
+    };
+    NodeConfig {
+        membership,
+        dashboard: DashboardConfig { enabled: false, ..DashboardConfig::default() },
+        cell: NodeName::from_static("testbed"),
+        landmarks: scene.landmarks(&testbed.placard).iter().map(LandmarkConfig::from).collect(),
+        fusion: fusion(testbed),
+        ..NodeConfig::default()
+    }
+}

@@ -1,0 +1,131 @@
+//! A scene from its first frame to its last map, in virtual time: rendered, detected, projected and fused by the parts
+//! that a live node runs.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+
+use anyhow::Context;
+use ecod::aggregator::Aggregator;
+use ecod::names::NodeName;
+use ecod::time::Timestamp;
+use ecod::wire::{GlobalMap, ObjectReport, ReportKind};
+use ecod_actors::camera::detect::Detect;
+use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
+use ecod_actors::camera::frame::Frame;
+
+use super::camera::TestbedCamera;
+use super::score::{SceneResult, SpotScore};
+use super::setup;
+use crate::testbed::{Cav, Scene, Testbed};
+
+/// One scene to be run.
+#[derive(Debug, Clone, Copy)]
+pub struct Trial<'a> {
+    /// Camera and placards.
+    pub testbed: &'a Testbed,
+    /// The scene.
+    pub scene: &'a Scene,
+    /// Number of fused maps to judge.
+    pub verdicts: u64,
+    /// Seed of everything that varies from frame to frame.
+    pub seed: u64,
+}
+
+/// When virtual time begins.
+const START: Timestamp = Timestamp(1_700_000_000_000_000);
+
+impl Trial<'_> {
+    /// Runs the scene on all cores; `progress` is told of every frame seen.
+    ///
+    /// # Errors
+    /// When a part of the pipeline cannot be built or a frame cannot be rendered.
+    pub fn run(&self, progress: impl Fn() + Sync) -> anyhow::Result<SceneResult> {
+        let reports = self.reports(&progress)?;
+        let mut fused = self.aggregator();
+        let mut alone: BTreeMap<NodeName, (Aggregator, SpotScore)> =
+            self.scene.cavs.iter().map(|cav| (cav.name.clone(), (self.aggregator(), SpotScore::default()))).collect();
+        let mut score = SpotScore::default();
+        for verdict in 0..self.verdicts {
+            let steps = verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();
+            let of_verdict = |cav: &[ObjectReport]| cav[steps.start as usize..steps.end as usize].to_vec();
+            let all: Vec<_> = reports.values().flat_map(|cav| of_verdict(cav)).collect();
+            if let Some(map) = fuse(&mut fused, all) {
+                score.judge(self.testbed, self.scene, &map);
+            }
+            for (name, cav) in &reports {
+                if let Some((aggregator, score)) = alone.get_mut(name)
+                    && let Some(map) = fuse(aggregator, of_verdict(cav))
+                {
+                    score.judge(self.testbed, self.scene, &map);
+                }
+            }
+        }
+        let alone = alone.into_iter().map(|(name, (_, score))| (name, score)).collect();
+        Ok(SceneResult::new(self.testbed, self.scene, self.verdicts, &score, &alone))
+    }
+
+    /// Frames that every vehicle captures for one verdict.
+    pub fn frames_per_verdict(&self) -> u64 {
+        let camera = &self.testbed.camera;
+        let frames = camera.submission_interval.as_secs_f64() / camera.capture_interval.as_secs_f64();
+        (frames.round() as u64).max(1)
+    }
+
+    /// Every vehicle's reports, one for each frame.
+    fn reports(&self, progress: &(impl Fn() + Sync)) -> anyhow::Result<BTreeMap<NodeName, Vec<ObjectReport>>> {
+        let next = AtomicU64::new(0);
+        let done = Mutex::new(BTreeMap::new());
+        let workers = thread::available_parallelism().map_or(1, usize::from).min(self.scene.cavs.len().max(1));
+        thread::scope(|scope| {
+            let work = || {
+                while let Some(cav) = self.scene.cavs.get(next.fetch_add(1, Ordering::Relaxed) as usize) {
+                    let reports = self.watch(cav, progress).with_context(|| format!("vehicle {}", cav.name));
+                    done.lock().unwrap_or_else(std::sync::PoisonError::into_inner).insert(cav.name.clone(), reports);
+                }
+            };
+            (1..workers).for_each(|_| drop(scope.spawn(work)));
+            work();
+        });
+        let done = done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+        done.into_iter().map(|(name, reports)| Ok((name, reports?))).collect()
+    }
+
+    /// One vehicle's reports.
+    fn watch(&self, cav: &Cav, progress: &impl Fn()) -> anyhow::Result<Vec<ObjectReport>> {
+        let camera = TestbedCamera::new(self.testbed, self.scene, cav, self.seed)?;
+        let mut detector = PlacardDetector::new(PlacardConfig::default());
+        let mut perception = setup::perception(self.testbed, self.scene, cav);
+        let interval = self.testbed.camera.capture_interval;
+        (0..self.verdicts * self.frames_per_verdict())
+            .map(|seq| {
+                let captured_at = START + interval * u32::try_from(seq)?;
+                let frame = Frame { image: camera.frame(seq)?, captured_at, seq };
+                let report = perception.report(detector.detect(&frame)?, captured_at);
+                progress();
+                Ok(report)
+            })
+            .collect()
+    }
+
+    fn aggregator(&self) -> Aggregator {
+        let landmarks = self.scene.landmarks(&self.testbed.placard);
+        Aggregator::new(NodeName::from_static("edge"), 1, setup::fusion(self.testbed), landmarks, START)
+    }
+}
+
+/// Fuses one verdict's reports in the order of capture and returns the last map.
+fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<GlobalMap> {
+    reports.sort_by(|a, b| a.captured_at_us.cmp(&b.captured_at_us).then_with(|| a.node.cmp(&b.node)));
+    let last = reports.last()?.captured_at_us;
+    let mut map = None;
+    for report in reports.into_iter().map(Arc::new) {
+        match aggregator.report(ReportKind::Detections, &report, report.captured_at_us) {
+            Ok(closed) => map = closed.and_then(|fused| fused.map).or(map),
+            Err(reason) => tracing::warn!(node = %report.node, %reason, "report not used"),
+        }
+    }
+    let deadline = aggregator.deadline();
+    aggregator.tick(deadline.max(last)).and_then(|fused| fused.map).or(map)
+}

@@ -1,0 +1,168 @@
+//! `ecod-lab eval`, and `ecod-lab testbed` of an intersection, as programs.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
+use ecod_actors::cli::cell;
+use serde_json::Value;
+use tempfile::TempDir;
+
+fn example(name: &str) -> PathBuf {
+    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples")).join(name)
+}
+
+fn ecod_lab(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_ecod-lab")).args(arguments).output().unwrap()
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Output of `ecod-node replay` for a file of reports.
+fn replay(config: ReplayConfig, reports: &Path) -> (Vec<FusedLine>, Summary) {
+    let mut replay = Replay::new(config);
+    let lines = fs::read_to_string(reports).unwrap();
+    let mut output: Vec<_> = lines.lines().flat_map(|line| replay.line(line.as_bytes())).collect();
+    let (rest, summary) = replay.finish();
+    output.extend(rest);
+    (output, summary)
+}
+
+/// Replays the example and returns the output.
+fn replay_lot(folder: &TempDir) -> PathBuf {
+    let (fused, _) = replay(cell(Some(&example("recordings/lot.toml"))).unwrap(), &example("recordings/lot.jsonl"));
+    let lines: Vec<_> = fused.iter().map(|line| serde_json::to_string(line).unwrap()).collect();
+    let output = folder.path().join("out.jsonl");
+    fs::write(&output, lines.join("\n")).unwrap();
+    output
+}
+
+#[test]
+fn a_replay_is_judged_beside_majority_and_every_vehicle() {
+    let folder = TempDir::new().unwrap();
+    let output = replay_lot(&folder);
+    let (truth, reports, config) =
+        (example("recordings/lot_truth.json"), example("recordings/lot.jsonl"), example("recordings/lot.toml"));
+    let result = folder.path().join("result.json");
+    let run = ecod_lab(&[
+        "eval",
+        "--truth",
+        text(&truth),
+        "--input",
+        text(&output),
+        "--reports",
+        text(&reports),
+        "--config",
+        text(&config),
+        "--out",
+        text(&result),
+    ]);
+    assert!(run.status.success(), "{}", said(&run));
+    let table = String::from_utf8(run.stdout).unwrap();
+    assert!(["PACE", "VOTE", "majority %", "euclid", "truth"].iter().all(|part| table.contains(part)), "{table}");
+    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+    for (algorithm, least) in [("pace", 100.0), ("vote", 75.0)] {
+        let scores = &result[algorithm];
+        assert_eq!(scores["items"].as_u64(), Some(8));
+        assert!(scores["accuracy_pct"].as_f64().unwrap() >= least, "{scores}");
+        assert_eq!(scores["vehicles"].as_object().unwrap().len(), 4);
+        assert!(scores["vehicles"]["euclid"]["accuracy_pct"].as_f64().unwrap() < 100.0);
+    }
+}
+
+#[test]
+fn objects_that_move_are_judged_by_where_they_were() {
+    let folder = TempDir::new().unwrap();
+    let recorded = |name: &str| Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/eval_tracks")).join(name);
+    let (truth, maps, result) = (recorded("truth.json"), recorded("maps.jsonl"), folder.path().join("result.json"));
+    let run = ecod_lab(&["eval", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)]);
+    assert!(run.status.success(), "{}", said(&run));
+    let table = String::from_utf8(run.stdout).unwrap();
+    assert!(
+        ["AP@0.5 %", "AP@4 %", "bicycle", "MODA %", "HOTA %", "switches"].iter().all(|p| table.contains(p)),
+        "{table}"
+    );
+    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+    let ap_pct = result["tracks"]["ap_pct"].as_array().unwrap();
+    assert!(ap_pct.len() == 4 && ap_pct.iter().all(|ap| ap.as_f64().is_some_and(|ap| ap > 10.0)), "{result}");
+    let broken = folder.path().join("broken.json");
+    fs::write(&broken, r#"{"frames": [{"t_us": 1, "objects": [{"id": 1, "label": "car", "x_m": 0}]}]}"#).unwrap();
+    let run = ecod_lab(&["eval", "--truth", text(&broken), "--input", text(&maps)]);
+    assert_eq!(run.status.code(), Some(2));
+    assert!(said(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"), "{}", said(&run));
+}
+
+#[test]
+fn the_recorded_intersection_is_judged_right() {
+    let folder = TempDir::new().unwrap();
+    let (scenes, out, reports) = (
+        example("testbed/vote_recording.json"),
+        folder.path().join("result.json"),
+        folder.path().join("reports.jsonl"),
+    );
+    let run = ecod_lab(&[
+        "testbed",
+        "--scenes",
+        text(&scenes),
+        "--generated",
+        "3",
+        "--out",
+        text(&out),
+        "--reports",
+        text(&reports),
+    ]);
+    assert!(run.status.success(), "{}", said(&run));
+    let result: Value = serde_json::from_slice(&fs::read(out).unwrap()).unwrap();
+    let recording = &result["scenes"][0];
+    assert_eq!((recording["verdicts"].as_u64(), recording["vote_accuracy_pct"].as_f64()), (Some(9), Some(100.0)));
+    assert_eq!(result["scenes"][1]["scenes"].as_u64(), Some(3));
+    let (_, summary) = replay(ReplayConfig::default(), &reports);
+    assert_eq!((summary.lines, summary.used()), (12, 12));
+}
+
+#[test]
+fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_intersection() {
+    let folder = TempDir::new().unwrap();
+    let recorded = fs::read_to_string(example("testbed/vote_recording.json")).unwrap();
+    let mut silent: Value = serde_json::from_str(&recorded).unwrap();
+    silent["frames"]["euclid"].as_array_mut().unwrap().truncate(1);
+    let renamed = recorded.replace("mouse", "remote").replace("\"cup\"", "\"bottle\"");
+    for scene in [renamed, silent.to_string()] {
+        let (scenes, out) = (folder.path().join("scenes.json"), folder.path().join("result.json"));
+        fs::write(&scenes, scene).unwrap();
+        let run = ecod_lab(&["testbed", "--scenes", text(&scenes), "--scene", "recording", "--out", text(&out)]);
+        assert!(run.status.success(), "{}", said(&run));
+        let result: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        assert_eq!(result["scenes"][0]["vote_accuracy_pct"].as_f64(), Some(100.0), "{result}");
+    }
+}
+
+#[test]
+fn what_cannot_be_judged_is_said() {
+    let folder = TempDir::new().unwrap();
+    let file = |name: &str, content: &str| {
+        let path = folder.path().join(name);
+        fs::write(&path, content).unwrap();
+        path
+    };
+    let (recording, truth, empty) =
+        (file("in.jsonl", "{}\n"), file("truth.json", "{\"a\": {}}"), file("empty.jsonl", ""));
+    let lot = example("recordings/lot_truth.json");
+    for (truth, input, code, part) in [
+        (Path::new("/no.json"), &recording, 2, "/no.json"),
+        (&truth, &recording, 2, "`a` has {}"),
+        (&lot, &empty, 1, "no map"),
+        (&lot, &recording, 1, "1 lines are neither"),
+    ] {
+        let run = ecod_lab(&["eval", "--truth", text(truth), "--input", text(input)]);
+        assert_eq!(run.status.code(), Some(code), "{truth:?}: {}", said(&run));
+        assert!(said(&run).contains(part), "{truth:?}: {}", said(&run));
+    }
+}

@@ -1,0 +1,29 @@
+//! Leadership: who leads the cell, and whose rounds a node accepts.
+//!
+//! | step | machine |
+//! |---|---|
+//! | nodes elect a leader and hand the lead over | [`election::Election`] |
+//! | a node is fit to lead while its parts work | [`health::HealthMonitor`], [`echo::EchoMonitor`] |
+//! | a node keeps links to the brokers of leader and standby | [`links::Links`] |
+//! | all of that, as one machine of inputs and effects | [`node::LeadershipNode`] |
+//! | receivers accept or refuse each round | [`round_filter::RoundFilter`], [`round_filter::PublisherFilter`] |
+//! | candidates replicate the evidence about vehicles | [`ledger_resync::LedgerResync`] |
+//!
+//! Machines meet in one value, [`Leadership`]: the node tells it, all others read it. [`timers`] relates every timer to the
+//! others.
+
+pub mod address;
+pub mod config;
+pub mod echo;
+pub mod election;
+pub mod health;
+pub mod ledger_resync;
+pub mod links;
+pub mod node;
+pub mod readiness;
+pub mod round_filter;
+pub mod timers;
+pub mod view;
+
+pub use address::{BrokerAddress, InvalidAddress};
+pub use view::{Leadership, Position};

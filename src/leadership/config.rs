@@ -1,0 +1,88 @@
+//! The election's settings.
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::{ConfigError, check_range};
+use crate::wire::Role;
+
+/// Settings of one node's part in the election; `[election]` in the configuration file.
+///
+/// The timings must be the same on every node of a cell, role and priority are each node's own.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ElectionConfig {
+    /// Role for which the node is meant; the `role` of the node, no key of this table. Default `auto`.
+    #[serde(skip)]
+    pub role: Role,
+    /// Preference among nodes of one role, higher leads first. Default 100.
+    pub priority: u8,
+    /// Time between two beats of the leader to its standby, in ms; its other successors, and better nodes that are not
+    /// fit, get every eighth. Default 50.
+    /// Shorter finds a silent leader sooner and costs packets.
+    pub beat_ms: u64,
+    /// Time between two beats of the leader to everyone else, in ms. Default 2500. Shorter costs a large cell packets.
+    pub idle_beat_ms: u64,
+    /// Beats that must be missing in a row, and no round taken, before a leader counts as lost. Default 4. Fewer is
+    /// faster, and takes lost packets for a lost leader more often.
+    pub silence_beats: u32,
+    /// How long a node that starts listens before it may lead, in ms. Default 1200. Longer makes it surer to find the
+    /// leader that is there, and a lone vehicle wait.
+    pub join_ms: u64,
+    /// How much longer each next candidate waits before it claims the lead, in ms. Default 60. Must exceed the
+    /// network's usual delay, or two candidates claim at once (harmless, the later epoch wins).
+    pub claim_step_ms: u64,
+    /// How long a better candidate must have been fit and heard before it is handed the lead, in ms. Default 3000.
+    /// Longer suffers a node that comes and goes less, and stays with the substitute longer.
+    pub stable_ms: u64,
+    /// How long a handover may take before the leader gives it up, in ms. Default 3000.
+    pub handover_ms: u64,
+    /// A timer later than this was stalled, in ms; only this much of the delay counts as time. Default 40.
+    pub stall_ms: u64,
+}
+
+impl Default for ElectionConfig {
+    fn default() -> Self {
+        Self {
+            role: Role::Auto,
+            priority: 100,
+            beat_ms: 50,
+            idle_beat_ms: 2500,
+            silence_beats: 4,
+            join_ms: 1200,
+            claim_step_ms: 60,
+            stable_ms: 3000,
+            handover_ms: 3000,
+            stall_ms: 40,
+        }
+    }
+}
+
+impl ElectionConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] naming the first key that is out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let ms = |key, value: u64, low: f64, high: f64| check_range(key, value as f64, low, high);
+        ms("beat_ms", self.beat_ms, 5.0, 10_000.0)?;
+        ms("idle_beat_ms", self.idle_beat_ms, self.beat_ms as f64, 60_000.0)?;
+        check_range("silence_beats", f64::from(self.silence_beats), 2.0, 100.0)?;
+        ms("join_ms", self.join_ms, 0.0, 60_000.0)?;
+        ms("claim_step_ms", self.claim_step_ms, 1.0, 10_000.0)?;
+        ms("stable_ms", self.stable_ms, 0.0, 3_600_000.0)?;
+        ms("handover_ms", self.handover_ms, 10.0, 600_000.0)?;
+        ms("stall_ms", self.stall_ms, 1.0, 10_000.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_valid_and_errors_name_the_key() {
+        assert_eq!(ElectionConfig::default().validate(), Ok(()));
+        let wrong = ElectionConfig { idle_beat_ms: 20, ..ElectionConfig::default() };
+        assert_eq!(wrong.validate().unwrap_err().key, "idle_beat_ms");
+    }
+}

@@ -1,0 +1,253 @@
+//! Following a leader: its beats, others' evidence, and its loss.
+
+use std::time::Duration;
+
+use crate::epoch::Epoch;
+use crate::leadership::election::interface::ElectionEffect;
+use crate::leadership::election::liveness::Following;
+use crate::leadership::election::message::{Body, ElectionMessage};
+use crate::leadership::election::{Beat, Election, State};
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::Role;
+
+impl Election {
+    pub(super) fn following_deadline(&self, following: &Following) -> Timestamp {
+        following.lost_at(&self.config).min(self.ask_at(following))
+    }
+
+    pub(super) fn follow_timers(&mut self, now: Timestamp) {
+        let State::Following(following) = &self.state else { return };
+        if now >= following.lost_at(&self.config) {
+            let leader = following.epoch.leader.clone();
+            self.peers.gone(&leader, now);
+            self.lose_leader(now);
+        } else if now >= self.ask_at(following) {
+            self.doubt(now);
+        }
+    }
+
+    /// Asks about the leader. While just a round is late, which all followers may miss, those who know best are asked first.
+    fn doubt(&mut self, now: Timestamp) {
+        let State::Following(following) = &mut self.state else { return };
+        let first = following.asked_at.is_none();
+        following.asked_at.get_or_insert(now);
+        if first && now < following.silent_at(&self.config) {
+            self.ask_near(now);
+        } else {
+            self.ask_all(now);
+        }
+    }
+
+    fn ask_at(&self, following: &Following) -> Timestamp {
+        let now = self.clock.now();
+        let pause = if now >= following.direct_timeout_at(&self.config) {
+            self.config.ask_period()
+        } else if now < following.silent_at(&self.config) {
+            self.config.beat()
+        } else {
+            self.config.beat() / 2
+        };
+        following.suspect_at(&self.config).max(self.questions.last_at() + pause)
+    }
+
+    /// Takes a leader's sign of life, or its claim.
+    pub(super) fn take_beat(&mut self, beat: Beat, now: Timestamp) {
+        if self.is_over(&beat.epoch) {
+            self.send_status(&beat.epoch.leader, now);
+            return;
+        }
+        match &mut self.state {
+            State::Following(following) if following.epoch == beat.epoch => self.refresh(beat, now),
+            State::Leading(_) => self.meet_leader(beat, now),
+            State::Seeking(_) if Some(&beat.epoch) >= self.epoch.as_ref() => self.follow(beat, now),
+            State::Following(following) if beat.epoch > following.epoch => {
+                let content = now < following.suspect_at(&self.config);
+                let rightful = beat.followers > 0 || beat.after.as_ref() >= Some(&following.epoch);
+                if content && !(beat.hears_us && rightful) {
+                    self.send_status(&beat.epoch.leader, now);
+                } else {
+                    self.follow(beat, now);
+                }
+            }
+            State::Following(_) => self.send_status(&beat.epoch.leader, now),
+            // It is lower than what was followed last: that one is lost, and has to be outdone.
+            State::Seeking(_) => {
+                let over = self.epoch.clone().max(self.over.clone());
+                self.send(&beat.epoch.leader, Body::Status { over }, now);
+            }
+        }
+    }
+
+    /// Decides which of two leaders stays: the higher epoch, but never one without followers before one with some.
+    fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
+        let State::Leading(leading) = &self.state else { return };
+        let own = leading.epoch.clone();
+        let followers = self.peers.followers(&own, now);
+        if beat.epoch < own {
+            let succeeded = leading.after.as_ref() >= Some(&beat.epoch);
+            if beat.hears_us && followers == 0 && beat.followers > 0 && !succeeded {
+                self.close(own.clone());
+                self.effects.push(ElectionEffect::StopPublishing { epoch: own });
+                self.effects.push(ElectionEffect::SendSnapshot { to: beat.epoch.leader.clone() });
+                self.seek(vec![beat.epoch.leader.clone()], now + self.config.response_timeout(), now);
+                self.send_status(&beat.epoch.leader, now);
+            } else {
+                self.send_beat(&beat.epoch.leader, now);
+            }
+            return;
+        }
+        let stays = if beat.hears_us {
+            followers > 0 && beat.followers == 0 && beat.after.as_ref() < Some(&own)
+        } else {
+            // It does not hear us. An edge that nobody else hears either serves nobody; a vehicle serves itself.
+            followers > 0 || self.config.role != Role::Edge
+        };
+        if !stays {
+            self.stop_leading(&beat.epoch.leader.clone());
+            self.follow(beat, now);
+        }
+    }
+
+    fn stop_leading(&mut self, next: &NodeName) {
+        if let State::Leading(leading) = &self.state {
+            self.effects.push(ElectionEffect::StopPublishing { epoch: leading.epoch.clone() });
+            self.effects.push(ElectionEffect::SendSnapshot { to: next.clone() });
+        }
+    }
+
+    fn follow(&mut self, beat: Beat, now: Timestamp) {
+        self.epoch = Some(beat.epoch.clone());
+        self.round = self.round.max(beat.round);
+        let leader = beat.epoch.leader.clone();
+        let beat_interval = Duration::from_millis(beat.every_ms);
+        self.state =
+            State::Following(Following::new(beat.epoch, beat.successors, beat_interval, now, Timestamp::default()));
+        self.send_status(&leader, now);
+    }
+
+    /// Follows a leader that is known from others only; its own beat completes it.
+    pub(super) fn adopt(&mut self, epoch: Epoch, heard_at: Timestamp, now: Timestamp) {
+        let leader = epoch.leader.clone();
+        self.epoch = Some(epoch.clone());
+        let unheard = Timestamp::default();
+        self.state = State::Following(Following::new(epoch, Vec::new(), self.config.beat(), unheard, heard_at));
+        self.peers.add(&leader);
+        self.send_status(&leader, now);
+    }
+
+    fn refresh(&mut self, beat: Beat, now: Timestamp) {
+        let State::Following(following) = &mut self.state else { return };
+        self.round = self.round.max(beat.round);
+        following.beat_interval = Duration::from_millis(beat.every_ms);
+        following.hear(now);
+        following.forget_round_interval(now);
+        if beat.hears_us {
+            following.bidirectional_at = now;
+        }
+        following.successors = beat.successors;
+        self.send_status(&beat.epoch.leader, now);
+    }
+
+    /// Learns what any message tells about leadership by its sender's epoch.
+    pub(super) fn hear_others(&mut self, message: &ElectionMessage, now: Timestamp) {
+        match &self.state {
+            State::Following(following) if following.epoch.leader == message.from => {
+                let leads = message.epoch.as_ref() == Some(&following.epoch);
+                // Others' word of the leadership may overtake what the leader sent before.
+                let is_unheard = following.direct_at == Timestamp::default();
+                let is_earlier = is_unheard && message.term < following.epoch.term;
+                if !leads && !is_earlier && !matches!(message.body, Body::Beat { .. }) {
+                    let ended = following.epoch.clone();
+                    let follows = message.epoch.clone().filter(|next| {
+                        *next > ended && next.leader != message.from && next.leader != self.id && !self.is_over(next)
+                    });
+                    self.close(ended);
+                    // Followers of the old leader follow the one that it follows: none of them need claim.
+                    match follows {
+                        Some(next) => self.adopt(next, now, now),
+                        None => self.lose_leader(now),
+                    }
+                }
+            }
+            State::Leading(leading) if message.hears_you => {
+                let own = leading.epoch.clone();
+                match &message.epoch {
+                    Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
+                        let other = other.clone();
+                        self.stop_leading(&other.leader);
+                        self.adopt(other, now, now);
+                    }
+                    Some(other) if *other != own => {}
+                    _ if message.term > own.term => self.renew_later(now),
+                    _ => {}
+                }
+            }
+            State::Seeking(_) | State::Following(_) | State::Leading(_) => {}
+        }
+    }
+
+    pub(super) fn take_status(&mut self, from: &NodeName, over: Option<&Epoch>, now: Timestamp) {
+        if let State::Leading(leading) = &self.state
+            && over.is_some_and(|over| *over >= leading.epoch)
+        {
+            self.renew_later(now);
+        }
+        if self.peers.get(from).is_some_and(|peer| peer.told) {
+            return;
+        }
+        if self.is_leading() {
+            self.send_beat(from, now);
+        } else {
+            self.send_status(from, now);
+        }
+    }
+
+    pub(super) fn take_resign(&mut self, epoch: &Epoch, last_round: u64, now: Timestamp) {
+        if self.epoch.as_ref() == Some(epoch) {
+            self.round = self.round.max(last_round);
+        }
+        let followed = matches!(&self.state, State::Following(following) if following.epoch == *epoch);
+        self.close(epoch.clone());
+        if followed {
+            self.lose_leader(now);
+        }
+    }
+
+    pub(super) fn peer_suspected(&mut self, peer: &NodeName, now: Timestamp) {
+        if matches!(&self.state, State::Following(following) if following.epoch.leader == *peer) {
+            self.ask_all(now);
+        }
+    }
+
+    /// Doubts a leader that the membership gave up: it may hear less than the leader's beats and others tell.
+    pub(super) fn peer_down(&mut self, peer: &NodeName, now: Timestamp) {
+        if let State::Following(following) = &mut self.state
+            && following.epoch.leader == *peer
+        {
+            following.given_up = true;
+            following.asked_at.get_or_insert(now);
+            self.ask_all(now);
+        }
+        self.peers.down(peer, now);
+        self.name_successors(now);
+    }
+
+    pub(super) fn peer_gone(&mut self, peer: &NodeName, now: Timestamp) {
+        self.peers.gone(peer, now);
+        match &self.state {
+            State::Following(following) if following.epoch.leader == *peer => {
+                self.close(following.epoch.clone());
+                self.lose_leader(now);
+            }
+            State::Seeking(_) | State::Following(_) | State::Leading(_) => self.name_successors(now),
+        }
+    }
+
+    fn lose_leader(&mut self, now: Timestamp) {
+        if let State::Following(following) = &mut self.state {
+            let order = std::mem::take(&mut following.successors);
+            self.seek(order, now, now);
+        }
+    }
+}

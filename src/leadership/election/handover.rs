@@ -1,0 +1,125 @@
+//! Handover of the lead to a better candidate, make before break.
+//!
+//! The old leader publishes until it hears that the new one leads. It yields right after a round, so that nearly a whole
+//! period is left for the few packets that this takes. The new leader goes on with the next round. If all of these packets
+//! are lost for a period, the old leader publishes that round too, and yields again after it.
+
+use crate::epoch::Epoch;
+use crate::leadership::election::interface::ElectionEffect;
+use crate::leadership::election::message::{Body, MAX_TERM};
+use crate::leadership::election::{Election, State};
+use crate::names::NodeName;
+use crate::time::Timestamp;
+
+/// A handover as the old leader sees it.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Handover {
+    pub(super) to: NodeName,
+    pub(super) retry_at: Timestamp,
+    started_at: Timestamp,
+    ready_at: Option<Timestamp>,
+    yielded: bool,
+}
+
+impl Election {
+    /// Starts a handover when a better candidate has been there long enough.
+    pub(super) fn start_handover(&mut self, now: Timestamp) {
+        let own = (&self.id, self.candidacy());
+        let State::Leading(leading) = &mut self.state else { return };
+        let challenger = self.peers.challenger(own, leading.since, self.config.stable(), now);
+        let Some((to, _)) = challenger.filter(|(_, from)| leading.handover.is_none() && now >= *from) else { return };
+        leading.handover =
+            Some(Handover { to: to.clone(), retry_at: now, started_at: now, ready_at: None, yielded: false });
+        self.name_successors(now);
+        self.effects.push(ElectionEffect::SendSnapshot { to });
+        self.drive_handover(now);
+    }
+
+    /// Repeats offers and yields, or gives the handover up.
+    pub(super) fn drive_handover(&mut self, now: Timestamp) {
+        let limit = self.config.handover();
+        let State::Leading(leading) = &mut self.state else { return };
+        let Some(handover) = &mut leading.handover else { return };
+        let to = handover.to.clone();
+        let fit = self.peers.hears(&to, now) && self.peers.may_lead(&to, now);
+        if !fit || now.since(handover.started_at) > limit {
+            leading.handover = None;
+            self.peers.restart_trial(&to, now);
+            return;
+        }
+        if now < handover.retry_at {
+            return;
+        }
+        // A cell that publishes no rounds has none to miss.
+        handover.yielded |= handover.ready_at.is_some_and(|at| now.since(at) > self.config.roundless_yield());
+        handover.retry_at = now + self.config.handover_retry(handover.yielded);
+        let last_round = self.round;
+        if handover.yielded {
+            self.effects.push(ElectionEffect::HoldRound);
+            self.send(&to, Body::Yield { last_round }, now);
+        } else if handover.ready_at.is_none() {
+            self.send(&to, Body::Offer, now);
+        }
+    }
+
+    pub(super) fn take_ready(&mut self, from: &NodeName, now: Timestamp) {
+        if let State::Leading(leading) = &mut self.state
+            && let Some(handover) = leading.handover.as_mut().filter(|handover| handover.to == *from)
+        {
+            handover.ready_at.get_or_insert(now);
+        }
+    }
+
+    pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
+        self.terms.seen = self.terms.seen.max(epoch.term.min(MAX_TERM));
+        self.round = self.round.max(round);
+        let least = self.config.beat();
+        match &mut self.state {
+            State::Following(following) if following.epoch == *epoch => following.take_round(least, now),
+            State::Leading(leading) => {
+                if let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some()) {
+                    handover.yielded = true;
+                    handover.retry_at = now;
+                    self.drive_handover(now);
+                }
+            }
+            State::Following(_) | State::Seeking(_) => {}
+        }
+    }
+
+    pub(super) fn take_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
+        let may_lead = self.candidacy().may_lead();
+        let State::Following(following) = &mut self.state else { return };
+        if following.epoch.leader != *from || epoch != Some(&following.epoch) || !may_lead {
+            return;
+        }
+        let fresh = following.offered_at.is_some_and(|at| now.since(at) <= self.config.response_timeout());
+        following.offered_at = Some(now);
+        if !fresh {
+            following.prepared = false;
+            self.effects.push(ElectionEffect::Prepare { leader: from.clone() });
+        } else if following.prepared {
+            self.send(from, Body::Ready, now);
+        }
+    }
+
+    pub(super) fn prepared(&mut self, now: Timestamp) {
+        if let State::Following(following) = &mut self.state
+            && following.offered_at.is_some()
+        {
+            following.prepared = true;
+            let leader = following.epoch.leader.clone();
+            self.send(&leader, Body::Ready, now);
+        }
+    }
+
+    pub(super) fn take_yield(&mut self, from: &NodeName, epoch: Option<&Epoch>, last_round: u64, now: Timestamp) {
+        let State::Following(following) = &self.state else { return };
+        let ours = following.epoch.leader == *from && epoch == Some(&following.epoch) && following.prepared;
+        if ours && self.candidacy().may_lead() {
+            let after = following.epoch.clone();
+            self.round = self.round.max(last_round);
+            self.lead(Some(after), now);
+        }
+    }
+}

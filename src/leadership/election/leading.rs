@@ -1,0 +1,127 @@
+//! Leading: beats, successors, and the search for a better candidate.
+
+use std::time::Duration;
+
+use crate::epoch::Epoch;
+use crate::leadership::election::handover::Handover;
+use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
+use crate::leadership::election::{Election, State};
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::Role;
+
+/// A node that leads.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Leading {
+    pub(super) epoch: Epoch,
+    pub(super) since: Timestamp,
+    /// The epoch that this one succeeded.
+    pub(super) after: Option<Epoch>,
+    /// The next leaders, the standby first.
+    pub(super) successors: Vec<NodeName>,
+    /// The handover under way.
+    pub(super) handover: Option<Handover>,
+    /// Time at which to lead on in a higher epoch, as some refuse this one.
+    renew_at: Option<Timestamp>,
+    beat_at: Timestamp,
+    beats: u64,
+}
+
+impl Leading {
+    pub(super) fn new(epoch: Epoch, after: Option<Epoch>, successors: Vec<NodeName>, now: Timestamp) -> Self {
+        Self { epoch, since: now, after, successors, handover: None, renew_at: None, beat_at: now, beats: 0 }
+    }
+
+    pub(super) fn deadline(&self) -> Timestamp {
+        self.handover.as_ref().map_or(self.beat_at, |handover| handover.retry_at.min(self.beat_at))
+    }
+}
+
+impl Election {
+    pub(super) fn lead_timers(&mut self, now: Timestamp) {
+        self.drive_handover(now);
+        let next = now + self.config.beat();
+        let State::Leading(leading) = &mut self.state else { return };
+        if now < leading.beat_at {
+            return;
+        }
+        if leading.handover.is_none() && leading.renew_at.is_some_and(|at| now >= at) {
+            let after = leading.epoch.clone();
+            self.lead(Some(after), now);
+            return;
+        }
+        leading.beat_at = next;
+        leading.beats += 1;
+        let beats = leading.beats;
+        self.name_successors(now);
+        self.start_handover(now);
+        let State::Leading(leading) = &self.state else { return };
+        let due: Vec<_> = (beats..)
+            .zip(self.peers.names())
+            .filter(|(turn, name)| turn % (self.beat_for(leading, name).as_millis() as u64 / self.config.beat_ms) == 0)
+            .map(|(_, name)| name.clone())
+            .collect();
+        for peer in due {
+            self.send_beat(&peer, now);
+        }
+    }
+
+    /// Plans to lead on in a term that nobody can refuse: a follower knows a later term, or believes this epoch to have
+    /// ended. A newer leader that is just taking over is heard before.
+    pub(super) fn renew_later(&mut self, now: Timestamp) {
+        let at = now + self.config.given_up_timeout();
+        if let State::Leading(leading) = &mut self.state {
+            leading.renew_at.get_or_insert(at);
+        }
+    }
+
+    pub(super) fn beat_all(&mut self, now: Timestamp) {
+        for peer in self.peers.names().cloned().collect::<Vec<_>>() {
+            self.send_beat(&peer, now);
+        }
+    }
+
+    pub(super) fn send_beat(&mut self, to: &NodeName, now: Timestamp) {
+        let State::Leading(leading) = &self.state else { return };
+        let body = Body::Beat {
+            every_ms: self.beat_for(leading, to).as_millis() as u64,
+            round: self.round,
+            followers: u8::try_from(self.peers.followers(&leading.epoch, now)).unwrap_or(u8::MAX),
+            after: leading.after.clone(),
+            successors: leading.successors.clone(),
+        };
+        self.send(to, body, now);
+    }
+
+    /// Time between two beats to a peer. A better candidate that is not yet fit is to be heard soon when it is.
+    fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
+        let outranks =
+            |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.class() < self.candidacy().class();
+        match leading.successors.iter().position(|name| name == to) {
+            Some(0) => self.config.beat(),
+            Some(_) => self.config.near_beat(),
+            None if self.peers.get(to).and_then(|peer| peer.candidacy).is_some_and(outranks)
+                && self.peers.hears(to, self.clock.now()) =>
+            {
+                self.config.near_beat()
+            }
+            None => self.config.idle_beat(),
+        }
+    }
+
+    /// Chooses the successors, and tells all when they changed.
+    pub(super) fn name_successors(&mut self, now: Timestamp) {
+        let State::Leading(leading) = &mut self.state else { return };
+        let mut next = self.peers.successors(MAX_SUCCESSORS, now);
+        if let Some(handover) = &leading.handover {
+            next.retain(|name| *name != handover.to);
+            next.insert(0, handover.to.clone());
+            next.truncate(MAX_SUCCESSORS);
+        }
+        if next == leading.successors {
+            return;
+        }
+        leading.successors = next;
+        self.beat_all(now);
+    }
+}

@@ -1,0 +1,289 @@
+//! Messages of the election, as they travel between the nodes of a cell.
+
+use minicbor::{Decode, Encode};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::epoch::Epoch;
+use crate::names::NodeName;
+use crate::wire::{self, Encoding, Limits, RejectReason, Role};
+
+/// Most successors that a leader names, the standby first.
+pub const MAX_SUCCESSORS: usize = 3;
+
+/// Largest term taken from the wire: the largest integer that every JSON reader keeps exactly.
+pub const MAX_TERM: u64 = (1 << 53) - 1;
+
+/// Largest encoded message in bytes; it fits one Ethernet frame with room for the membership's seal.
+pub const MAX_MESSAGE_BYTES: usize = 1200;
+
+/// One message; may be lost, repeated, delayed and re-ordered on its way.
+///
+/// The transport must prove the sender: the election believes [`Self::from`].
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct ElectionMessage {
+    /// Major version of the message, [`wire::SCHEMA_VERSION`].
+    #[n(0)]
+    pub schema: u32,
+    /// The sender.
+    #[n(1)]
+    pub from: NodeName,
+    /// The sender's run: when it started, in Unix microseconds by its own clock.
+    #[n(2)]
+    pub run: u64,
+    /// Counts up with every message of a run, whoever it is for.
+    #[n(3)]
+    pub seq: u64,
+    /// The sender as a candidate.
+    #[serde(rename = "standing")]
+    #[n(4)]
+    pub candidacy: Candidacy,
+    /// The highest term that the sender knows to have been used.
+    #[n(5)]
+    pub term: u64,
+    /// The epoch that the sender follows or leads; absent while it has no leader.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(8)]
+    pub epoch: Option<Epoch>,
+    /// Whether the sender lately heard the addressee: links may work one way only.
+    #[n(6)]
+    pub hears_you: bool,
+    /// Its content.
+    #[n(7)]
+    pub body: Body,
+}
+
+/// A node as a candidate: its rank among possible leaders.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct Candidacy {
+    /// The role it was started with.
+    #[n(0)]
+    pub role: Role,
+    /// Its configured priority, higher leads first.
+    #[n(1)]
+    pub priority: u8,
+    /// Its processor load in quarters, damped.
+    #[n(2)]
+    pub load: u8,
+    /// Whether broker, fuser and gateway all work.
+    #[n(3)]
+    pub fit: bool,
+}
+
+/// The protocol. In the quiet, once the leader is known:
+///
+/// ```text
+/// leader    -> successor   Beat      every beat_ms          successor -> leader   Status
+/// leader    -> others      Beat      every idle_beat_ms     other     -> leader   Status
+/// ```
+///
+/// A node without a leader, or whose leader has missed two beats, asks around; the leader answers `Beat`, a node that
+/// hears the leader `LeaderEvidence`, any other `Status`. A claim to lead is a `Beat` of a higher epoch:
+///
+/// ```text
+/// seeker    -> all         Ask
+/// follower  -> seeker      LeaderEvidence     "I heard it 12 ms ago"
+/// claimant  -> all         Beat      epoch + 1, after = the epoch it succeeds
+/// ```
+///
+/// Handover, the old leader publishing all the while:
+///
+/// ```text
+/// leader     -> challenger  Offer                 every beat_ms until Ready
+/// challenger -> leader      Ready                 broker and fuser run, state is there
+/// leader     -> challenger  Yield { last_round }  right after that round; repeated
+/// challenger -> all         Beat                  epoch + 1, first round last_round + 1: the old leader stops
+/// ```
+///
+/// A leader that cannot go on says `Resign` to all.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+#[cbor(flat)]
+pub enum Body {
+    /// "This is how I stand": a greeting, and the answer to a beat.
+    #[n(0)]
+    Status {
+        /// The highest epoch that the sender knows to be over, such as that of a leader whose broker refused it, or that
+        /// it has lost when it refuses a lower one's beat.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[n(0)]
+        over: Option<Epoch>,
+    },
+    /// "Who leads, and who hears it?"
+    #[n(1)]
+    Ask {
+        /// Counts up with every question of the sender's run.
+        #[n(0)]
+        ask: u64,
+    },
+    /// "I hear the leader of my epoch": the answer to [`Body::Ask`].
+    #[serde(rename = "vouch")]
+    #[n(2)]
+    LeaderEvidence {
+        /// The question answered.
+        #[n(0)]
+        ask: u64,
+        /// Time since the leader was heard, in ms.
+        #[n(1)]
+        age_ms: u64,
+    },
+    /// "I lead": the leader's sign of life.
+    #[n(3)]
+    Beat {
+        /// Time until the addressee gets the next one, in ms.
+        #[n(0)]
+        every_ms: u64,
+        /// The round published last.
+        #[n(1)]
+        round: u64,
+        /// How many nodes follow and are heard.
+        #[n(2)]
+        followers: u8,
+        /// The epoch that this one succeeded, if any.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[n(3)]
+        after: Option<Epoch>,
+        /// The next leaders, the standby first; at most [`MAX_SUCCESSORS`].
+        #[n(4)]
+        successors: Vec<NodeName>,
+    },
+    /// "Get ready to lead in my place": to the challenger.
+    #[n(4)]
+    Offer,
+    /// "I am ready": to the leader.
+    #[n(5)]
+    Ready,
+    /// "Lead from the next round on": to the challenger.
+    #[n(6)]
+    Yield {
+        /// The last round published by the leader.
+        #[n(0)]
+        last_round: u64,
+    },
+    /// "I no longer lead": to all.
+    #[n(7)]
+    Resign {
+        /// The epoch that is over.
+        #[n(0)]
+        epoch: Epoch,
+        /// The last round published in it.
+        #[n(1)]
+        last_round: u64,
+    },
+}
+
+impl wire::Payload for ElectionMessage {
+    fn schema(&self) -> u32 {
+        self.schema
+    }
+}
+
+impl ElectionMessage {
+    /// Writes the message.
+    pub fn encode(&self, encoding: Encoding) -> Vec<u8> {
+        wire::encode(self, encoding)
+    }
+
+    /// Reads a message and checks every value in it.
+    ///
+    /// # Errors
+    /// [`RejectReason::TooLarge`], [`RejectReason::UnknownSchema`], or [`RejectReason::Malformed`] also for values that
+    /// no node sends.
+    pub fn decode(bytes: &[u8]) -> Result<Self, RejectReason> {
+        let limits = Limits { payload_bytes: MAX_MESSAGE_BYTES, ..Limits::default() };
+        let message: Self = wire::decode(bytes, &limits)?;
+        if message.is_plausible() { Ok(message) } else { Err(RejectReason::Malformed) }
+    }
+
+    fn is_plausible(&self) -> bool {
+        let known = |epoch: &Option<Epoch>| epoch.as_ref().is_none_or(|epoch| epoch.term <= self.term);
+        let body = match &self.body {
+            Body::Status { over } => known(over),
+            Body::Beat { every_ms, after, successors, .. } => {
+                let leads = self.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.from);
+                leads && known(after) && successors.len() <= MAX_SUCCESSORS && (1..=60_000).contains(every_ms)
+            }
+            Body::Resign { epoch, .. } => epoch.term <= self.term && epoch.leader == self.from,
+            Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready | Body::Yield { .. } => true,
+        };
+        body && self.term <= MAX_TERM && known(&self.epoch)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::SCHEMA_VERSION;
+
+    fn beat(term: u64, leader: &str) -> ElectionMessage {
+        ElectionMessage {
+            schema: SCHEMA_VERSION,
+            from: NodeName::new("edge").unwrap(),
+            run: 1_732_154_400_000_000,
+            seq: 9,
+            candidacy: Candidacy { role: Role::Edge, priority: 100, load: 1, fit: true },
+            term,
+            epoch: Some(Epoch::new(4, NodeName::new(leader).unwrap())),
+            hears_you: true,
+            body: Body::Beat { every_ms: 40, round: 88, followers: 31, after: None, successors: vec![] },
+        }
+    }
+
+    #[test]
+    fn messages_survive_every_encoding_and_fit_a_packet() {
+        let mut message = beat(4, "edge");
+        let long = NodeName::new("x".repeat(64)).unwrap();
+        if let Body::Beat { successors, after, .. } = &mut message.body {
+            *successors = vec![long.clone(), long.clone(), long.clone()];
+            *after = Some(Epoch::new(3, long));
+        }
+        for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
+            let bytes = message.encode(encoding);
+            assert!(bytes.len() <= MAX_MESSAGE_BYTES, "{}", bytes.len());
+            assert_eq!(ElectionMessage::decode(&bytes), Ok(message.clone()));
+        }
+    }
+
+    /// Names in the code may change; what is on the wire may not.
+    #[test]
+    fn the_wire_keeps_its_names() {
+        let epoch = || Epoch::new(4, NodeName::from_static("edge"));
+        for (body, expected) in [
+            (Body::Status { over: Some(epoch()) }, r#"{"status":{"over":{"term":4,"leader":"edge"}}}"#),
+            (Body::Ask { ask: 7 }, r#"{"ask":{"ask":7}}"#),
+            (Body::LeaderEvidence { ask: 7, age_ms: 12 }, r#"{"vouch":{"ask":7,"age_ms":12}}"#),
+            (
+                Body::Beat { every_ms: 50, round: 88, followers: 3, after: None, successors: Vec::new() },
+                r#"{"beat":{"every_ms":50,"round":88,"followers":3,"successors":[]}}"#,
+            ),
+            (Body::Offer, r#""offer""#),
+            (Body::Ready, r#""ready""#),
+            (Body::Yield { last_round: 88 }, r#"{"yield":{"last_round":88}}"#),
+            (
+                Body::Resign { epoch: epoch(), last_round: 88 },
+                r#"{"resign":{"epoch":{"term":4,"leader":"edge"},"last_round":88}}"#,
+            ),
+        ] {
+            let message = ElectionMessage { body, ..beat(4, "edge") };
+            let json = String::from_utf8(message.encode(Encoding::Json)).unwrap();
+            let envelope = concat!(
+                r#"{"schema":1,"from":"edge","run":1732154400000000,"seq":9,"#,
+                r#""standing":{"role":"edge","priority":100,"load":1,"fit":true},"#,
+                r#""term":4,"epoch":{"term":4,"leader":"edge"},"hears_you":true,"body":"#,
+            );
+            assert_eq!(json, format!("{envelope}{expected}}}"));
+        }
+        let compact = ElectionMessage { body: Body::LeaderEvidence { ask: 7, age_ms: 12 }, ..beat(4, "edge") };
+        let compact: String = compact.encode(Encoding::Compact).iter().map(|byte| format!("{byte:02x}")).collect();
+        assert_eq!(compact, "");
+    }
+
+    #[test]
+    fn implausible_messages_are_refused() {
+        let refused = |message: ElectionMessage| ElectionMessage::decode(&message.encode(Encoding::Cbor)).unwrap_err();
+        assert_eq!(refused(beat(3, "edge")), RejectReason::Malformed, "an epoch beyond the sender's term");
+        assert_eq!(refused(beat(4, "euclid")), RejectReason::Malformed, "a beat in another's name");
+        assert_eq!(refused(beat(MAX_TERM + 1, "edge")), RejectReason::Malformed, "a term beyond all bounds");
+        assert_eq!(refused(ElectionMessage { schema: 2, ..beat(4, "edge") }), RejectReason::UnknownSchema);
+    }
+}

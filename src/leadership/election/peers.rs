@@ -1,0 +1,233 @@
+//! The other nodes as this one knows them, and their rank as candidates.
+
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use crate::epoch::Epoch;
+use crate::leadership::config::ElectionConfig;
+use crate::leadership::election::message::{Candidacy, ElectionMessage};
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::Role;
+
+/// Rank that is worth a handover: edge before auto, then the higher priority.
+pub(super) type Class = (bool, Reverse<u8>);
+
+impl Candidacy {
+    pub(super) fn class(&self) -> Class {
+        (self.role != Role::Edge, Reverse(self.priority))
+    }
+
+    pub(super) fn may_lead(&self) -> bool {
+        self.fit && self.role != Role::Cav
+    }
+}
+
+/// Another node.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub(super) struct Peer {
+    pub(super) candidacy: Option<Candidacy>,
+    /// Epoch that it follows or leads, by its own message.
+    pub(super) epoch: Option<Epoch>,
+    /// Whether our last message to it said that we hear it.
+    pub(super) told: bool,
+    run: u64,
+    seq: u64,
+    heard_at: Option<Timestamp>,
+    /// Time since when it has been heard without a gap, fit, and of one class.
+    fit_since: Option<Timestamp>,
+    /// Time until which it counts as gone although its messages may still be under way.
+    gone_until: Option<Timestamp>,
+    /// Time at which the membership gave it up, if it was not heard since.
+    given_up_at: Option<Timestamp>,
+}
+
+/// All other nodes that were ever heard of and not given up.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Peers {
+    table: BTreeMap<NodeName, Peer>,
+    contact_timeout: Duration,
+    response_timeout: Duration,
+    given_up_timeout: Duration,
+    standby_silence: Duration,
+    /// Time of the next look for peers that were given up and not heard since.
+    forget_at: Option<Timestamp>,
+}
+
+impl Peers {
+    /// No peers; timeouts are those of `config`.
+    pub(super) fn new(config: &ElectionConfig) -> Self {
+        Self {
+            table: BTreeMap::new(),
+            contact_timeout: config.contact_timeout(),
+            response_timeout: config.response_timeout(),
+            given_up_timeout: config.given_up_timeout(),
+            standby_silence: config.standby_silence(),
+            forget_at: None,
+        }
+    }
+
+    pub(super) fn add(&mut self, name: &NodeName) {
+        self.table.entry(name.clone()).or_default();
+    }
+
+    pub(super) fn names(&self) -> impl Iterator<Item = &NodeName> {
+        self.table.keys()
+    }
+
+    pub(super) fn get(&self, name: &NodeName) -> Option<&Peer> {
+        self.table.get(name)
+    }
+
+    pub(super) fn told(&mut self, name: &NodeName, hears: bool) {
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.told = hears;
+        }
+    }
+
+    /// Notes what every message says about its sender; false for one that is repeated or overtaken.
+    pub(super) fn note(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
+        let contact_timeout = self.contact_timeout;
+        let peer = self.table.entry(message.from.clone()).or_default();
+        let silent = peer.heard_at.is_none_or(|at| now.since(at) > contact_timeout);
+        let newer = (message.run, message.seq) > (peer.run, peer.seq);
+        if !newer && (message.run == peer.run || !silent) {
+            return false;
+        }
+        let same = peer.candidacy.is_some_and(|candidacy| candidacy.class() == message.candidacy.class());
+        if !message.candidacy.fit {
+            peer.fit_since = None;
+        } else if silent || !same || message.run != peer.run || peer.fit_since.is_none() {
+            peer.fit_since = Some(now);
+        }
+        // A new run, or one out of touch, has to be told again that it is heard.
+        peer.told &= !silent && message.run == peer.run;
+        peer.run = message.run;
+        peer.seq = message.seq;
+        peer.heard_at = Some(now);
+        peer.given_up_at = None;
+        peer.candidacy = Some(message.candidacy);
+        peer.epoch = message.epoch.clone();
+        true
+    }
+
+    /// Marks a peer whose process is gone.
+    pub(super) fn gone(&mut self, name: &NodeName, now: Timestamp) {
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.gone_until = Some(now + self.response_timeout);
+            peer.fit_since = None;
+            peer.heard_at = None;
+        }
+    }
+
+    /// Forgets a peer that the membership gave up: at once if it has been silent, else if it stays so.
+    pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
+        let Some(peer) = self.table.get_mut(name) else { return };
+        if peer.heard_at.is_none_or(|at| now.since(at) > self.given_up_timeout) {
+            self.table.remove(name);
+        } else {
+            peer.given_up_at = Some(now);
+            self.forget_at.get_or_insert(now + self.given_up_timeout);
+        }
+    }
+
+    /// Forgets who was given up and not heard since.
+    pub(super) fn forget_silent(&mut self, now: Timestamp) {
+        if self.forget_at.is_none_or(|at| now < at) {
+            return;
+        }
+        let wait = self.given_up_timeout;
+        self.table.retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
+        self.forget_at = self.table.values().filter_map(|peer| peer.given_up_at).min().map(|at| at + wait);
+    }
+
+    /// Lets a peer prove itself anew before it is handed the lead.
+    pub(super) fn restart_trial(&mut self, name: &NodeName, now: Timestamp) {
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.fit_since = peer.fit_since.map(|_| now);
+        }
+    }
+
+    /// Whether a peer was heard lately.
+    pub(super) fn hears(&self, name: &NodeName, now: Timestamp) -> bool {
+        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| now.since(at) <= self.contact_timeout)
+    }
+
+    /// Whether a peer was heard at `since` or later.
+    pub(super) fn heard_since(&self, name: &NodeName, since: Timestamp) -> bool {
+        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| at >= since)
+    }
+
+    /// How many nodes heard lately follow `epoch`.
+    pub(super) fn followers(&self, epoch: &Epoch, now: Timestamp) -> usize {
+        self.table.iter().filter(|(name, peer)| peer.epoch.as_ref() == Some(epoch) && self.hears(name, now)).count()
+    }
+
+    /// Whether a peer could lead, as far as is known without having heard it lately.
+    pub(super) fn may_lead(&self, name: &NodeName, now: Timestamp) -> bool {
+        self.table.get(name).is_some_and(|peer| {
+            peer.candidacy.is_some_and(|candidacy| candidacy.may_lead())
+                && peer.gone_until.is_none_or(|until| now >= until)
+        })
+    }
+
+    /// Whether a peer that a leader named its successor could still lead: the leader's word outweighs what the peer
+    /// said of itself long ago.
+    pub(super) fn may_succeed(&self, name: &NodeName, now: Timestamp) -> bool {
+        let unfit =
+            |peer: &Peer| peer.candidacy.is_some_and(|candidacy| !candidacy.may_lead()) && self.hears(name, now);
+        self.table.get(name).is_some_and(|peer| peer.gone_until.is_none_or(|until| now >= until) && !unfit(peer))
+    }
+
+    /// Everyone who could lead, in no order of preference.
+    pub(super) fn candidates(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, Candidacy)> {
+        self.table
+            .iter()
+            .filter(move |(name, _)| self.may_lead(name, now))
+            .filter_map(|(name, peer)| Some((name, peer.candidacy?)))
+    }
+
+    /// The leader's successors: heard lately and fit, the best first. The membership may hear less than the election does.
+    /// So a peer that it gave up remains a successor if it was heard within the beats that a standby may miss.
+    pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
+        let silence = self.standby_silence;
+        let given_up = |name: &NodeName| {
+            self.table.get(name).is_some_and(|peer| peer.given_up_at.is_some())
+                && !self.heard_since(name, now - silence)
+        };
+        let mut fit: Vec<_> =
+            self.candidates(now).filter(|(name, _)| self.hears(name, now) && !given_up(name)).collect();
+        fit.sort_by_key(|&(name, candidacy)| (candidacy.class(), candidacy.load, name.clone()));
+        fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
+    }
+
+    /// The best peer that has been fit for `stable` and should have the lead of `leader` with `candidacy`.
+    ///
+    /// Load never takes the lead from a living leader: leading is load, so the lead would swing. Among equals the lesser
+    /// name is handed the lead unless it is busier, once the leader has led `since` long enough to know that nobody better
+    /// is there. Waits for a better candidate that is more than halfway through `stable`; otherwise the lead moves twice.
+    pub(super) fn challenger(
+        &self,
+        (leader, candidacy): (&NodeName, Candidacy),
+        since: Timestamp,
+        stable: Duration,
+        now: Timestamp,
+    ) -> Option<(NodeName, Timestamp)> {
+        let ours = candidacy.class();
+        let present = || self.candidates(now).filter(|(name, _)| self.hears(name, now));
+        let is_best = present().all(|(_, other)| other.class() >= ours);
+        present()
+            .filter(|&(name, other)| {
+                let theirs = other.class();
+                theirs < ours || (is_best && theirs == ours && other.load <= candidacy.load && name < leader)
+            })
+            .filter_map(|(name, other)| {
+                let fit_since = self.table.get(name)?.fit_since?;
+                let since = if other.class() < ours { fit_since } else { fit_since.max(since) };
+                Some((name, other, since + stable))
+            })
+            .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.class(), name.clone()))
+            .map(|(name, _, from)| (name.clone(), from))
+    }
+}

@@ -1,0 +1,206 @@
+//! Without a leader: asking around, and claiming the lead in turn.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use crate::epoch::Epoch;
+use crate::leadership::election::interface::ElectionEffect;
+use crate::leadership::election::leading::Leading;
+use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
+use crate::leadership::election::{Election, State};
+use crate::names::NodeName;
+use crate::round::FirstRound;
+use crate::time::Timestamp;
+
+/// A node that knows of no leader.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Seeking {
+    /// Time at which the first in turn may claim.
+    since: Timestamp,
+    /// The successors named by the lost leader; others come after them.
+    order: Vec<NodeName>,
+    /// Time of the first question about the lost leader that nobody answered.
+    asked_at: Option<Timestamp>,
+    ask_at: Timestamp,
+    /// Evidence of the lost leader must be newer than this to bring it back.
+    pub(super) known_until: Timestamp,
+}
+
+impl Seeking {
+    pub(super) fn new(since: Timestamp, order: Vec<NodeName>, ask_at: Timestamp) -> Self {
+        Self { since, order, asked_at: None, ask_at, known_until: Timestamp::default() }
+    }
+}
+
+/// The latest questions. Evidence is dated from the question that it answers, so stale evidence cannot circulate.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub(super) struct Questions {
+    count: u64,
+    recent: VecDeque<(u64, Timestamp)>,
+}
+
+impl Questions {
+    const KEPT: usize = 8;
+
+    fn ask(&mut self, now: Timestamp) -> u64 {
+        self.count += 1;
+        self.recent.push_back((self.count, now));
+        if self.recent.len() > Self::KEPT {
+            self.recent.pop_front();
+        }
+        self.count
+    }
+
+    pub(super) fn asked_at(&self, ask: u64) -> Option<Timestamp> {
+        self.recent.iter().find(|(count, _)| *count == ask).map(|(_, at)| *at)
+    }
+
+    pub(super) fn last_at(&self) -> Timestamp {
+        self.recent.back().map_or_else(Timestamp::default, |(_, at)| *at)
+    }
+}
+
+impl Election {
+    pub(super) fn seeking_deadline(&self, seeking: &Seeking) -> Timestamp {
+        self.claim_at(seeking).map_or(seeking.ask_at, |claim_at| claim_at.min(seeking.ask_at))
+    }
+
+    pub(super) fn seek_timers(&mut self, now: Timestamp) {
+        let State::Seeking(seeking) = &self.state else { return };
+        if self.claim_at(seeking).is_some_and(|at| now >= at) {
+            self.lead(self.epoch.clone(), now);
+        } else if now >= seeking.ask_at {
+            self.ask_all(now);
+            let ask_at = now + self.config.ask_period();
+            if let State::Seeking(seeking) = &mut self.state {
+                seeking.ask_at = ask_at;
+            }
+        }
+    }
+
+    /// Seeks a leader; the first of `order` that can leads at once, the next one step later.
+    pub(super) fn seek(&mut self, order: Vec<NodeName>, since: Timestamp, now: Timestamp) {
+        let (known_until, asked_at) = match &self.state {
+            State::Following(following) => (following.evidence_at() + self.config.beat(), following.asked_at),
+            State::Seeking(_) | State::Leading(_) => (now, None),
+        };
+        // The first in turn is heard before everyone has to ask.
+        let ask_at = now + self.config.answer_time();
+        self.state = State::Seeking(Seeking { known_until, asked_at, ..Seeking::new(since, order, ask_at) });
+    }
+
+    pub(super) fn ask_all(&mut self, now: Timestamp) {
+        let ask = self.questions.ask(now);
+        self.send_all(&Body::Ask { ask }, now);
+    }
+
+    /// Asks the leader itself, and those who hear it often.
+    pub(super) fn ask_near(&mut self, now: Timestamp) {
+        let State::Following(following) = &self.state else { return };
+        let near = following.successors.iter().filter(|name| **name != self.id);
+        let near: Vec<_> = near.chain([&following.epoch.leader]).cloned().collect();
+        let ask = self.questions.ask(now);
+        for peer in near {
+            self.send(&peer, Body::Ask { ask }, now);
+        }
+    }
+
+    /// Answers a question about the leader: how long ago this node heard it.
+    pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
+        match &self.state {
+            State::Leading(_) => self.send_beat(from, now),
+            State::Following(following) if now.since(following.evidence_at()) <= self.config.response_timeout() => {
+                let age = now.since(following.evidence_at()).as_micros().div_ceil(1000);
+                self.send(from, Body::LeaderEvidence { ask, age_ms: u64::try_from(age).unwrap_or(u64::MAX) }, now);
+            }
+            State::Following(_) | State::Seeking(_) => self.send_status(from, now),
+        }
+    }
+
+    pub(super) fn take_leader_evidence(
+        &mut self,
+        from: &NodeName,
+        epoch: Option<Epoch>,
+        ask: u64,
+        age_ms: u64,
+        now: Timestamp,
+    ) {
+        let (Some(epoch), Some(asked_at)) = (epoch, self.questions.asked_at(ask)) else { return };
+        let heard_at = asked_at - Duration::from_millis(age_ms);
+        if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) {
+            return;
+        }
+        let believable = heard_at + self.config.response_timeout() > now;
+        let doubtful = match &mut self.state {
+            State::Following(following) if following.epoch == epoch => {
+                following.indirect_heard_at = following.indirect_heard_at.max(heard_at);
+                return;
+            }
+            State::Following(following) => now >= following.suspect_at(&self.config),
+            State::Seeking(seeking) => Some(&epoch) != self.epoch.as_ref() || heard_at > seeking.known_until,
+            State::Leading(_) => false,
+        };
+        if believable && doubtful && Some(&epoch) >= self.epoch.as_ref() {
+            self.adopt(epoch, heard_at, now);
+        }
+    }
+
+    /// Takes the lead in an unused term, succeeding `after`, and tells all.
+    pub(super) fn lead(&mut self, after: Option<Epoch>, now: Timestamp) {
+        let term = self.terms.seen.max(self.terms.found) + 1;
+        self.persist(term);
+        self.terms.seen = term;
+        let epoch = Epoch::new(term, self.id.clone());
+        self.epoch = Some(epoch.clone());
+        let successors = self.peers.successors(MAX_SUCCESSORS, now);
+        let first = match &self.state {
+            State::Seeking(seeking) if seeking.order.first() == Some(&self.id) => FirstRound::Overdue,
+            State::Seeking(_) => FirstRound::AfterConnects,
+            State::Following(_) => FirstRound::OnTime,
+            State::Leading(_) => FirstRound::InStep,
+        };
+        self.effects.push(ElectionEffect::Lead { epoch: epoch.clone(), first_round: self.round + 1, first });
+        self.state = State::Leading(Leading::new(epoch, after, successors, now));
+        self.beat_all(now);
+    }
+
+    /// Gives up the lead for want of broker, fuser or gateway, or because the node stops.
+    pub(super) fn resign(&mut self, now: Timestamp) {
+        let State::Leading(leading) = &mut self.state else { return };
+        let epoch = leading.epoch.clone();
+        let order = std::mem::take(&mut leading.successors);
+        self.close(epoch.clone());
+        self.effects.push(ElectionEffect::StopPublishing { epoch: epoch.clone() });
+        self.seek(order, now + self.config.response_timeout(), now);
+        self.send_all(&Body::Resign { epoch, last_round: self.round }, now);
+    }
+
+    /// Time of this node's turn to claim; `None` when it may not lead.
+    ///
+    /// A node that did not answer when the leader was doubted is as much out of reach as the leader. It is waited for no
+    /// longer than an answer takes.
+    fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
+        let turn = |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
+        let in_order = turn(None);
+        let among_present = seeking.asked_at.map(|at| turn(Some(at)).max(at + self.config.answer_time()));
+        self.candidacy().may_lead().then(|| among_present.map_or(in_order, |at| at.min(in_order)))
+    }
+
+    /// Number of nodes that would claim before this one, of those heard at `since` or later if it is given.
+    ///
+    /// The successors come first, in the order in which the lost leader named them: it heard them all, whereas what a
+    /// follower knows of others may be as old as their first greeting.
+    fn place(&self, order: &[NodeName], since: Option<Timestamp>) -> u32 {
+        let now = self.clock.now();
+        let present = |name: &NodeName| since.is_none_or(|at| self.peers.heard_since(name, at));
+        let there = |name: &&NodeName| **name == self.id || self.peers.may_succeed(name, now) && present(name);
+        let named: Vec<&NodeName> = order.iter().filter(there).collect();
+        let before = named.iter().position(|name| **name == self.id).unwrap_or_else(|| {
+            let place = |name: &NodeName, candidacy: Candidacy| (candidacy.class(), candidacy.load, name.clone());
+            let own = place(&self.id, self.candidacy());
+            let others = self.peers.candidates(now).filter(|(name, _)| !named.contains(name) && present(name));
+            named.len() + others.filter(|&(name, other)| place(name, other) < own).count()
+        });
+        u32::try_from(before).unwrap_or(u32::MAX)
+    }
+}

@@ -1,0 +1,273 @@
+//! Health of a node's own parts: whether they are fit to lead.
+//!
+//! The parts are looked at every [`HEALTH_PERIOD`]. A look shows at once how many rounds the fuser has closed and how busy
+//! the machine is; broker and gateway answer later. A stop of the whole node is no fault of its parts.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use crate::leadership::address::BrokerAddress;
+use crate::leadership::election::{AwakeClock, Health};
+use crate::leadership::links::{Brokers, DataPlane, LinkState};
+use crate::leadership::readiness::round_timeout;
+use crate::leadership::timers::{HEALTH_PERIOD, LOOK_TOLERANCE};
+use crate::time::Timestamp;
+
+/// The latest news of the parts.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct HealthMonitor {
+    links: BTreeMap<BrokerAddress, LinkState>,
+    sample: HealthSample,
+    /// Time that passed while this node was awake.
+    clock: AwakeClock,
+    look_at: Timestamp,
+    rounds_closed: u64,
+    round_closed_at: Option<Timestamp>,
+    load_percent: u8,
+}
+
+/// The answer of the parts to a look at them.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub struct HealthSample {
+    /// Whether clients can connect to the node's own broker.
+    pub broker_serves: bool,
+    /// State of the gateway's links; none when it does not answer.
+    pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
+    /// Whether the fuser runs.
+    pub fuser_runs: bool,
+}
+
+impl HealthMonitor {
+    /// A monitor that knows nothing; the first look is due at once.
+    pub fn new(now: Timestamp) -> Self {
+        Self {
+            links: BTreeMap::new(),
+            sample: HealthSample::default(),
+            clock: AwakeClock::new(now, LOOK_TOLERANCE),
+            look_at: now,
+            rounds_closed: 0,
+            round_closed_at: None,
+            load_percent: 0,
+        }
+    }
+
+    /// Time of the next look at the parts.
+    pub fn next_deadline(&self) -> Timestamp {
+        self.look_at
+    }
+
+    /// Whether to look at the parts now; the next look is then due [`HEALTH_PERIOD`] later.
+    pub fn is_due(&mut self, now: Timestamp) -> bool {
+        // A clock that was set back does not put the look off.
+        self.look_at = self.look_at.min(now + HEALTH_PERIOD);
+        let is_due = now >= self.look_at;
+        if is_due {
+            self.look_at = now + HEALTH_PERIOD;
+        }
+        is_due
+    }
+
+    /// Notes the state of a link; true when an established one has broken and nothing listens there any more.
+    pub fn note_link(&mut self, broker: &BrokerAddress, state: LinkState) -> bool {
+        match state {
+            // Whether nothing listens there is not known yet.
+            LinkState::Down | LinkState::Stalled => {
+                self.links.entry(broker.clone()).and_modify(|known| *known = state);
+                false
+            }
+            LinkState::Up => {
+                self.links.insert(broker.clone(), state);
+                false
+            }
+            LinkState::Refused => self.links.remove(broker).is_some(),
+        }
+    }
+
+    /// Forgets all links: the gateway makes them anew.
+    pub fn forget_links(&mut self) {
+        self.links.clear();
+    }
+
+    /// Notes the answers. They make up for a link that came up before there was anyone to be told.
+    pub fn note_sample(&mut self, sample: HealthSample) {
+        for (broker, state) in sample.links.iter().flatten() {
+            match state {
+                LinkState::Up | LinkState::Stalled => {
+                    self.links.insert(broker.clone(), *state);
+                }
+                // That it is refused is news of its own, which may still be under way.
+                LinkState::Down | LinkState::Refused => {
+                    self.links.entry(broker.clone()).and_modify(|known| *known = LinkState::Down);
+                }
+            }
+        }
+        self.sample = sample;
+    }
+
+    /// Notes a look: the number of rounds closed so far, and the processor load in percent.
+    pub fn note_look(&mut self, rounds_closed: u64, load_percent: u8, now: Timestamp) {
+        let due = self.clock.now() + HEALTH_PERIOD;
+        let now = self.clock.advance(now, due);
+        if rounds_closed != self.rounds_closed {
+            self.rounds_closed = rounds_closed;
+            self.round_closed_at = Some(now);
+        }
+        self.load_percent = load_percent;
+    }
+
+    /// The parts as the election wants to know them. A node that uses an external broker, its own, or both, needs one
+    /// of them. A stalled link is none, but in a leader with `no_other` to lead, which would only make way for nobody.
+    pub fn health(&self, plane: &DataPlane, brokers: &Brokers, no_other: bool, round_period: Duration) -> Health {
+        let external = self.is_up(plane.external.as_ref(), no_other);
+        let embedded = plane.embedded && self.sample.broker_serves;
+        let timeout = round_timeout(round_period);
+        let closes_rounds = self.round_closed_at.is_some_and(|at| self.clock.now().since(at) < timeout);
+        Health {
+            broker: external || embedded,
+            fuser: self.sample.fuser_runs && closes_rounds,
+            gateway: self.sample.links.is_some()
+                && (external || (embedded && self.is_up(brokers.own.as_ref(), no_other))),
+            load_percent: self.load_percent,
+        }
+    }
+
+    /// Whether members on other machines are reached: by the node's own broker, unless it is `private` to this machine,
+    /// or by an external one for as long as there is a link to it.
+    pub fn reaches_others(&self, plane: &DataPlane, private: bool, no_other: bool) -> bool {
+        !private || self.is_up(plane.external.as_ref(), no_other)
+    }
+
+    fn is_up(&self, broker: Option<&BrokerAddress>, no_other: bool) -> bool {
+        match broker.and_then(|broker| self.links.get(broker)) {
+            Some(LinkState::Up) => true,
+            Some(LinkState::Stalled) => no_other,
+            Some(LinkState::Down | LinkState::Refused) | None => false,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERIOD: Duration = Duration::from_millis(100);
+
+    fn address(port: u16) -> BrokerAddress {
+        format!("127.0.0.1:{port}").parse().unwrap()
+    }
+
+    /// A monitor of parts that answered, and have closed a round.
+    fn monitor(now: Timestamp) -> HealthMonitor {
+        let mut monitor = HealthMonitor::new(now);
+        monitor.note_sample(HealthSample { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true });
+        monitor.note_look(1, 0, now);
+        monitor
+    }
+
+    #[test]
+    fn only_an_established_link_that_broke_proves_its_process_gone() {
+        let mut monitor = HealthMonitor::new(Timestamp(0));
+        let broker = address(1);
+        assert!(!monitor.note_link(&broker, LinkState::Refused), "never reached");
+        assert!(!monitor.note_link(&broker, LinkState::Up));
+        assert!(!monitor.note_link(&broker, LinkState::Down));
+        assert!(monitor.note_link(&broker, LinkState::Refused));
+        assert!(!monitor.note_link(&broker, LinkState::Refused), "told once");
+    }
+
+    #[test]
+    fn a_node_is_fit_while_broker_link_and_rounds_work() {
+        let now = Timestamp(60_000_000);
+        let mut monitor = monitor(now);
+        let plane = DataPlane { external: None, embedded: true };
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit(), "no link to its own broker yet");
+        monitor.note_link(&address(1), LinkState::Up);
+        assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
+        for looks in 1..=12 {
+            monitor.note_look(1, 0, now + HEALTH_PERIOD * looks);
+        }
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD).fuser, "no rounds");
+        monitor.note_link(&address(1), LinkState::Down);
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD).gateway);
+    }
+
+    #[test]
+    fn a_node_that_was_stopped_does_not_blame_its_fuser() {
+        let now = Timestamp(60_000_000);
+        let mut monitor = monitor(now);
+        let fuser = |monitor: &HealthMonitor| {
+            let plane = DataPlane { external: None, embedded: true };
+            monitor.health(&plane, &Brokers::default(), false, PERIOD).fuser
+        };
+        monitor.note_look(1, 0, now + Duration::from_secs(10));
+        assert!(fuser(&monitor), "the look may come before the fuser's next round");
+        let after = |ms| now + Duration::from_secs(10) + Duration::from_millis(ms);
+        (1..=8).for_each(|looks| monitor.note_look(1, 0, after(250 * looks)));
+        assert!(!fuser(&monitor), "the fuser had its time");
+        monitor.note_look(2, 0, after(2250));
+        assert!(fuser(&monitor));
+    }
+
+    #[test]
+    fn a_link_that_came_up_unnoticed_is_found_by_asking() {
+        let now = Timestamp(60_000_000);
+        let mut monitor = monitor(now);
+        let plane = DataPlane { external: None, embedded: true };
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        let links = |state| Some(BTreeMap::from([(address(1), state)]));
+        let answer = |state| HealthSample { broker_serves: true, links: links(state), fuser_runs: true };
+        monitor.note_sample(answer(LinkState::Up));
+        assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
+        monitor.note_sample(answer(LinkState::Down));
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
+        assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
+    }
+
+    #[test]
+    fn a_broker_that_passes_nothing_on_is_none_unless_nobody_else_could_lead() {
+        let now = Timestamp(60_000_000);
+        let mut monitor = monitor(now);
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        monitor.note_link(&address(1), LinkState::Up);
+        let fit = |monitor: &HealthMonitor, no_other| {
+            let plane = DataPlane { external: None, embedded: true };
+            monitor.health(&plane, &brokers, no_other, PERIOD).is_fit()
+        };
+        assert!(fit(&monitor, false));
+        assert!(!monitor.note_link(&address(1), LinkState::Stalled));
+        assert_eq!((fit(&monitor, false), fit(&monitor, true)), (false, true));
+        monitor.note_link(&address(1), LinkState::Down);
+        assert!(!fit(&monitor, true));
+        monitor.note_link(&address(1), LinkState::Stalled);
+        assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
+    }
+
+    #[test]
+    fn an_external_broker_makes_up_for_a_private_one_only_while_it_is_there() {
+        let mut monitor = HealthMonitor::new(Timestamp(0));
+        let plane = DataPlane { external: Some(address(9)), embedded: true };
+        let reaches = |monitor: &HealthMonitor, private| monitor.reaches_others(&plane, private, false);
+        assert_eq!((reaches(&monitor, true), reaches(&monitor, false)), (false, true), "never reached");
+        for (state, reached) in [(LinkState::Up, true), (LinkState::Stalled, false), (LinkState::Down, false)] {
+            monitor.note_link(&address(9), state);
+            assert_eq!(reaches(&monitor, true), reached, "{state:?}");
+        }
+    }
+
+    #[test]
+    fn with_an_external_broker_its_link_counts_and_with_both_either() {
+        let now = Timestamp(60_000_000);
+        let mut monitor = monitor(now);
+        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        monitor.note_link(&address(1), LinkState::Up);
+        let fit = |monitor: &HealthMonitor, embedded| {
+            let plane = DataPlane { external: Some(address(9)), embedded };
+            monitor.health(&plane, &brokers, false, PERIOD).is_fit()
+        };
+        assert!(!fit(&monitor, false));
+        assert!(fit(&monitor, true), "falls back to its own");
+        monitor.note_link(&address(9), LinkState::Up);
+        assert!(fit(&monitor, false));
+    }
+}

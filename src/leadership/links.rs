@@ -1,0 +1,159 @@
+//! The brokers that a node keeps links to.
+//!
+//! Reports go out on every link, so that the standby gets them on its own broker. The leader publishes on its own broker
+//! and on the standby's. A link outlives its use by [`LINK_LINGER`].
+
+use std::collections::BTreeSet;
+
+use crate::leadership::address::BrokerAddress;
+use crate::leadership::timers::LINK_LINGER;
+use crate::time::Timestamp;
+
+/// Brokers that carry a cell's reports and maps.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct DataPlane {
+    /// A broker that belongs to no node and is used by all.
+    pub external: Option<BrokerAddress>,
+    /// Whether the brokers of leader and standby are used. Without an external broker they always are. Beside one they
+    /// are if configured, so that nothing is switched when it goes or returns.
+    pub embedded: bool,
+}
+
+/// State of a link to a broker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum LinkState {
+    /// Connected, subscribed, status published.
+    Up,
+    /// Connected, but nothing comes back of what is sent: the broker hangs, or its answers are lost.
+    Stalled,
+    /// Not connected; attempts go on.
+    Down,
+    /// Not connected, and nothing listens there: the broker's process is gone. Attempts go on.
+    Refused,
+}
+
+/// The brokers of leader and standby, and the node's own.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub struct Brokers {
+    /// The node's own broker.
+    pub own: Option<BrokerAddress>,
+    /// The leader's broker.
+    pub leader: Option<BrokerAddress>,
+    /// The standby's broker.
+    pub standby: Option<BrokerAddress>,
+}
+
+/// The links that a gateway is to keep.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct WantedLinks {
+    /// All brokers to be linked to.
+    pub brokers: Vec<BrokerAddress>,
+    /// Those of them whose reports a candidate takes: all vehicles send to each.
+    pub report_brokers: Vec<BrokerAddress>,
+}
+
+/// The links that are wanted, and those that are kept for a while longer.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Links {
+    plane: DataPlane,
+    present: Brokers,
+    /// Brokers no longer used, and until when their links are kept.
+    lingering: Vec<(BrokerAddress, Timestamp)>,
+    wanted: BTreeSet<BrokerAddress>,
+}
+
+impl Links {
+    /// No links yet.
+    pub fn new(plane: DataPlane) -> Self {
+        Self { plane, present: Brokers::default(), lingering: Vec::new(), wanted: BTreeSet::new() }
+    }
+
+    /// Notes the brokers of the moment; returns the links to keep if they are others than before.
+    pub fn update(&mut self, brokers: Brokers, now: Timestamp) -> Option<WantedLinks> {
+        let is_expired = self.lingering.iter().any(|(_, until)| *until <= now);
+        if brokers == self.present && !is_expired && !self.wanted.is_empty() {
+            return None;
+        }
+        if brokers != self.present {
+            let left = [self.present.leader.take(), self.present.standby.take()].into_iter().flatten();
+            self.lingering.extend(left.map(|broker| (broker, now + LINK_LINGER)));
+            self.present = brokers;
+        }
+        self.lingering.retain(|(_, until)| *until > now);
+        let mut wanted: BTreeSet<_> = self.plane.external.iter().cloned().collect();
+        if self.plane.embedded {
+            let Brokers { own, leader, standby } = &self.present;
+            wanted.extend([own, leader, standby].into_iter().flatten().cloned());
+            wanted.extend(self.lingering.iter().map(|(broker, _)| broker.clone()));
+        }
+        if wanted == self.wanted {
+            return None;
+        }
+        self.wanted = wanted;
+        let report_brokers = self.present.own.iter().chain(&self.plane.external).cloned().collect();
+        Some(WantedLinks { brokers: self.wanted.iter().cloned().collect(), report_brokers })
+    }
+
+    /// Forgets the wanted links, so that the next update tells them: a new gateway does not know them.
+    pub fn forget(&mut self) {
+        self.wanted.clear();
+    }
+
+    /// The brokers of the moment, as of the last update.
+    pub fn brokers(&self) -> &Brokers {
+        &self.present
+    }
+
+    /// Brokers that carry the data.
+    pub fn plane(&self) -> &DataPlane {
+        &self.plane
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn broker(port: u16) -> BrokerAddress {
+        format!("127.0.0.1:{port}").parse().unwrap()
+    }
+
+    fn brokers(own: u16, leader: u16, standby: u16) -> Brokers {
+        Brokers { own: Some(broker(own)), leader: Some(broker(leader)), standby: Some(broker(standby)) }
+    }
+
+    fn at(ms: u64) -> Timestamp {
+        Timestamp(ms * 1000)
+    }
+
+    fn update(links: &mut Links, brokers: Brokers, now: Timestamp) -> Option<Vec<BrokerAddress>> {
+        links.update(brokers, now).map(|wanted| wanted.brokers)
+    }
+
+    #[test]
+    fn a_link_outlives_a_change_of_leader_for_a_while() {
+        let mut links = Links::new(DataPlane { external: None, embedded: true });
+        assert_eq!(update(&mut links, brokers(3, 1, 2), at(0)), Some(vec![broker(1), broker(2), broker(3)]));
+        assert_eq!(update(&mut links, brokers(3, 2, 3), at(100)), None, "the old leader's is kept");
+        assert_eq!(update(&mut links, brokers(3, 2, 3), at(2200)), Some(vec![broker(2), broker(3)]));
+        links.forget();
+        assert_eq!(update(&mut links, brokers(3, 2, 3), at(2300)), Some(vec![broker(2), broker(3)]));
+    }
+
+    #[test]
+    fn an_external_broker_is_used_alone_or_beside_the_others() {
+        let external = Some(broker(9));
+        let mut alone = Links::new(DataPlane { external: external.clone(), embedded: false });
+        assert_eq!(update(&mut alone, brokers(3, 1, 2), at(0)), Some(vec![broker(9)]));
+        assert_eq!(update(&mut alone, brokers(3, 2, 3), at(1)), None);
+        let mut beside = Links::new(DataPlane { external, embedded: true });
+        assert_eq!(update(&mut beside, brokers(2, 1, 2), at(0)), Some(vec![broker(1), broker(2), broker(9)]));
+    }
+
+    #[test]
+    fn reports_are_taken_from_the_own_broker_and_the_external_one() {
+        let mut links = Links::new(DataPlane { external: Some(broker(9)), embedded: true });
+        let wanted = links.update(brokers(3, 1, 2), at(0)).unwrap();
+        assert_eq!(wanted.report_brokers, [broker(3), broker(9)]);
+    }
+}

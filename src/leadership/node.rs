@@ -1,0 +1,404 @@
+//! The leadership of one node: a machine without clocks or sockets that decides what its actors carry out.
+//!
+//! # Call order
+//!
+//! [`LeadershipNode::new`] with the saved term, then [`Input::OwnBroker`] if the node has one. From then on
+//! [`LeadershipNode::handle`] with whatever happens, and with [`Input::Wake`] at [`LeadershipNode::next_deadline`]. The
+//! [`Effect`]s are carried out in order, before the next input. Equal inputs give equal effects.
+//!
+//! # Parts
+//!
+//! [`Election`] decides who leads. [`HealthMonitor`] decides whether the node is fit to, [`Links`] which brokers it needs.
+//! The machine feeds them, and tells the outcome: a handover is prepared here, and a process known to be gone is one whose
+//! established link broke and was refused.
+//!
+//! The machine judges no rounds. [`RoundFilter`](crate::leadership::round_filter::RoundFilter) does, where they arrive,
+//! by the [`Leadership`] that this machine tells.
+
+mod interface;
+mod members;
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use uuid::Uuid;
+
+use crate::epoch::Epoch;
+use crate::leadership::address::BrokerAddress;
+use crate::leadership::election::{Election, ElectionEffect, ElectionInput, Health};
+use crate::leadership::health::HealthMonitor;
+use crate::leadership::links::{Brokers, LinkState, Links};
+use crate::leadership::timers::{DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME};
+use crate::leadership::view::Leadership;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::{NodeState, NodeStatus};
+
+pub use interface::{Effect, Input, Member, NodeSettings, Notice};
+
+use members::Members;
+
+/// Most nodes whose runs are remembered: brokers may tell of any number of names.
+const MAX_RUNS: usize = 4096;
+
+/// One node's leadership.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct LeadershipNode {
+    election: Election,
+    is_vehicle_only: bool,
+    keeps_reputations: bool,
+    round_period: Duration,
+    members: Members,
+    monitor: HealthMonitor,
+    /// The parts as the election knows them.
+    health: Health,
+    was_out_of_reach: bool,
+    links: Links,
+    own_broker: Option<SocketAddr>,
+    /// Last living run of each node, as brokers tell it.
+    runs: BTreeMap<NodeName, Uuid>,
+    preparation: Option<Preparation>,
+    /// Epoch of the last accepted round: a node without word from the election says that it follows it.
+    accepted: Option<Epoch>,
+    /// The leadership as told last.
+    leadership: Leadership,
+    status: NodeStatus,
+    /// Whether the gateway knows the status.
+    is_status_told: bool,
+    deadline: Timestamp,
+    /// Whether sockets are read before timers run, after a late wake-up.
+    is_draining: bool,
+    effects: Vec<Effect>,
+}
+
+/// A handover to this node under way.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Preparation {
+    leader: NodeName,
+    since: Timestamp,
+    has_evidence: bool,
+    check_at: Timestamp,
+}
+
+impl LeadershipNode {
+    /// The leadership of a node that starts. `saved_term` is the last [`Effect::PersistTerm`] of earlier runs, 0 without
+    /// any. `before` is the leadership that an earlier machine of this process told: it may have led in that term, and
+    /// there may be no disk that tells.
+    pub fn new(settings: NodeSettings, saved_term: u64, before: &Leadership, now: Timestamp) -> Self {
+        let is_vehicle_only = settings.is_vehicle_only();
+        let NodeSettings { election, plane, round_period, keeps_reputations, status } = settings;
+        let told_term = before.epoch.as_ref().map_or(0, |epoch| epoch.term.saturating_add(1));
+        Self {
+            election: Election::new(election, status.node.clone(), saved_term.max(told_term), now),
+            is_vehicle_only,
+            keeps_reputations,
+            round_period,
+            members: Members::default(),
+            monitor: HealthMonitor::new(now),
+            health: Health::default(),
+            was_out_of_reach: false,
+            links: Links::new(plane),
+            own_broker: None,
+            runs: BTreeMap::new(),
+            preparation: None,
+            accepted: status.aggregator.clone().map(|aggregator| Epoch::new(status.epoch, aggregator)),
+            leadership: before.clone(),
+            status,
+            is_status_told: false,
+            deadline: now,
+            is_draining: false,
+            effects: Vec::new(),
+        }
+    }
+
+    /// Takes in what happened; returns what to do.
+    pub fn handle(&mut self, input: Input, now: Timestamp) -> Vec<Effect> {
+        if let Input::Wake = input {
+            if now.since(self.deadline) > LATE_WAKE && !self.is_draining {
+                self.is_draining = true;
+                self.deadline = now + DRAIN_TIME;
+                return Vec::new();
+            }
+            self.is_draining = false;
+            let effects = self.election.tick(now);
+            self.carry_out(effects, now);
+        } else {
+            self.take(input, now);
+        }
+        self.run_timers(now);
+        self.tell(now);
+        if !self.is_draining {
+            let preparation = self.preparation.as_ref().map(|preparation| preparation.check_at);
+            let deadline = self.election.next_deadline().min(self.monitor.next_deadline());
+            self.deadline = preparation.map_or(deadline, |check_at| check_at.min(deadline));
+        }
+        std::mem::take(&mut self.effects)
+    }
+
+    /// Time at which to hand in [`Input::Wake`].
+    pub fn next_deadline(&self) -> Timestamp {
+        self.deadline
+    }
+
+    /// The election, to be asked.
+    pub fn election(&self) -> &Election {
+        &self.election
+    }
+
+    fn take(&mut self, input: Input, now: Timestamp) {
+        match input {
+            Input::Wake => {}
+            Input::Receive { from, message } if message.from != from => {
+                self.log(Notice::Misattributed { from, claimed: message.from });
+            }
+            Input::Receive { message, .. } => self.feed(ElectionInput::Receive { message }, now),
+            Input::MemberAlive { member } => self.meet(member, now),
+            Input::MemberChanged { member } => {
+                self.members.place(member);
+                self.update_health(now);
+            }
+            Input::MemberSuspected { name } => self.feed(ElectionInput::PeerSuspected { peer: name }, now),
+            Input::MemberDown { name } => self.part_with(name, now),
+            Input::OwnBroker { address } => self.own_broker = address,
+            Input::LinkChanged { broker, state } => self.take_link(&broker, state, now),
+            Input::StatusHeard { status } => self.take_status(&status, now),
+            Input::RoundAccepted { epoch, round } => self.take_round(epoch, round, now),
+            Input::EvidenceReceived { from } => {
+                if let Some(preparation) = self.preparation.as_mut().filter(|preparation| preparation.leader == from) {
+                    preparation.has_evidence = true;
+                }
+            }
+            Input::Looked { rounds_closed, load_percent, members } => {
+                self.take_look(rounds_closed, load_percent, members, now);
+            }
+            Input::PartsAnswered { sample } => {
+                self.monitor.note_sample(sample);
+                self.update_health(now);
+            }
+            Input::FuserRestarted => {
+                // A new fuser does not lead: the leadership is over.
+                if self.election.is_leading() {
+                    self.set_health(Health { fuser: false, ..self.health }, now);
+                }
+            }
+            Input::GatewayRestarted => {
+                self.links.forget();
+                self.monitor.forget_links();
+                self.is_status_told = false;
+                self.update_health(now);
+            }
+            Input::Leave => self.feed(ElectionInput::Leave, now),
+        }
+    }
+
+    fn run_timers(&mut self, now: Timestamp) {
+        if self.monitor.is_due(now) {
+            self.effects.push(Effect::Look);
+            if !self.is_vehicle_only {
+                self.effects.push(Effect::AskParts);
+            }
+        }
+        self.check_preparation(now);
+    }
+
+    fn feed(&mut self, input: ElectionInput, now: Timestamp) {
+        let effects = self.election.handle(input, now);
+        self.carry_out(effects, now);
+    }
+
+    fn carry_out(&mut self, effects: Vec<ElectionEffect>, now: Timestamp) {
+        for effect in effects {
+            let effect = match effect {
+                ElectionEffect::PersistTerm { term } => Effect::PersistTerm { term },
+                ElectionEffect::Send { to, message } => Effect::Send { to, message },
+                ElectionEffect::HoldRound => Effect::HoldRound,
+                ElectionEffect::StopPublishing { epoch } => Effect::StopPublishing { epoch },
+                ElectionEffect::SendSnapshot { to } => Effect::SendSnapshot { to },
+                ElectionEffect::Lead { epoch, first_round, first } => {
+                    self.preparation = None;
+                    self.tell_leadership();
+                    Effect::Lead { epoch, first_round, first }
+                }
+                ElectionEffect::Prepare { leader } => {
+                    self.preparation = Some(Preparation {
+                        leader: leader.clone(),
+                        since: now,
+                        has_evidence: !self.keeps_reputations,
+                        check_at: now + VEHICLE_CONNECT_TIME,
+                    });
+                    Effect::Log { notice: Notice::Preparing { leader } }
+                }
+            };
+            self.effects.push(effect);
+        }
+    }
+
+    fn meet(&mut self, member: Member, now: Timestamp) {
+        let peer = member.name.clone();
+        self.members.place(member);
+        self.feed(ElectionInput::PeerAlive { peer }, now);
+        self.update_health(now);
+    }
+
+    fn part_with(&mut self, name: NodeName, now: Timestamp) {
+        self.members.part_with(&name, now);
+        self.feed(ElectionInput::PeerDown { peer: name }, now);
+    }
+
+    fn take_link(&mut self, broker: &BrokerAddress, state: LinkState, now: Timestamp) {
+        let is_gone = self.monitor.note_link(broker, state);
+        self.update_health(now);
+        // A broker that belongs to no node says nothing about any.
+        if is_gone && self.links.plane().external.as_ref() != Some(broker) {
+            for peer in self.members.at(broker, now) {
+                self.log(Notice::ProcessGone { peer: peer.clone(), broker: broker.clone() });
+                self.feed(ElectionInput::PeerGone { peer }, now);
+            }
+        }
+    }
+
+    /// Notes a status. Where all use one broker, its word that the leader's connection broke is the quickest news of the
+    /// leader's end.
+    fn take_status(&mut self, status: &NodeStatus, now: Timestamp) {
+        let peer = status.node.clone();
+        if status.state != NodeState::Offline {
+            if self.runs.len() < MAX_RUNS || self.runs.contains_key(&peer) {
+                self.runs.insert(peer, status.id);
+            }
+            return;
+        }
+        let has_ended = self.runs.remove(&peer) == Some(status.id);
+        if has_ended && !self.links.plane().embedded && self.election.leader() == Some(&peer) {
+            self.log(Notice::LeaderDisconnected { peer: peer.clone() });
+            self.feed(ElectionInput::PeerGone { peer }, now);
+        }
+    }
+
+    /// Notes an accepted round. Rounds of other epochs than the election's own prove nothing: whoever reaches a broker can
+    /// publish some.
+    fn take_round(&mut self, epoch: Epoch, round: u64, now: Timestamp) {
+        if self.election.epoch() == Some(&epoch) {
+            self.feed(ElectionInput::Round { epoch: epoch.clone(), round }, now);
+        }
+        self.accepted = Some(epoch);
+    }
+
+    /// Notes a look. The list of members makes up for events from before the start, and for members that a restarted
+    /// membership lost without a word.
+    fn take_look(&mut self, rounds_closed: u64, load_percent: u8, members: Vec<Member>, now: Timestamp) {
+        if !self.is_vehicle_only {
+            self.monitor.note_look(rounds_closed, load_percent, now);
+            self.update_health(now);
+        }
+        for name in self.members.long_missing(&members, now) {
+            self.part_with(name, now);
+        }
+        for member in members {
+            if !self.members.knows(&member) {
+                self.meet(member, now);
+            }
+        }
+    }
+
+    fn check_preparation(&mut self, now: Timestamp) {
+        let Some(preparation) = &mut self.preparation else { return };
+        // A clock that was set back does not put the check off.
+        preparation.check_at = preparation.check_at.min(now + VEHICLE_CONNECT_TIME);
+        if now < preparation.check_at {
+            return;
+        }
+        let waited = now.since(preparation.since);
+        if (preparation.has_evidence || waited >= LEDGER_TIMEOUT) && self.health.is_fit() {
+            self.preparation = None;
+            self.feed(ElectionInput::Prepared, now);
+        } else {
+            preparation.check_at = now + PREPARATION_STEP;
+        }
+    }
+
+    fn update_health(&mut self, now: Timestamp) {
+        let no_other = self.election.is_leading() && self.election.standby().is_none();
+        let (plane, brokers) = (self.links.plane(), self.links.brokers());
+        let health = self.monitor.health(plane, brokers, no_other, self.round_period);
+        let is_reached = self.is_reached(no_other);
+        self.set_health(Health { broker: health.broker && is_reached, ..health }, now);
+    }
+
+    /// Whether the members reach the broker that this node would lead with; the first time that they do not is logged.
+    fn is_reached(&mut self, no_other: bool) -> bool {
+        let is_private = self.own_broker.is_some_and(|broker| broker.ip().is_loopback());
+        let is_reached = self.members.elsewhere().next().is_none()
+            || self.monitor.reaches_others(self.links.plane(), is_private, no_other);
+        if !is_reached && !std::mem::replace(&mut self.was_out_of_reach, true) {
+            let members = self.members.elsewhere().cloned().collect();
+            self.log(Notice::OutOfReach { members });
+        }
+        is_reached
+    }
+
+    fn set_health(&mut self, health: Health, now: Timestamp) {
+        if self.is_vehicle_only || health == self.health {
+            return;
+        }
+        match (self.health.is_fit(), health.is_fit()) {
+            (false, true) => self.log(Notice::Fit),
+            (true, false) => self.log(Notice::Unfit { health }),
+            _ => {}
+        }
+        self.health = health;
+        self.feed(ElectionInput::Health { health }, now);
+    }
+
+    /// Tells leadership, links and status where they changed.
+    fn tell(&mut self, now: Timestamp) {
+        self.tell_leadership();
+        let broker = |name: Option<&NodeName>| match name {
+            Some(name) if name == self.election.name() => self.own_broker.map(BrokerAddress::from),
+            Some(name) => self.members.broker_of(name),
+            None => None,
+        };
+        let own = self.own_broker.map(BrokerAddress::from);
+        let brokers = match self.leadership.leader() {
+            Some(leader) => {
+                Brokers { own, leader: broker(Some(leader)), standby: broker(self.leadership.standby.as_ref()) }
+            }
+            None => Brokers { own, ..self.links.brokers().clone() },
+        };
+        if let Some(links) = self.links.update(brokers, now) {
+            self.effects.push(Effect::SetLinks { links });
+        }
+        self.tell_status();
+    }
+
+    fn tell_leadership(&mut self) {
+        let leadership = Leadership::of(&self.election);
+        if leadership != self.leadership {
+            self.leadership = leadership.clone();
+            self.effects.push(Effect::TellLeadership { leadership });
+        }
+    }
+
+    fn tell_status(&mut self) {
+        let epoch = self.leadership.present_epoch().or(self.accepted.as_ref());
+        let state = if self.leadership.is_leading() { NodeState::Aggregating } else { NodeState::Following };
+        let (term, aggregator) = (epoch.map_or(0, |epoch| epoch.term), epoch.map(|epoch| &epoch.leader));
+        let fit = (!self.is_vehicle_only).then(|| self.health.is_fit());
+        let NodeStatus { state: told_state, epoch: told_term, aggregator: told_aggregator, fit: told_fit, .. } =
+            &self.status;
+        let told = (*told_state, *told_term, told_aggregator.as_ref(), *told_fit);
+        if !self.is_status_told || told != (state, term, aggregator, fit) {
+            let aggregator = aggregator.cloned();
+            self.status = NodeStatus { state, epoch: term, aggregator, fit, ..self.status.clone() };
+            self.is_status_told = true;
+            self.effects.push(Effect::PublishStatus { status: self.status.clone() });
+        }
+    }
+
+    fn log(&mut self, notice: Notice) {
+        self.effects.push(Effect::Log { notice });
+    }
+}
+
+#[cfg(test)]
+mod tests;

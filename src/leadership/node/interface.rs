@@ -1,0 +1,240 @@
+//! Inputs and effects of the leadership of one node.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use crate::epoch::Epoch;
+use crate::leadership::address::BrokerAddress;
+use crate::leadership::election::{ElectionConfig, ElectionMessage, Health};
+use crate::leadership::health::HealthSample;
+use crate::leadership::links::{DataPlane, LinkState, WantedLinks};
+use crate::leadership::view::Leadership;
+use crate::names::NodeName;
+use crate::round::FirstRound;
+use crate::wire::{NodeStatus, Role};
+
+/// Settings of one node's leadership.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NodeSettings {
+    /// Timings, role and priority.
+    pub election: ElectionConfig,
+    /// Brokers that carry the data.
+    pub plane: DataPlane,
+    /// Longest time between two rounds.
+    pub round_period: Duration,
+    /// Whether the node keeps reputations, and so waits for evidence before it is handed the lead.
+    pub keeps_reputations: bool,
+    /// The node's own status; state, epoch, aggregator and fitness follow the election.
+    pub status: NodeStatus,
+}
+
+/// Another node of the cell.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Member {
+    /// Its name.
+    pub name: NodeName,
+    /// Start of its present run, in Unix microseconds by its own clock.
+    pub run: u64,
+    /// Its broker, if it has one.
+    pub broker: Option<BrokerAddress>,
+    /// Whether it reaches this node's loopback address.
+    pub is_on_this_machine: bool,
+}
+
+/// Something that happened at a node.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Input {
+    /// The deadline has come.
+    Wake,
+    /// An authenticated message arrived.
+    Receive {
+        /// The sender, as the transport proved.
+        from: NodeName,
+        /// The message.
+        message: ElectionMessage,
+    },
+    /// The membership found a node, or a new run of it.
+    MemberAlive {
+        /// The node.
+        member: Member,
+    },
+    /// A living node's addresses changed.
+    MemberChanged {
+        /// The node as it is now.
+        member: Member,
+    },
+    /// The membership doubts a node.
+    MemberSuspected {
+        /// The node.
+        name: NodeName,
+    },
+    /// The membership gave a node up.
+    MemberDown {
+        /// The node.
+        name: NodeName,
+    },
+    /// The node's own broker listens, or no longer does.
+    OwnBroker {
+        /// Its address.
+        address: Option<SocketAddr>,
+    },
+    /// One of the gateway's links changed.
+    LinkChanged {
+        /// The broker at its other end.
+        broker: BrokerAddress,
+        /// Its state now.
+        state: LinkState,
+    },
+    /// A broker passed on what a node says about itself, or its last will.
+    StatusHeard {
+        /// The status.
+        status: NodeStatus,
+    },
+    /// A round was accepted by the node's [`RoundFilter`](crate::leadership::round_filter::RoundFilter).
+    RoundAccepted {
+        /// The epoch it was published in.
+        epoch: Epoch,
+        /// Its number.
+        round: u64,
+    },
+    /// Evidence about vehicles came from another candidate.
+    EvidenceReceived {
+        /// The candidate.
+        from: NodeName,
+    },
+    /// The answer to [`Effect::Look`], at once.
+    Looked {
+        /// Rounds that the fuser has closed so far.
+        rounds_closed: u64,
+        /// Processor load of the machine, 0 to 100 %.
+        load_percent: u8,
+        /// All nodes that the membership knows.
+        members: Vec<Member>,
+    },
+    /// The answer to [`Effect::AskParts`], later.
+    PartsAnswered {
+        /// The answer.
+        sample: HealthSample,
+    },
+    /// The fuser was started anew and has forgotten that it leads.
+    FuserRestarted,
+    /// The gateway was started anew and has no links.
+    GatewayRestarted,
+    /// The node is about to stop.
+    Leave,
+}
+
+/// Something that the actors of a node must do, in the order given.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Effect {
+    /// Hand a term to the disk, without waiting for it. It is mostly on disk long before it is needed.
+    PersistTerm {
+        /// To be given to [`LeadershipNode::new`](crate::leadership::node::LeadershipNode::new) after a restart.
+        term: u64,
+    },
+    /// Send a message once, without waiting.
+    Send {
+        /// The addressee.
+        to: NodeName,
+        /// The message.
+        message: ElectionMessage,
+    },
+    /// Show the leadership to all other parts. It comes before the [`Effect::Lead`] that it announces: the node's broker
+    /// admits the first round only if it knows the leader.
+    TellLeadership {
+        /// The leadership.
+        leadership: Leadership,
+    },
+    /// Publish from now on in this epoch. It comes again, with a new epoch, when a leader has to renew its own.
+    ///
+    /// This effect and all later ones wait until the disk has answered for the epoch's term, or for
+    /// [`DISK_TIMEOUT`](crate::leadership::timers::DISK_TIMEOUT). A disk that fails or hangs stops no leader: availability
+    /// comes before the uniqueness of epochs.
+    Lead {
+        /// The node's leadership.
+        epoch: Epoch,
+        /// Number of the next round.
+        first_round: u64,
+        /// Time at which it is due.
+        first: FirstRound,
+    },
+    /// Let the present round last its whole length: another node is about to lead from the next one on.
+    HoldRound,
+    /// Publish nothing more in this epoch.
+    StopPublishing {
+        /// The leadership that ended.
+        epoch: Epoch,
+    },
+    /// Keep links to these brokers.
+    SetLinks {
+        /// The brokers.
+        links: WantedLinks,
+    },
+    /// Tell all nodes this about the node.
+    PublishStatus {
+        /// The status.
+        status: NodeStatus,
+    },
+    /// Share all evidence about vehicles: a node needs it to lead, or to remain the leader.
+    SendSnapshot {
+        /// The node.
+        to: NodeName,
+    },
+    /// Look at the own parts and hand in [`Input::Looked`] at once.
+    Look,
+    /// Ask broker, gateway and fuser, and hand in [`Input::PartsAnswered`] when they have answered.
+    AskParts,
+    /// Write to the log.
+    Log {
+        /// The event.
+        notice: Notice,
+    },
+}
+
+/// Something worth a line in the log that no other effect tells.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Notice {
+    /// All parts work again.
+    Fit,
+    /// A part does not work, or the members do not reach the broker.
+    Unfit {
+        /// The parts.
+        health: Health,
+    },
+    /// Other machines do not reach this node's broker, so that it does not lead.
+    OutOfReach {
+        /// Members on other machines.
+        members: Vec<NodeName>,
+    },
+    /// A node's process is gone: its broker ended.
+    ProcessGone {
+        /// The node.
+        peer: NodeName,
+        /// Its broker.
+        broker: BrokerAddress,
+    },
+    /// The leader's connection to the broker that all use broke.
+    LeaderDisconnected {
+        /// The leader.
+        peer: NodeName,
+    },
+    /// The node is about to be handed the lead.
+    Preparing {
+        /// The leader that hands over.
+        leader: NodeName,
+    },
+    /// A message in another node's name was dropped.
+    Misattributed {
+        /// The sender.
+        from: NodeName,
+        /// The name in the message.
+        claimed: NodeName,
+    },
+}
+
+impl NodeSettings {
+    /// Whether the node never leads.
+    pub(super) fn is_vehicle_only(&self) -> bool {
+        self.election.role == Role::Cav
+    }
+}

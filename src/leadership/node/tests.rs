@@ -1,0 +1,327 @@
+//! Effects of a node's leadership, and their order.
+
+use super::*;
+use crate::leadership::election::{Body, Candidacy, ElectionConfig, ElectionMessage};
+use crate::leadership::health::HealthSample;
+use crate::leadership::links::DataPlane;
+use crate::leadership::timers::HEALTH_PERIOD;
+use crate::leadership::view::Position;
+use crate::wire::{Role, SCHEMA_VERSION};
+
+const START: Timestamp = Timestamp(1_732_154_400_000_000);
+
+fn name(name: &str) -> NodeName {
+    NodeName::new(name).unwrap()
+}
+
+fn broker(host: u8) -> SocketAddr {
+    SocketAddr::from(([10, 0, 0, host], 1883))
+}
+
+fn status(role: Role) -> NodeStatus {
+    NodeStatus::starting(name("euclid"), Uuid::nil(), role, "1.0")
+}
+
+/// The node `euclid` and what it has been told to do.
+struct Scene {
+    machine: LeadershipNode,
+    now: Timestamp,
+    rounds_closed: u64,
+    members: Vec<Member>,
+    effects: Vec<Effect>,
+    seq: u64,
+}
+
+impl Scene {
+    fn new(role: Role, external: Option<&str>) -> Self {
+        let plane = DataPlane { external: external.map(|at| at.parse().unwrap()), embedded: external.is_none() };
+        let settings = NodeSettings {
+            election: ElectionConfig { role, ..ElectionConfig::default() },
+            plane,
+            round_period: Duration::from_millis(100),
+            keeps_reputations: true,
+            status: status(role),
+        };
+        let machine = LeadershipNode::new(settings, 0, &Leadership::default(), START);
+        let (members, effects) = (Vec::new(), Vec::new());
+        let mut scene = Self { machine, now: START, rounds_closed: 0, members, effects, seq: 0 };
+        if role != Role::Cav {
+            scene.take(Input::OwnBroker { address: Some(broker(1)) });
+            scene.take(Input::LinkChanged { broker: broker(1).into(), state: LinkState::Up });
+        }
+        scene
+    }
+
+    /// A fit candidate that follows `edge` in term 7, whose standby it is.
+    fn standing_by() -> Self {
+        let mut scene = Self::new(Role::Auto, None);
+        scene.take(Input::MemberAlive { member: member("edge", 2) });
+        scene.members.push(member("edge", 2));
+        scene.run_for(1000);
+        scene.beat();
+        scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Up });
+        assert_eq!(scene.machine.leadership.position, Position::StandingBy);
+        assert!(scene.machine.health.is_fit());
+        scene.effects.clear();
+        scene
+    }
+
+    /// Hands in an input; looks at the parts, which all work, are answered at once.
+    fn take(&mut self, input: Input) {
+        for effect in self.machine.handle(input, self.now) {
+            let answer = match effect {
+                Effect::Look => {
+                    Input::Looked { rounds_closed: self.rounds_closed, load_percent: 0, members: self.members.clone() }
+                }
+                Effect::AskParts => Input::PartsAnswered {
+                    sample: HealthSample { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true },
+                },
+                effect => {
+                    self.effects.push(effect);
+                    continue;
+                }
+            };
+            self.take(answer);
+        }
+    }
+
+    fn run_for(&mut self, ms: u64) {
+        let end = self.now + Duration::from_millis(ms);
+        while self.machine.next_deadline() <= end {
+            self.now = self.now.max(self.machine.next_deadline());
+            self.rounds_closed = self.now.since(START).as_millis() as u64 / 100;
+            self.take(Input::Wake);
+        }
+        self.now = end;
+    }
+
+    /// A message of `edge`, which leads or follows `epoch`.
+    fn message(&mut self, epoch: Epoch, body: Body) -> ElectionMessage {
+        self.seq += 1;
+        ElectionMessage {
+            schema: SCHEMA_VERSION,
+            from: name("edge"),
+            run: 1,
+            seq: self.seq,
+            candidacy: Candidacy { role: Role::Edge, priority: 100, load: 0, fit: true },
+            term: epoch.term,
+            epoch: Some(epoch),
+            hears_you: true,
+            body,
+        }
+    }
+
+    /// Hears from `edge`, which leads in term 7.
+    fn hear(&mut self, body: Body) {
+        self.hear_in(Epoch::new(7, name("edge")), body);
+    }
+
+    fn hear_in(&mut self, epoch: Epoch, body: Body) {
+        let message = self.message(epoch, body);
+        self.take(Input::Receive { from: name("edge"), message });
+    }
+
+    fn beat(&mut self) {
+        let successors = vec![name("euclid")];
+        self.hear(Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors });
+    }
+
+    fn notices(&self) -> Vec<&Notice> {
+        let notice = |effect| match effect {
+            &Effect::Log { ref notice } => Some(notice),
+            _ => None,
+        };
+        self.effects.iter().filter_map(notice).collect()
+    }
+
+    fn position_of(&self, wanted: impl Fn(&Effect) -> bool) -> Option<usize> {
+        self.effects.iter().position(wanted)
+    }
+}
+
+fn member(node: &str, host: u8) -> Member {
+    Member { name: name(node), run: 1, broker: Some(broker(host).into()), is_on_this_machine: false }
+}
+
+#[test]
+fn a_leadership_is_shown_before_it_is_carried_out_and_its_term_goes_to_disk_before_both() {
+    let mut scene = Scene::new(Role::Auto, None);
+    scene.run_for(1300);
+    let leads = |effect: &Effect| matches!(effect, Effect::TellLeadership { leadership } if leadership.is_leading());
+    let persists = scene.position_of(|effect| matches!(effect, Effect::PersistTerm { term: 1 })).unwrap();
+    let tells = scene.position_of(leads).unwrap();
+    let lead = scene.position_of(|effect| matches!(effect, Effect::Lead { .. })).unwrap();
+    assert!(persists < tells && tells < lead);
+}
+
+#[test]
+fn a_link_that_was_up_and_is_refused_ends_its_leader_at_once() {
+    let mut scene = Scene::standing_by();
+    scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Down });
+    assert_eq!(scene.machine.leadership.position, Position::StandingBy);
+    scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Refused });
+    assert!(scene.machine.leadership.is_leading());
+    assert!(scene.notices().contains(&&Notice::ProcessGone { peer: name("edge"), broker: broker(2).into() }));
+}
+
+#[test]
+fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
+    let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
+    scene.take(Input::LinkChanged { broker: "10.0.0.9:1883".parse().unwrap(), state: LinkState::Up });
+    scene.take(Input::MemberAlive { member: member("edge", 2) });
+    scene.members.push(member("edge", 2));
+    scene.run_for(1000);
+    scene.beat();
+    let (living, earlier) = (Uuid::from_u128(2), Uuid::from_u128(1));
+    let status = |id, state| NodeStatus { node: name("edge"), id, state, ..status(Role::Edge) };
+    scene.take(Input::StatusHeard { status: status(living, NodeState::Aggregating) });
+    scene.take(Input::StatusHeard { status: status(earlier, NodeState::Offline) });
+    assert_eq!(scene.machine.leadership.leader(), Some(&name("edge")), "the will of a run before this one");
+    scene.take(Input::StatusHeard { status: status(living, NodeState::Aggregating) });
+    scene.take(Input::StatusHeard { status: status(living, NodeState::Offline) });
+    assert!(scene.notices().contains(&&Notice::LeaderDisconnected { peer: name("edge") }));
+}
+
+#[test]
+fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
+    for (evidence_at, ready_at) in [(Some(0), 300), (Some(420), 450), (None, 1000)] {
+        let mut scene = Scene::standing_by();
+        scene.hear(Body::Offer);
+        let offered_at = scene.now;
+        let mut ready = None;
+        for ms in 0..1200 {
+            if evidence_at == Some(ms) {
+                scene.take(Input::EvidenceReceived { from: name("gauss") });
+                scene.take(Input::EvidenceReceived { from: name("edge") });
+            }
+            if ms % 50 == 0 {
+                scene.beat();
+                scene.hear(Body::Offer);
+            }
+            scene.run_for(1);
+            let is_ready =
+                |effect: &Effect| matches!(effect, Effect::Send { message, .. } if message.body == Body::Ready);
+            if ready.is_none() && scene.position_of(is_ready).is_some() {
+                ready = Some(scene.now.since(offered_at).as_millis());
+            }
+        }
+        assert_eq!(ready, Some(ready_at), "evidence after {evidence_at:?} ms");
+    }
+}
+
+#[test]
+fn a_round_is_held_before_the_word_that_yields_the_next() {
+    let mut scene = Scene::new(Role::Auto, None);
+    scene.take(Input::MemberAlive { member: member("edge", 2) });
+    scene.members.push(member("edge", 2));
+    scene.run_for(1300);
+    assert!(scene.machine.leadership.is_leading());
+    let epoch = scene.machine.leadership.epoch.clone().unwrap();
+    for ms in 0..4500 {
+        if ms % 50 == 0 {
+            scene.hear_in(epoch.clone(), Body::Status { over: None });
+            scene.hear_in(epoch.clone(), Body::Ready);
+        }
+        if ms % 100 == 0 {
+            scene.take(Input::RoundAccepted { epoch: epoch.clone(), round: ms / 100 });
+        }
+        scene.run_for(1);
+    }
+    let yields =
+        |effect: &Effect| matches!(effect, Effect::Send { message, .. } if matches!(message.body, Body::Yield { .. }));
+    let yielded = scene.position_of(yields).expect("a better candidate is handed the lead");
+    assert_eq!(scene.effects[yielded - 1], Effect::HoldRound);
+    let snapshot = scene.position_of(|effect| *effect == Effect::SendSnapshot { to: name("edge") });
+    assert!(snapshot.is_some_and(|snapshot| snapshot < yielded));
+}
+
+#[test]
+fn a_late_wake_up_lets_waiting_messages_speak_first() {
+    let mut scene = Scene::standing_by();
+    let due = scene.machine.next_deadline();
+    scene.now = due + Duration::from_millis(300);
+    scene.take(Input::Wake);
+    assert_eq!(scene.effects, [], "timers wait");
+    assert_eq!(scene.machine.next_deadline(), scene.now + DRAIN_TIME);
+    scene.beat();
+    scene.now = scene.machine.next_deadline();
+    scene.take(Input::Wake);
+    assert_eq!(scene.machine.leadership.position, Position::StandingBy);
+    assert!(!scene.machine.is_draining);
+}
+
+#[test]
+fn a_gateway_started_anew_is_told_links_and_status_again() {
+    let mut scene = Scene::standing_by();
+    scene.take(Input::GatewayRestarted);
+    let [links] =
+        &scene.effects.iter().filter(|effect| matches!(effect, Effect::SetLinks { .. })).collect::<Vec<_>>()[..]
+    else {
+        panic!("links are told once: {:?}", scene.effects)
+    };
+    let Effect::SetLinks { links } = links else { return };
+    assert_eq!(links.brokers, [broker(1).into(), broker(2).into()]);
+    assert!(scene.position_of(|effect| matches!(effect, Effect::PublishStatus { .. })).is_some());
+    assert!(scene.notices().iter().any(|notice| matches!(notice, Notice::Unfit { .. })), "it has no links yet");
+}
+
+#[test]
+fn a_vehicle_asks_no_parts_and_never_says_that_it_is_fit() {
+    let mut scene = Scene::new(Role::Cav, None);
+    for _ in 0..8 {
+        scene.now = scene.now + HEALTH_PERIOD;
+        let effects = scene.machine.handle(Input::Wake, scene.now);
+        assert!(!effects.contains(&Effect::AskParts));
+        scene.effects.extend(effects);
+    }
+    let statuses: Vec<_> = scene.effects.iter().filter(|e| matches!(e, Effect::PublishStatus { .. })).collect();
+    let [Effect::PublishStatus { status }] = statuses[..] else { panic!("one status: {statuses:?}") };
+    assert_eq!((status.fit, status.state, status.epoch), (None, NodeState::Following, 0));
+}
+
+#[test]
+fn a_node_that_others_do_not_reach_is_not_fit_and_says_so_once() {
+    let mut scene = Scene::new(Role::Auto, None);
+    scene.take(Input::OwnBroker { address: Some(SocketAddr::from(([127, 0, 0, 1], 1883))) });
+    scene.take(Input::LinkChanged { broker: "127.0.0.1:1883".parse().unwrap(), state: LinkState::Up });
+    scene.members.push(member("gauss", 3));
+    scene.run_for(3000);
+    assert!(!scene.machine.health.is_fit());
+    let told = scene.notices().into_iter().filter(|notice| matches!(notice, Notice::OutOfReach { .. })).count();
+    assert_eq!(told, 1);
+}
+
+#[test]
+fn a_machine_started_anew_uses_no_term_that_it_may_have_led_in() {
+    let epoch = Some(Epoch::new(9, name("euclid")));
+    let before = Leadership { position: Position::Leading, epoch, standby: None, term: 9 };
+    let settings = NodeSettings {
+        election: ElectionConfig::default(),
+        plane: DataPlane { external: None, embedded: true },
+        round_period: Duration::from_millis(100),
+        keeps_reputations: false,
+        status: status(Role::Auto),
+    };
+    let mut scene = Scene::new(Role::Auto, None);
+    scene.machine = LeadershipNode::new(settings, 4, &before, START);
+    scene.take(Input::OwnBroker { address: Some(broker(1)) });
+    scene.take(Input::LinkChanged { broker: broker(1).into(), state: LinkState::Up });
+    scene.run_for(2000);
+    let led = scene.effects.iter().find_map(|effect| match effect {
+        Effect::Lead { epoch, .. } => Some(epoch.term),
+        _ => None,
+    });
+    assert_eq!(led, Some(11));
+}
+
+#[test]
+fn a_message_in_anothers_name_is_dropped() {
+    let mut scene = Scene::standing_by();
+    let mut before = scene.machine.clone();
+    let ended = Epoch::new(7, name("edge"));
+    let message = scene.message(ended.clone(), Body::Resign { epoch: ended, last_round: 40 });
+    scene.take(Input::Receive { from: name("gauss"), message });
+    assert_eq!(scene.notices(), [&Notice::Misattributed { from: name("gauss"), claimed: name("edge") }]);
+    before.deadline = scene.machine.deadline;
+    assert_eq!(scene.machine, before);
+}

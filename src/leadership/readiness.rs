@@ -1,0 +1,94 @@
+//! Readiness of a node: whether it follows a live aggregator, or leads with a working broker.
+
+use std::time::Duration;
+
+use serde::Serialize;
+
+use crate::epoch::Epoch;
+use crate::leadership::timers::PART_TIMEOUT;
+use crate::leadership::view::Leadership;
+use crate::time::Timestamp;
+
+/// Readiness of a node, and the reason.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Readiness {
+    /// Whether it does.
+    pub ready: bool,
+    /// The reason in words.
+    pub reason: String,
+}
+
+/// Maximum age of the newest round of a live aggregator that closes a round each `round_period`.
+pub fn round_timeout(round_period: Duration) -> Duration {
+    PART_TIMEOUT + 3 * round_period
+}
+
+impl Readiness {
+    /// Judges from the leadership, the epoch and arrival of the last accepted round, and whether a broker carries what
+    /// the node publishes. Without a `timeout` rounds are not waited for.
+    pub fn judge(
+        leadership: &Leadership,
+        last_round: Option<&(Epoch, Timestamp)>,
+        broker_works: bool,
+        timeout: Option<Duration>,
+        now: Timestamp,
+    ) -> Self {
+        let not = |reason: String| Self { ready: false, reason };
+        let Some(epoch) = leadership.present_epoch() else {
+            return not("no leader known".into());
+        };
+        if leadership.is_leading() && !broker_works {
+            return not("leading without a working broker".into());
+        }
+        let leader = &epoch.leader;
+        if let Some(timeout) = timeout {
+            let Some((_, received_at)) = last_round.filter(|(last, _)| last == epoch) else {
+                return not(format!("no round of {leader} yet"));
+            };
+            let age = now.since(*received_at);
+            if age > timeout {
+                return not(format!("no round of {leader} for {} s", age.as_secs()));
+            }
+        }
+        let reason = if leadership.is_leading() { "leading".into() } else { format!("following {leader}") };
+        Self { ready: true, reason }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::leadership::view::Position;
+    use crate::names::NodeName;
+
+    const TIMEOUT: Option<Duration> = Some(Duration::from_secs(2));
+
+    fn reason(leadership: &Leadership, round: Option<(u64, u64)>, broker_works: bool) -> (bool, String) {
+        let round = round.map(|(term, at_s)| (epoch(term), Timestamp(at_s * 1_000_000)));
+        let readiness = Readiness::judge(leadership, round.as_ref(), broker_works, TIMEOUT, Timestamp(10_000_000));
+        (readiness.ready, readiness.reason)
+    }
+
+    fn epoch(term: u64) -> Epoch {
+        Epoch::new(term, NodeName::from_static("edge"))
+    }
+
+    #[test]
+    fn ready_means_fresh_rounds_of_the_leader_and_a_broker_to_lead_with() {
+        let at = |position| Leadership { position, epoch: Some(epoch(4)), standby: None, term: 4 };
+        let (seeking, following, leading) = (at(Position::Seeking), at(Position::Following), at(Position::Leading));
+        assert_eq!(reason(&seeking, Some((4, 9)), true), (false, "no leader known".into()));
+        assert_eq!(reason(&following, None, false), (false, "no round of edge yet".into()));
+        assert_eq!(reason(&following, Some((3, 9)), false), (false, "no round of edge yet".into()));
+        assert_eq!(reason(&following, Some((4, 5)), false), (false, "no round of edge for 5 s".into()));
+        assert_eq!(reason(&following, Some((4, 9)), false), (true, "following edge".into()));
+        assert_eq!(reason(&leading, Some((4, 9)), true), (true, "leading".into()));
+        assert_eq!(reason(&leading, Some((4, 9)), false), (false, "leading without a working broker".into()));
+    }
+
+    #[test]
+    fn rounds_that_come_with_packets_only_are_not_waited_for() {
+        let following = Leadership { position: Position::Following, epoch: Some(epoch(4)), standby: None, term: 4 };
+        assert!(Readiness::judge(&following, None, false, None, Timestamp(0)).ready);
+    }
+}

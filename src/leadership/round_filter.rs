@@ -1,0 +1,301 @@
+//! Acceptance of rounds: the only place that decides whose rounds a node accepts.
+//!
+//! # Filters
+//!
+//! - [`RoundFilter`] judges each map, verdict and reputation message that arrives. Its owner is the actor that receives
+//!   them, so that no round takes a detour. It reads the [`Leadership`] of the moment and never asks.
+//! - [`PublisherFilter`] is the rule of a node's own broker: who may publish for all.
+//! - [`Leadership::knows_term`] is the rule for evidence, and for maps that a new leader goes on from.
+//!
+//! A round passes three checks in this order: its epoch and number do not go back ([`EpochGate`]), its leader is the
+//! elected one or may have succeeded it ([`SuccessionFilter`]), and it did not wait in a queue ([`StalenessFilter`]).
+//!
+//! # Invariants
+//!
+//! 1. An accepted round is never accepted again, and never followed by an earlier one of its leadership.
+//! 2. A leader that the election names is refused for [`crate::leadership::timers::SUCCESSOR_CREDIT`] at most.
+//! 3. A round older than [`crate::leadership::timers::MAX_ROUND_AGE`] is refused once its leader's delay is known.
+
+mod epoch_gate;
+mod publisher;
+mod staleness;
+mod succession;
+
+use crate::epoch::Epoch;
+use crate::leadership::timers::EPOCH_MEMORY;
+use crate::leadership::view::Leadership;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+use crate::wire::{GlobalMap, RejectReason, Reputations, Verdicts};
+
+pub use epoch_gate::EpochGate;
+pub use publisher::PublisherFilter;
+pub use staleness::StalenessFilter;
+pub use succession::SuccessionFilter;
+
+/// Filter of the maps, verdicts and reputations that arrive at one node.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct RoundFilter {
+    maps: SuccessionFilter,
+    map_age: StalenessFilter,
+    map_accepted_at: Option<Timestamp>,
+    verdicts: SuccessionFilter,
+    verdict_age: StalenessFilter,
+    reputations: SuccessionFilter,
+}
+
+/// A round that was accepted.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AcceptedRound {
+    /// The leadership that published it.
+    pub epoch: Epoch,
+    /// Its number.
+    pub round: u64,
+    /// Whether it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no maps come.
+    pub is_sign_of_life: bool,
+    /// Whether a new leader may go on from it. While nobody is known to lead, rounds of any term are accepted.
+    pub is_known_term: bool,
+}
+
+/// Reason for which a round was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// It or a later one of the same leadership was accepted: it came another way.
+    Repeated,
+    /// A round of a later leadership was accepted.
+    Superseded,
+    /// The election names another leader.
+    NotElected,
+    /// It was under way for too long.
+    Stale,
+}
+
+impl Refusal {
+    /// The reason that is counted; none for a repeated round, which is no fault.
+    pub fn reject_reason(self) -> Option<RejectReason> {
+        match self {
+            Self::Repeated => None,
+            Self::Superseded => Some(RejectReason::Superseded),
+            Self::NotElected => Some(RejectReason::NotElected),
+            Self::Stale => Some(RejectReason::Stale),
+        }
+    }
+}
+
+impl RoundFilter {
+    /// A filter of a node that starts. `saved_term` is the last term that an earlier run wrote to disk, 0 without any:
+    /// terms below those that it knew are refused at first.
+    pub fn new(saved_term: u64) -> Self {
+        let floor = floor(saved_term);
+        Self {
+            maps: SuccessionFilter::new(floor),
+            map_age: StalenessFilter::default(),
+            map_accepted_at: None,
+            verdicts: SuccessionFilter::new(floor),
+            verdict_age: StalenessFilter::default(),
+            // Brokers retain them: a node that starts gets them before it can have heard of any term.
+            reputations: SuccessionFilter::of_any_term(floor),
+        }
+    }
+
+    /// Accepts a map, or refuses it.
+    ///
+    /// # Errors
+    /// The reason for which it is refused.
+    pub fn accept_map(
+        &mut self,
+        map: &GlobalMap,
+        received_at: Timestamp,
+        leadership: &Leadership,
+    ) -> Result<AcceptedRound, Refusal> {
+        let epoch = Epoch::new(map.epoch, map.aggregator.clone());
+        self.maps.admit(&epoch, map.round, received_at, leadership)?;
+        check_age(&mut self.map_age, &epoch, map.fused_at_us, received_at)?;
+        self.map_accepted_at = Some(received_at);
+        Ok(accepted(epoch, map.round, true, leadership))
+    }
+
+    /// Accepts verdicts, or refuses them.
+    ///
+    /// # Errors
+    /// The reason for which they are refused.
+    pub fn accept_verdicts(
+        &mut self,
+        verdicts: &Verdicts,
+        received_at: Timestamp,
+        leadership: &Leadership,
+    ) -> Result<AcceptedRound, Refusal> {
+        let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
+        self.verdicts.admit(&epoch, verdicts.round, received_at, leadership)?;
+        check_age(&mut self.verdict_age, &epoch, verdicts.fused_at_us, received_at)?;
+        let is_sign_of_life = self.map_accepted_at.is_none_or(|at| received_at.since(at) >= EPOCH_MEMORY);
+        Ok(accepted(epoch, verdicts.round, is_sign_of_life, leadership))
+    }
+
+    /// Accepts reputations, or refuses them. They are a state, so that age does not matter.
+    ///
+    /// # Errors
+    /// The reason for which they are refused.
+    pub fn accept_reputations(
+        &mut self,
+        reputations: &Reputations,
+        received_at: Timestamp,
+        leadership: &Leadership,
+    ) -> Result<AcceptedRound, Refusal> {
+        let epoch = Epoch::new(reputations.epoch, reputations.aggregator.clone().unwrap_or(UNNAMED));
+        self.reputations.admit(&epoch, reputations.round, received_at, leadership)?;
+        Ok(accepted(epoch, reputations.round, false, leadership))
+    }
+}
+
+/// Lowest term that a node accepts after a restart: the highest that it knew when it stopped. It writes the next one to
+/// disk before that is needed.
+fn floor(saved_term: u64) -> u64 {
+    saved_term.saturating_sub(1)
+}
+
+fn check_age(
+    filter: &mut StalenessFilter,
+    epoch: &Epoch,
+    fused_at: Timestamp,
+    received_at: Timestamp,
+) -> Result<(), Refusal> {
+    if filter.is_fresh(epoch, fused_at, received_at) { Ok(()) } else { Err(Refusal::Stale) }
+}
+
+fn accepted(epoch: Epoch, round: u64, is_sign_of_life: bool, leadership: &Leadership) -> AcceptedRound {
+    AcceptedRound { is_known_term: leadership.knows_term(epoch.term), epoch, round, is_sign_of_life }
+}
+
+/// Aggregator of reputations that name none; it sorts before all others.
+const UNNAMED: NodeName = NodeName::from_static("-");
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::leadership::view::Position;
+    use crate::wire::SCHEMA_VERSION;
+
+    fn ms(n: u64) -> Timestamp {
+        Timestamp(n * 1000)
+    }
+
+    fn seeking() -> Leadership {
+        Leadership { term: 7, ..Leadership::default() }
+    }
+
+    fn following(term: u64, leader: &'static str) -> Leadership {
+        let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
+        Leadership { position: Position::Following, epoch, standby: None, term }
+    }
+
+    fn map(epoch: u64, round: u64, fused_at: Timestamp) -> GlobalMap {
+        GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("edge"),
+            epoch,
+            round,
+            fused_at_us: fused_at,
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+            pose_corrections: Default::default(),
+        }
+    }
+
+    fn take(filter: &mut RoundFilter, map: &GlobalMap, at: Timestamp, leadership: &Leadership) -> Result<(), Refusal> {
+        filter.accept_map(map, at, leadership).map(|_| ())
+    }
+
+    #[test]
+    fn a_huge_epoch_silences_the_others_for_a_moment_only() {
+        let (mut filter, seeking) = (RoundFilter::new(0), seeking());
+        let mut take = |epoch, round, at| take(&mut filter, &map(epoch, round, ms(at)), ms(at), &seeking);
+        assert_eq!(take(u64::MAX, 1, 0), Err(Refusal::NotElected));
+        assert_eq!(take(u64::MAX, 2, 500), Ok(()), "it goes on and on");
+        assert_eq!(take(7, 1, 1000), Err(Refusal::Superseded));
+        assert_eq!(take(7, 2, 3500), Err(Refusal::Stale), "it may have waited");
+        assert_eq!(take(7, 4, 3700), Ok(()));
+        assert_eq!(take(7, 4, 3800), Err(Refusal::Repeated), "not taken twice");
+    }
+
+    #[test]
+    fn rounds_that_waited_while_the_node_was_stopped_are_not_taken() {
+        let (mut filter, seeking) = (RoundFilter::new(0), seeking());
+        let at = |round: u64| ms(100 * round);
+        for round in 0..10 {
+            assert_eq!(take(&mut filter, &map(7, round, at(round)), at(round), &seeking), Ok(()));
+        }
+        let resumed = at(40);
+        for round in 10..31 {
+            let waited = take(&mut filter, &map(7, round, at(round)), resumed, &seeking);
+            assert_eq!(waited, Err(Refusal::Stale), "round {round}");
+        }
+        assert_eq!(take(&mut filter, &map(7, 31, at(31)), resumed, &seeking), Ok(()));
+    }
+
+    #[test]
+    fn a_refused_map_does_not_make_old_ones_look_fresh() {
+        let (mut filter, leadership) = (RoundFilter::new(0), following(8, "edge"));
+        let at = |round: u64| ms(100 * round);
+        for round in 0..10 {
+            assert_eq!(take(&mut filter, &map(8, round, at(round)), at(round), &leadership), Ok(()));
+        }
+        let resumed = at(40);
+        assert_eq!(take(&mut filter, &map(7, 99, at(10)), resumed, &leadership), Err(Refusal::Superseded));
+        assert_eq!(take(&mut filter, &map(8, 10, at(10)), resumed, &leadership), Err(Refusal::Stale));
+    }
+
+    #[test]
+    fn each_topic_goes_by_its_own_order_and_reputations_may_come_without_a_name() {
+        let (mut filter, seeking, now) = (RoundFilter::new(0), seeking(), Timestamp(1));
+        let reputations = |epoch, round, aggregator: Option<&'static str>| Reputations {
+            schema: SCHEMA_VERSION,
+            aggregator: aggregator.map(NodeName::from_static),
+            epoch,
+            round,
+            reputations: Default::default(),
+        };
+        assert!(filter.accept_map(&map(7, 9, now), now, &seeking).is_ok());
+        assert!(filter.accept_reputations(&reputations(7, 1, None), now, &seeking).is_ok());
+        assert!(filter.accept_reputations(&reputations(7, 1, Some("edge")), now, &seeking).is_ok());
+        let late = filter.accept_reputations(&reputations(7, 2, None), now, &seeking);
+        assert_eq!(late, Err(Refusal::Superseded));
+    }
+
+    #[test]
+    fn a_deposed_leader_is_refused_even_when_nobody_else_is_heard() {
+        let (mut filter, leadership) = (RoundFilter::new(0), following(8, "euclid"));
+        assert_eq!(take(&mut filter, &map(8, 1, ms(0)), ms(0), &leadership), Ok(()));
+        assert_eq!(take(&mut filter, &map(7, 99, ms(9000)), ms(9000), &leadership), Err(Refusal::Superseded));
+    }
+
+    #[test]
+    fn verdicts_are_signs_of_life_only_where_no_maps_come() {
+        let (mut filter, leadership) = (RoundFilter::new(0), following(8, "edge"));
+        let verdicts = |round: u64| Verdicts {
+            schema: SCHEMA_VERSION,
+            aggregator: NodeName::from_static("edge"),
+            epoch: 8,
+            round,
+            fused_at_us: ms(100 * round),
+            verdicts: Vec::new(),
+        };
+        let is_sign = |round: u64, filter: &mut RoundFilter| {
+            filter.accept_verdicts(&verdicts(round), ms(100 * round), &leadership).unwrap().is_sign_of_life
+        };
+        assert!(is_sign(1, &mut filter));
+        assert!(filter.accept_map(&map(8, 2, ms(200)), ms(200), &leadership).unwrap().is_sign_of_life);
+        assert!(!is_sign(2, &mut filter));
+        assert!((3..40).any(|round| is_sign(round, &mut filter)), "maps come no more");
+    }
+
+    #[test]
+    fn a_term_that_no_election_knows_is_accepted_and_not_gone_on_from() {
+        let mut filter = RoundFilter::new(0);
+        let next = filter.accept_map(&map(8, 1, ms(0)), ms(0), &seeking()).unwrap();
+        assert!(!next.is_known_term);
+        let known = filter.accept_map(&map(8, 2, ms(100)), ms(100), &following(8, "edge")).unwrap();
+        assert!(known.is_known_term);
+    }
+}

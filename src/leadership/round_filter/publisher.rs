@@ -1,0 +1,77 @@
+//! The rule of a node's own broker: who may publish for all.
+
+use crate::leadership::timers::FAREWELL_TIME;
+use crate::leadership::view::Leadership;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+
+/// Rule by which a broker passes maps, verdicts and reputations on.
+///
+/// The leader may publish. A leader before it may for [`FAREWELL_TIME`]: its last round is under way when its successor
+/// is known already. While nobody is known to lead anyone may, and receivers decide.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub struct PublisherFilter {
+    last: Option<Publisher>,
+    before: Option<Publisher>,
+}
+
+/// A leader and when it last published.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Publisher {
+    name: NodeName,
+    at: Timestamp,
+}
+
+impl PublisherFilter {
+    /// Whether a node may publish for all now.
+    pub fn may_publish(&mut self, name: &NodeName, leadership: &Leadership, now: Timestamp) -> bool {
+        match leadership.leader() {
+            None => true,
+            Some(leader) if leader == name => {
+                self.note(name, now);
+                true
+            }
+            Some(_) => [&self.last, &self.before]
+                .into_iter()
+                .flatten()
+                .any(|publisher| publisher.name == *name && now.since(publisher.at) < FAREWELL_TIME),
+        }
+    }
+
+    fn note(&mut self, name: &NodeName, now: Timestamp) {
+        if self.last.as_ref().is_some_and(|last| last.name != *name) {
+            self.before = self.last.take();
+        }
+        self.last = Some(Publisher { name: name.clone(), at: now });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::epoch::Epoch;
+    use crate::leadership::view::Position;
+
+    #[test]
+    fn the_leader_publishes_and_the_one_before_says_farewell() {
+        let led_by = |leader: &str| Leadership {
+            position: Position::Following,
+            epoch: Some(Epoch::new(1, NodeName::new(leader).unwrap())),
+            standby: None,
+            term: 1,
+        };
+        let mut filter = PublisherFilter::default();
+        let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(|name| NodeName::new(name).unwrap());
+        let mut may = |name: &NodeName, leadership: &Leadership, ms: u64| {
+            filter.may_publish(name, leadership, Timestamp(ms * 1000))
+        };
+        assert!(may(&gauss, &Leadership::default(), 0), "nobody is known to lead");
+        assert!(
+            may(&edge, &led_by("edge"), 0) && !may(&euclid, &led_by("edge"), 0) && !may(&gauss, &led_by("edge"), 0)
+        );
+        let next = led_by("euclid");
+        assert!(may(&edge, &next, 100) && may(&euclid, &next, 200) && may(&edge, &next, 999), "its last round");
+        assert!(!may(&edge, &next, 1000), "its time is over");
+        assert!(!may(&gauss, &next, 200));
+    }
+}

@@ -1,0 +1,124 @@
+//! Detection of rounds that waited in a queue, whatever the clock of their sender says.
+
+use std::time::Duration;
+
+use crate::delay::MinimumDelay;
+use crate::epoch::Epoch;
+use crate::leadership::timers::{LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT};
+use crate::time::Timestamp;
+
+/// Filter that tells rounds that have just been made from those that waited.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub struct StalenessFilter {
+    /// The present leadership and its least delay, to which the delay of its rounds is compared.
+    delay: Option<(Epoch, LeadersDelay)>,
+    newest_at: Option<Timestamp>,
+    /// Arrival of the first round after none had come for [`MAX_ROUND_AGE`].
+    resumed_at: Option<Timestamp>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct LeadersDelay {
+    least: MinimumDelay,
+    /// Whether the least delay is that of rounds that did not wait.
+    is_learnt: bool,
+    /// Time for which rounds have arrived no faster than they were made.
+    live_for: Duration,
+    /// Fusion and arrival of the last round.
+    last: (Timestamp, Timestamp),
+}
+
+impl LeadersDelay {
+    fn new(is_learnt: bool, fused_at: Timestamp, received_at: Timestamp) -> Self {
+        let least = MinimumDelay::new(received_at);
+        Self { least, is_learnt, live_for: Duration::ZERO, last: (fused_at, received_at) }
+    }
+
+    /// Takes a round; returns how long it waited, as far as is known.
+    fn observe(&mut self, fused_at: Timestamp, received_at: Timestamp) -> Duration {
+        let (last_fused_at, last_received_at) = std::mem::replace(&mut self.last, (fused_at, received_at));
+        let (made_in, came_in) = (fused_at.since(last_fused_at), received_at.since(last_received_at));
+        self.live_for = if 2 * came_in >= made_in { self.live_for + came_in } else { Duration::ZERO };
+        self.is_learnt |= self.live_for >= LIVE_STREAM_TIME;
+        let delay_us = received_at.micros_from(fused_at);
+        self.least.observe(delay_us, received_at);
+        Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs())
+    }
+}
+
+impl StalenessFilter {
+    /// Whether a round of `epoch`, whose order is right, spent no more than [`MAX_ROUND_WAIT`] in queues. A node that was
+    /// stopped, or a link that was, finds the rounds of that time waiting.
+    ///
+    /// The first round of a leadership is fresh: its clock is not known. After a time without rounds it is not, because it
+    /// may have waited; then a stream has to be live for [`LIVE_STREAM_TIME`] first.
+    pub fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
+        if self.newest_at.replace(received_at).is_some_and(|newest_at| received_at.since(newest_at) > MAX_ROUND_AGE) {
+            self.resumed_at = Some(received_at);
+        }
+        let known = self.delay.take().filter(|(of, _)| of == epoch).map(|(_, delay)| delay);
+        let has_waited = self.resumed_at.is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_ROUND_AGE);
+        let mut delay = known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
+        let waited = delay.observe(fused_at, received_at);
+        let is_fresh = delay.is_learnt && waited <= MAX_ROUND_WAIT;
+        self.delay = Some((epoch.clone(), delay));
+        is_fresh
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::names::NodeName;
+
+    const NOON: u64 = 1_732_154_400_000_000;
+
+    fn ms(n: u64) -> Timestamp {
+        Timestamp(NOON + 1000 * n)
+    }
+
+    #[test]
+    fn rounds_that_waited_are_old_whatever_the_leaders_clock_says() {
+        for ahead in [0, 3_600_000] {
+            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::default());
+            for round in 0..20 {
+                assert!(filter.is_fresh(&epoch, ms(ahead + 100 * round), ms(100 * round + 2)), "round {round}");
+            }
+            // Stopped for three seconds, the node finds thirty rounds.
+            let fresh: Vec<_> = (20..50).filter(|n| filter.is_fresh(&epoch, ms(ahead + 100 * n), ms(5002))).collect();
+            assert_eq!(fresh, Vec::from_iter(41..50));
+        }
+    }
+
+    #[test]
+    fn a_new_leadership_has_a_clock_of_its_own() {
+        let mut filter = StalenessFilter::default();
+        assert!(filter.is_fresh(&Epoch::new(3, NodeName::from_static("edge")), ms(0), ms(60_000)));
+        assert!(filter.is_fresh(&Epoch::new(4, NodeName::from_static("gauss")), ms(0), ms(60_300)));
+    }
+
+    #[test]
+    fn of_a_leadership_that_began_while_the_node_was_stopped_only_what_is_made_now_is_taken() {
+        let (edge, gauss) =
+            (Epoch::new(3, NodeName::from_static("edge")), Epoch::new(4, NodeName::from_static("gauss")));
+        let mut filter = StalenessFilter::default();
+        assert!(filter.is_fresh(&edge, ms(0), ms(1)));
+        // Stopped for eleven seconds, it hands out a round of its own, and then finds those of its successor.
+        assert!(filter.is_fresh(&edge, ms(11_000), ms(11_000)));
+        let waiting = (5..110).filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(11_001 + 3 * n))).count();
+        assert_eq!(waiting, 0, "however slowly they come");
+        let live: Vec<_> = (115..125).filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(9 + 100 * n))).collect();
+        assert_eq!(live, Vec::from_iter(117..125));
+    }
+
+    #[test]
+    fn a_way_that_became_longer_is_believed_in_the_end() {
+        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::default());
+        let is_fresh = |n: u64, filter: &mut StalenessFilter| {
+            filter.is_fresh(&epoch, ms(100 * n), ms(100 * n + if n < 10 { 1 } else { 1500 }))
+        };
+        assert!((0..10).all(|n| is_fresh(n, &mut filter)));
+        assert!(!is_fresh(10, &mut filter));
+        assert_eq!((11..250).map(|n| is_fresh(n, &mut filter)).last(), Some(true));
+    }
+}

@@ -1,0 +1,381 @@
+//! The order of leaderships on one topic: whose messages are accepted beside, before and after the elected leader's.
+//!
+//! A superseded leader is refused, and so is one that was not elected. Nobody is refused for good: word of an election may
+//! be lost, and who reaches a broker may forge any epoch.
+
+use crate::epoch::Epoch;
+use crate::leadership::round_filter::{EpochGate, Refusal};
+use crate::leadership::timers::{ELECTED_SILENCE, EPOCH_MEMORY, SUCCESSOR_CREDIT};
+use crate::leadership::view::Leadership;
+use crate::names::NodeName;
+use crate::time::Timestamp;
+
+/// Number of terms above the highest known one that the next leader may use: a restarted node skips the term that it may
+/// have used before.
+const TERMS_AHEAD: u64 = 2;
+
+/// Number of rounds by which the standby that takes over may be ahead of the elected leader's last. A standby that still
+/// leads on its own counts its own rounds, and is to be told to follow.
+const MAX_ROUNDS_AHEAD: u64 = 16;
+
+/// Filter of one topic: admits messages in the order of epoch, aggregator and round, of those that may lead.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct SuccessionFilter {
+    gate: EpochGate,
+    /// Whether any term is believed while nobody is known to lead.
+    believes_any_term: bool,
+    /// Arrival of the last admitted message; before any, of the first message.
+    newest_at: Option<Timestamp>,
+    elected: Option<Elected>,
+    /// Time since when others than the elected are admitted, or it is not.
+    others_since: Option<Timestamp>,
+    /// The elected epoch in which others have used up their credit.
+    overruled: Option<Epoch>,
+    /// The publisher of a term that the election has not heard of while nobody is known to lead.
+    stranger: Option<Stranger>,
+}
+
+/// The leader that the election named last.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Elected {
+    epoch: Epoch,
+    last_round: Option<u64>,
+    /// Arrival of its last round; before any, of the first message that found it elected.
+    heard_at: Timestamp,
+}
+
+/// A publisher that no election vouches for.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Stranger {
+    epoch: Epoch,
+    since: Timestamp,
+    last: Timestamp,
+}
+
+impl Elected {
+    /// Whether its standby may have taken over, or itself gone on in a later term, as after a split has healed. Leaders of
+    /// the same term are rivals that began at the same time.
+    fn is_succeeded_by(&self, epoch: &Epoch, round: u64, standby: Option<&NodeName>) -> bool {
+        let goes_on = |last| round > last && round - last <= MAX_ROUNDS_AHEAD;
+        let is_next = standby == Some(&epoch.leader) || self.epoch.leader == epoch.leader;
+        is_next && epoch.term > self.epoch.term && self.last_round.is_none_or(goes_on)
+    }
+}
+
+impl SuccessionFilter {
+    /// A filter that refuses terms below `floor` at first. While nobody is known to lead it also refuses terms below the
+    /// highest known one, or more than [`TERMS_AHEAD`] above it, until they were published for a while.
+    pub fn new(floor: u64) -> Self {
+        Self {
+            gate: EpochGate::new(floor),
+            believes_any_term: false,
+            newest_at: None,
+            elected: None,
+            others_since: None,
+            overruled: None,
+            stranger: None,
+        }
+    }
+
+    /// A filter that believes any term from `floor` on while nobody is known to lead.
+    pub fn of_any_term(floor: u64) -> Self {
+        Self { believes_any_term: true, ..Self::new(floor) }
+    }
+
+    /// Takes round `round` of `epoch`, or refuses it, given what the election says.
+    ///
+    /// # Errors
+    /// The reason for which it is refused; never [`Refusal::Stale`].
+    pub fn admit(
+        &mut self,
+        epoch: &Epoch,
+        round: u64,
+        received_at: Timestamp,
+        leadership: &Leadership,
+    ) -> Result<(), Refusal> {
+        let elected = leadership.present_epoch();
+        if let Some(elected) =
+            elected.filter(|elected| self.elected.as_ref().is_none_or(|last| last.epoch != **elected))
+        {
+            self.elected = Some(Elected { epoch: elected.clone(), last_round: None, heard_at: received_at });
+        }
+        match elected {
+            Some(elected) if elected == epoch => self.admit_elected(epoch, round, received_at),
+            Some(elected) => self.admit_other(epoch, round, received_at, elected, leadership.standby.as_ref()),
+            None if self.is_strange(epoch, leadership.term, received_at) => Err(Refusal::NotElected),
+            None => self.admit_in_order(epoch, round, received_at, true),
+        }
+    }
+
+    /// Whether an epoch that nobody vouches for is not to be believed yet.
+    ///
+    /// The election hears of terms from those who know the cell's key, at the latest when the next leader beats, and it
+    /// knows of a term that is over. Without any election only who publishes on and on is believed, and of several the
+    /// first.
+    fn is_strange(&mut self, epoch: &Epoch, known_term: u64, received_at: Timestamp) -> bool {
+        if self.believes_any_term {
+            return false;
+        }
+        let vouched = known_term..=known_term.saturating_add(TERMS_AHEAD);
+        if vouched.contains(&epoch.term) || self.gate.latest().is_some_and(|(latest, _)| latest == epoch) {
+            return false;
+        }
+        match &mut self.stranger {
+            Some(stranger) if stranger.epoch == *epoch => {
+                stranger.last = received_at;
+                received_at.since(stranger.since) < SUCCESSOR_CREDIT
+            }
+            Some(stranger) if received_at.since(stranger.last) < EPOCH_MEMORY => true,
+            _ => {
+                self.stranger = Some(Stranger { epoch: epoch.clone(), since: received_at, last: received_at });
+                true
+            }
+        }
+    }
+
+    /// The elected is heard even after somebody else with a later epoch, unless that one is likely to be the next
+    /// elected.
+    fn admit_elected(&mut self, epoch: &Epoch, round: u64, received_at: Timestamp) -> Result<(), Refusal> {
+        if self.elected.as_ref().and_then(|elected| elected.last_round).is_some_and(|last| round <= last) {
+            return Err(Refusal::Repeated);
+        }
+        if self.gate.latest().is_some_and(|(latest, _)| latest > epoch) {
+            let since = *self.others_since.get_or_insert(received_at);
+            if received_at.since(since) >= SUCCESSOR_CREDIT {
+                self.gate = EpochGate::default();
+                self.overruled = Some(epoch.clone());
+            }
+        }
+        self.admit_in_order(epoch, round, received_at, true)?;
+        if let Some(elected) = &mut self.elected {
+            (elected.last_round, elected.heard_at) = (Some(round), received_at);
+        }
+        self.others_since = None;
+        Ok(())
+    }
+
+    fn admit_other(
+        &mut self,
+        epoch: &Epoch,
+        round: u64,
+        received_at: Timestamp,
+        elected: &Epoch,
+        standby: Option<&NodeName>,
+    ) -> Result<(), Refusal> {
+        if epoch > elected {
+            let known = self.elected.as_ref().filter(|known| received_at.since(known.heard_at) < ELECTED_SILENCE);
+            let goes_on = self.gate.latest().is_some_and(|(latest, _)| latest == epoch);
+            let usurps = known.is_some_and(|known| match known.last_round {
+                None if goes_on => false,
+                _ => !known.is_succeeded_by(epoch, round, standby),
+            });
+            if usurps || self.overruled.as_ref() == Some(elected) {
+                return Err(Refusal::NotElected);
+            }
+        }
+        self.admit_in_order(epoch, round, received_at, false)?;
+        if epoch > elected {
+            self.others_since.get_or_insert(received_at);
+        }
+        Ok(())
+    }
+
+    /// `may_lead` says that nobody else is known to lead.
+    fn admit_in_order(
+        &mut self,
+        epoch: &Epoch,
+        round: u64,
+        received_at: Timestamp,
+        may_lead: bool,
+    ) -> Result<(), Refusal> {
+        let quiet = received_at.since(*self.newest_at.get_or_insert(received_at)) >= EPOCH_MEMORY;
+        let mut admitted = self.gate.admit(epoch, round);
+        if admitted.is_err() && quiet && may_lead {
+            self.gate = EpochGate::default();
+            admitted = self.gate.admit(epoch, round);
+        }
+        admitted.map_err(|_| match self.gate.latest() {
+            Some((latest, _)) if latest == epoch => Refusal::Repeated,
+            _ => Refusal::Superseded,
+        })?;
+        self.newest_at = Some(received_at);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::leadership::view::Position;
+
+    fn epoch(term: u64, leader: &str) -> Epoch {
+        Epoch::new(term, NodeName::new(leader).unwrap())
+    }
+
+    fn led_by(epoch: Epoch, standby: Option<&'static str>) -> Leadership {
+        let standby = standby.map(NodeName::from_static);
+        Leadership { position: Position::Following, term: epoch.term, epoch: Some(epoch), standby }
+    }
+
+    fn seeking(term: u64) -> Leadership {
+        Leadership { term, ..Leadership::default() }
+    }
+
+    fn at(ms: u64) -> Timestamp {
+        Timestamp(ms * 1000)
+    }
+
+    #[test]
+    fn a_forged_epoch_does_not_silence_the_elected() {
+        let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "gauss"));
+        let leadership = led_by(elected.clone(), Some("euclid"));
+        let mut filter = SuccessionFilter::of_any_term(0);
+        for round in 0..100 {
+            assert_eq!(filter.admit(&elected, round, at(100 * round), &leadership), Ok(()), "round {round}");
+            let refused = filter.admit(&forged, round, at(100 * round + 50), &leadership);
+            assert_eq!(refused, Err(Refusal::NotElected));
+        }
+    }
+
+    #[test]
+    fn one_that_poses_as_the_next_leader_is_believed_once_and_briefly() {
+        let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "euclid"));
+        let leadership = led_by(elected.clone(), Some("euclid"));
+        let mut filter = SuccessionFilter::of_any_term(0);
+        let mut lost = Vec::new();
+        for round in 0..100 {
+            if filter.admit(&elected, round, at(100 * round), &leadership).is_err() {
+                lost.push(round);
+            }
+            filter.admit(&forged, round + 1, at(100 * round + 50), &leadership).ok();
+        }
+        assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
+    }
+
+    #[test]
+    fn the_next_leader_is_taken_before_word_of_its_election_came() {
+        let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let mut filter = SuccessionFilter::of_any_term(0);
+        let (before, after) = (led_by(old.clone(), Some("euclid")), led_by(new.clone(), None));
+        assert_eq!(filter.admit(&old, 1, at(0), &before), Ok(()));
+        assert_eq!(filter.admit(&new, 2, at(100), &before), Ok(()));
+        assert_eq!(filter.admit(&old, 2, at(110), &before), Err(Refusal::Superseded), "no way back");
+        assert_eq!(filter.admit(&new, 3, at(200), &after), Ok(()));
+        let unknown = epoch(9, "gauss");
+        assert_eq!(filter.admit(&unknown, 4, at(300), &after), Err(Refusal::NotElected));
+        assert_eq!(filter.admit(&unknown, 5, at(500), &after), Ok(()), "the elected has fallen silent");
+    }
+
+    #[test]
+    fn the_elected_goes_on_in_a_later_term_before_word_of_it_came() {
+        let (before, renewed) = (epoch(7, "edge"), epoch(8, "edge"));
+        let leadership = led_by(before.clone(), Some("euclid"));
+        let mut filter = SuccessionFilter::of_any_term(0);
+        assert_eq!(filter.admit(&before, 41, at(0), &leadership), Ok(()));
+        assert_eq!(filter.admit(&renewed, 42, at(100), &leadership), Ok(()));
+        assert_eq!(filter.admit(&before, 42, at(110), &leadership), Err(Refusal::Superseded));
+    }
+
+    #[test]
+    fn a_saved_term_does_not_shut_out_for_good_who_publishes_without_any_election() {
+        let (unelected, leadership) = (epoch(3, "aggregator"), seeking(50));
+        let mut filter = SuccessionFilter::new(50);
+        let taken = |round: &u64| filter.admit(&unelected, *round, at(100 * round), &leadership).is_ok();
+        assert_eq!((0..60).find(taken), Some(35), "half a second to be believed, and three for what was saved");
+    }
+
+    #[test]
+    fn a_standby_that_still_leads_on_its_own_is_not_taken_for_the_next_leader() {
+        let (elected, lone) = (epoch(2, "euclid"), epoch(3, "edge"));
+        let leadership = led_by(elected.clone(), Some("edge"));
+        let mut filter = SuccessionFilter::of_any_term(0);
+        assert_eq!(filter.admit(&elected, 42, at(0), &leadership), Ok(()));
+        assert_eq!(filter.admit(&lone, 3, at(50), &leadership), Err(Refusal::NotElected), "it has just started");
+        assert_eq!(filter.admit(&lone, 9000, at(50), &leadership), Err(Refusal::NotElected), "it was alone for long");
+        assert_eq!(filter.admit(&elected, 43, at(100), &leadership), Ok(()));
+        assert_eq!(filter.admit(&epoch(5, "edge"), 44, at(200), &leadership), Ok(()), "it takes over");
+    }
+
+    #[test]
+    fn who_began_to_lead_at_the_same_time_as_the_elected_waits_for_its_silence() {
+        let (elected, rival) = (epoch(1, "edge"), epoch(1, "v02"));
+        for standby in [None, Some("v02")] {
+            let leadership = led_by(elected.clone(), standby);
+            let mut filter = SuccessionFilter::new(0);
+            for round in 0..3 {
+                let refused = filter.admit(&rival, round, at(100 * round), &leadership);
+                assert_eq!(refused, Err(Refusal::NotElected), "{standby:?}, round {round}");
+            }
+            assert_eq!(filter.admit(&elected, 0, at(210), &leadership), Ok(()), "its first word comes late");
+            assert_eq!(filter.admit(&rival, 3, at(300), &leadership), Err(Refusal::NotElected));
+            assert_eq!(filter.admit(&rival, 5, at(500), &leadership), Ok(()), "the elected is silent");
+        }
+    }
+
+    #[test]
+    fn who_was_taken_before_the_elected_was_known_is_taken_until_the_elected_is_heard() {
+        let (elected, rival, renewed) = (epoch(1, "edge"), epoch(1, "v02"), epoch(2, "edge"));
+        let mut filter = SuccessionFilter::new(0);
+        assert_eq!(filter.admit(&rival, 1, at(0), &seeking(1)), Ok(()));
+        let leadership = led_by(elected.clone(), None);
+        assert_eq!(filter.admit(&elected, 1, at(20), &leadership), Err(Refusal::Superseded));
+        assert_eq!(filter.admit(&rival, 2, at(100), &leadership), Ok(()), "one of both goes on");
+        let leadership = led_by(renewed.clone(), None);
+        assert_eq!(filter.admit(&renewed, 5, at(420), &leadership), Ok(()), "it leads on in a term above both");
+        assert_eq!(filter.admit(&rival, 6, at(430), &leadership), Err(Refusal::Superseded));
+    }
+
+    #[test]
+    fn the_elected_is_heard_half_a_second_after_a_later_one_that_said_one_word_only() {
+        let (elected, later) = (epoch(6, "euclid"), epoch(6, "gauss"));
+        let mut filter = SuccessionFilter::new(0);
+        assert_eq!(filter.admit(&later, 40, at(0), &seeking(5)), Ok(()));
+        let leadership = led_by(elected.clone(), None);
+        let passes = (1..10).map(|n| filter.admit(&elected, 40 + n, at(100 * n), &leadership).is_ok());
+        assert_eq!(passes.collect::<Vec<_>>(), [[false; 5].as_slice(), &[true; 4]].concat());
+    }
+
+    #[test]
+    fn while_nobody_leads_an_unknown_term_is_believed_only_of_one_who_goes_on_publishing() {
+        let seeking_in_7 = seeking(7);
+        let mut filter = SuccessionFilter::new(0);
+        let next = epoch(8, "edge");
+        for round in 0..20 {
+            let forged = epoch(1 << 40 | round, "mallory");
+            let refused = filter.admit(&forged, round, at(100 * round), &seeking_in_7);
+            assert_eq!(refused, Err(Refusal::NotElected), "round {round}");
+            assert_eq!(filter.admit(&next, round, at(100 * round + 1), &seeking_in_7), Ok(()), "round {round}");
+        }
+        let later = epoch(12, "euclid");
+        assert_eq!(filter.admit(&later, 20, at(10_000), &seeking_in_7), Err(Refusal::NotElected));
+        let seeking_in_12 = seeking(12);
+        assert_eq!(filter.admit(&later, 21, at(10_100), &seeking_in_12), Ok(()), "the election has heard of it");
+        assert_eq!(filter.admit(&next, 22, at(20_000), &seeking_in_12), Err(Refusal::NotElected), "it is over");
+    }
+
+    #[test]
+    fn who_publishes_without_any_election_is_believed_however_seldom() {
+        for (period_ms, believed_from) in [(100, 5), (1000, 1), (5000, 1)] {
+            let mut filter = SuccessionFilter::new(0);
+            for term in [3, 1_763_683_200] {
+                let unelected = epoch(term, "aggregator");
+                let start = 100_000 * (1 + u64::from(term > 3));
+                let taken =
+                    |round: &u64| filter.admit(&unelected, *round, at(start + period_ms * round), &seeking(7)).is_ok();
+                let taken: Vec<_> = (0..8).filter(taken).collect();
+                assert_eq!(taken, Vec::from_iter(believed_from..8), "term {term} every {period_ms} ms");
+            }
+        }
+    }
+
+    #[test]
+    fn the_last_round_of_the_old_leader_passes_while_the_new_one_has_sent_none() {
+        let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let mut filter = SuccessionFilter::of_any_term(0);
+        let after = led_by(new.clone(), None);
+        assert_eq!(filter.admit(&old, 1, at(0), &led_by(old.clone(), None)), Ok(()));
+        assert_eq!(filter.admit(&old, 2, at(100), &after), Ok(()));
+        assert_eq!(filter.admit(&new, 3, at(200), &after), Ok(()));
+        assert_eq!(filter.admit(&old, 4, at(300), &after), Err(Refusal::Superseded));
+    }
+}

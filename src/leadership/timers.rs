@@ -1,0 +1,260 @@
+//! Timing of leadership: every constant in one table, with the relation that each one keeps to others.
+//!
+//! Settings of `[election]` are in [`ElectionConfig`]; `beat`, `idle_beat`, `silence_beats`, `claim_step` and `handover`
+//! stand for them here. *Round* is the default round period, 100 ms. A test of this file checks every relation.
+//!
+//! | timer | value | must be | because |
+//! |---|---|---|---|
+//! | [`ElectionConfig::standby_silence`] | `beat * silence_beats`, 200 ms | below [`ELECTED_SILENCE`] | a round of the new leader is accepted when it comes |
+//! | [`ElectionConfig::response_timeout`] | four of these, 800 ms | above a claim, an answer and a retry | it ends what those concerned do at once |
+//! | [`ElectionConfig::given_up_timeout`] | two of these, 400 ms | between both above | the membership's word weighs less than the leader's beats |
+//! | [`ElectionConfig::ask_period`] | one of these, 200 ms | not above an answer's wait | lost questions are repeated in time |
+//! | [`ElectionConfig::answer_time`] | `claim_step * 2`, 120 ms | below [`ElectionConfig::ask_period`] | who is asked answers before the next question |
+//! | [`ElectionConfig::near_beat`] | `beat * 8`, 400 ms | below [`ElectionConfig::response_timeout`] | a second successor hears of a new standby in time |
+//! | [`ElectionConfig::contact_timeout`] | `idle_beat * 5/2`, 6.25 s | above two idle beats | one lost beat is no lost contact |
+//! | [`overdue`], [`missing`] | 3/2 and 5/2 of a round interval | in this order | doubt comes before loss |
+//! | [`ELECTED_SILENCE`] | 250 ms | above two rounds | one late round is no silence |
+//! | [`SUCCESSOR_CREDIT`] | 500 ms | twice [`ELECTED_SILENCE`] | word of the election comes within it |
+//! | [`EPOCH_MEMORY`] | 3 s | above [`MAX_ROUND_AGE`] and [`SUCCESSOR_CREDIT`] | a forged epoch ends, a queued round does not return |
+//! | [`MAX_ROUND_AGE`] | 1 s | above [`MAX_ROUND_WAIT`] | the rest is the way itself |
+//! | [`MAX_ROUND_WAIT`] | 900 ms | above [`SUCCESSOR_CREDIT`] | a failover alone makes no round stale |
+//! | [`MAX_ADOPTED_MAP_AGE`] | 1 s | [`MAX_ROUND_AGE`] | a new leader goes on from maps that others may still accept |
+//! | [`LIVE_STREAM_TIME`] | 150 ms | above a round | at least two rounds prove a live stream |
+//! | [`FAREWELL_TIME`] | 1 s | not below [`MAX_ROUND_AGE`] | what receivers may accept a broker passes on |
+//! | [`LINK_LINGER`] | 2 s | above [`FAREWELL_TIME`] | the last round finds a link |
+//! | [`HEALTH_PERIOD`] | 250 ms | below half of [`PART_TIMEOUT`] | two looks see a part's end |
+//! | [`LOOK_TOLERANCE`] | 500 ms | above [`HEALTH_PERIOD`] | a late look on a busy machine is still time |
+//! | [`ANSWER_STEP`] times [`ANSWER_STEPS`] | 1 s | below [`PART_TIMEOUT`] | a hung part shows before its rounds do |
+//! | [`PART_TIMEOUT`] | 2 s and three rounds | above [`ECHO_TIMEOUT`] | a stalled broker is found by its missing echo |
+//! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part as long as two looks |
+//! | [`ECHO_TIMEOUT`] | 800 ms | above [`MIN_UNANSWERED`] rounds | both conditions hold at about the same time |
+//! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::round::CONNECT_TIME`] | a planned handover waits for everybody |
+//! | [`LEDGER_TIMEOUT`] | 1 s | above [`VEHICLE_CONNECT_TIME`], below `handover` | a lost ledger delays a handover and does not end it |
+//! | [`PREPARATION_STEP`] | 50 ms | below [`VEHICLE_CONNECT_TIME`] | it delays a handover by little |
+//! | [`LATE_WAKE`] | 20 ms | below `stall_ms` | messages are read before lateness stops the clock |
+//! | [`DRAIN_TIME`] | 10 ms | below [`LATE_WAKE`] | the delay itself is no late timer |
+//! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is understood after its node was given up |
+//! | [`REDISCOVERY_TIME`] | 2 s | above [`ElectionConfig::response_timeout`] | a membership that restarts costs no leader |
+//! | [`DISK_TIMEOUT`] | 1 s | below `handover` | a hung disk delays a handover and does not end it |
+//! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
+
+use std::time::Duration;
+
+use crate::leadership::config::ElectionConfig;
+
+/// Maximum age of a round that a node accepts.
+pub const MAX_ROUND_AGE: Duration = Duration::from_secs(1);
+
+/// Maximum time that a round spent in queues. The shortest way itself is not known, only the time beyond it.
+pub const MAX_ROUND_WAIT: Duration = Duration::from_millis(900);
+
+/// Maximum age of the map whose objects a new leader goes on with.
+pub const MAX_ADOPTED_MAP_AGE: Duration = Duration::from_secs(1);
+
+/// Time for which rounds arrive no faster than they were made before their delay counts as that of a live stream.
+pub const LIVE_STREAM_TIME: Duration = Duration::from_millis(150);
+
+/// Time for which the newest round outranks rounds of lower epochs. It bounds how long a forged epoch silences a leader.
+pub const EPOCH_MEMORY: Duration = Duration::from_secs(3);
+
+/// Silence after which a later epoch is accepted from a node other than the standby.
+pub const ELECTED_SILENCE: Duration = Duration::from_millis(250);
+
+/// Time for which a later epoch is believed while the election names another leader: its word may be on the way.
+pub const SUCCESSOR_CREDIT: Duration = Duration::from_millis(500);
+
+/// Time after its last message for which a superseded leader may still publish at a broker.
+pub const FAREWELL_TIME: Duration = Duration::from_secs(1);
+
+/// Time for which a link outlives its use: vehicles that are not yet linked to the new leader's broker are served by the
+/// old one's.
+pub const LINK_LINGER: Duration = Duration::from_secs(2);
+
+/// Time between two looks at the own parts.
+pub const HEALTH_PERIOD: Duration = Duration::from_millis(250);
+
+/// Lateness of a look that still counts as time; more means that the whole node was held up.
+pub const LOOK_TOLERANCE: Duration = Duration::from_millis(500);
+
+/// One step of the wait for a part's answer; a stop of the whole node takes up one step only.
+pub const ANSWER_STEP: Duration = Duration::from_millis(100);
+
+/// Steps for which a part's answer is waited for.
+pub const ANSWER_STEPS: usize = 10;
+
+/// Time without a round after which a fuser counts as broken; three round periods are added.
+pub const PART_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Steps for which readiness waits for a part's answer.
+pub const READINESS_STEPS: usize = 5;
+
+/// Time without an echo after which a broker counts as stalled. Six busy loops on two processors delay a broker by some
+/// tens of milliseconds.
+pub const ECHO_TIMEOUT: Duration = Duration::from_millis(800);
+
+/// Number of messages without an echo, sent over [`ECHO_TIMEOUT`], after which a broker counts as stalled.
+pub const MIN_UNANSWERED: u32 = 6;
+
+/// Time given to vehicles to connect to the broker of a node that is about to be handed the lead.
+pub const VEHICLE_CONNECT_TIME: Duration = Duration::from_millis(300);
+
+/// Time for which a node that is about to be handed the lead waits for the old leader's evidence.
+pub const LEDGER_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Time between two checks of what a handover waits for.
+pub const PREPARATION_STEP: Duration = Duration::from_millis(50);
+
+/// Lateness of a wake-up that means that the process stalled: sockets are read for [`DRAIN_TIME`] first.
+pub const LATE_WAKE: Duration = Duration::from_millis(20);
+
+/// Time for which sockets are read after a late wake-up before timers run.
+pub const DRAIN_TIME: Duration = Duration::from_millis(10);
+
+/// Time after a node was given up during which the end of its broker still proves its process gone.
+pub const DEPARTED_TIME: Duration = Duration::from_secs(5);
+
+/// Time for a restarted membership to find its members again.
+pub const REDISCOVERY_TIME: Duration = Duration::from_secs(2);
+
+/// Time for which a node waits for its disk: for its term before it leads, for reputations before it publishes them.
+pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Least time between two transfers of all evidence to new leaders: leaders may seem to come and go fast.
+pub const FULL_RESYNC_PAUSE: Duration = Duration::from_secs(5);
+
+/// Number of round intervals after the last round when rounds no longer count as regular.
+pub(crate) const REGULAR_GAPS: u32 = 8;
+
+/// Beats of the standby for each beat of another successor.
+const NEAR_BEATS: u32 = 8;
+
+/// Time after a round at which the next one is late: its leader is doubted.
+pub(crate) fn overdue(round_interval: Duration) -> Duration {
+    round_interval * 3 / 2
+}
+
+/// Time after a round at which two are missing: without other signs of life its leader is lost.
+pub(crate) fn missing(round_interval: Duration) -> Duration {
+    round_interval * 5 / 2
+}
+
+impl ElectionConfig {
+    /// Silence after which a standby gives the leader up.
+    pub(crate) fn standby_silence(&self) -> Duration {
+        self.beat() * self.silence_beats
+    }
+
+    /// Time for anything that those concerned do at once: an answer, a claim, a restart.
+    pub(crate) fn response_timeout(&self) -> Duration {
+        self.standby_silence() * 4
+    }
+
+    /// Silence after which a node that the membership gave up is lost, and wait before a refused epoch is renewed.
+    pub(crate) fn given_up_timeout(&self) -> Duration {
+        self.response_timeout() / 2
+    }
+
+    /// Time between two questions of a node that has no leader.
+    pub(crate) fn ask_period(&self) -> Duration {
+        self.response_timeout() / 4
+    }
+
+    /// Time that an answer takes at most on a working network.
+    pub(crate) fn answer_time(&self) -> Duration {
+        self.claim_step() * 2
+    }
+
+    /// Time for which a peer that gets idle beats may be silent and still count as heard.
+    pub(crate) fn contact_timeout(&self) -> Duration {
+        self.idle_beat() * 5 / 2
+    }
+
+    /// Time between two beats to a successor other than the standby.
+    pub(crate) fn near_beat(&self) -> Duration {
+        (self.beat() * NEAR_BEATS).min(self.idle_beat())
+    }
+
+    /// Time between two offers of the lead; after the last round between two messages that yield it, a quarter.
+    pub(crate) fn handover_retry(&self, has_yielded: bool) -> Duration {
+        if has_yielded { self.beat() / 4 } else { self.beat() }
+    }
+
+    /// Time after which a leader yields although it publishes no rounds.
+    pub(crate) fn roundless_yield(&self) -> Duration {
+        self.handover() / 3
+    }
+
+    pub(crate) fn beat(&self) -> Duration {
+        Duration::from_millis(self.beat_ms)
+    }
+
+    pub(crate) fn idle_beat(&self) -> Duration {
+        Duration::from_millis(self.idle_beat_ms)
+    }
+
+    pub(crate) fn claim_step(&self) -> Duration {
+        Duration::from_millis(self.claim_step_ms)
+    }
+
+    pub(crate) fn stable(&self) -> Duration {
+        Duration::from_millis(self.stable_ms)
+    }
+
+    pub(crate) fn handover(&self) -> Duration {
+        Duration::from_millis(self.handover_ms)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::round::{CONNECT_TIME, RoundConfig};
+
+    /// Every line of the table above.
+    #[test]
+    fn every_timer_keeps_its_relation_to_the_others() {
+        let config = ElectionConfig::default();
+        let round = Duration::from_secs_f64(RoundConfig::default().period_s);
+        let stall = Duration::from_millis(config.stall_ms);
+        for (smaller, larger, why) in [
+            (config.standby_silence(), ELECTED_SILENCE, "a new leader's first round is accepted"),
+            (config.answer_time() + config.ask_period(), config.response_timeout(), "a lost answer is repeated"),
+            (config.standby_silence(), config.given_up_timeout(), "beats weigh more than the membership"),
+            (config.given_up_timeout(), config.response_timeout(), "a given up node is not waited for"),
+            (config.answer_time(), config.ask_period(), "answers come before the next question"),
+            (config.near_beat(), config.response_timeout(), "second successors hear of changes"),
+            (config.idle_beat() * 2, config.contact_timeout(), "one lost beat is no lost contact"),
+            (overdue(round), missing(round), "doubt before loss"),
+            (2 * round, ELECTED_SILENCE, "one late round is no silence"),
+            (ELECTED_SILENCE, SUCCESSOR_CREDIT, "word of the election comes in time"),
+            (SUCCESSOR_CREDIT, EPOCH_MEMORY, "forged epochs end"),
+            (MAX_ROUND_AGE, EPOCH_MEMORY, "no queued round returns"),
+            (MAX_ROUND_WAIT, MAX_ROUND_AGE, "the way takes the rest"),
+            (SUCCESSOR_CREDIT, MAX_ROUND_WAIT, "a failover makes no round stale"),
+            (round, LIVE_STREAM_TIME, "two rounds prove a live stream"),
+            (MAX_ROUND_AGE, FAREWELL_TIME + Duration::from_nanos(1), "brokers pass on what receivers accept"),
+            (FAREWELL_TIME, LINK_LINGER, "the last round finds a link"),
+            (2 * HEALTH_PERIOD, PART_TIMEOUT, "two looks see a part's end"),
+            (HEALTH_PERIOD, LOOK_TOLERANCE, "a late look is still time"),
+            (ANSWER_STEP * ANSWER_STEPS as u32, PART_TIMEOUT, "a hung part shows before its rounds do"),
+            (ECHO_TIMEOUT, PART_TIMEOUT, "a missing echo shows first"),
+            (HEALTH_PERIOD, ANSWER_STEP * READINESS_STEPS as u32, "a page waits for two looks"),
+            (MIN_UNANSWERED * round, ECHO_TIMEOUT, "both conditions hold at once"),
+            (CONNECT_TIME, VEHICLE_CONNECT_TIME, "a planned handover waits for everybody"),
+            (VEHICLE_CONNECT_TIME, LEDGER_TIMEOUT, "evidence has more time than links"),
+            (LEDGER_TIMEOUT, config.handover(), "a lost ledger ends no handover"),
+            (PREPARATION_STEP, VEHICLE_CONNECT_TIME, "checks delay a handover by little"),
+            (LATE_WAKE, stall, "messages are read before the clock stops"),
+            (DRAIN_TIME, LATE_WAKE, "the delay is no late timer"),
+            (REDISCOVERY_TIME, DEPARTED_TIME, "a broker's end is understood"),
+            (config.response_timeout(), REDISCOVERY_TIME, "a restarted membership costs no leader"),
+            (DISK_TIMEOUT, config.handover(), "a hung disk ends no handover"),
+            (FULL_RESYNC_PAUSE, Duration::from_secs(10), "a new leader is told before the next snapshot"),
+        ] {
+            assert!(smaller < larger, "{why}: {smaller:?} is not below {larger:?}");
+        }
+        assert_eq!(SUCCESSOR_CREDIT, 2 * ELECTED_SILENCE);
+        assert_eq!(MAX_ADOPTED_MAP_AGE, MAX_ROUND_AGE);
+        assert!(config.stable() > config.response_timeout(), "a candidate's trial outlasts a restart");
+    }
+}

@@ -1,0 +1,68 @@
+//! The view of leadership that all parts of a node work with.
+
+use serde::Serialize;
+
+use crate::epoch::Epoch;
+use crate::leadership::election::Election;
+use crate::names::NodeName;
+
+/// The leader and its standby, as one node sees them.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub struct Leadership {
+    /// The node's own place in its cell.
+    pub position: Position,
+    /// Highest epoch followed or led so far; its leader is the present one unless the node seeks.
+    pub epoch: Option<Epoch>,
+    /// The next leader, if the leader has named one; it may be this node.
+    pub standby: Option<NodeName>,
+    /// Highest term that the election knows to have been used.
+    pub term: u64,
+}
+
+/// A node's place in its cell.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Position {
+    /// It knows of no leader.
+    #[default]
+    Seeking,
+    /// It follows the epoch's leader.
+    Following,
+    /// It follows, and leads next.
+    StandingBy,
+    /// It leads.
+    Leading,
+}
+
+impl Leadership {
+    pub(super) fn of(election: &Election) -> Self {
+        let standby = election.standby();
+        let position = match election.leader() {
+            None => Position::Seeking,
+            Some(_) if election.is_leading() => Position::Leading,
+            Some(_) if standby == Some(election.name()) => Position::StandingBy,
+            Some(_) => Position::Following,
+        };
+        Self { position, epoch: election.epoch().cloned(), standby: standby.cloned(), term: election.term() }
+    }
+
+    /// The leader; none while the node seeks.
+    pub fn leader(&self) -> Option<&NodeName> {
+        self.present_epoch().map(|epoch| &epoch.leader)
+    }
+
+    /// The epoch followed or led now; none while the node seeks.
+    pub fn present_epoch(&self) -> Option<&Epoch> {
+        self.epoch.as_ref().filter(|_| self.position != Position::Seeking)
+    }
+
+    /// Whether this node leads.
+    pub fn is_leading(&self) -> bool {
+        self.position == Position::Leading
+    }
+
+    /// Whether the election knows that a term was used. Only what nodes say with the cell's key makes a term known.
+    pub fn knows_term(&self, term: u64) -> bool {
+        term <= self.term
+    }
+}

@@ -1,0 +1,156 @@
+//! The ledger: settled votes by epoch, vehicle and label, and the reputations that follow from them.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::marks::Marks;
+use super::{Counts, Evidence, RememberedVotes, ReputationConfig};
+use crate::epoch::Epoch;
+use crate::names::{Label, NodeName};
+use crate::wire::{LedgerMark, Reputation};
+
+/// The votes of one vehicle in one lane.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct Record {
+    pub(super) labels: BTreeMap<Label, Counts>,
+    /// Their sum.
+    pub(super) sum: Counts,
+    pub(super) marks: Marks,
+}
+
+/// The evidence of all epochs. Serialised, it is the snapshot that is persisted and replicated.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "Snapshot", into = "Snapshot")]
+pub struct ReputationLedger {
+    /// By the epoch whose aggregator writes the lane, and by vehicle.
+    pub(super) lanes: BTreeMap<Epoch, BTreeMap<NodeName, Record>>,
+    /// Number of counts and marks in all lanes.
+    pub(super) entries: usize,
+}
+
+/// Counts by vehicle and label.
+type SnapshotLane = BTreeMap<NodeName, BTreeMap<Label, Counts>>;
+
+/// A ledger in its serialised form; snapshots of early versions have no marks.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Snapshot {
+    /// By term, and by the aggregator that wrote the lane.
+    lanes: BTreeMap<u64, BTreeMap<NodeName, SnapshotLane>>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    marks: Vec<LedgerMark>,
+}
+
+impl From<Snapshot> for ReputationLedger {
+    fn from(Snapshot { lanes, marks }: Snapshot) -> Self {
+        let mut ledger = Self::default();
+        for (term, aggregators) in lanes {
+            for (aggregator, vehicles) in aggregators {
+                let lane = ledger.lanes.entry(Epoch::new(term, aggregator)).or_default();
+                for (node, labels) in vehicles {
+                    ledger.entries += labels.len();
+                    let sum = labels.values().copied().fold(Counts::default(), Counts::plus);
+                    lane.insert(node, Record { labels, sum, marks: Marks::default() });
+                }
+            }
+        }
+        ledger.merge_marks(marks, None);
+        ledger
+    }
+}
+
+impl From<ReputationLedger> for Snapshot {
+    fn from(ledger: ReputationLedger) -> Self {
+        let marks = ledger.marks().collect();
+        let mut lanes: BTreeMap<u64, BTreeMap<_, _>> = BTreeMap::new();
+        for (Epoch { term, leader }, vehicles) in ledger.lanes {
+            let labels = vehicles.into_iter().map(|(node, record)| (node, record.labels)).collect();
+            lanes.entry(term).or_default().insert(leader, labels);
+        }
+        Self { lanes, marks }
+    }
+}
+
+impl ReputationLedger {
+    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Other lanes give
+    /// way to it, see [`Self::merge_entries`]. The vote is not counted where its lane alone takes all the room.
+    pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
+        let lane = Epoch::new(epoch, aggregator.clone());
+        let Some(record) = self.record_mut(&lane, &evidence.node, Some(&evidence.label), Some(&lane)) else { return };
+        record.labels.entry(evidence.label.clone()).or_default().add(evidence.correct);
+        record.sum.add(evidence.correct);
+        let sum = record.sum;
+        self.reach_mark(&lane, &evidence.node, sum);
+    }
+
+    /// Takes in all evidence of `other`, within the same bounds.
+    pub fn merge(&mut self, other: &Self) {
+        self.merge_entries(other.entries(), None);
+        self.merge_marks(other.marks(), None);
+    }
+
+    /// Every record, lane by lane.
+    pub(super) fn records(&self) -> impl Iterator<Item = (&Epoch, &NodeName, &Record)> {
+        let of_lane = |(lane, vehicles)| std::iter::repeat(lane).zip(vehicles);
+        self.lanes.iter().flat_map(of_lane).map(|(lane, (node, record))| (lane, node, record))
+    }
+
+    /// Every record with its vehicle, the latest lanes first.
+    fn latest_first(&self) -> impl Iterator<Item = (&NodeName, &Record)> {
+        self.lanes.values().rev().flatten()
+    }
+
+    /// The latest term in which each vehicle was counted.
+    pub fn latest_lanes(&self) -> BTreeMap<NodeName, u64> {
+        self.records().map(|(lane, node, _)| (node.clone(), lane.term)).collect()
+    }
+
+    /// Every vehicle's (correct, incorrect) over all lanes.
+    pub fn totals(&self) -> BTreeMap<NodeName, (u64, u64)> {
+        let mut totals: BTreeMap<NodeName, Counts> = BTreeMap::new();
+        for (node, record) in self.latest_first() {
+            let total = totals.entry(node.clone()).or_default();
+            *total = total.plus(record.sum);
+        }
+        totals.into_iter().map(|(node, Counts { correct, incorrect })| (node, (correct, incorrect))).collect()
+    }
+
+    /// The reputations to publish: scores from the remembered votes by [`ReputationConfig::mean`], 0.30 to 1.00, and
+    /// the counts of all votes.
+    pub fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
+        let mut remembered: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
+        for (node, record) in self.latest_first() {
+            let sum = remembered.entry(node).or_default();
+            let (correct, incorrect) = record.latest((0.0, config.memory_votes - (sum.0 + sum.1)));
+            *sum = (sum.0 + correct, sum.1 + incorrect);
+        }
+        let reputation = |(node, (correct, incorrect)): (NodeName, (u64, u64))| {
+            let latest = remembered.get(&node).copied().unwrap_or_default();
+            let score = config.mean(latest.0, latest.1).clamp(0.30, 1.00);
+            (node, Reputation { score, correct, incorrect })
+        };
+        self.totals().into_iter().map(reputation).collect()
+    }
+
+    /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest, without the very
+    /// latest ones, of which `own` gives the number. Each lane's votes are divided among labels as in the whole lane.
+    pub fn remembered(&self, memory_votes: f64, own: impl Fn(&NodeName) -> u64) -> BTreeMap<NodeName, RememberedVotes> {
+        let mut rooms: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
+        let mut remembered: BTreeMap<NodeName, RememberedVotes> = BTreeMap::new();
+        for (node, record) in self.latest_first() {
+            let room = rooms.entry(node).or_insert_with(|| (own(node) as f64, memory_votes));
+            let (correct, incorrect) = record.latest(*room);
+            room.0 = (room.0 - record.sum.total() as f64).max(0.0);
+            room.1 -= correct + incorrect;
+            let shares = (correct / record.sum.correct.max(1) as f64, incorrect / record.sum.incorrect.max(1) as f64);
+            let labels = remembered.entry(node.clone()).or_default();
+            for (label, counts) in &record.labels {
+                let sum = labels.entry(label.clone()).or_default();
+                sum.0 += shares.0 * counts.correct as f64;
+                sum.1 += shares.1 * counts.incorrect as f64;
+            }
+        }
+        remembered
+    }
+}

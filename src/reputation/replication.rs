@@ -1,0 +1,242 @@
+//! Replication: the ledger in pieces that fit into messages, and its bounds.
+
+use std::collections::BTreeSet;
+
+use super::Counts;
+use super::ledger::{Record, ReputationLedger};
+use crate::epoch::Epoch;
+use crate::names::{Label, NodeName};
+use crate::wire::{LedgerEntry, LedgerMark};
+
+/// Maximum number of lanes: the latest are kept.
+pub const MAX_LANES: usize = 64;
+
+/// Maximum number of counts and marks. For a new one the oldest lanes are dropped. It is not taken where only its own
+/// and later lanes are left, except in the present leader's lane, to which later lanes give way too.
+pub const MAX_ENTRIES: usize = 65_536;
+
+/// The key of a count: an entry without its numbers.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct EntryKey {
+    /// The lane.
+    pub lane: Epoch,
+    /// The vehicle.
+    pub node: NodeName,
+    /// The label that it stated.
+    pub label: Label,
+}
+
+impl ReputationLedger {
+    /// Every count, lane by lane.
+    pub fn entries(&self) -> impl Iterator<Item = LedgerEntry> {
+        self.records().flat_map(|(lane, node, record)| {
+            record.labels.iter().map(move |(label, counts)| entry(lane, node, label, *counts))
+        })
+    }
+
+    /// The counts that `keys` name, as they are now.
+    pub fn entries_of(&self, keys: &BTreeSet<EntryKey>) -> Vec<LedgerEntry> {
+        let find = |EntryKey { lane, node, label }: &EntryKey| {
+            Some(entry(lane, node, label, *self.lanes.get(lane)?.get(node)?.labels.get(label)?))
+        };
+        keys.iter().filter_map(find).collect()
+    }
+
+    /// The counts and marks that are missing in `other` or larger than there.
+    pub fn beyond(&self, other: &Self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
+        let known = |epoch: u64, aggregator: &NodeName, node: &NodeName| {
+            other.lanes.get(&Epoch::new(epoch, aggregator.clone()))?.get(node)
+        };
+        let is_news = |entry: &LedgerEntry| {
+            let counts = known(entry.epoch, &entry.aggregator, &entry.node).and_then(|r| r.labels.get(&entry.label));
+            counts.is_none_or(|counts| counts.correct < entry.correct || counts.incorrect < entry.incorrect)
+        };
+        let is_new_mark = |mark: &LedgerMark| {
+            let marks = known(mark.epoch, &mark.aggregator, &mark.node).map(|record| &record.marks);
+            marks.is_none_or(|marks| marks.would_keep(mark.number) && !marks.has(mark.number))
+        };
+        (self.entries().filter(is_news).collect(), self.marks().filter(is_new_mark).collect())
+    }
+
+    /// Takes the larger of every count; true when that changed anything.
+    ///
+    /// Beyond [`MAX_LANES`] and [`MAX_ENTRIES`] the oldest lanes are forgotten, so that all who merge the same entries
+    /// forget the same lanes. The lane of the `present` leader always has room and is never forgotten.
+    pub fn merge_entries(&mut self, entries: impl IntoIterator<Item = LedgerEntry>, present: Option<&Epoch>) -> bool {
+        let mut changed = false;
+        for LedgerEntry { epoch, aggregator, node, label, correct, incorrect } in entries {
+            let lane = Epoch::new(epoch, aggregator);
+            let Some(record) = self.record_mut(&lane, &node, Some(&label), present) else { continue };
+            let counts = record.labels.entry(label).or_default();
+            let before = *counts;
+            counts.merge(Counts { correct, incorrect });
+            changed |= *counts != before;
+            let grown =
+                Counts { correct: counts.correct - before.correct, incorrect: counts.incorrect - before.incorrect };
+            record.sum = record.sum.plus(grown);
+        }
+        changed
+    }
+
+    /// Number of lanes.
+    pub fn lanes(&self) -> usize {
+        self.lanes.len()
+    }
+
+    /// The record of a vehicle in a lane. `None` if it lacks `label` and there is no room for one more count.
+    pub(super) fn record_mut(
+        &mut self,
+        lane: &Epoch,
+        node: &NodeName,
+        label: Option<&Label>,
+        present: Option<&Epoch>,
+    ) -> Option<&mut Record> {
+        let known = self.lanes.get(lane).and_then(|vehicles| vehicles.get(node));
+        if label.is_some_and(|label| known.is_none_or(|record| !record.labels.contains_key(label))) {
+            if !self.make_room(lane, present) {
+                return None;
+            }
+            self.entries += 1;
+        }
+        Some(self.lanes.entry(lane.clone()).or_default().entry(node.clone()).or_default())
+    }
+
+    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false if the lanes that are
+    /// left do not give way to it.
+    pub(super) fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
+        while self.entries >= MAX_ENTRIES || (!self.lanes.contains_key(lane) && self.lanes.len() >= MAX_LANES) {
+            if !self.forget_oldest(lane, present) {
+                return false;
+            }
+        }
+        true
+    }
+
+    /// Forgets the oldest lane except the present one, if it is older than `lane` or `lane` is the present one.
+    fn forget_oldest(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
+        let oldest = self.lanes.keys().find(|other| *other != lane && Some(*other) != present).cloned();
+        let gives_way = |oldest: &Epoch| oldest < lane || present == Some(lane);
+        let Some(forgotten) = oldest.filter(gives_way).and_then(|oldest| self.lanes.remove(&oldest)) else {
+            return false;
+        };
+        self.entries -= forgotten.values().map(|record| record.labels.len() + record.marks.len()).sum::<usize>();
+        true
+    }
+}
+
+fn entry(lane: &Epoch, node: &NodeName, label: &Label, Counts { correct, incorrect }: Counts) -> LedgerEntry {
+    LedgerEntry {
+        epoch: lane.term,
+        aggregator: lane.leader.clone(),
+        node: node.clone(),
+        label: label.clone(),
+        correct,
+        incorrect,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reputation::Evidence;
+
+    fn name(name: &str) -> NodeName {
+        NodeName::new(name).unwrap()
+    }
+
+    fn vote(correct: bool) -> Evidence {
+        Evidence { node: name("euclid"), label: "cup".into(), correct }
+    }
+
+    #[test]
+    fn shares_carry_a_ledger_over_in_any_order_and_number() {
+        let mut ledger = ReputationLedger::default();
+        for epoch in 1..=3 {
+            (0..epoch).for_each(|n| ledger.record(epoch, &name("edge"), &vote(n > 0)));
+        }
+        let mut entries: Vec<_> = ledger.entries().collect();
+        entries.reverse();
+        let mut copy = ReputationLedger::default();
+        for share in entries.chunks(2) {
+            assert!(copy.merge_entries(share.to_vec(), None));
+            assert!(!copy.merge_entries(share.to_vec(), None), "the same again changes nothing");
+        }
+        assert_eq!(copy, ledger);
+
+        let lane = Epoch::new(3, name("edge"));
+        ledger.record(3, &name("edge"), &vote(false));
+        let changed = [EntryKey { lane, node: name("euclid"), label: "cup".into() }].into();
+        copy.merge_entries(ledger.entries_of(&changed), None);
+        assert_eq!(copy, ledger);
+    }
+
+    #[test]
+    fn what_another_lacks_makes_it_the_same_and_no_more() {
+        let mut ledger = ReputationLedger::default();
+        (0..200).for_each(|n| ledger.record(2, &name("edge"), &vote(n % 3 > 0)));
+        let mut other = ledger.clone();
+        (0..200).for_each(|n| ledger.record(2, &name("edge"), &vote(n % 3 > 0)));
+        ledger.record(1, &name("gauss"), &vote(true));
+        other.record(3, &name("edge"), &vote(true));
+        let (entries, marks) = ledger.beyond(&other);
+        assert_eq!(entries.len(), 2);
+        other.merge_entries(entries, None);
+        other.merge_marks(marks, None);
+        assert_eq!(ledger.beyond(&other), (Vec::new(), Vec::new()));
+        ledger.merge(&other);
+        assert_eq!(other, ledger);
+    }
+
+    #[test]
+    fn only_the_latest_lanes_are_kept() {
+        let mut ledger = ReputationLedger::default();
+        for epoch in 0..(2 * MAX_LANES as u64) {
+            let lane = Epoch::new(epoch, name("edge"));
+            let entry = entry(&lane, &name("euclid"), &"cup".into(), Counts { correct: 1, incorrect: 0 });
+            ledger.merge_entries([entry], None);
+        }
+        assert_eq!(ledger.lanes(), MAX_LANES);
+        let oldest = ledger.entries().next().unwrap();
+        assert_eq!(oldest.epoch, MAX_LANES as u64);
+        let forgotten = LedgerEntry { epoch: 0, ..oldest };
+        assert!(!ledger.merge_entries([forgotten], None), "an old lane does not come back");
+    }
+
+    #[test]
+    fn the_present_leaders_lane_has_room_whatever_others_claim() {
+        let counted = Counts { correct: 1, incorrect: 0 };
+        let flood = |epoch: u64| {
+            let lane = move |n| Epoch::new(epoch, name(&format!("forger{n:03}")));
+            (0..2 * MAX_LANES).map(move |n| entry(&lane(n), &name("liar"), &"cup".into(), counted))
+        };
+        let present = Epoch::new(7, name("edge"));
+        let vote_of = |ledger: &ReputationLedger| ledger.totals().get(&name("euclid")).copied();
+
+        let mut own = ReputationLedger::default();
+        own.merge_entries(flood(7).chain(flood(8)), None);
+        own.record(7, &name("edge"), &vote(true));
+        assert_eq!((vote_of(&own), own.lanes()), (Some((1, 0)), MAX_LANES), "later lanes give way");
+        own.merge_entries(flood(9), Some(&present));
+        assert_eq!((vote_of(&own), own.lanes()), (Some((1, 0)), MAX_LANES), "and none displaces it");
+
+        let mut copy = ReputationLedger::default();
+        copy.merge_entries(flood(8), None);
+        let told = entry(&present, &name("euclid"), &"cup".into(), counted);
+        assert!(!copy.merge_entries([told.clone()], None));
+        assert!(copy.merge_entries([told], Some(&present)), "nor does it at whoever follows");
+    }
+
+    #[test]
+    fn names_used_up_in_one_lane_displace_older_lanes_and_nothing_else() {
+        let mut ledger = ReputationLedger::default();
+        ledger.record(1, &name("edge"), &vote(true));
+        ledger.record(2, &name("edge"), &vote(true));
+        for number in 0..MAX_ENTRIES {
+            let node = name(&format!("v{number}"));
+            ledger.record(2, &name("edge"), &Evidence { node, label: "cup".into(), correct: true });
+        }
+        ledger.record(2, &name("edge"), &vote(true));
+        assert_eq!((ledger.entries().count(), ledger.lanes()), (MAX_ENTRIES, 1));
+        assert_eq!(ledger.totals()[&name("euclid")], (2, 0), "who is known goes on being counted");
+    }
+}

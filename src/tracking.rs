@@ -1,0 +1,61 @@
+//! Tracking of objects at no known location: each once, under one identity, across vehicles that move.
+//!
+//! A [`Tracker`] takes admitted reports by [`Tracker::observe`] and closes rounds by [`Tracker::close`]. Within a round,
+//! reports count in the order of capture, whatever the order of arrival. `docs/tracks.md` has the equations.
+//!
+//! Nothing has to be known of a vehicle beforehand. Its noise, field of view, detection rates, calibration and pose error
+//! are learnt from what it has in common with the others. Received maps lend identities and no evidence: no track is
+//! spawned or kept alive by them.
+
+mod calibration;
+mod config;
+mod coverage;
+mod detection_history;
+mod existence;
+mod gating;
+mod grid;
+mod kinematics;
+mod lifecycle;
+mod neighbours;
+mod occlusion;
+mod registration;
+mod sensors;
+mod store;
+#[cfg(test)]
+mod tests;
+mod track;
+mod tracker;
+mod trust;
+mod update;
+
+use std::collections::BTreeMap;
+
+pub use config::{TracksConfig, TracksMode};
+pub use tracker::Tracker;
+
+use crate::names::NodeName;
+use crate::reputation::Evidence;
+use crate::time::Timestamp;
+use crate::wire::{FusedObject, PoseCorrection};
+
+/// Result of a round.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TracksRound {
+    /// The objects at the time of the round, the oldest first.
+    pub objects: Vec<FusedObject>,
+    /// Corrections of positions by vehicle.
+    pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
+    /// Capture time of the oldest report of the round.
+    pub oldest_capture: Option<Timestamp>,
+    /// Judgements of the vehicles' statements.
+    pub evidence: Vec<Evidence>,
+}
+
+/// Numbers of reports and objects that were not used.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TracksLosses {
+    /// Reports that came later than [`TracksConfig::max_lag_s`].
+    pub late: u64,
+    /// New objects beyond [`TracksConfig::max_tracks`] or [`TracksConfig::max_density`].
+    pub refused: u64,
+}

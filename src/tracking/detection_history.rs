@@ -1,0 +1,112 @@
+//! Detection history of one track: a slot for each vehicle that looked at it.
+
+use std::time::Duration;
+
+use smallvec::SmallVec;
+
+use super::existence::SensorHistory;
+use super::sensors::SensorId;
+use crate::time::Timestamp;
+
+/// Maximum number of vehicles in a track's history.
+const MAX_SLOTS: usize = 32;
+
+/// Time after its vehicle's last look after which a slot is free. If newcomers could take slots earlier, none of more
+/// than [`MAX_SLOTS`] vehicles would stay long enough to be judged.
+const SLOT_KEPT: Duration = Duration::from_secs(1);
+
+/// Detections and misses of one track by vehicle.
+#[derive(Debug, Clone, Default)]
+pub(super) struct DetectionHistory {
+    /// Vehicles by slot, apart from their histories: every look searches them, and a history is some 20 times as large.
+    sensors: SmallVec<[SensorId; 12]>,
+    histories: Vec<SensorHistory>,
+}
+
+impl DetectionHistory {
+    /// The histories of all vehicles.
+    pub(super) fn iter(&self) -> impl Iterator<Item = &SensorHistory> {
+        self.histories.iter()
+    }
+
+    /// Number of vehicles.
+    pub(super) fn len(&self) -> usize {
+        self.histories.len()
+    }
+
+    /// The history of a vehicle that has a slot.
+    pub(super) fn get(&self, sensor: SensorId) -> Option<&SensorHistory> {
+        self.slot_of(sensor).map(|slot| &self.histories[slot])
+    }
+
+    /// Whether a vehicle has a slot or can have one.
+    pub(super) fn has_room(&self, sensor: SensorId, at: Timestamp) -> bool {
+        self.find_slot(sensor, at).is_some()
+    }
+
+    /// The history of a vehicle that looks at the object, if there is room for it.
+    pub(super) fn for_look(&mut self, sensor: SensorId, at: Timestamp) -> Option<&mut SensorHistory> {
+        let slot = self.find_slot(sensor, at)?;
+        Some(self.occupy(slot, sensor, at))
+    }
+
+    /// The history of a vehicle that detects the object; it may replace one that never did.
+    pub(super) fn for_hit(&mut self, sensor: SensorId, at: Timestamp) -> Option<&mut SensorHistory> {
+        let without_hit = || self.histories.iter().position(|history| history.last_hit.is_none());
+        let slot = self.find_slot(sensor, at).or_else(without_hit)?;
+        Some(self.occupy(slot, sensor, at))
+    }
+
+    /// Removes all vehicles.
+    pub(super) fn clear(&mut self) {
+        self.sensors.clear();
+        self.histories.clear();
+    }
+
+    /// Removes the vehicles that are not `known`.
+    pub(super) fn retain(&mut self, known: impl Fn(SensorId) -> bool) {
+        self.histories.retain(|history| known(history.sensor));
+        self.sensors.retain(|sensor| known(*sensor));
+    }
+
+    /// Merges the history of another track of the same object. Of two histories of one vehicle, the one with the later
+    /// detection stays.
+    pub(super) fn merge(&mut self, other: Self) {
+        for theirs in other.histories {
+            match self.slot_of(theirs.sensor) {
+                Some(slot) if self.histories[slot].last_hit < theirs.last_hit => self.histories[slot] = theirs,
+                None if self.histories.len() < MAX_SLOTS => {
+                    self.sensors.push(theirs.sensor);
+                    self.histories.push(theirs);
+                }
+                _ => {}
+            }
+        }
+    }
+
+    fn slot_of(&self, sensor: SensorId) -> Option<usize> {
+        self.sensors.iter().position(|occupant| *occupant == sensor)
+    }
+
+    /// The slot that a vehicle has or can have; `None` while all are in use.
+    fn find_slot(&self, sensor: SensorId, at: Timestamp) -> Option<usize> {
+        let unused = || Some(self.histories.len()).filter(|count| *count < MAX_SLOTS);
+        let expired = || {
+            let looks = self.histories.iter().map(|history| history.last_look).enumerate();
+            let (oldest, look) = looks.min_by_key(|(_, look)| *look)?;
+            (at.since(look) > SLOT_KEPT).then_some(oldest)
+        };
+        self.slot_of(sensor).or_else(unused).or_else(expired)
+    }
+
+    fn occupy(&mut self, slot: usize, sensor: SensorId, at: Timestamp) -> &mut SensorHistory {
+        if slot == self.histories.len() {
+            self.sensors.push(sensor);
+            self.histories.push(SensorHistory::new(sensor, at));
+        } else if self.sensors[slot] != sensor {
+            self.sensors[slot] = sensor;
+            self.histories[slot] = SensorHistory::new(sensor, at);
+        }
+        &mut self.histories[slot]
+    }
+}

@@ -1,0 +1,210 @@
+//! Owner of the sensor models: what is learnt of each vehicle, and the only module that creates a [`SensorId`].
+
+use hashbrown::HashMap;
+use nalgebra::Matrix2;
+
+use super::calibration::Calibration;
+use super::config::TracksConfig;
+use super::coverage::Coverage;
+use super::registration::Registration;
+use super::trust::{DormantCounts, Fleet, TrustCounts};
+use crate::geometry::Covariance;
+use crate::names::NodeName;
+use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
+use crate::time::Timestamp;
+use crate::wire::{ObjectReport, PerceivedObject};
+
+/// Number of a vehicle that is heard. [`Sensors::forget_silent`] frees it for another vehicle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct SensorId(u32);
+
+impl SensorId {
+    /// Index into tables by vehicle.
+    pub(super) fn number(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Models of the vehicles that are heard, and the trust in all.
+#[derive(Debug, Clone)]
+pub(super) struct Sensors {
+    models: Vec<Option<Box<SensorModel>>>,
+    ids: HashMap<NodeName, SensorId>,
+    pub(super) fleet: Fleet,
+    pub(super) dormant: DormantCounts,
+}
+
+impl Sensors {
+    /// No vehicles.
+    pub(super) fn new(reputation: ReputationConfig) -> Self {
+        Self {
+            models: Vec::new(),
+            ids: HashMap::new(),
+            fleet: Fleet::new(reputation),
+            dormant: DormantCounts::default(),
+        }
+    }
+
+    /// The model of a vehicle that reports, created if it is new, and the trust in all.
+    pub(super) fn hear(
+        &mut self,
+        node: &NodeName,
+        at: Timestamp,
+        config: &TracksConfig,
+    ) -> (&mut SensorModel, &mut Fleet) {
+        let number = match self.ids.get(node) {
+            Some(id) => id.number(),
+            None => self.models.iter().position(Option::is_none).unwrap_or(self.models.len()),
+        };
+        if number == self.models.len() {
+            self.models.push(None);
+        }
+        let model = self.models[number].get_or_insert_with(|| {
+            let id = SensorId(number as u32);
+            let counts = self.dormant.of(node);
+            self.ids.insert(node.clone(), id);
+            self.fleet.set_counts(id, &counts);
+            Box::new(SensorModel::new(id, node.clone(), at, counts, config))
+        });
+        (model, &mut self.fleet)
+    }
+
+    /// The model of a vehicle that is heard.
+    pub(super) fn get(&self, id: SensorId) -> Option<&SensorModel> {
+        self.models.get(id.number())?.as_deref()
+    }
+
+    /// The same, mutable.
+    pub(super) fn get_mut(&mut self, id: SensorId) -> Option<&mut SensorModel> {
+        self.models.get_mut(id.number())?.as_deref_mut()
+    }
+
+    /// The model of a vehicle that is heard, by name.
+    pub(super) fn by_name(&self, node: &NodeName) -> Option<&SensorModel> {
+        self.get(*self.ids.get(node)?)
+    }
+
+    /// The models of all vehicles that are heard.
+    pub(super) fn iter(&self) -> impl Iterator<Item = &SensorModel> {
+        self.models.iter().flatten().map(Box::as_ref)
+    }
+
+    /// Takes the counts of all vehicles from a ledger.
+    pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
+        let mut silent = Vec::new();
+        for (node, (correct, incorrect)) in ledger.totals() {
+            let counts = TrustCounts::new(correct, incorrect, self.fleet.reputation());
+            match self.ids.get(&node).and_then(|id| self.models[id.number()].as_deref_mut()) {
+                Some(sensor) => {
+                    sensor.counts = counts;
+                    self.fleet.set_counts(sensor.id, &counts);
+                }
+                None => silent.push((node, counts)),
+            }
+        }
+        self.dormant.keep(silent);
+    }
+
+    /// Counts evidence about vehicles that are heard.
+    pub(super) fn learn(&mut self, evidence: &[Evidence]) {
+        for Evidence { node, correct, .. } in evidence {
+            if let Some(sensor) = self.ids.get(node).and_then(|id| self.models[id.number()].as_deref_mut()) {
+                self.fleet.count(sensor.id, &mut sensor.counts, *correct);
+            }
+        }
+    }
+
+    /// Forgets the vehicles whose last report is before `limit`, but for their counts; true if there were any.
+    pub(super) fn forget_silent(&mut self, limit: Timestamp) -> bool {
+        let is_silent = |model: &mut Box<SensorModel>| model.last_report < limit;
+        let mut silent = Vec::new();
+        for sensor in self.models.iter_mut().filter_map(|slot| slot.take_if(is_silent)) {
+            self.ids.remove(&sensor.node);
+            self.fleet.forget(sensor.id);
+            silent.push((sensor.node, sensor.counts));
+        }
+        let is_any_silent = !silent.is_empty();
+        self.dormant.keep(silent);
+        is_any_silent
+    }
+}
+
+/// Learnt properties of one vehicle's sensor.
+#[derive(Debug, Clone)]
+pub(super) struct SensorModel {
+    pub(super) id: SensorId,
+    pub(super) node: NodeName,
+    last_report: Timestamp,
+    pub(super) registration: Registration,
+    pub(super) noise: NoiseModel,
+    pub(super) calibration: Calibration,
+    pub(super) coverage: Coverage,
+    pub(super) counts: TrustCounts,
+}
+
+impl SensorModel {
+    fn new(id: SensorId, node: NodeName, at: Timestamp, counts: TrustCounts, config: &TracksConfig) -> Self {
+        Self {
+            id,
+            node,
+            last_report: at,
+            registration: Registration::new(at, &config.bias_prior()),
+            noise: NoiseModel::default(),
+            calibration: Calibration::new(config.even_confidence),
+            coverage: Coverage::default(),
+            counts,
+        }
+    }
+
+    /// Updates time, place and field of view from a report; true if the vehicle has jumped to another place.
+    pub(super) fn observe(&mut self, report: &ObjectReport, at: Timestamp, config: &TracksConfig) -> bool {
+        self.last_report = self.last_report.max(at);
+        let has_jumped = self.coverage.observe(report);
+        if has_jumped {
+            self.registration = Registration::new(at, &config.bias_prior());
+        }
+        if let Some(centre) = self.coverage.centre() {
+            self.registration.set_pivot(centre);
+        }
+        has_jumped
+    }
+}
+
+/// Scatter of reported positions about their tracks, as a multiple of the stated covariance.
+#[derive(Debug, Clone)]
+pub(super) struct NoiseModel {
+    scale: f64,
+    weight: f64,
+}
+
+impl Default for NoiseModel {
+    fn default() -> Self {
+        Self { scale: 1.0, weight: 30.0 }
+    }
+}
+
+impl NoiseModel {
+    /// Weight beyond which older detections are forgotten.
+    const MEMORY: f64 = 500.0;
+
+    /// Covariance of a reported position, m².
+    pub(super) fn covariance(&self, object: &PerceivedObject, config: &TracksConfig) -> Matrix2<f64> {
+        let floor = Matrix2::identity() * (config.noise_floor_m * config.noise_floor_m);
+        stated(object, config).matrix() * self.scale + floor
+    }
+
+    /// Learns from the squared distance of a detection from a well-known track, m²; `expected` is the track's part of it.
+    pub(super) fn learn(&mut self, object: &PerceivedObject, squared: f64, expected: f64, config: &TracksConfig) {
+        let stated = stated(object, config);
+        let ratio = ((squared - expected) / (stated.xx + stated.yy)).clamp(0.0, 25.0);
+        self.weight = (self.weight + 1.0).min(Self::MEMORY);
+        self.scale += (ratio - self.scale) / self.weight;
+        // A stated covariance is a lower bound.
+        let min = if object.covariance_m2.is_some() { 1.0 } else { 0.05 };
+        self.scale = self.scale.max(min);
+    }
+}
+
+fn stated(object: &PerceivedObject, config: &TracksConfig) -> Covariance {
+    object.covariance().unwrap_or_else(|| Covariance::isotropic(config.noise_m))
+}

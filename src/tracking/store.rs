@@ -1,0 +1,194 @@
+//! Owner of the tracks: the only module that creates a [`TrackIndex`].
+
+use std::ops::{Index, IndexMut};
+
+use hashbrown::HashMap;
+use nalgebra::Vector2;
+
+use super::config::TracksConfig;
+use super::grid::{IndexedTrack, TrackGrid};
+use super::sensors::SensorId;
+use super::track::Track;
+use crate::time::Timestamp;
+
+/// Position of a track in the store. [`TrackStore::retain`] invalidates it; nothing keeps one across that call.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct TrackIndex(u32);
+
+impl TrackIndex {
+    /// Number of the track, the oldest first.
+    pub(super) fn number(self) -> u32 {
+        self.0
+    }
+}
+
+/// The tracks, the oldest first, with indexes by position and by vehicle.
+#[derive(Debug, Clone)]
+pub(super) struct TrackStore {
+    tracks: Vec<Track>,
+    grid: TrackGrid,
+    /// Time of the grid's positions.
+    indexed_at: Timestamp,
+    /// Speed of the fastest track since then, m/s.
+    fastest_mps: f64,
+    /// The track of each vehicle that reports its pose.
+    of_vehicle: HashMap<SensorId, TrackIndex>,
+    max_tracks: usize,
+    max_density: usize,
+    gate_m: f64,
+    /// Tracks that were refused for want of room.
+    pub(super) refused: u64,
+}
+
+/// Minimum side of a grid cell in metres. Trade-off: larger cells return more false candidates; smaller cells cost more
+/// look-ups.
+const MIN_CELL_M: f64 = 24.0;
+
+impl TrackStore {
+    /// An empty store.
+    pub(super) fn new(config: &TracksConfig) -> Self {
+        let TracksConfig { max_tracks, max_density, gate_m, .. } = *config;
+        Self {
+            tracks: Vec::new(),
+            grid: TrackGrid::new(gate_m * (MIN_CELL_M / gate_m).ceil()),
+            indexed_at: Timestamp(0),
+            fastest_mps: 0.0,
+            of_vehicle: HashMap::new(),
+            max_tracks,
+            max_density,
+            gate_m,
+            refused: 0,
+        }
+    }
+
+    /// Number of tracks.
+    pub(super) fn len(&self) -> usize {
+        self.tracks.len()
+    }
+
+    /// All tracks, the oldest first.
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Track> {
+        self.tracks.iter()
+    }
+
+    /// All tracks with their indices, the oldest first.
+    pub(super) fn indexed(&self) -> impl Iterator<Item = (TrackIndex, &Track)> {
+        self.tracks.iter().enumerate().map(|(index, track)| (TrackIndex(index as u32), track))
+    }
+
+    /// Adds a track unless there is no room for it.
+    pub(super) fn add(&mut self, track: Track) -> Option<TrackIndex> {
+        let crowd = self.grid.crowd(&track.state.position, self.gate_m);
+        if self.tracks.len() >= self.max_tracks || crowd >= self.max_density {
+            self.refused += 1;
+            return None;
+        }
+        let index = TrackIndex(self.tracks.len() as u32);
+        self.grid.insert(track.indexed(index, self.indexed_at));
+        self.tracks.push(track);
+        self.note_speed(index);
+        Some(index)
+    }
+
+    /// Indexes all tracks where they are at `at`.
+    pub(super) fn reindex(&mut self, at: Timestamp) {
+        self.indexed_at = at;
+        self.fastest_mps = self.tracks.iter().map(|track| track.state.velocity.norm()).fold(0.0, f64::max);
+        self.clear_indexes();
+        for (number, track) in self.tracks.iter().enumerate() {
+            let index = TrackIndex(number as u32);
+            self.of_vehicle.extend(track.vehicle.map(|vehicle| (vehicle, index)));
+            self.grid.insert(track.indexed(index, at));
+        }
+    }
+
+    /// The same if a track may be too far from its indexed position at `at`.
+    pub(super) fn reindex_if_stale(&mut self, at: Timestamp) {
+        if self.drift_m(at) > self.gate_m / 2.0 {
+            self.reindex(at);
+        }
+    }
+
+    /// Maximum distance of a track at `at` from its indexed position.
+    fn drift_m(&self, at: Timestamp) -> f64 {
+        self.fastest_mps * self.seconds_since_indexed(at).abs()
+    }
+
+    /// Seconds from the time of the grid to `at`, negative before it.
+    pub(super) fn seconds_since_indexed(&self, at: Timestamp) -> f64 {
+        at.micros_from(self.indexed_at) as f64 * 1e-6
+    }
+
+    /// Maximum distance of most tracks at `at` from their indexed positions, metres.
+    ///
+    /// Updates of the round may have moved a track by half a gate. A new track may have moved farther; it is found from
+    /// the next round on.
+    pub(super) fn slack_m(&self, at: Timestamp) -> f64 {
+        self.drift_m(at) + self.gate_m / 2.0
+    }
+
+    /// Visits the tracks whose indexed position is within `reach_m` of a position.
+    pub(super) fn near(&self, position: &Vector2<f64>, reach_m: f64, visit: impl FnMut(&IndexedTrack)) {
+        self.grid.near(position, reach_m, visit);
+    }
+
+    /// Takes note that a track's velocity has changed.
+    pub(super) fn note_speed(&mut self, index: TrackIndex) {
+        self.fastest_mps = self.fastest_mps.max(self[index].state.velocity.norm());
+    }
+
+    /// The track of a vehicle that reports its pose.
+    pub(super) fn of_vehicle(&self, vehicle: SensorId) -> Option<TrackIndex> {
+        self.of_vehicle.get(&vehicle).copied()
+    }
+
+    /// Makes a track that of a vehicle.
+    pub(super) fn set_vehicle(&mut self, index: TrackIndex, vehicle: SensorId) {
+        self.of_vehicle.insert(vehicle, index);
+        self[index].vehicle = Some(vehicle);
+    }
+
+    /// Merges the later track into the older one; the later one stays until the next [`Self::retain`].
+    pub(super) fn merge(&mut self, older: TrackIndex, later: TrackIndex) {
+        let merged = self[later].clone();
+        self[older].merge(merged);
+    }
+
+    /// Removes the other tracks and clears the indexes; every [`TrackIndex`] is invalid afterwards.
+    pub(super) fn retain(&mut self, mut keep: impl FnMut(TrackIndex, &Track) -> bool) {
+        let mut number = 0;
+        self.tracks.retain(|track| {
+            number += 1;
+            keep(TrackIndex(number - 1), track)
+        });
+        self.clear_indexes();
+    }
+
+    /// Forgets the vehicles that are not `known`.
+    pub(super) fn retain_vehicles(&mut self, known: impl Fn(SensorId) -> bool) {
+        for track in &mut self.tracks {
+            track.history.retain(&known);
+            track.vehicle = track.vehicle.filter(|vehicle| known(*vehicle));
+        }
+        self.of_vehicle.clear();
+    }
+
+    fn clear_indexes(&mut self) {
+        self.grid.clear();
+        self.of_vehicle.clear();
+    }
+}
+
+impl Index<TrackIndex> for TrackStore {
+    type Output = Track;
+
+    fn index(&self, index: TrackIndex) -> &Track {
+        &self.tracks[index.0 as usize]
+    }
+}
+
+impl IndexMut<TrackIndex> for TrackStore {
+    fn index_mut(&mut self, index: TrackIndex) -> &mut Track {
+        &mut self.tracks[index.0 as usize]
+    }
+}

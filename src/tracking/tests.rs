@@ -1,0 +1,465 @@
+mod beside;
+mod fast;
+mod trust;
+
+use std::collections::BTreeSet;
+
+use nalgebra::{Matrix2, Vector2};
+use proptest::collection::vec;
+use proptest::prelude::*;
+use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use uuid::Uuid;
+
+use super::coverage::Coverage;
+use super::kinematics::{KinematicState, Measurement};
+use super::*;
+use crate::geometry::Covariance;
+use crate::reputation::ReputationConfig;
+use crate::wire::{FieldOfView, GlobalMap, ObjectReport, PerceivedObject, SCHEMA_VERSION, WirePose};
+
+const START: Timestamp = Timestamp(1_732_154_400_000_000);
+
+fn at(frame: u64) -> Timestamp {
+    Timestamp(START.0 + frame * 100_000)
+}
+
+fn name(node: &str) -> NodeName {
+    NodeName::new(node).unwrap()
+}
+
+fn car(x_m: f64, y_m: f64) -> PerceivedObject {
+    PerceivedObject::new("car", 0.8, x_m, y_m)
+}
+
+fn report(node: &str, frame: u64, objects: Vec<PerceivedObject>) -> ObjectReport {
+    ObjectReport { objects, ..ObjectReport::new(name(node), frame, at(frame)) }
+}
+
+fn tracker() -> Tracker {
+    Tracker::new(TracksConfig::default(), ReputationConfig::default())
+}
+
+/// Objects with a confidence above 0.5.
+fn sure(round: &TracksRound) -> Vec<&FusedObject> {
+    round.objects.iter().filter(|object| object.confidence > 0.5).collect()
+}
+
+fn noise(rng: &mut ChaCha8Rng, m: f64) -> f64 {
+    rng.random_range(-m..m)
+}
+
+/// Two cars, one standing and one going east at 10 m/s, seen by two vehicles; returns the last round.
+fn two_cars(tracker: &mut Tracker, frames: std::ops::Range<u64>, seen: impl Fn(u64) -> bool) -> TracksRound {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut last = TracksRound::default();
+    for frame in frames {
+        for node in ["euclid", "gauss"] {
+            let mut place = |x: f64, y: f64| car(x + noise(&mut rng, 0.3), y + noise(&mut rng, 0.3));
+            let mut objects = vec![place(0.0, 20.0)];
+            if seen(frame) {
+                objects.push(place(frame as f64, 0.0));
+            }
+            tracker.observe(report(node, frame, objects), at(frame));
+        }
+        last = tracker.close(at(frame));
+    }
+    last
+}
+
+fn near(object: &FusedObject, x_m: f64, y_m: f64, within_m: f64) -> bool {
+    (object.x_m - x_m).hypot(object.y_m - y_m) < within_m
+}
+
+#[test]
+fn what_several_vehicles_see_is_one_object_with_a_velocity() {
+    let round = two_cars(&mut tracker(), 0..30, |_| true);
+    let cars = sure(&round);
+    assert_eq!(cars.len(), 2, "{cars:?}");
+    assert!(near(cars[0], 0.0, 20.0, 0.3) && near(cars[1], 29.0, 0.0, 0.5), "{cars:?}");
+    let [east, north] = cars[1].velocity_mps.unwrap();
+    assert!((east - 10.0).abs() < 1.0 && north.abs() < 1.0, "{east} {north}");
+    assert_eq!(cars[1].contributors, [name("euclid"), name("gauss")]);
+    assert_eq!((&*cars[1].label, cars[1].age_s), ("car", Some(0.0)));
+}
+
+#[test]
+fn an_object_keeps_its_identity_through_occlusion_and_fades_while_it_is_hidden() {
+    let mut tracker = tracker();
+    let before = two_cars(&mut tracker, 0..30, |_| true);
+    let hidden = two_cars(&mut tracker, 30..38, |_| false);
+    let find = |round: &TracksRound| round.objects.iter().find(|object| object.y_m.abs() < 3.0).cloned();
+    let (seen, coasting) = (find(&before).unwrap(), find(&hidden).unwrap());
+    assert_eq!(seen.id, coasting.id);
+    assert!(near(&coasting, 37.0, 0.0, 2.0), "{coasting:?}");
+    assert!(coasting.confidence < seen.confidence);
+    let again = two_cars(&mut tracker, 38..45, |_| true);
+    assert_eq!(find(&again).unwrap().id, seen.id);
+    let gone = two_cars(&mut tracker, 45..90, |_| false);
+    assert!(find(&gone).is_none());
+}
+
+#[test]
+fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
+    let config = TracksConfig { vehicle_label: "van".into(), ..TracksConfig::default() };
+    let mut tracker = Tracker::new(config, ReputationConfig::default());
+    let mut round = TracksRound::default();
+    for frame in 0..20 {
+        let x_m = frame as f64 * 0.5;
+        for (node, x_m, sees) in [("euclid", x_m, x_m + 0.4), ("gauss", 30.0, x_m - 0.5)] {
+            // euclid detects its own bonnet, gauss detects euclid.
+            let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+            tracker.observe(ObjectReport { pose, ..report(node, frame, vec![car(sees, 0.2)]) }, at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    let vehicles: Vec<_> = round.objects.iter().map(|object| object.vehicle.clone()).collect();
+    assert_eq!(vehicles, [Some(name("euclid")), Some(name("gauss"))], "{:?}", round.objects);
+    assert!(near(&round.objects[0], 9.5, 0.0, 1.0));
+    assert_eq!((&*round.objects[0].label, &*round.objects[1].label), ("car", "van"));
+}
+
+#[test]
+fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
+    let mut tracker = tracker();
+    let mut ids = BTreeSet::new();
+    for frame in 0..40 {
+        let x_m = if frame < 20 { 0.0 } else { 500.0 };
+        let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+        tracker.observe(ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
+        let round = tracker.close(at(frame));
+        let [vehicle] = &*round.objects else { panic!("{:?}", round.objects) };
+        assert!(near(vehicle, x_m, 0.0, 0.5), "{vehicle:?}");
+        assert!(vehicle.velocity_mps.is_none_or(|[x, y]| x.hypot(y) < 2.0), "{vehicle:?}");
+        ids.insert(vehicle.id);
+    }
+    assert_eq!(ids.len(), 1);
+}
+
+#[test]
+fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
+    let existence = |watchers: u32| {
+        let mut tracker = tracker();
+        let mut round = TracksRound::default();
+        for frame in 0..=20 {
+            let pose = |x_m| Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+            let place = pose(if frame < 20 { 0.0 } else { 500.0 });
+            tracker.observe(ObjectReport { pose: place, ..report("euclid", frame, vec![]) }, at(frame));
+            let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+            for watcher in (0..watchers).filter(|_| frame == 20) {
+                let node = format!("watcher-{watcher}");
+                let report = ObjectReport { pose: pose(10.0), view, ..report(&node, frame, vec![]) };
+                tracker.observe(report, at(frame));
+            }
+            round = tracker.close(at(frame));
+        }
+        round.objects.iter().find(|object| object.vehicle == Some(name("euclid"))).and_then(|object| object.existence)
+    };
+    assert!(existence(0).is_some());
+    assert_eq!(existence(5), existence(0));
+}
+
+/// A vehicle's first pose counts once: half of what a second one says.
+#[test]
+fn the_pose_that_spawns_a_track_is_not_counted_twice() {
+    let mut tracker = tracker();
+    for frame in 0..2 {
+        let pose = Some(WirePose { x_m: frame as f64, y_m: 0.0, heading_rad: 0.0 });
+        tracker.observe(ObjectReport { pose, ..report("euclid", 0, vec![]) }, at(0));
+        let round = tracker.close(at(0));
+        let variance = round.objects[0].covariance_m2[0];
+        let config = TracksConfig::default();
+        let alone = (config.vehicle_radius_m / 2.0).powi(2) + config.common_m.powi(2);
+        if frame == 0 {
+            assert!((variance - alone).abs() < 1e-9, "{variance}");
+        } else {
+            assert!((round.objects[0].x_m - 0.5).abs() < 1e-9);
+        }
+    }
+}
+
+#[test]
+fn what_is_said_of_velocities_is_never_taken_for_better_than_one_of_them_says() {
+    let mut state = KinematicState::new(at(5), &measurement(), 8.0);
+    let said = Vector2::new(10.0, 0.0);
+    for _ in 0..1000 {
+        state.update_velocity(at(5), said, 1.0, 4.0);
+    }
+    assert!((state.velocity_covariance().trace() / 2.0 - 1.0).abs() < 1e-9);
+    assert!((state.velocity.x - 10.0).abs() < 0.5);
+    let mut late = KinematicState::new(at(5), &measurement(), 8.0);
+    late.update_velocity(at(0), said, 1.0, 4.0);
+    assert!((late.velocity_covariance().trace() / 2.0 - 3.0).abs() < 1e-9, "half a second ago is less sure");
+}
+
+fn measurement() -> Measurement {
+    Measurement { position: Vector2::zeros(), independent: Matrix2::identity(), common_m: 0.2 }
+}
+
+#[test]
+fn a_heading_about_due_east_is_not_averaged_to_west() {
+    let mut tracker = tracker();
+    for frame in 0..30 {
+        let heading_rad = Some(if frame % 2 == 0 { 359f64 } else { 1.0 }.to_radians());
+        let seen = PerceivedObject { heading_rad, ..car(0.0, 0.0) };
+        tracker.observe(report("euclid", frame, vec![seen]), at(frame));
+        let round = tracker.close(at(frame));
+        let heading_deg = round.objects[0].heading_rad.unwrap().to_degrees();
+        assert!(heading_deg.abs() < 1.01, "{heading_deg}");
+    }
+}
+
+#[test]
+fn a_late_report_is_used_within_the_bound_and_counted_beyond() {
+    for frame_m in [1.5, 2.8] {
+        a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m);
+    }
+}
+
+fn a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m: f64) {
+    let mut on_time = tracker();
+    let mut late = tracker();
+    for frame in 0..30 {
+        let x_m = frame as f64 * frame_m;
+        for tracker in [&mut on_time, &mut late] {
+            tracker.observe(report("euclid", frame, vec![car(x_m, 0.0)]), at(frame));
+        }
+        on_time.observe(report("gauss", frame, vec![car(x_m, 0.0)]), at(frame));
+        if frame >= 3 {
+            late.observe(report("gauss", frame - 3, vec![car(x_m - 3.0 * frame_m, 0.0)]), at(frame - 3));
+        }
+        on_time.close(at(frame));
+        late.close(at(frame));
+    }
+    let [a, b] = [&mut on_time, &mut late].map(|tracker| tracker.close(at(30)));
+    assert_eq!((a.objects.len(), b.objects.len()), (1, 1), "{:?}", b.objects);
+    assert!(near(&b.objects[0], a.objects[0].x_m, a.objects[0].y_m, 0.3), "held against where it was then");
+    assert_eq!(b.objects[0].contributors.len(), 2);
+    late.observe(report("gauss", 20, vec![car(0.0, 0.0)]), at(20));
+    assert_eq!(late.losses().late, 1);
+}
+
+#[test]
+fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
+    let mut coverage = Coverage::default();
+    let place = |x_m: f64| vec![car(x_m - 20.0, 0.0), car(x_m + 20.0, 0.0)];
+    for frame in 0..10 {
+        assert!(!coverage.observe(&report("euclid", frame, place(0.0))));
+    }
+    assert!(coverage.observe(&report("euclid", 10, place(5_000.0))));
+    assert!((coverage.range_m() - 20.0).abs() < 1e-9, "{}", coverage.range_m());
+    assert!(coverage.rates_at(&Vector2::new(4_990.0, 0.0)).is_some());
+    assert!(coverage.rates_at(&Vector2::new(10.0, 0.0)).is_none());
+}
+
+#[test]
+fn a_view_has_its_stated_angle_and_no_more_than_all_around() {
+    let sees = |angle_rad: f64, bearing_rad: f64| {
+        let mut coverage = Coverage::default();
+        let pose = Some(WirePose { x_m: 10.0, y_m: -5.0, heading_rad: 2.0 });
+        let stated = Some(FieldOfView { range_m: 50.0, angle_rad });
+        coverage.observe(&ObjectReport { pose, view: stated, ..report("euclid", 0, vec![]) });
+        coverage
+            .rates_at(&(Vector2::new(10.0, -5.0) + Vector2::new(bearing_rad.cos(), bearing_rad.sin()) * 20.0))
+            .is_some()
+    };
+    assert!(sees(1.0, 2.0) && sees(1.0, 2.45) && sees(1.0, 1.55));
+    assert!(!sees(1.0, 2.55) && !sees(1.0, 1.45) && !sees(1.0, 5.1));
+    for angle_rad in [std::f64::consts::TAU, 7.0, 2.0 * std::f64::consts::TAU, 360.0] {
+        assert!((0..36).all(|n| sees(angle_rad, f64::from(n) * 0.18)), "{angle_rad}");
+    }
+}
+
+#[test]
+fn what_a_vehicle_was_off_by_says_nothing_of_where_it_has_jumped_to() {
+    let mut tracker = tracker();
+    let place = |x_m: f64| (0..4).map(|n| car(x_m + 10.0 * f64::from(n), 0.0)).collect::<Vec<_>>();
+    for frame in 0..30 {
+        tracker.observe(report("euclid", frame, place(0.0)), at(frame));
+        tracker.observe(report("gauss", frame, place(0.5)), at(frame));
+        tracker.close(at(frame));
+    }
+    tracker.observe(report("euclid", 30, place(0.0)), at(30));
+    tracker.observe(report("gauss", 30, place(0.5)), at(30));
+    tracker.observe(report("gauss", 31, place(5_000.0)), at(31));
+    let corrections = tracker.close(at(31)).pose_corrections;
+    assert!(corrections.contains_key(&name("euclid")) && !corrections.contains_key(&name("gauss")), "{corrections:?}");
+}
+
+/// Twelve parked cars seen by both, `gauss` off by an offset and a rotation; returns the last round.
+fn misaligned(config: TracksConfig) -> TracksRound {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let mut tracker = Tracker::new(config, ReputationConfig::default());
+    let mut round = TracksRound::default();
+    for frame in 0..60 {
+        let place = |n: u64| ((n % 4) as f64 * 12.0 - 18.0, (n / 4) as f64 * 14.0 - 14.0);
+        for (node, dx, turn) in [("euclid", 0.0, 0.0), ("gauss", 0.7, 0.01f64)] {
+            let mut seen = |n| {
+                let (x, y): (f64, f64) = place(n);
+                let (sin, cos) = turn.sin_cos();
+                car(cos * x - sin * y + dx + noise(&mut rng, 0.2), sin * x + cos * y + noise(&mut rng, 0.2))
+            };
+            let objects = (0..12).map(&mut seen).collect();
+            tracker.observe(report(node, frame, objects), at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    round
+}
+
+#[test]
+fn offsets_and_rotations_of_poses_are_found_and_published() {
+    let round = misaligned(TracksConfig::default());
+    assert_eq!(sure(&round).len(), 12);
+    let [a, b] = ["euclid", "gauss"].map(|node| round.pose_corrections[&name(node)]);
+    assert!((a.dx_m - b.dx_m - 0.7).abs() < 0.15, "{a:?} {b:?}");
+    assert!((a.dheading_rad - b.dheading_rad - 0.01).abs() < 0.004, "{a:?} {b:?}");
+    let off = misaligned(TracksConfig { align: false, ..TracksConfig::default() });
+    assert!(off.pose_corrections.is_empty());
+}
+
+#[test]
+fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_takes_them_over() {
+    let (mut leader, mut standby, mut newcomer) = (tracker(), tracker(), tracker());
+    let map = two_cars(&mut leader, 0..30, |_| true);
+    assert_eq!(two_cars(&mut standby, 0..30, |_| true), map);
+    let other = two_cars(&mut newcomer, 20..30, |_| true);
+    let ids = |round: &TracksRound| sure(round).iter().map(|object| object.id).collect::<BTreeSet<Uuid>>();
+    assert!(ids(&map).is_disjoint(&ids(&other)));
+    let unseen = FusedObject {
+        existence: Some(0.9),
+        ..FusedObject::new(Uuid::from_u128(7), "bus", 0.9, 60.0, 60.0, Covariance::isotropic(0.2))
+    };
+    let map = GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: name("edge"),
+        epoch: 1,
+        round: 30,
+        fused_at_us: at(29),
+        oldest_capture_us: None,
+        landmarks: Vec::new(),
+        objects: map.objects.into_iter().chain([unseen]).collect(),
+        pose_corrections: BTreeMap::new(),
+    };
+    newcomer.adopt_map(&map, at(29));
+    let adopted = two_cars(&mut newcomer, 30..31, |_| true);
+    assert!(ids(&adopted).is_superset(&map.objects[..2].iter().map(|object| object.id).collect()));
+    let taken_over = adopted.objects.iter().find(|object| object.id == Uuid::from_u128(7)).unwrap();
+    assert!(taken_over.existence.unwrap() > 0.8, "{taken_over:?}");
+    let later = two_cars(&mut newcomer, 31..80, |_| true);
+    assert_eq!(later.objects.len(), 2, "a map alone keeps nothing alive");
+}
+
+#[test]
+fn a_person_beside_a_car_is_not_the_car() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..20 {
+        let person = PerceivedObject {
+            scores: [("person".into(), 0.7), ("cyclist".into(), 0.2)].into(),
+            ..PerceivedObject::new("person", 0.7, 1.2, 0.0)
+        };
+        let objects = if frame % 2 == 0 { vec![car(0.0, 0.0), person] } else { vec![person, car(0.0, 0.0)] };
+        tracker.observe(report("euclid", frame, objects), at(frame));
+        round = tracker.close(at(frame));
+    }
+    let labels: Vec<_> = sure(&round).iter().map(|object| (object.label.to_string(), object.x_m.round())).collect();
+    assert_eq!(labels, [("car".to_owned(), 0.0), ("person".to_owned(), 1.0)]);
+    let person = sure(&round)[1];
+    assert!(person.scores["person"] > 0.7 && person.scores["cyclist"] < 0.3);
+}
+
+#[test]
+fn a_detector_with_low_confidences_is_understood_after_a_while() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..200 {
+        let mut objects: Vec<_> =
+            (0..10).map(|n| PerceivedObject::new("car", rng.random_range(0.12..0.3), n as f64 * 10.0, 0.0)).collect();
+        for _ in 0..5 {
+            let (x, y) = (rng.random_range(0.0..90.0), rng.random_range(10.0..60.0));
+            objects.push(PerceivedObject::new("car", rng.random_range(0.02..0.08), x, y));
+        }
+        tracker.observe(report("euclid", frame, objects), at(frame));
+        round = tracker.close(at(frame));
+    }
+    assert_eq!(sure(&round).len(), 10, "{:?}", sure(&round));
+}
+
+#[test]
+fn no_more_objects_than_an_area_can_hold_are_kept() {
+    let config = TracksConfig { max_density: 4, max_tracks: 20, ..TracksConfig::default() };
+    let mut tracker = Tracker::new(config, ReputationConfig::default());
+    let crowd = (0..100).map(|n| car((n % 10) as f64 * 0.3, (n / 10) as f64 * 0.3)).collect();
+    tracker.observe(report("euclid", 0, crowd), at(0));
+    let round = tracker.close(at(0));
+    assert!(round.objects.len() <= 4, "{}", round.objects.len());
+    let wide = (0..100).map(|n| car(n as f64 * 50.0, 0.0)).collect();
+    tracker.observe(report("euclid", 1, wide), at(1));
+    assert!(tracker.close(at(1)).objects.len() <= 20);
+    assert!(tracker.losses().refused >= 150);
+}
+
+prop_compose! {
+    fn object()(
+        label in prop_oneof![Just("car"), Just("person")],
+        confidence in 0.0..=1.0f64,
+        (x, y) in prop_oneof![(-20.0..20.0f64, -20.0..20.0f64), (-1e8..1e8f64, -1e8..1e8f64)],
+        covariance_m2 in prop::option::of(prop_oneof![Just([0.0, 0.0, 0.0]), Just([1e12, 0.0, 1e-12]), Just([0.5, 0.5, 0.5])]),
+        velocity_mps in prop::option::of([-1e4..1e4f64, -1e4..1e4f64]),
+        heading_rad in prop::option::of(-1e6..1e6f64),
+    ) -> PerceivedObject {
+        PerceivedObject { covariance_m2, velocity_mps, heading_rad, ..PerceivedObject::new(label, confidence, x, y) }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn whatever_is_reported_comes_to_numbers_that_can_be_computed_with(
+        rounds in vec(vec((0..4u64, 0..9u64, vec(object(), 0..12), prop::option::of((-50.0..50.0f64, -4.0..4.0f64))), 0..6), 1..8),
+    ) {
+        let mut tracker = tracker();
+        for (frame, reports) in rounds.into_iter().enumerate() {
+            for (seq, (node, lag, objects, pose)) in reports.into_iter().enumerate() {
+                let pose = pose.map(|(x_m, heading_rad)| WirePose { x_m, y_m: 0.0, heading_rad });
+                let seq = (frame * 10 + seq) as u64;
+                let report = ObjectReport { pose, seq, ..report(&format!("v{node}"), frame as u64, objects) };
+                tracker.observe(report, at(frame as u64 + 10 - lag));
+            }
+            let round = tracker.close(at(frame as u64 + 10));
+            let mut ids = BTreeSet::new();
+            for object in &round.objects {
+                prop_assert!(object.x_m.is_finite() && object.y_m.is_finite() && object.covariance().is_valid(), "{:?}", object);
+                prop_assert!((0.0..=1.0).contains(&object.confidence) && (0.0..=1.0).contains(&object.existence.unwrap()));
+                prop_assert!(object.velocity_mps.iter().flatten().all(|speed| speed.abs() <= 71.0), "{:?}", object);
+                prop_assert!(object.covariance_m2[0] >= 1e-3 && object.covariance_m2[2] >= 1e-3, "floors hold");
+                prop_assert!(ids.insert(object.id), "each once");
+            }
+        }
+    }
+
+    #[test]
+    fn the_order_in_which_the_reports_of_a_round_come_does_not_matter(
+        rounds in vec(vec((0..4u64, vec(object(), 0..8)), 0..6), 1..6),
+        seed in any::<u64>(),
+    ) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (mut straight, mut shuffled) = (tracker(), tracker());
+        for (frame, reports) in rounds.into_iter().enumerate() {
+            let frame = frame as u64;
+            let mut reports: Vec<_> = reports
+                .into_iter()
+                .enumerate()
+                .map(|(seq, (node, objects))| ObjectReport { seq: seq as u64, ..report(&format!("v{node}"), frame, objects) })
+                .collect();
+            assert!(reports.iter().all(|report| straight.observe(report.clone(), at(frame))));
+            reports.shuffle(&mut rng);
+            assert!(reports.iter().all(|report| shuffled.observe(report.clone(), at(frame))));
+            prop_assert_eq!(straight.close(at(frame)), shuffled.close(at(frame)));
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! Roads on which everything is fast, and frames that move.
+
+use super::*;
+
+/// Two vehicles with a pose each, one behind the other at 27 m/s, between cars that go with them and cars that come
+/// the other way; the second one's clock is 30 ms ahead. Returns by how much cars are off in the last round, on average.
+fn highway(stamped_late_us: u64) -> Vector2<f64> {
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let mut tracker = tracker();
+    let mut off = Vec::new();
+    let lanes = [(27.0, -2.0, 0.0), (31.0, -6.0, 7.0), (-26.0, 2.0, 11.0), (-30.0, 6.0, 3.0)];
+    for frame in 0..250 {
+        let t_s = frame as f64 * 0.1;
+        for (n, node) in ["euclid", "gauss"].into_iter().enumerate() {
+            let x_m = 27.0 * t_s - 30.0 * n as f64;
+            let mut objects = Vec::new();
+            for (speed_mps, y_m, first_m) in lanes {
+                let from = ((x_m - 60.0 - first_m - speed_mps * t_s) / 25.0).ceil() as i64;
+                let cars = (from..from + 5).map(|car| first_m + 25.0 * car as f64 + speed_mps * t_s);
+                objects.extend(cars.filter(|car_m| (car_m - x_m).abs() > 4.0).map(|x_m| {
+                    let (x_m, y_m) = (x_m + noise(&mut rng, 0.2), y_m + noise(&mut rng, 0.2));
+                    car(x_m, y_m)
+                }));
+            }
+            let captured = at(frame) + std::time::Duration::from_micros(n as u64 * stamped_late_us);
+            let pose = Some(WirePose { x_m, y_m: -2.0, heading_rad: 0.0 });
+            tracker.observe(ObjectReport { pose, ..report(node, frame, objects) }, captured);
+        }
+        let round = tracker.close(at(frame));
+        if frame == 249 {
+            for object in sure(&round).iter().filter(|object| object.vehicle.is_none()) {
+                let nearest = lanes.into_iter().map(|(speed_mps, y_m, first_m)| {
+                    let along = (object.x_m - first_m - speed_mps * t_s).rem_euclid(25.0);
+                    Vector2::new(if along > 12.5 { along - 25.0 } else { along }, object.y_m - y_m)
+                });
+                off.extend(nearest.min_by(|a, b| a.norm().total_cmp(&b.norm())));
+            }
+        }
+    }
+    assert!(off.len() >= 15, "{}", off.len());
+    off.iter().sum::<Vector2<f64>>() / off.len() as f64
+}
+
+#[test]
+fn poses_that_are_corrected_do_not_carry_the_map_away_as_vehicles_drive() {
+    for late_us in [0, 30_000] {
+        let off = highway(late_us);
+        assert!(off.norm() < 0.4, "off by {off:?} with stamps {late_us} µs late");
+    }
+}
+
+#[test]
+fn what_comes_the_other_way_in_a_frame_that_moves_is_one_object_with_a_velocity() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..10 {
+        let objects = vec![car(100.0 - 6.0 * frame as f64, 3.0), car(50.0 - 3.0 * frame as f64, -3.0)];
+        tracker.observe(report("euclid", frame, objects), at(frame));
+        round = tracker.close(at(frame));
+    }
+    let cars = sure(&round);
+    let speeds: Vec<_> = cars.iter().map(|car| car.velocity_mps.unwrap()[0].round()).collect();
+    assert_eq!(speeds, [-60.0, -30.0], "{cars:?}");
+}
+
+#[test]
+fn a_car_that_all_have_seen_for_long_is_still_there_a_moment_later() {
+    let mut tracker = tracker();
+    two_cars(&mut tracker, 0..30, |_| true);
+    for (after, least) in [(30, 0.9), (31, 0.85), (34, 0.7)] {
+        let round = tracker.clone().close(at(after));
+        assert!(round.objects.iter().all(|object| object.existence.unwrap() > least), "{after} {:?}", round.objects);
+    }
+}
+
+#[test]
+fn a_glimpse_of_something_far_away_widens_no_view() {
+    let mut coverage = Coverage::default();
+    let mut objects: Vec<_> = (0..20).map(|n| car(f64::from(n), 0.0)).collect();
+    assert!(!coverage.observe(&report("euclid", 0, objects.clone())));
+    objects.push(car(1e6, 0.0));
+    assert!(!coverage.observe(&report("euclid", 1, objects)), "the vehicle is where it was");
+    assert!(coverage.range_m() < 30.0, "{}", coverage.range_m());
+    let stated = ObjectReport {
+        view: Some(FieldOfView { range_m: 100.0, angle_rad: 1.0 }),
+        ..report("euclid", 2, (0..20).map(|n| car(f64::from(n), 0.0)).collect())
+    };
+    coverage.observe(&stated);
+    assert!(coverage.range_m() < 30.0, "a view without a pose says nothing of where it is");
+}

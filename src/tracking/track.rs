@@ -1,0 +1,266 @@
+//! One track: an object that is followed.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use nalgebra::Vector2;
+use smallvec::SmallVec;
+use uuid::Uuid;
+
+use super::config::TracksConfig;
+use super::detection_history::DetectionHistory;
+use super::existence::{SensorHistory, logistic};
+use super::grid::IndexedTrack;
+use super::kinematics::{KinematicState, Measurement};
+use super::neighbours::Neighbours;
+use super::sensors::SensorId;
+use super::store::TrackIndex;
+use crate::geometry::{Covariance, wrap_angle};
+use crate::names::{Label, NodeName};
+use crate::time::Timestamp;
+use crate::wire::{FusedObject, PerceivedObject};
+
+/// Maximum age of another vehicle's detection that confirms a track.
+const CONFIRMED_WITHIN: Duration = Duration::from_millis(500);
+
+/// Maximum number of labels of a track; the likeliest stay.
+const MAX_LABELS: usize = 8;
+
+/// Similarity to a label that was never read.
+pub(super) const MIN_LABEL_SIMILARITY: f64 = 0.02;
+
+/// Maximum position error of a useful object, metres.
+const USABLE_M: f64 = 1.5;
+
+/// Log-odds of existence before any evidence.
+const PRIOR_NATS: f64 = 0.4;
+
+/// Rate at which objects disappear, per second.
+const DISAPPEARANCE_RATE: f64 = 0.02;
+
+/// Time constant in seconds with which an unseen object disappears.
+const UNSEEN_S: f64 = 2.0;
+
+/// Prior odds that a track is an object: most are clutter.
+const PRIOR_ODDS: f64 = 0.07;
+
+/// State of one track.
+#[derive(Debug, Clone)]
+pub(super) struct Track {
+    pub(super) id: Uuid,
+    pub(super) state: KinematicState,
+    pub(super) history: DetectionHistory,
+    /// Fading weights of the labels that were read.
+    labels: SmallVec<[(Label, f64); 1]>,
+    heading_rad: Option<f64>,
+    size_m: Option<[f64; 2]>,
+    pub(super) first_seen: Timestamp,
+    pub(super) last_seen: Timestamp,
+    /// Odds that the object has disappeared since it was last seen.
+    disappeared: f64,
+    /// The vehicle that this track is, by its reported pose.
+    pub(super) vehicle: Option<SensorId>,
+    /// Number of detections.
+    pub(super) hits: u32,
+    pub(super) neighbours: Neighbours,
+    /// Log-odds from another aggregator, which fade, and the time at which they came.
+    inherited: Option<(f64, Timestamp)>,
+}
+
+impl Track {
+    /// A track with one measurement.
+    pub(super) fn new(id: Uuid, at: Timestamp, measurement: &Measurement, config: &TracksConfig) -> Self {
+        Self {
+            id,
+            state: KinematicState::new(at, measurement, config.speed_mps),
+            history: DetectionHistory::default(),
+            labels: SmallVec::new(),
+            heading_rad: None,
+            size_m: None,
+            first_seen: at,
+            last_seen: at,
+            disappeared: 0.0,
+            vehicle: None,
+            hits: 0,
+            neighbours: Neighbours::default(),
+            inherited: None,
+        }
+    }
+
+    /// The entry of the grid at `at`.
+    pub(super) fn indexed(&self, track: TrackIndex, at: Timestamp) -> IndexedTrack {
+        IndexedTrack { position: self.state.position_at(at), velocity: self.state.velocity, track }
+    }
+
+    /// Updates labels, heading and size from a detection.
+    pub(super) fn update_attributes(&mut self, object: &PerceivedObject, heading_rad: Option<f64>) {
+        const KEPT: f64 = 0.95;
+        const SHARE: f64 = 0.3;
+        self.labels.iter_mut().for_each(|(_, weight)| *weight *= KEPT);
+        let label = [(&object.label, object.confidence)];
+        let scores = object.scores.iter().map(|(label, score)| (label, *score));
+        let has_no_scores = object.scores.is_empty();
+        for (label, score) in scores.chain(label.into_iter().filter(|_| has_no_scores)) {
+            match self.labels.iter_mut().find(|(known, _)| known == label) {
+                Some((_, weight)) => *weight += score,
+                None => self.labels.push((label.clone(), score)),
+            }
+        }
+        if self.labels.len() > MAX_LABELS {
+            self.labels.sort_by(|a, b| b.1.total_cmp(&a.1));
+            self.labels.truncate(MAX_LABELS);
+        }
+        if let Some(new) = heading_rad {
+            let old = self.heading_rad.unwrap_or(new);
+            self.heading_rad = Some(wrap_angle(old + SHARE * wrap_angle(new - old)));
+        }
+        if let Some(new) = object.size_m {
+            let old = self.size_m.unwrap_or(new);
+            self.size_m = Some([0, 1].map(|side| old[side] + SHARE * (new[side] - old[side])));
+        }
+    }
+
+    /// Records a detection at `at`.
+    pub(super) fn record_hit(&mut self, at: Timestamp) {
+        self.last_seen = self.last_seen.max(at);
+        self.disappeared = 0.0;
+        self.hits = self.hits.saturating_add(1);
+    }
+
+    /// Records a miss at `at` by a vehicle that had detected the object and last looked `dt_s` before; `rate` is its
+    /// probability of detection.
+    pub(super) fn record_miss(&mut self, at: Timestamp, dt_s: f64, rate: f64) {
+        if at > self.last_seen {
+            self.disappeared = ((self.disappeared + DISAPPEARANCE_RATE * dt_s) / (1.0 - rate)).min(1e6);
+        }
+    }
+
+    /// Similarity of a detection's labels to those of the track, 0 to 1.
+    pub(super) fn label_similarity(&self, object: &PerceivedObject) -> f64 {
+        if self.labels.is_empty() {
+            return 1.0;
+        }
+        let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum::<f64>() + 1e-9;
+        let stated: f64 = object.scores.values().sum();
+        let share = |label: &Label| {
+            if object.scores.is_empty() {
+                f64::from(u8::from(*label == object.label))
+            } else {
+                object.scores.get(label).copied().unwrap_or(0.0) / stated.max(1e-9)
+            }
+        };
+        let common: f64 = self.labels.iter().map(|(label, weight)| weight / total * share(label)).sum();
+        common.max(MIN_LABEL_SIMILARITY)
+    }
+
+    /// Log-odds of existence; `trust` weighs the evidence of each vehicle.
+    fn existence_nats(&self, at: Timestamp, trust: impl Fn(SensorId) -> f64) -> f64 {
+        let evidence: f64 = self.history.iter().map(|history| trust(history.sensor) * history.nats(at)).sum();
+        let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
+        PRIOR_NATS + evidence + inherited
+    }
+
+    /// Probability that an object that existed is still there.
+    pub(super) fn survival(&self, now: Timestamp) -> f64 {
+        let age = now.since(self.last_seen).as_secs_f64();
+        (-age / UNSEEN_S).exp() / (1.0 + self.disappeared)
+    }
+
+    /// The histories of the vehicles that detected the object since `limit`.
+    pub(super) fn seen_by(&self, limit: Timestamp) -> impl Iterator<Item = &SensorHistory> {
+        self.history.iter().filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
+    }
+
+    /// Whether another vehicle than `sensor` detected the object shortly before `at`.
+    pub(super) fn is_confirmed(&self, sensor: SensorId, at: Timestamp) -> bool {
+        self.seen_by(at - CONFIRMED_WITHIN).any(|history| history.sensor != sensor)
+    }
+
+    /// Whether a vehicle detected both objects in the frame of its last detection.
+    pub(super) fn is_resolved_from(&self, other: &Self) -> bool {
+        self.history.iter().any(|own| {
+            own.last_hit.is_some()
+                && other.history.iter().any(|theirs| theirs.sensor == own.sensor && theirs.last_hit == own.last_hit)
+        })
+    }
+
+    /// Merges a later track of the same object; the identity and labels of this one stay.
+    pub(super) fn merge(&mut self, other: Self) {
+        self.history.merge(other.history);
+        if self.last_seen < other.last_seen {
+            self.state = other.state;
+            self.last_seen = other.last_seen;
+            self.disappeared = other.disappeared;
+        }
+        self.neighbours.merge(other.neighbours, self.id);
+        self.hits = self.hits.saturating_add(other.hits);
+        self.vehicle = self.vehicle.or(other.vehicle);
+        self.heading_rad = self.heading_rad.or(other.heading_rad);
+        self.size_m = self.size_m.or(other.size_m);
+    }
+
+    /// Takes existence and attributes from another aggregator's object.
+    pub(super) fn inherit(&mut self, object: &FusedObject, at: Timestamp) {
+        let existence = object.existence.unwrap_or(object.confidence).clamp(0.01, 0.99);
+        self.inherited = Some(((existence / (1.0 - existence) / PRIOR_ODDS).ln() - PRIOR_NATS, at));
+        self.first_seen = object.first_seen_us.map_or(self.first_seen, |first| first.min(self.first_seen));
+        self.labels = object.scores.iter().map(|(label, score)| (label.clone(), *score)).collect();
+        self.heading_rad = object.heading_rad;
+        self.size_m = object.size_m;
+    }
+
+    /// The object of the map at `now`.
+    pub(super) fn object(
+        &self,
+        now: Timestamp,
+        config: &TracksConfig,
+        trust: impl Fn(SensorId) -> f64,
+        name: impl Fn(SensorId) -> Option<NodeName>,
+    ) -> FusedObject {
+        let covariance = self.state.covariance_at(now, config.density());
+        let position = self.state.position_at(now);
+        let existence = with_prior_odds(logistic(self.existence_nats(now, trust))) * self.survival(now);
+        let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
+        let mut scores = BTreeMap::new();
+        scores.extend(self.labels.iter().map(|(label, weight)| (label.clone(), weight / total.max(1e-9))));
+        let variance = covariance.trace() / 2.0;
+        let usable = 1.0 - (-USABLE_M * USABLE_M / (2.0 * variance)).exp();
+        let covariance = Covariance { xx: covariance.m11, xy: covariance.m12, yy: covariance.m22 };
+        let confidence = existence * usable;
+        let has_velocity = self.hits > 1;
+        let seen_by = self.seen_by(now - Duration::from_secs_f64(config.life_s));
+        let mut contributors = Vec::with_capacity(self.history.len());
+        contributors.extend(seen_by.filter_map(|history| name(history.sensor)));
+        FusedObject {
+            contributors,
+            existence: Some(existence),
+            scores,
+            velocity_mps: has_velocity.then_some([self.state.velocity.x, self.state.velocity.y]),
+            heading_rad: self.heading_rad.or_else(|| self.course_rad()),
+            size_m: self.size_m,
+            age_s: Some(now.since(self.last_seen).as_secs_f64()),
+            first_seen_us: Some(self.first_seen),
+            vehicle: self.vehicle.and_then(name),
+            ..FusedObject::new(self.id, self.label(config), confidence, position.x, position.y, covariance)
+        }
+    }
+
+    /// The likeliest label; a track without labels is a vehicle that only its own pose reports.
+    pub(super) fn label(&self, config: &TracksConfig) -> Label {
+        let best = self.labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
+        best.map_or_else(|| config.vehicle_label.clone(), |(label, _)| label.clone())
+    }
+
+    /// Direction of the velocity, radians; `None` unless the velocity is well known.
+    fn course_rad(&self) -> Option<f64> {
+        let velocity: Vector2<f64> = self.state.velocity;
+        let sigma = (self.state.velocity_covariance().trace() / 2.0).sqrt();
+        (velocity.norm() > (3.0 * sigma).max(1.0)).then(|| velocity.y.atan2(velocity.x))
+    }
+}
+
+/// A probability at even prior odds, converted to [`PRIOR_ODDS`].
+fn with_prior_odds(probability: f64) -> f64 {
+    let probability = probability.clamp(0.0, 1.0);
+    PRIOR_ODDS * probability / (PRIOR_ODDS * probability + 1.0 - probability)
+}

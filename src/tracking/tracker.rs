@@ -1,0 +1,179 @@
+//! The tracker: predict, associate, update, manage.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::config::TracksConfig;
+use super::lifecycle::{adopt_map, merge, prune};
+use super::registration::{RegistrationFrame, register};
+use super::sensors::Sensors;
+use super::store::TrackStore;
+use super::update::{ReportOutcome, ReportUpdate};
+use super::{TracksLosses, TracksRound};
+use crate::names::NodeName;
+use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
+use crate::time::Timestamp;
+use crate::wire::{FusedObject, GlobalMap, ObjectReport, PerceivedObject, PoseCorrection};
+
+/// Tracks objects; see the [module](super).
+#[derive(Debug, Clone)]
+pub struct Tracker {
+    config: TracksConfig,
+    pub(super) sensors: Sensors,
+    tracks: TrackStore,
+    /// Reports of the open round with their times of capture.
+    pending: Vec<(Timestamp, Arc<ObjectReport>)>,
+    /// Time of the latest report that was fused.
+    fused_until: Timestamp,
+    late: u64,
+    /// Time from which judgements become evidence.
+    recorded_from: Timestamp,
+}
+
+impl Tracker {
+    /// A tracker without tracks; takes both configurations as valid.
+    pub fn new(config: TracksConfig, reputation: ReputationConfig) -> Self {
+        Self {
+            sensors: Sensors::new(reputation),
+            tracks: TrackStore::new(&config),
+            config,
+            pending: Vec::new(),
+            fused_until: Timestamp(0),
+            late: 0,
+            recorded_from: Timestamp::default(),
+        }
+    }
+
+    /// Takes one admitted report, captured at `captured_at` on the aggregator's clock; false if it came too late.
+    pub fn observe(&mut self, report: impl Into<Arc<ObjectReport>>, captured_at: Timestamp) -> bool {
+        self.observe_only(report.into(), captured_at, |_| true)
+    }
+
+    /// Takes the `wanted` objects of a report: those at no known location.
+    pub fn observe_only(
+        &mut self,
+        report: Arc<ObjectReport>,
+        captured_at: Timestamp,
+        wanted: impl Fn(&PerceivedObject) -> bool,
+    ) -> bool {
+        if self.fused_until.since(captured_at).as_secs_f64() > self.config.max_lag_s {
+            self.late += 1;
+            return false;
+        }
+        let report = if report.objects.iter().all(&wanted) { report } else { only(&report, wanted) };
+        self.pending.push((captured_at, report));
+        true
+    }
+
+    /// Takes the trust in all vehicles from a ledger.
+    pub fn adopt(&mut self, ledger: &ReputationLedger) {
+        self.sensors.adopt(ledger);
+    }
+
+    /// Takes evidence of VOTE about vehicles that are heard.
+    pub fn learn(&mut self, evidence: &[Evidence]) {
+        self.sensors.learn(evidence);
+    }
+
+    /// Takes identities, and objects that are unknown here, from another aggregator's map, received at `now`.
+    pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
+        adopt_map(&mut self.tracks, map, now, &self.config);
+    }
+
+    /// Begins a leadership: earlier observations are for the leader before to judge.
+    pub(crate) fn begin_record(&mut self, now: Timestamp) {
+        self.recorded_from = now;
+    }
+
+    /// Reports and objects that were not used so far.
+    pub fn losses(&self) -> TracksLosses {
+        TracksLosses { late: self.late, refused: self.tracks.refused }
+    }
+
+    /// Closes the round at `now`.
+    pub fn close(&mut self, now: Timestamp) -> TracksRound {
+        let pending = std::mem::take(&mut self.pending);
+        let oldest_capture = pending.iter().map(|(captured_at, _)| *captured_at).min();
+        let (frames, evidence) = self.update(&self.in_order(pending), now);
+        if self.config.align {
+            register(frames, &self.tracks, &mut self.sensors, &self.config);
+        }
+        merge(&mut self.tracks, now, &self.config);
+        prune(&mut self.tracks, &mut self.sensors, now, &self.config);
+        TracksRound { objects: self.objects(now), pose_corrections: self.corrections(), oldest_capture, evidence }
+    }
+
+    /// The reports of a round in the order of capture, whatever the order of arrival.
+    fn in_order(&self, pending: Vec<(Timestamp, Arc<ObjectReport>)>) -> Vec<Captured> {
+        let mut reports: Vec<Captured> = pending
+            .into_iter()
+            .map(|(stamp, report)| {
+                let sensor = self.sensors.by_name(&report.node);
+                let delay_s = sensor.map_or(0.0, |sensor| sensor.registration.delay_s());
+                Captured { at: stamp.shifted((-delay_s * 1e6) as i64), delay_s, report }
+            })
+            .collect();
+        reports.sort_by(|a, b| (a.at, &a.report.node, a.report.seq).cmp(&(b.at, &b.report.node, b.report.seq)));
+        reports
+    }
+
+    /// Updates the tracks by each report; returns what registration needs, and judgements of the vehicles.
+    fn update(&mut self, reports: &[Captured], now: Timestamp) -> (Vec<RegistrationFrame>, Vec<Evidence>) {
+        let (mut frames, mut evidence): (Vec<RegistrationFrame>, Vec<Evidence>) = Default::default();
+        self.tracks.reindex(reports.first().map_or(now, |report| report.at));
+        for Captured { at, delay_s, report } in reports {
+            let (at, delay_s) = (*at, *delay_s);
+            self.tracks.reindex_if_stale(at);
+            let (sensor, fleet) = self.sensors.hear(&report.node, at, &self.config);
+            let id = sensor.id;
+            let update = ReportUpdate::new(&self.config, &mut self.tracks, (sensor, fleet), report, at);
+            let ReportOutcome { has_jumped, samples, evidence: judged } = update.run();
+            if has_jumped {
+                frames.retain(|earlier| earlier.sensor != id);
+            }
+            frames.push(RegistrationFrame { sensor: id, at, delay_s, samples });
+            if at >= self.recorded_from {
+                evidence.extend(judged);
+            }
+            self.fused_until = self.fused_until.max(at);
+        }
+        (frames, evidence)
+    }
+
+    fn objects(&self, now: Timestamp) -> Vec<FusedObject> {
+        let trust = |id| self.sensors.fleet.trust(id);
+        let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
+        let objects = self.tracks.iter().map(|track| track.object(now, &self.config, trust, name));
+        let mut published = Vec::with_capacity(self.tracks.len());
+        published.extend(objects.filter(|object| object.confidence >= self.config.min_confidence));
+        published
+    }
+
+    fn corrections(&self) -> BTreeMap<NodeName, PoseCorrection> {
+        if !self.config.align {
+            return BTreeMap::new();
+        }
+        let corrections = self.sensors.iter();
+        corrections.filter_map(|sensor| Some((sensor.node.clone(), sensor.registration.correction()?))).collect()
+    }
+}
+
+/// A report of the round.
+struct Captured {
+    /// Time of capture: the stamp less the vehicle's delay.
+    at: Timestamp,
+    delay_s: f64,
+    report: Arc<ObjectReport>,
+}
+
+/// The report with the `wanted` objects only.
+fn only(report: &ObjectReport, wanted: impl Fn(&PerceivedObject) -> bool) -> Arc<ObjectReport> {
+    let objects = report.objects.iter().filter(|object| wanted(object)).cloned().collect();
+    let (pose, view) = (report.pose, report.view);
+    Arc::new(ObjectReport {
+        pose,
+        view,
+        objects,
+        ..ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us)
+    })
+}

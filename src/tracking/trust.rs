@@ -1,0 +1,244 @@
+//! Trust in vehicles: which of them report objects that others see, and which fabricate or hide objects.
+//!
+//! Every [`JUDGED_AFTER`] of looks, a vehicle's statement about an object is compared with the evidence of the others.
+//! Where they agree that the object exists, a detection is correct; never to have detected it is a miss if most
+//! vehicles detect objects at that distance. Where at least two others look and agree that nothing exists, a detection
+//! is a false positive. One vehicle against another settles nothing.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use super::detection_history::DetectionHistory;
+use super::existence::Statement;
+use super::sensors::SensorId;
+use crate::names::NodeName;
+use crate::reputation::ReputationConfig;
+use crate::time::Timestamp;
+
+/// Time between judgements of a vehicle's statement about an object.
+pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
+
+/// Minimum log-odds, by the others' evidence, of an object that exists.
+const EXISTS_NATS: f64 = 2.0;
+
+/// Maximum log-odds, by the others' evidence, of an object that does not exist.
+const ABSENT_NATS: f64 = -1.5;
+
+/// Minimum share of looks with a detection for which a vehicle states that an object exists.
+const MIN_STATED: f64 = 0.4;
+
+/// Minimum share of vehicles that detect objects at a distance, for a miss there to be judged.
+const MIN_EXPECTED: f64 = 0.6;
+
+/// Weight above which a vehicle counts as one of the others.
+const MIN_PEER_WEIGHT: f64 = 0.5;
+
+/// Share of a newcomer's reputation at and below which evidence weighs nothing.
+const WORTHLESS: f64 = 0.6;
+
+/// Judgement of a vehicle's statement about an object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Judgement {
+    /// The vehicle detected an object that exists.
+    Correct,
+    /// The vehicle detected an object that does not exist.
+    FalsePositive,
+    /// The vehicle did not detect an object that exists.
+    Miss,
+}
+
+/// Evidence of all vehicles but one about an object.
+#[derive(Debug, Clone, Copy, Default)]
+struct PeerEvidence {
+    /// Log-odds of existence.
+    nats: f64,
+    /// Number of vehicles that looked.
+    looking: usize,
+    /// Number of vehicles that detected it recently.
+    detecting: usize,
+}
+
+impl PeerEvidence {
+    fn of(history: &DetectionHistory, sensor: SensorId, at: Timestamp, fleet: &Fleet) -> Self {
+        let mut peers = Self::default();
+        for history in history.iter().filter(|history| history.sensor != sensor) {
+            if at.since(history.last_look) > JUDGED_AFTER {
+                continue;
+            }
+            let weight = fleet.trust(history.sensor);
+            peers.nats += weight * history.nats(at);
+            peers.looking += usize::from(weight > MIN_PEER_WEIGHT && history.looks > 5);
+            let is_recent = history.last_hit.is_some_and(|hit| at.since(hit) <= JUDGED_AFTER);
+            peers.detecting += usize::from(weight > MIN_PEER_WEIGHT && is_recent);
+        }
+        peers
+    }
+
+    fn judge(&self, statement: Statement) -> Option<Judgement> {
+        let share = f64::from(statement.hits) / f64::from(statement.looks.max(1));
+        let exists = self.nats >= EXISTS_NATS;
+        if self.detecting >= 1 && exists && share >= MIN_STATED {
+            Some(Judgement::Correct)
+        } else if self.detecting >= 2 && exists && statement.hits == 0 {
+            Some(Judgement::Miss)
+        } else if self.looking >= 2 && self.detecting == 0 && self.nats <= ABSENT_NATS && share >= MIN_STATED {
+            Some(Judgement::FalsePositive)
+        } else {
+            None
+        }
+    }
+}
+
+/// Correct and incorrect statements of one vehicle, the latest ones counting most.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct TrustCounts {
+    correct: f64,
+    incorrect: f64,
+}
+
+impl TrustCounts {
+    /// Counts from a ledger.
+    pub(super) fn new(correct: u64, incorrect: u64, config: &ReputationConfig) -> Self {
+        let mut counts = Self { correct: correct as f64, incorrect: incorrect as f64 };
+        counts.fade(config);
+        counts
+    }
+
+    /// Adds one statement.
+    pub(super) fn count(&mut self, is_correct: bool, config: &ReputationConfig) {
+        *(if is_correct { &mut self.correct } else { &mut self.incorrect }) += 1.0;
+        self.fade(config);
+    }
+
+    fn fade(&mut self, config: &ReputationConfig) {
+        let kept = (config.memory_votes / self.total()).min(1.0);
+        self.correct *= kept;
+        self.incorrect *= kept;
+    }
+
+    fn total(&self) -> f64 {
+        self.correct + self.incorrect
+    }
+
+    /// Weight of the vehicle's evidence: 1 from a newcomer's reputation up, 0 at that of a proven liar.
+    pub(super) fn trust(&self, config: &ReputationConfig) -> f64 {
+        let reputation = config.mean(self.correct, self.incorrect);
+        ((reputation / config.initial - WORTHLESS) / (1.0 - WORTHLESS)).clamp(0.0, 1.0)
+    }
+}
+
+/// Counts of vehicles that are not heard at present.
+#[derive(Debug, Clone, Default)]
+pub(super) struct DormantCounts(BTreeMap<NodeName, TrustCounts>);
+
+impl DormantCounts {
+    /// Maximum number of vehicles.
+    pub(super) const MAX: usize = 4096;
+
+    /// The counts of a vehicle.
+    pub(super) fn of(&self, node: &NodeName) -> TrustCounts {
+        self.0.get(node).copied().unwrap_or_default()
+    }
+
+    /// Keeps the counts of vehicles; those with the fewest statements make room.
+    pub(super) fn keep(&mut self, vehicles: impl IntoIterator<Item = (NodeName, TrustCounts)>) {
+        self.0.extend(vehicles.into_iter().filter(|(_, counts)| counts.total() > 0.0));
+        let excess = self.0.len().saturating_sub(Self::MAX);
+        if excess > 0 {
+            let mut totals: Vec<_> = self.0.iter().map(|(node, counts)| (counts.total(), node.clone())).collect();
+            totals.sort_by(|a, b| a.0.total_cmp(&b.0).then_with(|| a.1.cmp(&b.1)));
+            for (_, node) in totals.iter().take(excess) {
+                self.0.remove(node);
+            }
+        }
+    }
+}
+
+/// Trust in every vehicle and detection rates of all: the standard by which one vehicle is judged.
+#[derive(Debug, Clone)]
+pub(super) struct Fleet {
+    reputation: ReputationConfig,
+    /// Weight of the evidence of each vehicle by its id, 0 to 1.
+    trust: Vec<f64>,
+    /// By distance, the number of vehicles that detected an object that exists, and of all.
+    detections: Vec<(f64, f64)>,
+}
+
+impl Fleet {
+    const BIN_M: f64 = 10.0;
+    const BINS: usize = 16;
+    const MEMORY: f64 = 500.0;
+
+    /// Minimum weight of a bin from which detections are expected.
+    const MIN_WEIGHT: f64 = 10.0;
+
+    /// A fleet without vehicles.
+    pub(super) fn new(reputation: ReputationConfig) -> Self {
+        Self { reputation, trust: Vec::new(), detections: vec![(0.0, 1.0); Self::BINS] }
+    }
+
+    /// Parameters of reputations.
+    pub(super) fn reputation(&self) -> &ReputationConfig {
+        &self.reputation
+    }
+
+    /// Weight of a vehicle's evidence, 0 to 1.
+    pub(super) fn trust(&self, sensor: SensorId) -> f64 {
+        self.trust.get(sensor.number()).copied().unwrap_or(0.0)
+    }
+
+    /// Sets the counts from which a vehicle's trust follows.
+    pub(super) fn set_counts(&mut self, sensor: SensorId, counts: &TrustCounts) {
+        if self.trust.len() <= sensor.number() {
+            self.trust.resize(sensor.number() + 1, 0.0);
+        }
+        self.trust[sensor.number()] = counts.trust(&self.reputation);
+    }
+
+    /// Removes a vehicle.
+    pub(super) fn forget(&mut self, sensor: SensorId) {
+        self.trust[sensor.number()] = 0.0;
+    }
+
+    /// Adds a statement to a vehicle's counts.
+    pub(super) fn count(&mut self, sensor: SensorId, counts: &mut TrustCounts, is_correct: bool) {
+        counts.count(is_correct, &self.reputation);
+        self.set_counts(sensor, counts);
+    }
+
+    /// Judges a vehicle's statement about an object `distance_m` away by the evidence of the others; `None` where they
+    /// settle nothing.
+    pub(super) fn judge(
+        &mut self,
+        sensor: SensorId,
+        statement: Statement,
+        history: &DetectionHistory,
+        distance_m: f64,
+        at: Timestamp,
+    ) -> Option<Judgement> {
+        let judgement = PeerEvidence::of(history, sensor, at, self).judge(statement)?;
+        if judgement != Judgement::FalsePositive {
+            self.learn(distance_m, judgement == Judgement::Correct);
+        }
+        (judgement != Judgement::Miss || self.expects(distance_m)).then_some(judgement)
+    }
+
+    fn learn(&mut self, distance_m: f64, is_detected: bool) {
+        let (detections, all) = &mut self.detections[Self::bin(distance_m)];
+        *detections += f64::from(u8::from(is_detected));
+        *all += 1.0;
+        let kept = (Self::MEMORY / *all).min(1.0);
+        *detections *= kept;
+        *all *= kept;
+    }
+
+    /// Whether most vehicles detect objects at a distance.
+    fn expects(&self, distance_m: f64) -> bool {
+        let (detections, all) = self.detections[Self::bin(distance_m)];
+        all >= Self::MIN_WEIGHT && detections / all >= MIN_EXPECTED
+    }
+
+    fn bin(distance_m: f64) -> usize {
+        ((distance_m / Self::BIN_M) as usize).min(Self::BINS - 1)
+    }
+}

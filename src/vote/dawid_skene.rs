@@ -1,0 +1,325 @@
+//! Probability of each label given the votes: the model of Dawid & Skene (1979) with hierarchical priors.
+
+use std::collections::BTreeSet;
+
+use super::config::WeightedConfig;
+use super::confusion::{Confusion, LabelIndex};
+
+/// Evidence about one vehicle.
+#[derive(Debug, Clone, Default)]
+pub(super) struct VehicleEvidence {
+    /// Evidence of fresh votes, which may be judged again.
+    pub(super) live: Confusion,
+    /// Fading evidence of votes that went stale.
+    pub(super) settled: Confusion,
+    /// Fading evidence from the ledger of other aggregators.
+    pub(super) inherited: Confusion,
+    /// Cumulative sum of the drop in the vehicle's rate of right votes.
+    shortfall: f64,
+    /// Log-odds of being right minus those of the fleet on the same classes.
+    advantage: f64,
+}
+
+impl VehicleEvidence {
+    fn correct(&self) -> f64 {
+        self.live.correct() + self.settled.correct() + self.inherited.correct()
+    }
+
+    /// Page's (1954) cumulative sum test: after a sudden drop in right votes most of the vehicle's past is forgotten.
+    fn watch_for_drop(&mut self, right: f64) {
+        let past = self.settled.total() + self.inherited.total();
+        let usual = (self.settled.correct() + self.inherited.correct()) / past.max(1.0);
+        self.shortfall = (self.shortfall + usual - right - SHORTFALL_SLACK).max(0.0);
+        if self.shortfall > SHORTFALL_ALARM {
+            self.shortfall = 0.0;
+            self.settled.fade(KEPT_AFTER_ALARM);
+            self.inherited.fade(KEPT_AFTER_ALARM);
+        }
+    }
+
+    /// Number of votes.
+    pub(super) fn votes(&self) -> f64 {
+        self.live.total() + self.settled.total() + self.inherited.total()
+    }
+}
+
+/// A vote as the model takes it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct WeightedVote {
+    /// Index of the vehicle.
+    pub(super) vehicle: usize,
+    /// The stated label.
+    pub(super) label: LabelIndex,
+    /// Calibrated confidence × visibility, 1 for a plain vote.
+    pub(super) weight: f64,
+    /// Part of the vote that does not depend on other vehicles, 0 to 1.
+    pub(super) independence: f64,
+}
+
+/// Confusion of each vehicle and of the fleet, and the shares of the classes.
+///
+/// A vehicle's probability of stating `l` where `t` is true has a Dirichlet prior. The prior's mean is the fleet's
+/// confusion, shifted in log-odds by the vehicle's overall reliability. That reliability is shrunk towards the fleet's.
+#[derive(Debug, Clone, Default)]
+pub(super) struct DawidSkene {
+    config: WeightedConfig,
+    pub(super) vehicles: Vec<VehicleEvidence>,
+    live: Confusion,
+    settled: Confusion,
+    labels: usize,
+    /// Expected number of landmarks of each label.
+    shares: Vec<f64>,
+    log_shares: Vec<f64>,
+}
+
+/// Weight, in votes, of the assumed accuracy against the fleet's record of a class.
+const FLEET_PRIOR_VOTES: f64 = 1.0;
+/// Drop in the rate of right votes that is tolerated.
+const SHORTFALL_SLACK: f64 = 0.2;
+/// Cumulative drop beyond it, in votes, that is a change: about seven wrong votes of a vehicle with 80 % right ones.
+const SHORTFALL_ALARM: f64 = 4.0;
+/// Part of a vehicle's past that still counts after a change.
+const KEPT_AFTER_ALARM: f64 = 0.1;
+
+impl DawidSkene {
+    pub(super) fn new(config: WeightedConfig) -> Self {
+        Self { config, ..Self::default() }
+    }
+
+    /// Makes room for a label.
+    pub(super) fn add_label(&mut self) {
+        self.labels += 1;
+        self.shares.push(0.0);
+        self.log_shares.push(0.0);
+    }
+
+    /// Number of labels that there is room for.
+    pub(super) fn labels(&self) -> usize {
+        self.labels
+    }
+
+    /// Number of correct votes by label.
+    pub(super) fn support(&self) -> Vec<f64> {
+        let evidence = [&self.live, &self.settled].into_iter().chain(self.vehicles.iter().map(|w| &w.inherited));
+        let mut support = vec![0.0; self.labels];
+        for confusion in evidence {
+            for (label, sum) in support.iter_mut().enumerate() {
+                *sum += confusion.cell(label as LabelIndex, label as LabelIndex);
+            }
+        }
+        support
+    }
+
+    /// Forgets labels, none of which is in the live evidence; their indices may be reused.
+    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+        labels.iter().for_each(|label| self.shares[usize::from(*label)] = 0.0);
+        let of_vehicles = self.vehicles.iter_mut().flat_map(|w| [&mut w.live, &mut w.settled, &mut w.inherited]);
+        [&mut self.live, &mut self.settled].into_iter().chain(of_vehicles).for_each(|c| c.forget_labels(labels));
+    }
+
+    fn wrong_labels(&self) -> f64 {
+        self.labels.saturating_sub(1).max(1) as f64
+    }
+
+    fn fleet_accuracy(&self) -> f64 {
+        let correct = self.live.correct() + self.settled.correct();
+        let total = self.live.total() + self.settled.total();
+        (correct + FLEET_PRIOR_VOTES * self.config.assumed_accuracy) / (total + FLEET_PRIOR_VOTES)
+    }
+
+    fn fleet_row(&self, truth: LabelIndex) -> f64 {
+        self.live.row(truth) + self.settled.row(truth) + FLEET_PRIOR_VOTES
+    }
+
+    fn fleet(&self, truth: LabelIndex, stated: LabelIndex, accuracy: f64) -> f64 {
+        let prior = if truth == stated { accuracy } else { (1.0 - accuracy) / self.wrong_labels() };
+        let count = self.live.cell(truth, stated) + self.settled.cell(truth, stated);
+        (count + FLEET_PRIOR_VOTES * prior) / self.fleet_row(truth)
+    }
+
+    /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before [`Self::posterior`] when
+    /// evidence has changed.
+    pub(super) fn refresh(&mut self, vehicles: impl Iterator<Item = usize>) {
+        self.refresh_shares();
+        let accuracy = self.fleet_accuracy();
+        for vehicle in vehicles {
+            let evidence = &self.vehicles[vehicle];
+            let expected = |rows: &Confusion| -> f64 { rows.rows().map(|(t, n)| n * self.fleet(t, t, accuracy)).sum() };
+            let counted = evidence.votes();
+            let fleet = if counted > 1e-9 {
+                ((expected(&evidence.live) + expected(&evidence.settled) + expected(&evidence.inherited)) / counted)
+                    .clamp(1e-6, 1.0 - 1e-6)
+            } else {
+                accuracy.clamp(1e-6, 1.0 - 1e-6)
+            };
+            let prior = self.config.vehicle_prior_votes;
+            let own = ((evidence.correct() + prior * fleet) / (evidence.votes() + prior)).clamp(1e-6, 1.0 - 1e-6);
+            self.vehicles[vehicle].advantage = log_odds(own) - log_odds(fleet);
+        }
+    }
+
+    /// James–Stein shrinkage of the shares towards equal ones (Hausser & Strimmer 2009). The number of draws is capped
+    /// at `class_share_verdicts`, because confusion and not sampling limits the accuracy of the shares.
+    fn refresh_shares(&mut self) {
+        let total: f64 = self.shares.iter().map(|s| s.max(0.0) + 1.0).sum();
+        let equal = 1.0 / self.labels.max(1) as f64;
+        let share = |s: &f64| (s.max(0.0) + 1.0) / total;
+        let squares: f64 = self.shares.iter().map(|s| share(s).powi(2)).sum();
+        let spread: f64 = self.shares.iter().map(|s| (share(s) - equal).powi(2)).sum();
+        let draws = (total - self.labels as f64).clamp(2.0, self.config.class_share_verdicts);
+        let shrink = ((1.0 - squares) / ((draws - 1.0) * spread).max(1e-12)).clamp(0.0, 1.0);
+        for (log, s) in self.log_shares.iter_mut().zip(&self.shares) {
+            *log = (shrink * equal + (1.0 - shrink) * share(s)).ln();
+        }
+    }
+
+    /// As [`Self::log_of_stating`], but at most as much as where the stated label is true: no vote counts against its
+    /// own label. Otherwise the model has a mirrored solution, in which the honest majority consists of consistent liars.
+    fn log_likelihood(&self, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
+        let own = self.log_of_stating(vote, vote.label, accuracy);
+        if truth == vote.label { own } else { own.min(self.log_of_stating(vote, truth, accuracy)) }
+    }
+
+    /// The posterior without `vote`, given all votes but this one.
+    pub(super) fn leave_one_out(&self, posterior: &[(LabelIndex, f64)], vote: &WeightedVote) -> Vec<(LabelIndex, f64)> {
+        let accuracy = self.fleet_accuracy();
+        let own = self.log_likelihood(vote, vote.label, accuracy);
+        let others: Vec<_> = posterior
+            .iter()
+            .map(|&(label, p)| {
+                let lead = vote.weight * vote.independence * (own - self.log_likelihood(vote, label, accuracy));
+                (label, p * lead.min(500.0).exp())
+            })
+            .collect();
+        let total: f64 = others.iter().map(|(_, p)| p).sum();
+        if total > 0.0 { others.into_iter().map(|(label, p)| (label, p / total)).collect() } else { posterior.to_vec() }
+    }
+
+    /// Natural logarithm of the probability that the vehicle states the vote's label where `truth` is the true one.
+    fn log_of_stating(&self, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
+        let evidence = &self.vehicles[vote.vehicle];
+        let right = self.fleet(truth, truth, accuracy).clamp(1e-6, 1.0 - 1e-6);
+        let assumed_right = 1.0 / (1.0 + (-(log_odds(right) + evidence.advantage)).exp());
+        let assumed = if truth == vote.label {
+            assumed_right
+        } else {
+            let shared = self.fleet(truth, vote.label, accuracy) / (1.0 - right);
+            let sharing = self.config.confusion_sharing;
+            (1.0 - assumed_right) * (sharing * shared + (1.0 - sharing) / self.wrong_labels())
+        };
+        let prior = self.config.class_prior_votes;
+        let evidence = [&evidence.live, &evidence.settled, &evidence.inherited];
+        let count: f64 = evidence.iter().map(|e| e.cell(truth, vote.label)).sum();
+        let row: f64 = evidence.iter().map(|e| e.row(truth)).sum();
+        ((count + prior * assumed) / (row + prior)).max(1e-12).ln()
+    }
+
+    /// Probability of each of `candidates` given the votes; newcomers together are limited to their share.
+    pub(super) fn posterior(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> Vec<(LabelIndex, f64)> {
+        let newcomer = self.newcomer_factor(votes);
+        let accuracy = self.fleet_accuracy();
+        let mut logs: Vec<f64> = candidates
+            .iter()
+            .map(|&truth| {
+                let said = |vote: &WeightedVote| {
+                    let factor = if self.is_newcomer(vote.vehicle) { newcomer } else { 1.0 };
+                    factor * vote.weight * vote.independence * self.log_likelihood(vote, truth, accuracy)
+                };
+                self.log_shares[usize::from(truth)] + votes.iter().map(said).sum::<f64>()
+            })
+            .collect();
+        let most = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        logs.iter_mut().for_each(|log| *log = (*log - most).exp());
+        let total: f64 = logs.iter().sum();
+        candidates.iter().zip(logs).map(|(&label, p)| (label, p / total)).collect()
+    }
+
+    /// Whether too few of a vehicle's votes are settled to trust it. Fresh votes do not prove it: a vehicle could send
+    /// many at once.
+    pub(super) fn is_newcomer(&self, vehicle: usize) -> bool {
+        let evidence = &self.vehicles[vehicle];
+        evidence.settled.total() + evidence.inherited.total() < self.config.probation_votes
+    }
+
+    /// Factor that limits the summed weight of newcomers to `newcomer_share` of the proven vehicles'; 1 where no vehicle
+    /// is proven.
+    pub(super) fn newcomer_factor(&self, votes: &[WeightedVote]) -> f64 {
+        let (mut newcomers, mut proven) = (0.0, 0.0);
+        for vote in votes {
+            *(if self.is_newcomer(vote.vehicle) { &mut newcomers } else { &mut proven }) +=
+                vote.weight * vote.independence;
+        }
+        let most = self.config.newcomer_share * proven;
+        if proven > 0.0 && newcomers > most { most / newcomers } else { 1.0 }
+    }
+
+    /// Adds the votes as live evidence; `sign` −1 takes them back. A single vote is no evidence about its vehicle.
+    pub(super) fn add_live(&mut self, votes: &[WeightedVote], posterior: &[(LabelIndex, f64)], sign: f64) {
+        for &(truth, p) in posterior {
+            self.shares[usize::from(truth)] += sign * p;
+            for vote in votes.iter().filter(|_| votes.len() > 1) {
+                let weight = sign * p * vote.weight.min(1.0);
+                self.vehicles[vote.vehicle].live.add(truth, vote.label, weight);
+                self.live.add(truth, vote.label, weight);
+            }
+        }
+    }
+
+    /// Adds a vote, which must not be live at present, to the fading evidence.
+    ///
+    /// The vehicle is judged by the posterior of the `others`, the fleet by that of `all`. Otherwise few vehicles that
+    /// outvote one would together seem wrong more often than right.
+    pub(super) fn settle(&mut self, vote: &WeightedVote, others: &[(LabelIndex, f64)], all: &[(LabelIndex, f64)]) {
+        let fade = 1.0 - 1.0 / self.config.memory_votes;
+        let fleet_fade = 1.0 - 1.0 / (self.config.memory_votes * self.vehicles.len().max(1) as f64);
+        let evidence = &mut self.vehicles[vote.vehicle];
+        let right = others.iter().find(|(truth, _)| *truth == vote.label).map_or(0.0, |(_, p)| *p);
+        evidence.watch_for_drop(right);
+        evidence.settled.fade(fade);
+        evidence.inherited.fade(fade);
+        self.settled.fade(fleet_fade);
+        for (truth, p) in sharpened(others) {
+            evidence.settled.add(truth, vote.label, p * vote.weight.min(1.0));
+        }
+        for (truth, p) in sharpened(all) {
+            self.settled.add(truth, vote.label, p * vote.weight.min(1.0));
+        }
+    }
+
+    /// Forgets all evidence that is not live.
+    pub(super) fn clear_settled(&mut self) {
+        self.settled = Confusion::default();
+        for evidence in &mut self.vehicles {
+            evidence.settled = Confusion::default();
+            evidence.inherited = Confusion::default();
+        }
+    }
+
+    /// Forgets all live evidence.
+    pub(super) fn clear_live(&mut self) {
+        self.live = Confusion::default();
+        self.shares.iter_mut().for_each(|s| *s = 0.0);
+        self.vehicles.iter_mut().for_each(|w| w.live = Confusion::default());
+    }
+
+    /// Probability that a vehicle is right, shrunk towards the fleet's.
+    pub(super) fn reliability(&self, vehicle: usize) -> f64 {
+        let evidence = &self.vehicles[vehicle];
+        let prior = self.config.vehicle_prior_votes;
+        let fleet = self.fleet_accuracy().min(self.config.assumed_accuracy);
+        (evidence.correct() + prior * fleet) / (evidence.votes() + prior)
+    }
+}
+
+/// Probabilities in proportion to their squares, for evidence that is kept.
+///
+/// Without this, the small probabilities of labels that are never true would add up: they would describe how such labels
+/// are stated, from votes on other labels only.
+fn sharpened(posterior: &[(LabelIndex, f64)]) -> impl Iterator<Item = (LabelIndex, f64)> + '_ {
+    let squares: f64 = posterior.iter().map(|(_, p)| p * p).sum();
+    posterior.iter().map(move |&(label, p)| (label, p * p / squares.max(f64::MIN_POSITIVE)))
+}
+
+fn log_odds(p: f64) -> f64 {
+    (p / (1.0 - p)).ln()
+}

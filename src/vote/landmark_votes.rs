@@ -1,0 +1,205 @@
+//! The votes on one landmark.
+
+use std::collections::BTreeSet;
+
+use super::calibration::{Calibration, Weights};
+use super::confusion::LabelIndex;
+use super::dawid_skene::{DawidSkene, WeightedVote};
+use super::dependence::Dependence;
+use crate::time::Timestamp;
+
+/// Independent part of a vehicle's statements: one frame is much like the next.
+const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;
+/// tanh(0.8 z) is the two-sided normal probability of z, within 0.02.
+const NORMAL_TO_LOGISTIC: f64 = 0.8;
+
+/// A vote that counts at present.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct StoredVote {
+    pub(super) vehicle: usize,
+    pub(super) label: LabelIndex,
+    pub(super) confidence: f64,
+    pub(super) visibility: f64,
+    /// The vehicle's latest statements.
+    pub(super) recent: RecentStatements,
+    pub(super) weight: f64,
+    /// Part of the weight that does not depend on other vehicles, 0 to 1.
+    pub(super) independence: f64,
+    pub(super) at: Timestamp,
+    /// When it began to count once more as evidence.
+    pub(super) since: Timestamp,
+    /// Rank of its confidence as of the last judgement.
+    pub(super) band: usize,
+    /// Probability that the others give its label, while the live evidence on confidences contains it.
+    pub(super) agreement: Option<f64>,
+    /// Whether the posterior rests on it.
+    pub(super) judged: bool,
+    /// Whether it has been compared with the other vehicles' votes since it began to count.
+    pub(super) compared: bool,
+}
+
+/// The latest statements of one vehicle on one landmark: the fading weight of its votes for each label. A single frame
+/// that shows a wrong label does not change the vehicle's vote.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct RecentStatements {
+    labels: [(LabelIndex, f64); 3],
+    /// Fading number of statements.
+    statements: f64,
+}
+
+impl RecentStatements {
+    /// Adds a statement of `weight` after earlier ones faded by the factor `kept`; returns the label stated most.
+    pub(super) fn add(&mut self, label: LabelIndex, weight: f64, kept: f64) -> LabelIndex {
+        self.statements = self.statements * kept + 1.0;
+        self.labels.iter_mut().for_each(|(_, sum)| *sum *= kept);
+        let known = self.labels.iter().position(|(known, sum)| *known == label && *sum > 0.0);
+        let least = (0..self.labels.len()).min_by(|&a, &b| self.labels[a].1.total_cmp(&self.labels[b].1));
+        let place = &mut self.labels[known.or(least).unwrap_or_default()];
+        *place = (label, weight + known.map_or(0.0, |_| place.1));
+        let stated = *place;
+        let more = self.labels.iter().copied().filter(|(_, sum)| *sum > stated.1);
+        more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
+    }
+
+    /// Forgets statements of labels whose indices may be reused.
+    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
+        self.labels.iter_mut().filter(|(label, _)| is_gone(*label)).for_each(|place| *place = (0, 0.0));
+    }
+
+    /// Certainty, 0 to 1, that the label stated most is not so by chance: the lead over the next label in standard
+    /// deviations of a multinomial draw, as a two-sided probability. A vehicle that wavers between two labels hardly
+    /// votes.
+    pub(super) fn certainty(&self) -> f64 {
+        let mut sums = self.labels.map(|(_, sum)| sum);
+        sums.sort_by(f64::total_cmp);
+        let [third, second, first] = sums;
+        let total = (first + second + third).max(f64::MIN_POSITIVE);
+        let lead = (first - second) / total;
+        let variance = ((first + second) / total - lead * lead) / (INDEPENDENT_FRAMES * self.statements).max(1.0);
+        (NORMAL_TO_LOGISTIC * lead / variance.max(1e-9).sqrt()).tanh()
+    }
+}
+
+impl StoredVote {
+    pub(super) fn weighted(&self) -> WeightedVote {
+        WeightedVote { vehicle: self.vehicle, label: self.label, weight: self.weight, independence: self.independence }
+    }
+}
+
+/// The votes on one landmark, at most one of each vehicle, in order of vehicle.
+#[derive(Debug, Clone, Default)]
+pub(super) struct LandmarkVotes {
+    pub(super) votes: Vec<StoredVote>,
+    /// Probability of each label as of the last judgement.
+    pub(super) posterior: Vec<(LabelIndex, f64)>,
+    /// Whether the live evidence contains votes and posterior at present.
+    pub(super) counted: bool,
+    /// The label of the verdict.
+    pub(super) published: Option<LabelIndex>,
+    /// When its oldest vote goes stale.
+    pub(super) due: Option<Timestamp>,
+}
+
+impl LandmarkVotes {
+    pub(super) fn weighted_votes(&self) -> Vec<WeightedVote> {
+        self.votes.iter().map(StoredVote::weighted).collect()
+    }
+
+    pub(super) fn candidates(&self) -> Vec<LabelIndex> {
+        self.votes.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
+    }
+
+    /// Counts new votes as evidence on dependence and on confidences; where there are many voters, `order` decides which
+    /// pairs are compared.
+    pub(super) fn compare(
+        &mut self,
+        dependence: &mut Dependence,
+        calibration: &mut Calibration,
+        order: impl Fn(usize) -> usize,
+    ) {
+        if self.votes.iter().any(|c| !c.compared) {
+            let mut votes: Vec<_> = self.votes.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
+            votes.sort_by_key(|(vehicle, ..)| order(*vehicle));
+            dependence.compare(&votes);
+            for vote in self.votes.iter_mut().filter(|c| !c.compared) {
+                calibration.record_confidence(vote.vehicle, vote.confidence);
+                vote.compared = true;
+            }
+        }
+    }
+
+    /// Sets the weight of every vote.
+    pub(super) fn weigh(&mut self, dependence: &Dependence, calibration: &Calibration, weights: &Weights) {
+        for place in 0..self.votes.len() {
+            let StoredVote { vehicle, label, confidence, visibility, recent, .. } = self.votes[place];
+            let agrees = |other: usize| {
+                self.votes.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.votes[at].label == label)
+            };
+            let independence = dependence.independence(vehicle, agrees);
+            let band = calibration.band(vehicle, confidence);
+            let vote = &mut self.votes[place];
+            (vote.independence, vote.band, vote.weight) =
+                (independence, band, weights.of(band, confidence) * visibility * recent.certainty());
+        }
+    }
+
+    /// Adds to the evidence on confidences how probable the others make the label of each vote.
+    pub(super) fn record_agreement(&mut self, model: &DawidSkene, calibration: &mut Calibration) {
+        if self.has_several_voters() {
+            for vote in &mut self.votes {
+                let agreement = probability(&model.leave_one_out(&self.posterior, &vote.weighted()), vote.label);
+                calibration.count(vote.band, agreement, 1.0);
+                vote.agreement = Some(agreement);
+            }
+        }
+    }
+
+    /// Publishes the most probable label, unless the published one is at most `hysteresis` behind.
+    pub(super) fn publish(&mut self, hysteresis: f64) {
+        let mut best: Option<(LabelIndex, f64)> = None;
+        for &(label, p) in &self.posterior {
+            if best.is_none_or(|(_, most)| p > most) {
+                best = Some((label, p));
+            }
+        }
+        let kept = self.published.map_or(0.0, |published| probability(&self.posterior, published));
+        if kept == 0.0 || best.is_some_and(|(_, p)| p > kept + hysteresis) {
+            self.published = best.map(|(label, _)| label);
+        }
+    }
+
+    /// Share of each label in the weighted votes; equal shares where all voters waver, so that no vote has weight.
+    pub(super) fn majority(&self) -> Vec<(LabelIndex, f64)> {
+        let total: f64 = self.votes.iter().map(|c| c.weight * c.independence).sum();
+        let candidates = self.candidates();
+        let equal = 1.0 / candidates.len() as f64;
+        let of_label = |label| self.votes.iter().filter(move |c| c.label == label);
+        let share = |label| of_label(label).map(|c| c.weight * c.independence).sum::<f64>() / total;
+        candidates.into_iter().map(|label| (label, if total > 0.0 { share(label) } else { equal })).collect()
+    }
+
+    /// Forgets labels with the votes for them; returns the number of votes. Not allowed while it is counted.
+    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
+        let votes = self.votes.len();
+        self.votes.retain(|vote| !is_gone(vote.label));
+        self.posterior.retain(|(label, _)| !is_gone(*label));
+        self.published = self.published.filter(|label| !is_gone(*label));
+        let total: f64 = self.posterior.iter().map(|(_, p)| p).sum();
+        if total > 0.0 && !self.votes.is_empty() {
+            self.posterior.iter_mut().for_each(|(_, p)| *p /= total);
+        } else {
+            self.posterior.clear();
+        }
+        votes - self.votes.len()
+    }
+
+    /// Whether several vehicles voted and can thus judge each other.
+    pub(super) fn has_several_voters(&self) -> bool {
+        self.votes.len() > 1
+    }
+}
+
+/// Probability of a label; 0 for one that is not listed.
+pub(super) fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
+    posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
+}

@@ -1,0 +1,124 @@
+//! The ways to turn votes into verdicts.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::config::{VoteConfig, VoteMode};
+use super::paper::PaperVoting;
+use super::weighted::WeightedVoting;
+use crate::names::{Label, LandmarkId, NodeName};
+use crate::reputation::{Evidence, ReputationLedger};
+use crate::time::Timestamp;
+use crate::wire::{Reputation, Verdict};
+
+/// A vote before it is counted.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct NewVote<'a> {
+    pub(super) landmark: &'a LandmarkId,
+    pub(super) node: &'a NodeName,
+    pub(super) label: &'a Label,
+    pub(super) confidence: f64,
+    /// Distance in metres and bearing in radians of the landmark, where the vehicle's pose is known.
+    pub(super) range_bearing: Option<(f64, f64)>,
+    pub(super) at: Timestamp,
+}
+
+/// A voting method. What a method does without keeps the default, which does nothing.
+pub(super) trait VotingMethod {
+    /// Makes a landmark known, so that it has a verdict even without votes.
+    fn add_landmark(&mut self, landmark: LandmarkId);
+
+    /// Forgets a landmark.
+    fn remove_landmark(&mut self, landmark: &LandmarkId);
+
+    /// Forgets vehicles.
+    fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>);
+
+    /// Makes room for the label of a vote; returns how many votes were forgotten for it, `None` if there is no room.
+    fn make_room_for(&mut self, vote: &NewVote<'_>, max_labels: usize) -> Option<usize>;
+
+    /// Counts a vote.
+    fn add_vote(&mut self, vote: &NewVote<'_>);
+
+    /// Ends a round: returns the landmarks with news and the votes that are now known to be right or wrong.
+    fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>);
+
+    /// The verdict at a landmark.
+    fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict>;
+
+    /// The trust in each vehicle.
+    fn reputations(&self) -> BTreeMap<NodeName, Reputation>;
+
+    /// Whether a vehicle has voted often enough to be judged, and was right more often than wrong.
+    fn is_proven(&self, _node: &NodeName) -> bool {
+        false
+    }
+
+    /// See [`super::Vote::begin_record`].
+    fn begin_record(&mut self, _now: Timestamp) {}
+
+    /// See [`super::Vote::refine`].
+    fn refine(&mut self, _passes: u32) {}
+
+    /// See [`super::Vote::adopt`].
+    fn adopt(&mut self, _ledger: &ReputationLedger, _limits: &VoteConfig) {}
+
+    /// See [`super::Vote::resume`].
+    fn resume(&mut self, _reputations: &BTreeMap<NodeName, Reputation>) {}
+}
+
+/// The configured method.
+#[derive(Debug, Clone)]
+pub(super) enum Method {
+    Paper(PaperVoting),
+    Weighted(Box<WeightedVoting>),
+}
+
+impl Method {
+    pub(super) fn new(config: &VoteConfig) -> Self {
+        match config.mode {
+            VoteMode::Paper => Self::Paper(PaperVoting::new(config.paper.clone())),
+            VoteMode::Weighted => Self::Weighted(Box::new(WeightedVoting::new(config.weighted.clone()))),
+        }
+    }
+
+    pub(super) fn get(&self) -> &dyn VotingMethod {
+        match self {
+            Self::Paper(method) => method,
+            Self::Weighted(method) => &**method,
+        }
+    }
+
+    pub(super) fn get_mut(&mut self) -> &mut dyn VotingMethod {
+        match self {
+            Self::Paper(method) => method,
+            Self::Weighted(method) => &mut **method,
+        }
+    }
+}
+
+/// A verdict with `published` or else the label of the highest score, the first in alphabetical order on a tie.
+///
+/// With hysteresis the published label may not be the highest for a while; its margin is negative then.
+pub(super) fn verdict(
+    landmark: LandmarkId,
+    votes: BTreeMap<Label, f64>,
+    published: Option<Label>,
+    contributors: Vec<NodeName>,
+) -> Verdict {
+    let label = published.or_else(|| best(&votes).cloned());
+    let score = label.as_ref().and_then(|l| votes.get(l)).copied().unwrap_or(0.0);
+    let others = votes.iter().filter(|(l, _)| Some(*l) != label.as_ref()).map(|(_, s)| *s);
+    let margin = score - others.fold(0.0, f64::max);
+    Verdict { landmark, label, score, margin, votes, contributors }
+}
+
+/// The label of the highest score, the first in alphabetical order on a tie.
+pub(super) fn best(votes: &BTreeMap<Label, f64>) -> Option<&Label> {
+    let mut best: Option<(&Label, f64)> = None;
+    for (label, &score) in votes {
+        if best.is_none_or(|(_, highest)| score > highest) {
+            best = Some((label, score));
+        }
+    }
+    best.map(|(label, _)| label)
+}

@@ -1,0 +1,63 @@
+//! Evidence taken over from a reputation ledger.
+
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+
+use super::WeightedVoting;
+use crate::names::{Label, NodeName};
+use crate::reputation::{RememberedVotes, ReputationLedger};
+use crate::vote::config::VoteConfig;
+use crate::vote::confusion::{Confusion, LabelIndex};
+
+impl WeightedVoting {
+    /// Takes over the ledger's remembered votes beyond those that were counted here: a standby has counted the latest
+    /// ones itself. They replace those of an earlier ledger.
+    ///
+    /// Where room is short, the labels with most evidence are taken, and the vehicles that were right most often, on a
+    /// tie those in the latest lanes. A ledger counts by stated label only: the truth behind a wrong vote is taken to
+    /// be any other label with equal probability.
+    pub(super) fn take_over(&mut self, ledger: &ReputationLedger, limits: &VoteConfig) {
+        let own = |node: &NodeName| self.vehicles.get(node).map_or(0, |&vehicle| self.counts[vehicle].total());
+        let (heard, mut others): (Vec<_>, Vec<_>) = ledger
+            .remembered(self.config.memory_votes, own)
+            .into_iter()
+            .partition(|(node, _)| self.vehicles.contains_key(node));
+        let lanes = ledger.latest_lanes();
+        others.sort_by_cached_key(|(node, labels)| {
+            let correct: f64 = labels.values().map(|(correct, _)| correct).sum();
+            (Reverse(correct.round() as u64), Reverse(lanes.get(node).copied()), node.clone())
+        });
+        others.truncate(limits.max_vehicles.saturating_sub(self.vehicles.len()));
+        let known = [heard, others].concat();
+        self.take_over_labels(&known, limits.max_labels);
+        for (node, labels) in known {
+            let mut inherited = Confusion::default();
+            for (label, (correct, incorrect)) in labels {
+                let Some(label) = self.labels.index(&label) else { continue };
+                inherited.add(label, label, correct);
+                let others: Vec<_> = (0..self.labels.len() as LabelIndex).filter(|l| *l != label).collect();
+                let each = incorrect / others.len().max(1) as f64;
+                if each > 0.0 {
+                    others.into_iter().for_each(|truth| inherited.add(truth, label, each));
+                }
+            }
+            let vehicle = self.vehicle(&node);
+            self.model.vehicles[vehicle].inherited = inherited;
+        }
+    }
+
+    fn take_over_labels(&mut self, known: &[(NodeName, RememberedVotes)], max_labels: usize) {
+        let mut votes: BTreeMap<&Label, f64> = BTreeMap::new();
+        for (label, (correct, incorrect)) in known.iter().flat_map(|(_, labels)| labels) {
+            // A label that is mostly wrong is of use only where there is room.
+            *votes.entry(label).or_default() += correct + 1e-3 * incorrect;
+        }
+        let mut labels: Vec<_> = votes.into_iter().collect();
+        labels.sort_by(|a, b| b.1.total_cmp(&a.1));
+        for (label, _) in labels {
+            if self.labels.has_room_for(label, max_labels) {
+                self.label(label, None);
+            }
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! The life of a vote: live evidence while it is fresh, then settled evidence that fades.
+
+use super::{StoredVote, WeightedVoting};
+use crate::names::LandmarkId;
+use crate::reputation::Evidence;
+use crate::time::Timestamp;
+use crate::vote::landmark_votes::probability;
+
+impl WeightedVoting {
+    /// Sets the next expiry of a landmark: when its oldest vote goes stale.
+    pub(super) fn schedule_expiry(&mut self, landmark: &LandmarkId) {
+        let freshness = self.freshness();
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
+        let oldest = landmark_votes.votes.iter().map(|vote| vote.at).min();
+        let due = oldest.map(|at| at + freshness);
+        if let Some(before) = std::mem::replace(&mut landmark_votes.due, due) {
+            self.expiries.remove(&(before, landmark.clone()));
+        }
+        self.expiries.extend(due.map(|due| (due, landmark.clone())));
+    }
+
+    /// Removes the votes that are stale at `now`.
+    pub(super) fn expire(&mut self, now: Timestamp) {
+        let freshness = self.freshness();
+        while let Some((due, landmark)) = self.expiries.first().cloned() {
+            if due > now {
+                break;
+            }
+            self.expiries.pop_first();
+            self.remove_votes(&landmark, |vote| vote.at + freshness <= now);
+            self.schedule_expiry(&landmark);
+        }
+    }
+
+    /// Removes the votes that `is_past` selects, after all votes on the landmark have been settled.
+    pub(super) fn remove_votes(&mut self, landmark: &LandmarkId, is_past: impl Fn(&StoredVote) -> bool) {
+        if !self.landmarks.get(landmark).is_some_and(|l| l.votes.iter().any(&is_past)) {
+            return;
+        }
+        self.settle_votes(landmark);
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
+        landmark_votes.votes.retain(|vote| !is_past(vote));
+        if landmark_votes.votes.is_empty() {
+            landmark_votes.published = None;
+            landmark_votes.posterior.clear();
+        }
+    }
+
+    /// Takes a landmark's votes out of the live evidence until it is judged again.
+    pub(super) fn remove_live(&mut self, landmark: &LandmarkId) {
+        if let Some(landmark_votes) = self.landmarks.get_mut(landmark)
+            && std::mem::take(&mut landmark_votes.counted)
+        {
+            self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, -1.0);
+            for vote in &mut landmark_votes.votes {
+                if let Some(agreement) = vote.agreement.take() {
+                    self.calibration.count(vote.band, agreement, -1.0);
+                }
+            }
+        }
+    }
+
+    /// Turns the judged votes on a landmark into settled evidence; they begin to count anew.
+    ///
+    /// All are settled at once. If they were settled in turn, the first would be judged by evidence that the others
+    /// still lack.
+    pub(super) fn settle_votes(&mut self, landmark: &LandmarkId) {
+        self.remove_live(landmark);
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
+        if landmark_votes.has_several_voters() {
+            // A vote is judged by the others: a vehicle that decides alone must not prove itself right.
+            let judged = landmark_votes.votes.iter().filter(|vote| vote.judged);
+            let settled: Vec<_> = judged
+                .map(|vote| (*vote, self.model.leave_one_out(&landmark_votes.posterior, &vote.weighted())))
+                .collect();
+            for (vote, others) in settled {
+                self.model.settle(&vote.weighted(), &others, &landmark_votes.posterior);
+                self.calibration.settle(vote.band, probability(&others, vote.label));
+                let correct = landmark_votes.published == Some(vote.label);
+                self.counts[vote.vehicle].add(correct);
+                if vote.at >= self.recorded_from {
+                    let (node, label) = (&self.names[vote.vehicle], self.labels.name(vote.label));
+                    self.evidence.push(Evidence { node: node.clone(), label: label.clone(), correct });
+                }
+            }
+        }
+        for vote in &mut landmark_votes.votes {
+            (vote.since, vote.judged, vote.compared) = (vote.at, false, false);
+        }
+        self.changed.insert(landmark.clone());
+    }
+}

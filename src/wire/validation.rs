@@ -1,0 +1,294 @@
+//! Validation of payloads: every value from outside is checked before it is used.
+
+use std::collections::BTreeMap;
+
+use minicbor::{Decode, Encode};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::{
+    FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, NodeStatus, ObjectReport, PerceivedObject,
+    PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
+};
+use crate::geometry::Covariance;
+use crate::names::{Label, MAX_NAME_BYTES};
+use crate::time::Timestamp;
+
+/// Bounds of a payload; one beyond them is not decoded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// Maximum size of a report, status or share in bytes.
+    pub payload_bytes: usize,
+    /// Maximum size of a map, verdicts or reputations in bytes; they grow with the cell.
+    pub map_bytes: usize,
+    /// Maximum number of objects, and of seen landmarks, in one report.
+    pub objects: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self { payload_bytes: 256 * 1024, map_bytes: 8 * 1024 * 1024, objects: 1024 }
+    }
+}
+
+/// Largest epoch, round, count or time: every JSON reader keeps integers up to 2⁵³ − 1 exact (RFC 8259, section 6).
+pub const MAX_INTEGER: u64 = (1 << 53) - 1;
+
+/// Maximum lead in seconds of a round's time of fusion over the receiver's clock. Maps do not need synchronised clocks;
+/// this only rejects rounds that would look fresh for hours.
+pub const MAX_FUSED_AHEAD_S: u64 = 3600;
+
+/// Maximum number of counts, and of marks, in one share: it stays below the default of [`Limits::payload_bytes`].
+pub const MAX_SHARE_ENTRIES: usize = 512;
+
+/// Largest coordinate of a position on Earth in metres.
+const WORLD_BOUND_M: f64 = 1e8;
+
+/// Fastest object in metres per second.
+const SPEED_BOUND_MPS: f64 = 1e4;
+
+/// Largest size of an object and largest range of a sensor in metres.
+const SIZE_BOUND_M: f64 = 1e5;
+
+/// Largest angle in radians: headings may count full turns.
+const ANGLE_BOUND_RAD: f64 = 1e6;
+
+/// Maximum number of classes with scores of one object.
+const MAX_SCORES: usize = 256;
+
+/// Largest score of a label: far more than the votes of all vehicles of a cell.
+const SCORE_BOUND: f64 = 1e9;
+
+/// A message on a topic, with a version of its schema.
+pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b, ()> {
+    /// Major version that the payload states.
+    fn schema(&self) -> u32;
+
+    /// Maximum size in bytes.
+    fn max_bytes(limits: &Limits) -> usize {
+        limits.payload_bytes
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// The first reason found.
+    fn check(&self, _limits: &Limits) -> Result<(), RejectReason> {
+        Ok(())
+    }
+}
+
+macro_rules! payloads {
+    ($($type:ty: at most $max_bytes:ident, checked by $check:path;)*) => {
+        $(impl Payload for $type {
+            fn schema(&self) -> u32 {
+                self.schema
+            }
+
+            fn max_bytes(limits: &Limits) -> usize {
+                limits.$max_bytes
+            }
+
+            fn check(&self, limits: &Limits) -> Result<(), RejectReason> {
+                $check(self, limits)
+            }
+        })*
+    };
+}
+
+payloads! {
+    ObjectReport: at most payload_bytes, checked by ObjectReport::validate;
+    GlobalMap: at most map_bytes, checked by check_map;
+    Verdicts: at most map_bytes, checked by check_verdicts;
+    Reputations: at most map_bytes, checked by check_reputations;
+    LedgerShare: at most payload_bytes, checked by check_share;
+    NodeStatus: at most payload_bytes, checked by check_status;
+}
+
+impl ObjectReport {
+    /// Checks version, counts, numbers and labels.
+    ///
+    /// # Errors
+    /// The first reason found.
+    pub fn validate(&self, limits: &Limits) -> Result<(), RejectReason> {
+        if self.schema != SCHEMA_VERSION {
+            return Err(RejectReason::UnknownSchema);
+        }
+        let seen = self.seen.as_deref().unwrap_or_default();
+        if self.objects.len() > limits.objects || seen.len() > limits.objects {
+            return Err(RejectReason::TooManyObjects);
+        }
+        if let Some(pose) = self.pose
+            && !(in_world(pose.x_m) && in_world(pose.y_m) && pose.heading_rad.is_finite())
+        {
+            return Err(RejectReason::NotFinite);
+        }
+        self.view.map_or(Ok(()), check_view)?;
+        check_labels(seen.iter().map(|id| &**id))?;
+        self.objects.iter().try_for_each(PerceivedObject::validate)
+    }
+}
+
+impl PerceivedObject {
+    /// Checks numbers and labels.
+    ///
+    /// # Errors
+    /// The first reason found.
+    pub fn validate(&self) -> Result<(), RejectReason> {
+        check_place(self.x_m, self.y_m)?;
+        self.covariance().map_or(Ok(()), check_covariance)?;
+        check_confidence(self.confidence)?;
+        check_motion(self.velocity_mps, self.heading_rad, self.size_m)?;
+        check_scores(&self.scores)?;
+        check_labels([&*self.label].into_iter().chain(self.landmark.as_deref()))
+    }
+}
+
+/// Checks that a time of fusion is less than [`MAX_FUSED_AHEAD_S`] ahead.
+///
+/// # Errors
+/// [`RejectReason::FromTheFuture`].
+pub fn check_fused_at(fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
+    let ahead = fused_at.since(received_at);
+    if ahead.as_secs() < MAX_FUSED_AHEAD_S { Ok(()) } else { Err(RejectReason::FromTheFuture) }
+}
+
+fn check_map(map: &GlobalMap, _: &Limits) -> Result<(), RejectReason> {
+    let times = [Some(map.fused_at_us), map.oldest_capture_us];
+    check_integers([map.epoch, map.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
+    map.landmarks.iter().try_for_each(check_landmark)?;
+    map.objects.iter().try_for_each(check_object)?;
+    map.pose_corrections.values().try_for_each(check_correction)
+}
+
+fn check_verdicts(verdicts: &Verdicts, _: &Limits) -> Result<(), RejectReason> {
+    check_integers([verdicts.epoch, verdicts.round, verdicts.fused_at_us.micros()])?;
+    verdicts.verdicts.iter().try_for_each(check_verdict)
+}
+
+fn check_reputations(reputations: &Reputations, _: &Limits) -> Result<(), RejectReason> {
+    check_integers([reputations.epoch, reputations.round])?;
+    reputations.reputations.values().try_for_each(|reputation| {
+        check_integers([reputation.correct, reputation.incorrect])?;
+        check_between(reputation.score, 0.0, 1.0)
+    })
+}
+
+fn check_share(share: &LedgerShare, _: &Limits) -> Result<(), RejectReason> {
+    if share.entries.len() > MAX_SHARE_ENTRIES || share.marks.len() > MAX_SHARE_ENTRIES {
+        return Err(RejectReason::TooManyObjects);
+    }
+    check_integers(share.epoch)?;
+    let mut marks = share.marks.iter();
+    marks.try_for_each(|mark| check_integers([mark.epoch, mark.number, mark.correct, mark.incorrect]))?;
+    share.entries.iter().try_for_each(|entry| {
+        check_integers([entry.epoch, entry.correct, entry.incorrect])?;
+        check_labels([&*entry.label])
+    })
+}
+
+fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
+    check_integers([status.epoch])?;
+    check_labels([&*status.version])
+}
+
+fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
+    check_place(state.x_m, state.y_m)?;
+    check_confidence(state.confidence)?;
+    check_labels([&*state.id].into_iter().chain(state.label.as_deref()))
+}
+
+fn check_object(object: &FusedObject) -> Result<(), RejectReason> {
+    check_place(object.x_m, object.y_m)?;
+    check_covariance(object.covariance())?;
+    check_confidence(object.confidence)?;
+    object.existence.map_or(Ok(()), check_confidence)?;
+    check_motion(object.velocity_mps, object.heading_rad, object.size_m)?;
+    check_scores(&object.scores)?;
+    object.age_s.map_or(Ok(()), |age_s| check_between(age_s, 0.0, MAX_INTEGER as f64))?;
+    check_integers(object.first_seen_us.map(Timestamp::micros))?;
+    check_labels([&*object.label])
+}
+
+fn check_correction(correction: &PoseCorrection) -> Result<(), RejectReason> {
+    let [x_m, y_m] = correction.about_m;
+    check_place(x_m, y_m)?;
+    check_place(correction.dx_m, correction.dy_m)?;
+    check_between(correction.dheading_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)?;
+    check_between(correction.pairs, 0.0, MAX_INTEGER as f64)
+}
+
+fn check_view(view: FieldOfView) -> Result<(), RejectReason> {
+    check_between(view.range_m, 0.0, SIZE_BOUND_M)?;
+    check_between(view.angle_rad, 0.0, ANGLE_BOUND_RAD)
+}
+
+fn check_motion(
+    velocity_mps: Option<[f64; 2]>,
+    heading_rad: Option<f64>,
+    size_m: Option<[f64; 2]>,
+) -> Result<(), RejectReason> {
+    let mut speeds = velocity_mps.into_iter().flatten();
+    speeds.try_for_each(|speed| check_between(speed, -SPEED_BOUND_MPS, SPEED_BOUND_MPS))?;
+    heading_rad.map_or(Ok(()), |heading| check_between(heading, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD))?;
+    size_m.into_iter().flatten().try_for_each(|size| check_between(size, 0.0, SIZE_BOUND_M))
+}
+
+fn check_scores(scores: &BTreeMap<Label, f64>) -> Result<(), RejectReason> {
+    if scores.len() > MAX_SCORES {
+        return Err(RejectReason::TooManyObjects);
+    }
+    scores.values().copied().try_for_each(check_confidence)?;
+    check_labels(scores.keys().map(|label| &**label))
+}
+
+fn check_between(value: f64, low: f64, high: f64) -> Result<(), RejectReason> {
+    match value {
+        _ if (low..=high).contains(&value) => Ok(()),
+        _ if value.is_finite() => Err(RejectReason::OutOfRange),
+        _ => Err(RejectReason::NotFinite),
+    }
+}
+
+fn check_verdict(verdict: &Verdict) -> Result<(), RejectReason> {
+    let mut scores = [verdict.score, verdict.margin].into_iter().chain(verdict.votes.values().copied());
+    scores.try_for_each(|score| check_between(score, -SCORE_BOUND, SCORE_BOUND))?;
+    let labels = verdict.votes.keys().chain(&verdict.label);
+    check_labels([&*verdict.landmark].into_iter().chain(labels.map(|label| &**label)))
+}
+
+fn check_place(x_m: f64, y_m: f64) -> Result<(), RejectReason> {
+    if in_world(x_m) && in_world(y_m) { Ok(()) } else { Err(RejectReason::NotFinite) }
+}
+
+fn check_covariance(covariance: Covariance) -> Result<(), RejectReason> {
+    if covariance.is_valid() { Ok(()) } else { Err(RejectReason::NotFinite) }
+}
+
+fn check_confidence(confidence: f64) -> Result<(), RejectReason> {
+    match confidence {
+        0.0..=1.0 => Ok(()),
+        _ if confidence.is_finite() => Err(RejectReason::ConfidenceOutOfRange),
+        _ => Err(RejectReason::NotFinite),
+    }
+}
+
+fn check_labels<'a>(labels: impl IntoIterator<Item = &'a str>) -> Result<(), RejectReason> {
+    if labels.into_iter().all(is_label) { Ok(()) } else { Err(RejectReason::InvalidLabel) }
+}
+
+fn check_integers(values: impl IntoIterator<Item = u64>) -> Result<(), RejectReason> {
+    if values.into_iter().all(|value| value <= MAX_INTEGER) { Ok(()) } else { Err(RejectReason::OutOfRange) }
+}
+
+fn in_world(coordinate_m: f64) -> bool {
+    coordinate_m.abs() <= WORLD_BOUND_M
+}
+
+/// Whether a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
+pub fn is_label(text: &str) -> bool {
+    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
+}
+
+#[cfg(test)]
+mod tests;

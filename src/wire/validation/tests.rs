@@ -1,0 +1,244 @@
+mod shares;
+
+use proptest::collection::{btree_map, vec};
+use proptest::prelude::*;
+use uuid::Uuid;
+
+use super::*;
+use crate::names::{Label, NodeName};
+use crate::wire::{Encoding, NodeState, Reputation, Role, decode, encode};
+
+fn edge() -> NodeName {
+    NodeName::from_static("edge")
+}
+
+fn map() -> GlobalMap {
+    GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: edge(),
+        epoch: 3,
+        round: 88,
+        fused_at_us: Timestamp(1_732_154_400_123_456),
+        oldest_capture_us: Some(Timestamp(1_732_154_400_000_000)),
+        landmarks: vec![LandmarkState {
+            id: "slot-0".into(),
+            label: Some("ABCD123".into()),
+            confidence: 0.93,
+            x_m: 0.25,
+            y_m: 0.48,
+            contributors: vec![edge()],
+            observers: vec![edge()],
+        }],
+        objects: vec![FusedObject {
+            contributors: vec![edge()],
+            existence: Some(0.9),
+            scores: [("car".into(), 0.9), ("truck".into(), 0.1)].into(),
+            velocity_mps: Some([3.0, -4.0]),
+            heading_rad: Some(-0.9),
+            size_m: Some([4.5, 1.8]),
+            age_s: Some(0.1),
+            first_seen_us: Some(Timestamp(1_732_154_390_000_000)),
+            vehicle: Some(edge()),
+            ..FusedObject::new(Uuid::nil(), "car", 0.8, 1.0, 2.0, Covariance { xx: 0.1, xy: 0.0, yy: 0.2 })
+        }],
+        pose_corrections: [(
+            edge(),
+            PoseCorrection { about_m: [1.0, 2.0], dx_m: 0.2, dy_m: -0.1, dheading_rad: 0.01, pairs: 12.5 },
+        )]
+        .into(),
+    }
+}
+
+fn verdicts() -> Verdicts {
+    Verdicts {
+        schema: SCHEMA_VERSION,
+        aggregator: edge(),
+        epoch: 3,
+        round: 88,
+        fused_at_us: Timestamp(1_732_154_400_123_456),
+        verdicts: vec![Verdict {
+            landmark: "ball".into(),
+            label: Some("sports ball".into()),
+            score: 1.84,
+            margin: -0.61,
+            votes: [("sports ball".into(), 1.84), ("cup".into(), 2.45)].into(),
+            contributors: vec![edge()],
+        }],
+    }
+}
+
+fn reputations() -> Reputations {
+    let reputation = Reputation { score: 0.62, correct: 410, incorrect: 22 };
+    let reputations = [(edge(), reputation)].into();
+    Reputations { schema: SCHEMA_VERSION, aggregator: Some(edge()), epoch: 3, round: 88, reputations }
+}
+
+fn status() -> NodeStatus {
+    NodeStatus {
+        schema: SCHEMA_VERSION,
+        node: edge(),
+        id: Uuid::nil(),
+        role: Role::Edge,
+        state: NodeState::Aggregating,
+        epoch: 3,
+        aggregator: Some(edge()),
+        fit: Some(true),
+        version: "0.1.0".into(),
+    }
+}
+
+/// What spoils a payload, and the reason that is then given.
+type Flaw<T> = (fn(&mut T), RejectReason);
+
+/// Spoils a sound payload in every listed way and sends it; CBOR, because JSON has no word for NaN.
+fn each_flaw_has_its_reason<T: Payload>(sound: impl Fn() -> T, flaws: &[Flaw<T>]) {
+    for encoding in [Encoding::Cbor, Encoding::Compact] {
+        let received = |payload: &T| decode::<T>(&encode(payload, encoding), &Limits::default()).err();
+        assert_eq!(received(&sound()), None);
+        for (index, (spoil, expected)) in flaws.iter().enumerate() {
+            let mut payload = sound();
+            spoil(&mut payload);
+            assert_eq!(received(&payload), Some(*expected), "flaw {index} in {encoding:?}");
+        }
+    }
+}
+
+#[test]
+fn each_flaw_of_a_map_has_its_reason() {
+    fn edge_of(map: &mut GlobalMap) -> &mut PoseCorrection {
+        map.pose_corrections.get_mut(&edge()).unwrap()
+    }
+    each_flaw_has_its_reason(
+        map,
+        &[
+            (|m| m.epoch = 1 << 53, RejectReason::OutOfRange),
+            (|m| m.round = u64::MAX, RejectReason::OutOfRange),
+            (|m| m.fused_at_us = Timestamp(u64::MAX), RejectReason::OutOfRange),
+            (|m| m.oldest_capture_us = Some(Timestamp(1 << 53)), RejectReason::OutOfRange),
+            (|m| m.landmarks[0].x_m = f64::NAN, RejectReason::NotFinite),
+            (|m| m.landmarks[0].y_m = 1e9, RejectReason::NotFinite),
+            (|m| m.landmarks[0].confidence = 1.01, RejectReason::ConfidenceOutOfRange),
+            (|m| m.landmarks[0].confidence = f64::NAN, RejectReason::NotFinite),
+            (|m| m.landmarks[0].id = "".into(), RejectReason::InvalidLabel),
+            (|m| m.landmarks[0].label = Some("a\tb".into()), RejectReason::InvalidLabel),
+            (|m| m.objects[0].x_m = f64::NEG_INFINITY, RejectReason::NotFinite),
+            (|m| m.objects[0].covariance_m2 = [-0.1, 0.0, 0.2], RejectReason::NotFinite),
+            (|m| m.objects[0].covariance_m2[1] = f64::INFINITY, RejectReason::NotFinite),
+            (|m| m.objects[0].confidence = -0.5, RejectReason::ConfidenceOutOfRange),
+            (|m| m.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
+            (|m| m.objects[0].existence = Some(1.5), RejectReason::ConfidenceOutOfRange),
+            (|m| m.objects[0].scores = [("".into(), 0.5)].into(), RejectReason::InvalidLabel),
+            (|m| m.objects[0].velocity_mps = Some([f64::NAN, 0.0]), RejectReason::NotFinite),
+            (|m| m.objects[0].velocity_mps = Some([0.0, 1e9]), RejectReason::OutOfRange),
+            (|m| m.objects[0].heading_rad = Some(f64::INFINITY), RejectReason::NotFinite),
+            (|m| m.objects[0].size_m = Some([4.0, -1.0]), RejectReason::OutOfRange),
+            (|m| m.objects[0].age_s = Some(-1.0), RejectReason::OutOfRange),
+            (|m| m.objects[0].first_seen_us = Some(Timestamp(1 << 53)), RejectReason::OutOfRange),
+            (|m| edge_of(m).dheading_rad = f64::NAN, RejectReason::NotFinite),
+            (|m| edge_of(m).dx_m = f64::INFINITY, RejectReason::NotFinite),
+            (|m| edge_of(m).pairs = -1.0, RejectReason::OutOfRange),
+        ],
+    );
+}
+
+#[test]
+fn each_flaw_of_verdicts_has_its_reason() {
+    each_flaw_has_its_reason(
+        verdicts,
+        &[
+            (|v| v.epoch = 1 << 53, RejectReason::OutOfRange),
+            (|v| v.fused_at_us = Timestamp(1 << 53), RejectReason::OutOfRange),
+            (|v| v.verdicts[0].score = f64::NAN, RejectReason::NotFinite),
+            (|v| v.verdicts[0].margin = f64::INFINITY, RejectReason::NotFinite),
+            (|v| v.verdicts[0].score = 1e300, RejectReason::OutOfRange),
+            (|v| v.verdicts[0].votes = [("cup".into(), f64::NAN)].into(), RejectReason::NotFinite),
+            (|v| v.verdicts[0].votes = [("".into(), 1.0)].into(), RejectReason::InvalidLabel),
+            (|v| v.verdicts[0].landmark = "".into(), RejectReason::InvalidLabel),
+            (|v| v.verdicts[0].label = Some("".into()), RejectReason::InvalidLabel),
+        ],
+    );
+}
+
+#[test]
+fn each_flaw_of_reputations_and_statuses_has_its_reason() {
+    fn edges(reputations: &mut Reputations) -> &mut Reputation {
+        reputations.reputations.get_mut(&edge()).unwrap()
+    }
+    each_flaw_has_its_reason(
+        reputations,
+        &[
+            (|r| r.round = 1 << 53, RejectReason::OutOfRange),
+            (|r| edges(r).score = f64::NAN, RejectReason::NotFinite),
+            (|r| edges(r).score = 1.5, RejectReason::OutOfRange),
+            (|r| edges(r).score = -0.1, RejectReason::OutOfRange),
+            (|r| edges(r).correct = u64::MAX, RejectReason::OutOfRange),
+            (|r| edges(r).incorrect = 1 << 53, RejectReason::OutOfRange),
+        ],
+    );
+    each_flaw_has_its_reason(
+        status,
+        &[
+            (|s| s.epoch = 1 << 53, RejectReason::OutOfRange),
+            (|s| s.version = String::new(), RejectReason::InvalidLabel),
+            (|s| s.version = "0".repeat(1000), RejectReason::InvalidLabel),
+        ],
+    );
+}
+
+#[test]
+fn what_an_aggregator_sends_may_be_larger_than_a_report() {
+    let limits = Limits { payload_bytes: 256, map_bytes: 4096, ..Limits::default() };
+    let mut large = map();
+    large.landmarks = vec![large.landmarks[0].clone(); 10];
+    let bytes = encode(&large, Encoding::Json);
+    assert!(bytes.len() > limits.payload_bytes);
+    assert_eq!(decode(&bytes, &limits), Ok(large));
+    assert_eq!(decode::<GlobalMap>(&[b' '; 4097], &limits), Err(RejectReason::TooLarge));
+    assert_eq!(decode::<NodeStatus>(&[b' '; 257], &limits), Err(RejectReason::TooLarge));
+}
+
+#[test]
+fn a_map_from_tomorrow_is_rejected_and_one_from_a_clock_a_little_ahead_is_not() {
+    let now = Timestamp(1_732_154_400_000_000);
+    let hour = 3_600_000_000;
+    assert_eq!(check_fused_at(now.shifted(hour - 1), now), Ok(()));
+    assert_eq!(check_fused_at(now.shifted(hour), now), Err(RejectReason::FromTheFuture));
+    assert_eq!(check_fused_at(now.shifted(-30 * hour), now), Ok(()), "order is by epoch and round, not by time");
+}
+
+/// Numbers as junk has them: any bit pattern, and the bounds.
+fn number() -> impl Strategy<Value = f64> {
+    prop_oneof![any::<f64>(), Just(0.5), Just(1e8), Just(f64::NAN)]
+}
+
+fn label() -> impl Strategy<Value = Label> {
+    prop_oneof![Just(""), Just("cup"), Just("\u{7}")].prop_map(Label::from)
+}
+
+proptest! {
+    /// Whatever passes holds only numbers that can be computed with.
+    #[test]
+    fn no_number_that_is_none_gets_through(
+        (confidence, x_m, y_m, covariance_m2) in (number(), number(), number(), [number(), number(), number()]),
+        (score, margin, votes) in (number(), number(), btree_map(label(), number(), 0..3)),
+        (epoch, text, landmarks) in (any::<u64>(), label(), vec((number(), number()), 0..3)),
+    ) {
+        let mut map = GlobalMap { epoch, ..map() };
+        map.objects[0] =
+            FusedObject { confidence, x_m, y_m, covariance_m2, label: text.clone(), ..map.objects[0].clone() };
+        let first = map.landmarks[0].clone();
+        map.landmarks = landmarks.iter().map(|&(x_m, confidence)| LandmarkState { x_m, confidence, ..first.clone() }).collect();
+        if let Ok(map) = decode::<GlobalMap>(&encode(&map, Encoding::Cbor), &Limits::default()) {
+            prop_assert!(map.epoch <= MAX_INTEGER && !map.objects[0].label.is_empty());
+            let object = &map.objects[0];
+            prop_assert!(object.covariance_m2.iter().chain([&object.x_m, &object.y_m]).all(|n| n.is_finite()));
+            prop_assert!(map.landmarks.iter().all(|l| l.x_m.is_finite() && (0.0..=1.0).contains(&l.confidence)));
+        }
+        let mut verdicts = Verdicts { epoch, ..verdicts() };
+        verdicts.verdicts[0] = Verdict { score, margin, votes, landmark: text, ..verdicts.verdicts[0].clone() };
+        if let Ok(verdicts) = decode::<Verdicts>(&encode(&verdicts, Encoding::Cbor), &Limits::default()) {
+            let verdict = &verdicts.verdicts[0];
+            prop_assert!(verdict.votes.values().chain([&verdict.score, &verdict.margin]).all(|n| n.is_finite()));
+        }
+    }
+}

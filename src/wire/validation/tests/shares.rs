@@ -1,0 +1,56 @@
+//! Shares of the ledger: the largest one fits, and each flaw has its reason.
+
+use crate::names::NodeName;
+use crate::wire::{
+    Encoding, LedgerEntry, LedgerShare, Limits, MAX_INTEGER, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION,
+    decode_share, encode,
+};
+
+fn share() -> LedgerShare {
+    let name = |name: &str| NodeName::new(name).unwrap();
+    let entry = LedgerEntry {
+        epoch: 3,
+        aggregator: name(&"a".repeat(64)),
+        node: name(&"n".repeat(64)),
+        label: "\"".repeat(64).into(),
+        correct: MAX_INTEGER,
+        incorrect: MAX_INTEGER,
+    };
+    LedgerShare {
+        schema: SCHEMA_VERSION,
+        node: name("edge"),
+        epoch: Some(3),
+        entries: vec![entry; MAX_SHARE_ENTRIES],
+        marks: Vec::new(),
+    }
+}
+
+fn reason(share: &LedgerShare) -> Option<RejectReason> {
+    let read = |encoding| decode_share(&encode(share, encoding), &NodeName::from_static("edge"), &Limits::default());
+    assert_eq!(read(Encoding::Json), read(Encoding::Cbor));
+    assert_eq!(read(Encoding::Json), read(Encoding::Compact));
+    read(Encoding::Json).err()
+}
+
+#[test]
+fn the_largest_share_fits_and_each_flaw_has_its_reason() {
+    assert_eq!(reason(&share()), None);
+    type Flaw = (fn(&mut LedgerShare), RejectReason);
+    let flaws: [Flaw; 5] = [
+        (|s| s.schema = 2, RejectReason::UnknownSchema),
+        (|s| s.node = NodeName::from_static("gauss"), RejectReason::NodeMismatch),
+        (|s| s.entries.truncate(1), RejectReason::TooManyObjects),
+        (|s| s.entries[7].incorrect += 1, RejectReason::OutOfRange),
+        (|s| s.entries[7].label = "".into(), RejectReason::InvalidLabel),
+    ];
+    for (spoil, expected) in flaws {
+        let mut share = share();
+        if expected == RejectReason::TooManyObjects {
+            share.entries.iter_mut().for_each(|entry| entry.label = "cup".into());
+            share.entries.push(share.entries[0].clone());
+        } else {
+            spoil(&mut share);
+        }
+        assert_eq!(reason(&share), Some(expected));
+    }
+}

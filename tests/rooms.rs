@@ -1,0 +1,232 @@
+//! The rooms of the house: modules of each crate by floor, read from the code. Imports run downward, without a circle.
+//!
+//! A room is a module of a crate's root. A folder that holds folders has rooms of its own: its modules. Files of a
+//! folder without folders may know each other. Tests are left out.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use syn::visit::{self, Visit};
+
+/// A module: the crate and the names below it.
+type Module = Vec<String>;
+
+/// Crates by name in paths, and their sources.
+const CRATES: [(&str, &str); 3] = [("ecod", "src"), ("ecod_actors", "actors/src"), ("ecod_lab", "lab/src")];
+
+#[test]
+fn imports_run_downward_without_a_circle() {
+    let house = House::read(Path::new(env!("CARGO_MANIFEST_DIR")));
+    assert!(house.imports.len() > 100, "the sources were read");
+    let mut circles = Vec::new();
+    for parent in house.parents() {
+        let rooms = house.rooms(&parent);
+        println!("{}, {} rooms", parent.join("::"), rooms.len());
+        match floors(&rooms) {
+            Ok(floors) => {
+                for (number, floor) in floors.iter().enumerate().rev() {
+                    println!("  {:>2}  {}", number + 1, floor.join(" "));
+                }
+            }
+            Err(circle) => circles.push(house.explain(&parent, &circle)),
+        }
+    }
+    assert!(circles.is_empty(), "rooms that import each other:\n{}", circles.concat());
+}
+
+#[test]
+fn a_circle_is_found_and_named() {
+    let graph = |edges: &[(&str, &str)]| {
+        let mut graph = BTreeMap::<String, BTreeSet<String>>::new();
+        for (from, to) in edges {
+            graph.entry((*from).into()).or_default().insert((*to).into());
+            graph.entry((*to).into()).or_default();
+        }
+        graph
+    };
+    let tower = floors(&graph(&[("roof", "hall"), ("hall", "cellar"), ("roof", "cellar")]));
+    assert_eq!(tower, Ok(vec![vec!["cellar".into()], vec!["hall".into()], vec!["roof".into()]]));
+    let knot = floors(&graph(&[("roof", "hall"), ("hall", "attic"), ("attic", "hall"), ("hall", "cellar")]));
+    assert_eq!(knot, Err(BTreeSet::from(["attic".into(), "hall".into()])));
+}
+
+/// All modules and their imports.
+struct House {
+    /// Every module, with the file of each; a folder holds further modules.
+    modules: BTreeMap<Module, PathBuf>,
+    /// Importing module, imported module.
+    imports: BTreeSet<(Module, Module)>,
+}
+
+impl House {
+    fn read(root: &Path) -> Self {
+        let mut modules = BTreeMap::new();
+        for (name, sources) in CRATES {
+            collect(&root.join(sources), &[name.to_owned()], &mut modules);
+        }
+        let mut imports = BTreeSet::new();
+        for (module, path) in &modules {
+            let file = syn::parse_file(&fs::read_to_string(path).unwrap()).unwrap();
+            let mut reader = Reader { module, modules: &modules, imports: &mut imports };
+            reader.visit_file(&file);
+        }
+        Self { modules, imports }
+    }
+
+    /// Modules whose children are rooms: the crates, and folders that hold folders.
+    fn parents(&self) -> BTreeSet<Module> {
+        let is_folder =
+            |module: &Module| self.modules.keys().any(|other| other.len() > module.len() && other.starts_with(module));
+        let folders = self.modules.keys().filter(|module| module.len() > 1 && is_folder(module));
+        folders.map(|module| module[..module.len() - 1].to_vec()).collect()
+    }
+
+    /// The rooms of a parent, each with the rooms that it imports.
+    fn rooms(&self, parent: &Module) -> BTreeMap<String, BTreeSet<String>> {
+        let room = |module: &Module| {
+            (module.len() > parent.len() && module.starts_with(parent)).then(|| module[parent.len()].clone())
+        };
+        let mut rooms: BTreeMap<_, BTreeSet<_>> =
+            self.modules.keys().filter_map(room).map(|name| (name, BTreeSet::new())).collect();
+        for (from, to) in &self.imports {
+            if let (Some(from), Some(to)) = (room(from), room(to))
+                && from != to
+            {
+                rooms.entry(from).or_default().insert(to);
+            }
+        }
+        rooms
+    }
+
+    /// The imports that tie a circle.
+    fn explain(&self, parent: &Module, circle: &BTreeSet<String>) -> String {
+        let inside = |module: &Module| {
+            module.len() > parent.len() && module.starts_with(parent) && circle.contains(&module[parent.len()])
+        };
+        let tied = self
+            .imports
+            .iter()
+            .filter(|(from, to)| inside(from) && inside(to) && from[parent.len()] != to[parent.len()]);
+        tied.map(|(from, to)| format!("  {} -> {}\n", from.join("::"), to.join("::"))).collect()
+    }
+}
+
+/// Rooms by floor, the lowest first; or the rooms that lie on a circle or between two.
+fn floors(rooms: &BTreeMap<String, BTreeSet<String>>) -> Result<Vec<Vec<String>>, BTreeSet<String>> {
+    let mut placed = BTreeSet::new();
+    let mut floors = Vec::new();
+    while placed.len() < rooms.len() {
+        let floor: Vec<_> = rooms
+            .iter()
+            .filter(|(room, imports)| !placed.contains(*room) && imports.is_subset(&placed))
+            .map(|(room, _)| room.clone())
+            .collect();
+        if floor.is_empty() {
+            return Err(tied(rooms, &placed));
+        }
+        placed.extend(floor.iter().cloned());
+        floors.push(floor);
+    }
+    Ok(floors)
+}
+
+/// Rooms that are not placed and that a room of the same kind imports.
+fn tied(rooms: &BTreeMap<String, BTreeSet<String>>, placed: &BTreeSet<String>) -> BTreeSet<String> {
+    let mut left: BTreeSet<_> = rooms.keys().filter(|room| !placed.contains(*room)).cloned().collect();
+    loop {
+        let imported: BTreeSet<_> = left.iter().flat_map(|room| rooms[room].intersection(&left)).cloned().collect();
+        if imported.len() == left.len() {
+            return left;
+        }
+        left = imported;
+    }
+}
+
+/// Notes the modules of a folder; `lib.rs` is the crate itself.
+fn collect(folder: &Path, parent: &[String], modules: &mut BTreeMap<Module, PathBuf>) {
+    let Ok(entries) = fs::read_dir(folder) else { return };
+    for path in entries.map(|entry| entry.unwrap().path()) {
+        let stem = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        if stem == "tests" || stem == "bin" {
+            continue;
+        }
+        let module = if stem == "lib" { parent.to_vec() } else { [parent, &[stem]].concat() };
+        if path.is_dir() {
+            collect(&path, &module, modules);
+        } else if path.extension().is_some_and(|extension| extension == "rs") && path.file_stem().unwrap() != "main" {
+            modules.insert(module, path);
+        }
+    }
+}
+
+/// Reads the imports of one file.
+struct Reader<'a> {
+    module: &'a Module,
+    modules: &'a BTreeMap<Module, PathBuf>,
+    imports: &'a mut BTreeSet<(Module, Module)>,
+}
+
+impl Reader<'_> {
+    /// Notes the module that a path leads to.
+    fn note(&mut self, path: &[String]) {
+        let Some(first) = path.first() else { return };
+        let mut target = match first.as_str() {
+            "crate" => vec![self.module[0].clone()],
+            "self" => self.module.clone(),
+            "super" => self.module[..self.module.len() - 1].to_vec(),
+            name if CRATES.iter().any(|(known, _)| *known == name) => vec![name.to_owned()],
+            _ => [self.module.as_slice(), &[first.clone()]].concat(),
+        };
+        if !self.modules.contains_key(&target) {
+            return;
+        }
+        for name in &path[1..] {
+            if name == "super" {
+                target.pop();
+                continue;
+            }
+            target.push(name.clone());
+            if !self.modules.contains_key(&target) {
+                target.pop();
+                break;
+            }
+        }
+        self.imports.insert((self.module.clone(), target));
+    }
+
+    fn note_tree(&mut self, before: &[String], tree: &syn::UseTree) {
+        let with = |name: &syn::Ident| [before, &[name.to_string()]].concat();
+        match tree {
+            syn::UseTree::Path(path) => self.note_tree(&with(&path.ident), &path.tree),
+            syn::UseTree::Name(name) => self.note(&with(&name.ident)),
+            syn::UseTree::Rename(rename) => self.note(&with(&rename.ident)),
+            syn::UseTree::Glob(_) => self.note(before),
+            syn::UseTree::Group(group) => group.items.iter().for_each(|tree| self.note_tree(before, tree)),
+        }
+    }
+}
+
+impl<'ast> Visit<'ast> for Reader<'_> {
+    fn visit_item_use(&mut self, item: &'ast syn::ItemUse) {
+        self.note_tree(&[], &item.tree);
+    }
+
+    fn visit_path(&mut self, path: &'ast syn::Path) {
+        let names: Vec<_> = path.segments.iter().map(|segment| segment.ident.to_string()).collect();
+        if names.len() > 1 {
+            self.note(&names);
+        }
+        visit::visit_path(self, path);
+    }
+
+    fn visit_item_mod(&mut self, item: &'ast syn::ItemMod) {
+        let is_test = item.attrs.iter().any(|attribute| {
+            attribute.path().is_ident("cfg")
+                && attribute.meta.require_list().is_ok_and(|list| list.tokens.to_string() == "test")
+        });
+        if !is_test {
+            visit::visit_item_mod(self, item);
+        }
+    }
+}
