@@ -27,7 +27,7 @@ use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
-use crate::observe::recorder::LogSender;
+use crate::observe::recorder::{LogItem, LogSender};
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
 use crate::transport::mqtt::Incoming;
@@ -128,7 +128,7 @@ impl FollowerState {
         self.tell_election(accepted);
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         self.write(&received);
-        self.recording.map(map, received_at);
+        self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
         Ok(())
     }
@@ -137,7 +137,7 @@ impl FollowerState {
         let accepted = self.filter.accept_verdicts(verdicts, received_at, &self.leadership.borrow())?;
         let _accept = self.spans.accept("verdicts", &**verdicts, received_at);
         self.counters.count(Event::VerdictsAccepted);
-        self.recording.verdicts(verdicts, received_at);
+        self.recording.send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
         self.tell_election(accepted);
         self.newest.verdicts.send_replace(Some(Received { received_at, message: Arc::clone(verdicts) }));
         Ok(())
@@ -146,7 +146,7 @@ impl FollowerState {
     fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), Refusal> {
         self.filter.accept_reputations(reputations, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::ReputationsAccepted);
-        self.recording.reputations(reputations, received_at);
+        self.recording.send(received_at, LogItem::Reputations(Arc::clone(reputations)));
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
         Ok(())
     }

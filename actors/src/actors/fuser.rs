@@ -32,7 +32,7 @@ pub use intake::{Intake, Put};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
-use crate::observe::recorder::LogSender;
+use crate::observe::recorder::{LogItem, LogSender};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::{RoundReports, Spans};
@@ -157,7 +157,7 @@ impl FuserState {
 
     fn take(&mut self, delivery: &Delivery) {
         let Incoming::Report { kind, report } = &delivery.message else { return };
-        self.recording.report(*kind, report, delivery.received_at);
+        self.recording.send(delivery.received_at, LogItem::Report(*kind, Arc::clone(report)));
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
             Ok(fused) => {
@@ -202,7 +202,7 @@ impl FuserState {
         let now = clock::now();
         if command != Command::Tick || now >= self.aggregator.deadline() {
             let fused = self.aggregator.command(&command, now);
-            self.recording.journal(now, JournalEvent::Command(command));
+            self.recording.send(now, LogItem::Journal(JournalEvent::Command(command)));
             self.publish(fused, now);
         }
     }
@@ -226,7 +226,7 @@ impl FuserState {
         let Some(fused) = fused else { return };
         let _round = self.spans.round(&fused, &std::mem::take(&mut self.reports)).entered();
         let Fused { epoch, round, map, verdicts, evidence, reputations } = fused;
-        self.recording.round(round, now);
+        self.recording.send(now, LogItem::Round(round));
         let has_verdicts = verdicts.is_some();
         if let Some(map) = map {
             self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });

@@ -1,4 +1,4 @@
-//! Camera calibration from photographs of a chessboard, and the file that keeps it.
+//! Camera calibration from photographs of a chessboard, and the calibration file.
 
 use std::path::{Path, PathBuf};
 
@@ -10,15 +10,15 @@ use serde::{Deserialize, Serialize};
 use crate::camera::frame_source::images;
 use crate::camera::lens::Lens;
 
-/// Views of the board below which a calibration is refused.
+/// Minimum number of photographs that show the whole board.
 pub const MIN_VIEWS: usize = 5;
 
 /// A printed chessboard.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chessboard {
-    /// Inner corners along a row: squares less one.
+    /// Inner corners along a row: squares minus one.
     pub columns: u16,
-    /// Inner corners along a column: squares less one.
+    /// Inner corners along a column: squares minus one.
     pub rows: u16,
     /// Side of a square in millimetres.
     pub square_mm: f64,
@@ -44,7 +44,7 @@ pub struct Calibration {
     pub distortion: [f64; 5],
     /// Root mean square distance in pixels between found and reprojected corners; good is below 0.5.
     pub rms_px: f64,
-    /// The photographs it rests on.
+    /// Photographs used.
     pub images: Vec<PathBuf>,
 }
 
@@ -57,10 +57,10 @@ pub struct CalibrationReport {
     pub without_board: Vec<PathBuf>,
 }
 
-/// Why a camera is not calibrated, or a calibration not read.
+/// Error of a calibration or its file.
 #[derive(Debug, thiserror::Error)]
 pub enum CalibrationError {
-    /// The board is too small to be one.
+    /// The board is too small.
     #[error("chessboard of {columns}x{rows} inner corners and {square_mm} mm squares: need at least 3x3 and a size")]
     InvalidBoard {
         /// Inner corners along a row.
@@ -70,10 +70,10 @@ pub enum CalibrationError {
         /// Side of a square in millimetres.
         square_mm: f64,
     },
-    /// Not an image that OpenCV reads.
+    /// OpenCV cannot read the image.
     #[error("cannot read image {0:?}")]
     UnreadableImage(PathBuf),
-    /// All photographs must be of one size.
+    /// The photographs have different sizes.
     #[error("image {path:?} is {width}x{height}, the others are {expected_width}x{expected_height}")]
     SizeDiffers {
         /// The image.
@@ -87,20 +87,20 @@ pub enum CalibrationError {
         /// Height of the first image.
         expected_height: i32,
     },
-    /// The board was found in too few photographs.
+    /// Too few photographs show the board.
     #[error("the chessboard was found in {found} images, need {MIN_VIEWS}; not in {without_board:?}")]
     TooFewViews {
-        /// Photographs with the board.
+        /// Number of photographs with the board.
         found: usize,
         /// Photographs without.
         without_board: Vec<PathBuf>,
     },
-    /// OpenCV failed, in the named image where it was about one.
+    /// OpenCV failed on an image or in a step.
     #[error("opencv failed on {what}")]
     OpenCv {
         /// An image or a step.
         what: String,
-        /// OpenCV's own words.
+        /// OpenCV's error.
         #[source]
         source: opencv::Error,
     },
@@ -109,7 +109,7 @@ pub enum CalibrationError {
     Directory {
         /// The directory.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         #[source]
         source: std::io::Error,
     },
@@ -118,7 +118,7 @@ pub enum CalibrationError {
     File {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         #[source]
         source: std::io::Error,
     },
@@ -127,12 +127,12 @@ pub enum CalibrationError {
     Malformed {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
 }
 
-/// The photographs that are meant by paths of files and directories; a directory gives its images by name.
+/// Photographs among files and directories; those of a directory in the order of their names.
 ///
 /// # Errors
 /// [`CalibrationError::Directory`] when one cannot be listed.
@@ -149,7 +149,7 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
     Ok(photographs)
 }
 
-/// Calibrates a camera from photographs of a chessboard, held at different angles and all over the image (Zhang 2000).
+/// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and all over the image.
 ///
 /// # Errors
 /// [`CalibrationError`], naming the image it is about.
@@ -232,7 +232,7 @@ impl Calibration {
     }
 }
 
-/// The board's inner corners to a fraction of a pixel, if all are there.
+/// Inner corners of the board with subpixel accuracy, if all are visible.
 fn find_board(image: &Mat, board: &Chessboard) -> opencv::Result<Option<Vector<Point2f>>> {
     let mut corners = Vector::<Point2f>::new();
     let pattern = Size::new(board.columns.into(), board.rows.into());
@@ -240,7 +240,7 @@ fn find_board(image: &Mat, board: &Chessboard) -> opencv::Result<Option<Vector<P
         return Ok(None);
     }
     let none = Size::new(-1, -1);
-    imgproc::corner_sub_pix(image, &mut corners, Size::new(5, 5), none, until(30, 1e-3)?)?;
+    imgproc::corner_sub_pix(image, &mut corners, Size::new(5, 5), none, stop_after(30, 1e-3)?)?;
     Ok(Some(corners))
 }
 
@@ -266,7 +266,7 @@ fn solve(
         &mut Vector::<Mat>::new(),
         &mut Vector::<Mat>::new(),
         0,
-        until(100, 1e-9)?,
+        stop_after(100, 1e-9)?,
     )?;
     let entry = |row, column| camera.at_2d::<f64>(row, column).copied();
     let mut coefficients = [0.0; 5];
@@ -286,7 +286,7 @@ fn solve(
     })
 }
 
-fn until(iterations: i32, change: f64) -> opencv::Result<TermCriteria> {
+fn stop_after(iterations: i32, change: f64) -> opencv::Result<TermCriteria> {
     TermCriteria::new(TermCriteria_Type::COUNT as i32 | TermCriteria_Type::EPS as i32, iterations, change)
 }
 

@@ -1,4 +1,4 @@
-//! Which files a log consists of, and whose they are.
+//! Selection of log files by node.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -10,22 +10,22 @@ use ecod::model::names::NodeName;
 use super::Failure;
 use crate::observe::recorder::{LogError, LogReader};
 
-/// Chooses among logs that lie together.
+/// Choice among logs of several nodes.
 #[derive(Debug, Args)]
 pub(super) struct NodeArguments {
-    /// Whose log it is, where those of several nodes are given
+    /// Node whose log to use, among logs of several nodes
     #[arg(long, value_name = "NAME")]
     pub(super) node: Option<NodeName>,
 }
 
-/// The files of one node's log, in order.
+/// Files of one node's log, in order.
 pub(super) struct Logs {
     pub(super) files: Vec<PathBuf>,
-    /// Why a file does not say under which configuration it was written.
+    /// Error of the first file whose configuration is unknown.
     pub(super) unusable: Option<LogError>,
 }
 
-/// A file, and what its beginning says.
+/// A file and the identity at its beginning.
 struct LogInput {
     path: PathBuf,
     node: Option<NodeName>,
@@ -33,7 +33,7 @@ struct LogInput {
 }
 
 impl Logs {
-    /// Looks into files that are logs, and directories of logs, for those of one node.
+    /// Finds the log files of one node among files and directories.
     pub(super) fn find(inputs: &[PathBuf], NodeArguments { node }: &NodeArguments) -> Result<Self, Failure> {
         let mut logs = Vec::new();
         for input in inputs {
@@ -41,10 +41,10 @@ impl Logs {
                 let found =
                     crate::observe::recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
                 for path in found.map_err(Failure::usage)? {
-                    logs.push(LogInput::look_into(path)?);
+                    logs.push(LogInput::open(path)?);
                 }
             } else if LogReader::recognises(input).map_err(Failure::usage)? {
-                logs.push(LogInput::look_into(input.clone())?);
+                logs.push(LogInput::open(input.clone())?);
             } else {
                 return Err(Failure::usage(anyhow!("{} is not a log", input.display())));
             }
@@ -63,7 +63,7 @@ impl Logs {
 }
 
 impl LogInput {
-    fn look_into(path: PathBuf) -> Result<Self, Failure> {
+    fn open(path: PathBuf) -> Result<Self, Failure> {
         let mut log = LogReader::open(&path).map_err(Failure::usage)?;
         let unusable = match log.next() {
             Some(Err(error @ (LogError::Newer { .. } | LogError::Identity { .. }))) => Some(error),
@@ -74,7 +74,7 @@ impl LogInput {
     }
 }
 
-/// Those of the node that is asked for; files that do not say whose they are go with the only one.
+/// Files of the wanted node. Files without a node's name belong to the only node.
 fn one_node(mut logs: Vec<LogInput>, node: Option<&NodeName>) -> Result<Vec<LogInput>, Failure> {
     let nodes: BTreeSet<_> = logs.iter().filter_map(|log| log.node.clone()).collect();
     let names = || nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(", ");

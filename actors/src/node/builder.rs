@@ -222,10 +222,10 @@ impl NodeBuilder {
             }
             #[cfg(feature = "camera")]
             ActorKind::Detector => {
-                let pictures = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
+                let images = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
                 let (counters, spans) = (self.counters(), self.spans());
-                let arguments = crate::node::camera::detector(&self.config, projector, pictures, counters, spans);
+                let arguments = crate::node::camera::detector(&self.config, projector, images, counters, spans);
                 let arguments = arguments.map_err(in_full)?;
                 slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }

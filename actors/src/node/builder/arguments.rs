@@ -30,7 +30,7 @@ use crate::node::config::NodeConfig;
 use crate::node::slots::ActorKind;
 use crate::observe::dashboard::{LandmarkFacts, NodeFacts, NodeSources};
 use crate::observe::readiness::{Vitals, patience};
-use crate::observe::recorder::LogIdentity;
+use crate::observe::recorder::{LogIdentity, LogItem};
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
@@ -111,7 +111,7 @@ impl NodeBuilder {
             live_state.update(&delivery.message, at);
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
-                    recording.report(*kind, report, at);
+                    recording.send(at, LogItem::Report(*kind, Arc::clone(report)));
                     true
                 }
                 // Evidence is for those that lead now or next; others that get it only look at it.
@@ -134,22 +134,22 @@ impl NodeBuilder {
                 Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
                 Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
                 Incoming::Ledger(share) if !fuses => {
-                    recording.share(share, at);
+                    recording.send(at, LogItem::Share(Arc::clone(share)));
                     true
                 }
                 Incoming::Ledger(share) => {
-                    recording.share(share, at);
+                    recording.send(at, LogItem::Share(Arc::clone(share)));
                     let input = Input::EvidenceReceived { from: share.node.clone() };
                     election.send(LeaderElectionMessage::Note { input });
                     keeper.send(ReputationKeeperMessage::Merge { delivery })
                 }
                 Incoming::Link { broker, state } => {
-                    recording.link(broker, *state, at);
+                    recording.send(at, LogItem::Link(broker.clone(), *state));
                     let input = Input::LinkChanged { broker: broker.clone(), state: *state };
                     election.send(LeaderElectionMessage::Note { input })
                 }
                 Incoming::Status { status, .. } => {
-                    recording.status(status, at);
+                    recording.send(at, LogItem::Status(Arc::clone(status)));
                     election.send(LeaderElectionMessage::TakeStatus { delivery })
                 }
             };
@@ -193,7 +193,7 @@ impl NodeBuilder {
         let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
         let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
-        self.recording.journal(now, JournalEvent::Start { ledger });
+        self.recording.send(now, LogItem::Journal(JournalEvent::Start { ledger }));
         FuserArguments {
             aggregator,
             recording: self.recording.clone(),
