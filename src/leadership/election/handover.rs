@@ -5,7 +5,7 @@
 //! are lost for a period, the old leader publishes that round too, and yields again after it.
 
 use crate::leadership::election::interface::ElectionEffect;
-use crate::leadership::election::message::{Body, MAX_TERM};
+use crate::leadership::election::message::Body;
 use crate::leadership::election::{Election, State};
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -71,7 +71,7 @@ impl Election {
     }
 
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
-        self.terms.seen = self.terms.seen.max(epoch.term.min(MAX_TERM));
+        self.learn_term(epoch.term);
         self.round = self.round.max(round);
         let least = self.config.beat();
         match &mut self.state {

@@ -14,6 +14,10 @@ pub const MAX_SUCCESSORS: usize = 3;
 /// Largest term taken from the wire: the largest integer that every JSON reader keeps exactly.
 pub const MAX_TERM: u64 = (1 << 53) - 1;
 
+/// Largest step by which one message raises the highest known term. A cell uses one term per change of leader, so it
+/// never gets so far ahead of a node. A forged term near [`MAX_TERM`] would end elections for good.
+pub const MAX_TERM_STEP: u64 = 1 << 20;
+
 /// Largest encoded message in bytes; it fits one Ethernet frame with room for the membership's seal.
 pub const MAX_MESSAGE_BYTES: usize = 1200;
 
@@ -275,7 +279,7 @@ mod tests {
         }
         let compact = ElectionMessage { body: Body::LeaderEvidence { ask: 7, age_ms: 12 }, ..beat(4, "edge") };
         let compact: String = compact.encode(Encoding::Compact).iter().map(|byte| format!("{byte:02x}")).collect();
-        assert_eq!(compact, "");
+        assert_eq!(compact, "890164656467651b000627629fb54800098402186401f504f58302070c82046465646765");
     }
 
     #[test]
