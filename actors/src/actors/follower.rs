@@ -30,7 +30,6 @@ use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::{LogItem, LogSender};
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
-use crate::transport::mqtt::Incoming;
 
 /// What a follower needs at its start.
 pub struct FollowerArguments {
@@ -92,14 +91,12 @@ impl Actor for Follower {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let (FollowerMessage::TakeMap { delivery }
-        | FollowerMessage::TakeVerdicts { delivery }
-        | FollowerMessage::TakeReputations { delivery }) = message;
-        let taken = match &delivery.message {
-            Incoming::Map(map) => state.take_map(map, delivery.received_at),
-            Incoming::Verdicts(verdicts) => state.take_verdicts(verdicts, delivery.received_at),
-            Incoming::Reputations(reputations) => state.take_reputations(reputations, delivery.received_at),
-            _ => Ok(()),
+        let taken = match message {
+            FollowerMessage::TakeMap { delivery } => state.take_map(&delivery.message, delivery.received_at),
+            FollowerMessage::TakeVerdicts { delivery } => state.take_verdicts(&delivery.message, delivery.received_at),
+            FollowerMessage::TakeReputations { delivery } => {
+                state.take_reputations(&delivery.message, delivery.received_at)
+            }
         };
         match taken.map_err(Refusal::reject_reason) {
             Ok(()) => {}

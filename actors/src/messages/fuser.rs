@@ -13,7 +13,7 @@ use ecod::wire::{GlobalMap, Reputation};
 /// What the fuser is asked to do.
 #[derive(Debug)]
 pub enum FuserMessage {
-    /// Fuse the reports that wait in the intake.
+    /// Fuse the reports that wait in its queue.
     TakeReports,
     /// Keep another aggregator's map, which the follower's gate admitted, to go on from when leading.
     TakeMap {

@@ -15,7 +15,7 @@ use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 use super::NodeBuilder;
 use crate::actors::dashboard::DashboardArguments;
 use crate::actors::follower::FollowerArguments;
-use crate::actors::fuser::FuserArguments;
+use crate::actors::fuser::{FuserArguments, QueuedReport};
 use crate::actors::gateway::GatewayArguments;
 use crate::actors::leader_election::{LeaderElectionArguments, Parts, saved_term};
 use crate::actors::membership::MembershipArguments;
@@ -105,7 +105,7 @@ impl NodeBuilder {
         let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
         let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
-        let (intake, counters) = (self.intake.clone(), self.counters());
+        let (report_queue, counters) = (self.report_queue.clone(), self.counters());
         Arc::new(move |delivery| {
             let at = delivery.received_at;
             live_state.update(&delivery.message, at);
@@ -124,15 +124,25 @@ impl NodeBuilder {
                 }
                 Incoming::Report { kind, report } => {
                     let (kind, report) = (*kind, Arc::clone(report));
-                    let put = intake.put(kind, &report, delivery);
-                    if put.has_replaced {
-                        counters.shed(ShedReason::ReportReplaced, report.node.as_str());
+                    let node = report.node.clone();
+                    let outcome = report_queue.push(delivery.map(|_| QueuedReport { kind, report }));
+                    if outcome.has_replaced {
+                        counters.shed(ShedReason::ReportReplaced, node.as_str());
                     }
-                    !put.is_first || fuser.send(FuserMessage::TakeReports)
+                    !outcome.is_first || fuser.send(FuserMessage::TakeReports)
                 }
-                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
-                Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
-                Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
+                Incoming::Map(map) => {
+                    let map = Arc::clone(map);
+                    follower.send(FollowerMessage::TakeMap { delivery: delivery.map(|_| map) })
+                }
+                Incoming::Verdicts(verdicts) => {
+                    let verdicts = Arc::clone(verdicts);
+                    follower.send(FollowerMessage::TakeVerdicts { delivery: delivery.map(|_| verdicts) })
+                }
+                Incoming::Reputations(reputations) => {
+                    let reputations = Arc::clone(reputations);
+                    follower.send(FollowerMessage::TakeReputations { delivery: delivery.map(|_| reputations) })
+                }
                 Incoming::Ledger(share) if !fuses => {
                     recording.send(at, LogItem::Share(Arc::clone(share)));
                     true
@@ -141,7 +151,8 @@ impl NodeBuilder {
                     recording.send(at, LogItem::Share(Arc::clone(share)));
                     let input = Input::EvidenceReceived { from: share.node.clone() };
                     election.send(LeaderElectionMessage::Note { input });
-                    keeper.send(ReputationKeeperMessage::Merge { delivery })
+                    let share = Arc::clone(share);
+                    keeper.send(ReputationKeeperMessage::Merge { delivery: delivery.map(|_| share) })
                 }
                 Incoming::Link { broker, state } => {
                     recording.send(at, LogItem::Link(broker.clone(), *state));
@@ -150,7 +161,8 @@ impl NodeBuilder {
                 }
                 Incoming::Status { status, .. } => {
                     recording.send(at, LogItem::Status(Arc::clone(status)));
-                    election.send(LeaderElectionMessage::TakeStatus { delivery })
+                    let status = Arc::clone(status);
+                    election.send(LeaderElectionMessage::TakeStatus { delivery: delivery.map(|_| status) })
                 }
             };
         })
@@ -176,7 +188,7 @@ impl NodeBuilder {
             cell: self.config.cell.clone(),
             reputation: self.config.fusion.reputation.clone(),
             config: self.config.reputations.clone(),
-            book: self.book.clone(),
+            reputations: self.reputations.clone(),
             file: self.state_file("reputations"),
             newest: self.newest.reputations.subscribe(),
             members: self.members(),
@@ -190,14 +202,14 @@ impl NodeBuilder {
     /// A fuser starts with the evidence that the keeper has, and goes on with the objects of the newest map.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
-        let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
+        let (now, ledger) = (clock::now(), Arc::new(self.reputations.open().ledger.clone()));
         let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
         self.recording.send(now, LogItem::Journal(JournalEvent::Start { ledger }));
         FuserArguments {
             aggregator,
             recording: self.recording.clone(),
-            intake: self.intake.clone(),
+            report_queue: self.report_queue.clone(),
             newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
