@@ -9,7 +9,6 @@ use ecod::epoch::Epoch;
 use ecod::leadership::Position;
 use ecod::leadership::readiness::Readiness;
 use ecod::names::NodeName;
-use ecod::time::Timestamp;
 use tokio::sync::watch;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
 
