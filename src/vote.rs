@@ -14,6 +14,7 @@
 
 mod calibration;
 mod config;
+mod configured_method;
 mod confusion;
 mod dawid_skene;
 mod dependence;
@@ -39,7 +40,8 @@ use crate::model::time::Timestamp;
 use crate::perception::landmark::Landmark;
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::wire::{Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict};
-use method::{Method, NewVote};
+use configured_method::ConfiguredMethod;
+use method::NewVote;
 
 /// The result of one round.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -88,14 +90,14 @@ pub struct Vote {
     /// Landmarks of an open cell, oldest first.
     arrivals: VecDeque<LandmarkId>,
     last_reports: BTreeMap<NodeName, LastReport>,
-    method: Method,
+    method: ConfiguredMethod,
     ignored: u64,
 }
 
 impl Vote {
     /// A machine for `landmarks`; without any, the cell is open and takes landmarks from the reports as they appear.
     pub fn new(config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
-        let mut method = Method::new(&config);
+        let mut method = ConfiguredMethod::new(&config);
         for landmark in &landmarks {
             method.get_mut().add_landmark(landmark.id.clone());
         }

@@ -121,7 +121,7 @@ impl Vehicle {
         if now >= self.tick_at {
             self.tick_at = now + SHARE_PERIOD;
             let shares = self.resync.tick(&self.ledger, &self.leadership, now);
-            self.share(shares);
+            self.share(&shares);
         }
         if now >= self.aggregator.deadline() {
             self.rounds_closed += 1;
@@ -161,7 +161,7 @@ impl Vehicle {
     fn publish(&mut self, fused: Fused, now: Timestamp) -> anyhow::Result<()> {
         let Fused { epoch, map, evidence, .. } = fused;
         let shares = self.resync.record(&epoch, &evidence, &mut self.ledger);
-        self.share(shares);
+        self.share(&shares);
         *self.settled.entry(epoch).or_default() += evidence.len() as u64;
         let map = map.context("PACE does not run")?;
         self.outbox.push((None, Payload::Map(encode(&map, Encoding::Cbor))));
@@ -185,10 +185,10 @@ impl Vehicle {
         if merged.is_news {
             self.aggregator.adopt(&self.ledger);
         }
-        self.share(merged.shares);
+        self.share(&merged.shares);
     }
 
-    fn share(&mut self, shares: Vec<LedgerShare>) {
+    fn share(&mut self, shares: &[LedgerShare]) {
         let shares = shares.iter().map(|share| (None, Payload::Evidence(encode(share, Encoding::Cbor))));
         self.outbox.extend(shares);
     }
@@ -213,7 +213,7 @@ impl Vehicle {
                 self.news.push(format!("{epoch} leads from #{first_round}"));
                 self.resync.lead(epoch.clone());
                 self.aggregator.lead(epoch, first_round, first, now);
-                self.share(self.resync.snapshot(&self.ledger));
+                self.share(&self.resync.snapshot(&self.ledger));
             }
             Effect::HoldRound => self.aggregator.hold(),
             Effect::StopPublishing { epoch } => {
@@ -221,7 +221,7 @@ impl Vehicle {
                 self.resync.step_down();
                 self.aggregator.step_down();
             }
-            Effect::SendSnapshot { .. } => self.share(self.resync.snapshot(&self.ledger)),
+            Effect::SendSnapshot { .. } => self.share(&self.resync.snapshot(&self.ledger)),
             Effect::Look => {
                 let members = self.members.values().cloned().collect();
                 return Some(Input::Looked { rounds_closed: self.rounds_closed, load_percent: 0, members });

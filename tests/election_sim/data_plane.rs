@@ -3,6 +3,8 @@
 //! A node publishes on every link that it keeps. Each broker passes on what its rule lets through, to all nodes that are
 //! linked to it: so rounds come twice, late, or from two leaders at once.
 
+use std::collections::btree_map::Entry;
+
 use ecod::aggregator::round::FirstRound;
 use ecod::leadership::links::{LinkState, WantedLinks};
 use ecod::leadership::node::Input;
@@ -20,8 +22,8 @@ impl World {
         let is_wanted = |broker: &usize| wanted.brokers.contains(&address_of(*broker));
         self.nodes[index].links.retain(|broker, _| is_wanted(broker));
         for broker in (0..self.nodes.len()).filter(is_wanted) {
-            if !self.nodes[index].links.contains_key(&broker) {
-                self.nodes[index].links.insert(broker, LinkState::Down);
+            if let Entry::Vacant(link) = self.nodes[index].links.entry(broker) {
+                link.insert(LinkState::Down);
                 self.plan_connect(index, broker, 0);
             }
         }

@@ -183,7 +183,7 @@ impl ObserverArguments {
             let JoinArguments { config: file, cell, .. } = self.join.clone();
             let join = JoinArguments { config: file, cell, ..JoinArguments::default() };
             if let Some(holder) = (RunArguments { join, ..RunArguments::default() }).load()?.name {
-                let name = NodeName::new(&format!("{holder}{OBSERVER_MARK}{default_name}"));
+                let name = NodeName::new(format!("{holder}{OBSERVER_MARK}{default_name}"));
                 config.name = Some(name.map_err(Failure::usage)?);
             }
         }

@@ -127,11 +127,11 @@ impl Scene {
     }
 
     fn notices(&self) -> Vec<&Notice> {
-        let notice = |effect| match effect {
-            &Effect::Log { ref notice } => Some(notice),
+        let notice = self.effects.iter().filter_map(|effect| match effect {
+            Effect::Log { notice } => Some(notice),
             _ => None,
-        };
-        self.effects.iter().filter_map(notice).collect()
+        });
+        notice.collect()
     }
 
     fn position_of(&self, wanted: impl Fn(&Effect) -> bool) -> Option<usize> {

@@ -54,7 +54,7 @@ pub enum LogError {
         source: std::io::Error,
     },
     /// The file has no end, as after its writer was killed.
-    #[error("{path} was not finished: its last messages are missing")]
+    #[error("{path} was not finished: it ends before its last messages")]
     Truncated {
         /// The file.
         path: PathBuf,
