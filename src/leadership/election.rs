@@ -10,7 +10,7 @@
 //!
 //! - *Machine*: [`Election::new`], [`Election::handle`], [`Election::tick`], [`Election::next_deadline`].
 //! - *Questions*, which change nothing: [`Election::epoch`], [`Election::leader`], [`Election::is_leading`],
-//!   [`Election::standby`], [`Election::floor`].
+//!   [`Election::standby`], [`Election::term`].
 //!
 //! # States
 //!
@@ -21,7 +21,7 @@
 //!
 //! 1. No two leaderships share an [`Epoch`]: a node uses a term once, and the epoch holds its name. The term is handed to
 //!    the disk first; see [`ElectionEffect::Lead`] for a disk that fails.
-//! 2. The epoch that a node follows or leads never goes back while it runs, nor below [`Election::floor`] after a
+//! 2. The epoch that a node follows or leads never goes back while it runs, nor below the saved term after a
 //!    restart.
 //! 3. A component whose links all work both ways, left alone, has exactly one leader: the best candidate by role and
 //!    priority, if one is fit.

@@ -64,7 +64,7 @@ impl Elected {
 
 impl SuccessionFilter {
     /// A filter that refuses terms below `floor` at first. While nobody is known to lead it also refuses terms below the
-    /// highest known one, or more than [`TERMS_AHEAD`] above it, until they were published for a while.
+    /// highest known one, or more than `TERMS_AHEAD` above it, until they were published for a while.
     pub fn new(floor: u64) -> Self {
         Self {
             gate: EpochGate::new(floor),

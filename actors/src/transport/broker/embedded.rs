@@ -42,7 +42,7 @@ pub trait MqttBroker: Send {
     /// Stops it and starts it at the address where it serves, or else at `fallback`. Retained messages are lost.
     ///
     /// # Errors
-    /// As [`Mqtt::start`]; the broker is then stopped.
+    /// As [`MqttBroker::start`]; the broker is then stopped.
     fn restart(&mut self, fallback: SocketAddr) -> Result<SocketAddr, BrokerError> {
         let address = match self.health() {
             BrokerHealth::Serving(address) => address,
