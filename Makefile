@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions replay-check edge-only recording-check live-check tracing-check asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -84,6 +84,12 @@ audit: ## licences, sources and duplicate policies of all dependencies; known vu
 
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
 	packaging/check-core
+
+rooms: ## print the modules of each crate by floor, and prove that imports run downward without a circle
+	cargo test --quiet --locked -p ecod --test rooms -- --nocapture
+
+code-lines: ## count the lines of code of each room, without tests and comments
+	packaging/code-lines
 
 replay-check: setup ## prove that replays are byte-equal from run to run and from debug to release
 	packaging/check-replay

@@ -5,14 +5,14 @@ mod figures;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
-use ecod::geometry::Pose;
-use ecod::landmark::{Landmark, LandmarkIndex};
-use ecod::names::NodeName;
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::geometry::Pose;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig, PaceMode};
-use ecod::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
-use ecod::time::Timestamp;
+use ecod::perception::camera::Intrinsics;
+use ecod::perception::landmark::{Landmark, LandmarkIndex};
+use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
 use ecod::wire::{Encoding, Limits, ObjectReport, PerceivedObject, WirePose, decode_report, encode};
 use nalgebra::Point2;
 

@@ -5,9 +5,9 @@ mod figures;
 
 use std::time::Instant;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::replay::{Replay, ReplayConfig};
-use ecod::time::Timestamp;
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 use serde_json::json;
 

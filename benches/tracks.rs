@@ -4,9 +4,9 @@ mod figures;
 
 use std::time::{Duration, Instant};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::reputation::ReputationConfig;
-use ecod::time::Timestamp;
 use ecod::tracking::{Tracker, TracksConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 

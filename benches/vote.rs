@@ -4,9 +4,9 @@ mod figures;
 
 use std::time::{Duration, Instant};
 
-use ecod::names::{Label, NodeName};
+use ecod::model::names::{Label, NodeName};
+use ecod::model::time::Timestamp;
 use ecod::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, PerceivedObject};
 

@@ -6,11 +6,11 @@
 
 use std::path::{Path, PathBuf};
 
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
-use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::names::NodeName;
+use ecod::perception::camera::Intrinsics;
+use ecod::perception::landmark::LandmarkConfig;
+use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ecod::wire::Role;
 use ecod_actors::camera::config::{CameraConfig, OpticsConfig};
 use ecod_actors::camera::detect::{CustomDetector, Detect, DetectError, DetectorConfig};

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
-use ecod::names::{MAX_NAME_BYTES, NodeName};
+use ecod::model::names::{MAX_NAME_BYTES, NodeName};
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -11,8 +11,8 @@ use std::collections::BTreeMap;
 use std::error::Error;
 use std::time::Duration;
 
-use ecod::names::{Label, NodeName};
-use ecod::time::Timestamp;
+use ecod::model::names::{Label, NodeName};
+use ecod::model::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig};
 use ecod::wire::{ObjectReport, PerceivedObject};
 use plotters::prelude::*;

@@ -3,7 +3,7 @@
 //! `cargo run --example subscribe_map -- 127.0.0.1:1883 lot-1`
 
 use anyhow::Context;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{GlobalMap, Limits, Topic, Topics, decode};
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};
 

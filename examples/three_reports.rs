@@ -5,9 +5,9 @@
 use std::sync::Arc;
 
 use ecod::aggregator::{Aggregator, FusionConfig};
-use ecod::landmark::{Landmark, LandmarkConfig};
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::{Landmark, LandmarkConfig};
 use ecod::wire::{ObjectReport, ReportKind, decode_report};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

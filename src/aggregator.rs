@@ -10,6 +10,8 @@
 //! A standby takes reports and closes rounds, but returns nothing. After [`Aggregator::lead`] it returns its rounds,
 //! which rest on all evidence that it has gathered.
 
+pub mod round;
+
 mod command;
 mod config;
 #[cfg(test)]
@@ -21,16 +23,16 @@ use std::sync::Arc;
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
 
-use crate::epoch::Epoch;
-use crate::landmark::{Landmark, LandmarkIndex};
-use crate::names::NodeName;
+use crate::admission::report_window::{Admitted, ReportWindow};
+use crate::aggregator::round::{FirstRound, RoundTrigger};
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::pace::Pace;
+use crate::perception::landmark::{Landmark, LandmarkIndex};
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::round::{FirstRound, RoundTrigger};
-use crate::time::Timestamp;
 use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
-use crate::window::{Admitted, ReportWindow};
 use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
 
 /// A closed round.

@@ -7,28 +7,16 @@
 #![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 #![cfg_attr(not(test), deny(clippy::string_slice))]
 
+pub mod admission;
 pub mod aggregator;
 pub mod association;
-pub mod camera;
 pub mod config;
-pub mod delay;
-pub mod detection;
-pub mod epoch;
-pub mod geometry;
-pub mod landmark;
 pub mod leadership;
-pub mod names;
+pub mod model;
 pub mod pace;
-pub mod pose_history;
-pub mod projection;
+pub mod perception;
 pub mod replay;
 pub mod reputation;
-pub mod round;
-pub mod time;
 pub mod tracking;
-pub mod view;
 pub mod vote;
-pub mod window;
 pub mod wire;
-
-pub use leadership::election;

@@ -16,14 +16,14 @@ use nalgebra::Point2;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::config::config_section;
-use crate::geometry::Covariance;
-use crate::landmark::{Landmark, LandmarkGate, LandmarkIndex};
-use crate::time::Timestamp;
-use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
-
 pub use bayes::BayesPace;
 pub use paper::PaperPace;
+
+use crate::config::config_section;
+use crate::model::geometry::Covariance;
+use crate::model::time::Timestamp;
+use crate::perception::landmark::{Landmark, LandmarkGate, LandmarkIndex};
+use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
 
 /// The implementation of PACE.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

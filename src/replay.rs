@@ -24,9 +24,9 @@ pub use journal::{JournalEntry, JournalEvent, JournalReplay, JournalSummary};
 pub use records::FusedLine;
 
 use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
-use crate::landmark::{Landmark, LandmarkConfig};
-use crate::names::{LandmarkId, NodeName};
-use crate::time::Timestamp;
+use crate::model::names::{LandmarkId, NodeName};
+use crate::model::time::Timestamp;
+use crate::perception::landmark::{Landmark, LandmarkConfig};
 use crate::tracking::TracksLosses;
 use crate::vote::MAX_LABELS;
 use crate::wire::{Limits, ObjectReport, RejectReason, ReportKind};

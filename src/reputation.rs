@@ -13,13 +13,13 @@ mod replication;
 
 use std::collections::BTreeMap;
 
+use serde::{Deserialize, Serialize};
+
 pub use ledger::ReputationLedger;
 pub use replication::{EntryKey, MAX_ENTRIES, MAX_LANES};
 
-use serde::{Deserialize, Serialize};
-
 use crate::config::config_section;
-use crate::names::{Label, NodeName};
+use crate::model::names::{Label, NodeName};
 
 /// A settled vote: whether it agreed with the verdict is known and final.
 #[derive(Debug, Clone, PartialEq, Eq)]

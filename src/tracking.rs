@@ -33,9 +33,9 @@ use std::collections::BTreeMap;
 pub use config::{TracksConfig, TracksMode};
 pub use tracker::Tracker;
 
-use crate::names::NodeName;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
-use crate::time::Timestamp;
 use crate::wire::{FusedObject, PoseCorrection};
 
 /// Result of a round.

@@ -14,6 +14,7 @@
 
 mod calibration;
 mod config;
+mod configured_method;
 mod confusion;
 mod dawid_skene;
 mod dependence;
@@ -33,13 +34,14 @@ pub use config::{MAX_LABELS, PaperConfig, VoteConfig, VoteMode, WeightedConfig};
 pub use paper::REPUTATION_RANGE;
 pub use visibility::{paper as paper_visibility, weighted as weighted_visibility};
 
-use crate::geometry::Pose;
-use crate::landmark::Landmark;
-use crate::names::{LandmarkId, NodeName};
+use crate::model::geometry::Pose;
+use crate::model::names::{LandmarkId, NodeName};
+use crate::model::time::Timestamp;
+use crate::perception::landmark::Landmark;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict};
-use method::{Method, NewVote};
+use configured_method::ConfiguredMethod;
+use method::NewVote;
 
 /// The result of one round.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -61,7 +63,7 @@ struct LastReport {
 }
 
 /// Largest step back in time of an overtaken report; a larger one means that the vehicle's clock was set back.
-/// [`crate::window::ReportWindow`] admits reports for as long by default.
+/// [`crate::admission::report_window::ReportWindow`] admits reports for as long by default.
 const MAX_OVERTAKEN: Duration = Duration::from_secs(3);
 /// Silence after which a vehicle may be forgotten for another: unproven vehicles, proven vehicles.
 const RETENTION: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(600)];
@@ -88,14 +90,14 @@ pub struct Vote {
     /// Landmarks of an open cell, oldest first.
     arrivals: VecDeque<LandmarkId>,
     last_reports: BTreeMap<NodeName, LastReport>,
-    method: Method,
+    method: ConfiguredMethod,
     ignored: u64,
 }
 
 impl Vote {
     /// A machine for `landmarks`; without any, the cell is open and takes landmarks from the reports as they appear.
     pub fn new(config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
-        let mut method = Method::new(&config);
+        let mut method = ConfiguredMethod::new(&config);
         for landmark in &landmarks {
             method.get_mut().add_landmark(landmark.id.clone());
         }

@@ -34,12 +34,12 @@ pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
-pub use validation::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload, check_fused_at, is_label};
+pub use validation::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload, check_fused_at};
 
-use crate::epoch::Epoch;
-use crate::geometry::Pose;
-use crate::names::{Label, LandmarkId, NodeName};
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::geometry::Pose;
+use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::time::Timestamp;
 use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
 
 /// Major version of every payload; others are rejected.

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use ecod::landmark::{Landmark, LandmarkIndex, VacancySign};
-use ecod::names::{Label, NodeName};
+use ecod::model::names::{Label, NodeName};
+use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig, PaceMode};
-use ecod::time::Timestamp;
+use ecod::perception::landmark::{Landmark, LandmarkIndex, VacancySign};
 use ecod::wire::{LandmarkState, ObjectReport, PerceivedObject};
 use nalgebra::Point2;
 use proptest::prelude::*;

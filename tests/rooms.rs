@@ -176,7 +176,7 @@ impl Reader<'_> {
             "self" => self.module.clone(),
             "super" => self.module[..self.module.len() - 1].to_vec(),
             name if CRATES.iter().any(|(known, _)| *known == name) => vec![name.to_owned()],
-            _ => [self.module.as_slice(), &[first.clone()]].concat(),
+            _ => [self.module.as_slice(), std::slice::from_ref(first)].concat(),
         };
         if !self.modules.contains_key(&target) {
             return;

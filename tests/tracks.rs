@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::aggregator::round::FirstRound;
 use ecod::aggregator::{Aggregator, FusionConfig};
-use ecod::epoch::Epoch;
-use ecod::landmark::Landmark;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::Landmark;
 use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
-use ecod::round::FirstRound;
-use ecod::time::Timestamp;
 use ecod::tracking::{TracksConfig, TracksMode};
 use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, RejectReason, ReportKind, encode};
 use nalgebra::Point2;

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use ecod::landmark::{Landmark, Synonym};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::{Landmark, Synonym};
 use ecod::reputation::{Evidence, ReputationLedger};
-use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, PerceivedObject, RejectReason, WirePose};
 use nalgebra::Point2;

@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use ecod::names::{Label, LandmarkId, NodeName};
-use ecod::time::Timestamp;
+use ecod::model::names::{Label, LandmarkId, NodeName};
+use ecod::model::time::Timestamp;
 use ecod::vote::{REPUTATION_RANGE, Vote, VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, PerceivedObject, Verdict, WirePose};
 use proptest::prelude::*;

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
 use rand::{RngExt, SeedableRng};

@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use ecod::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig};
 use ecod::wire::{ObjectReport, PerceivedObject};
 

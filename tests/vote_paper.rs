@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use ecod::landmark::Landmark;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::Landmark;
 use ecod::vote::{Vote, VoteConfig, VoteMode};
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 use nalgebra::Point2;

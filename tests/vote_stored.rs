@@ -1,7 +1,7 @@
 //! VOTE over votes that are kept: labels by annotators, and passes over them.
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::vote::{Vote, VoteConfig, WeightedConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
 

@@ -1,4 +1,4 @@
-//! From light to detections in the world: frame sources, detectors, lens, projection.
+//! Camera of a vehicle: frame sources, detectors, lens, calibration, and placing detections in the world.
 
 #[cfg(feature = "camera")]
 pub mod calibrate;

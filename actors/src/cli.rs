@@ -1,4 +1,4 @@
-//! The command line of `ecod-node`, and what that of `ecod-lab` shares with it.
+//! Command line of `ecod-node`, with the parts that `ecod-lab` shares.
 
 #[cfg(feature = "camera")]
 mod calibrate;
@@ -27,58 +27,74 @@ pub use replay::cell;
 #[cfg(fuzzing)]
 pub use replay::rounds_of_log;
 pub use report::{PageArguments, page};
-pub use run::RunArguments;
 
-/// Camera vehicles that see together: run a node of a cell, or one of the commands.
+use run::RunArguments;
+
+/// Cooperative perception of camera vehicles: run a node of a cell, or one of the commands
 #[derive(Debug, Parser)]
-#[command(name = "ecod-node", version, args_conflicts_with_subcommands = true, arg_required_else_help = true)]
+#[command(
+    name = "ecod-node",
+    version,
+    args_conflicts_with_subcommands = true,
+    arg_required_else_help = true,
+    after_long_help = logging::HELP
+)]
 struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
     #[command(flatten)]
     run: RunArguments,
-    /// Form of the log; RUST_LOG sets what is in it
-    #[arg(long, global = true, value_enum, value_name = "FORM", default_value_t)]
+    /// Format of log lines: auto, text, json or journal; `ecod-node --help` explains them
+    #[arg(
+        long,
+        global = true,
+        value_enum,
+        value_name = "FORM",
+        default_value_t,
+        help_heading = "Logging",
+        hide_short_help = true,
+        hide_possible_values = true
+    )]
     log_format: LogFormat,
 }
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Look whether a node can run here: camera, broker, ports, key, clock, disk; say what to fix
+    /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
     Doctor(doctor::DoctorArguments),
-    /// Join a cell as an observer and show it in this terminal
+    /// Join a cell as an observer and show it in the terminal
     Top(top::TopArguments),
-    /// Join a cell as an observer and record what all of it says (MCAP)
+    /// Join a cell as an observer and record all its messages (MCAP)
     Record(record::RecordArguments),
-    /// Run recorded reports again, in virtual time: the same input gives the same output
+    /// Fuse recorded reports again in virtual time: equal input gives equal output
     Replay(replay::ReplayArguments),
-    /// Write one page about a log: leadership, latency, gaps, reputations, coverage, drops
+    /// Write an HTML report about a log: leadership, latency, gaps, reputations, coverage, losses
     Report(report::ReportArguments),
     /// Calibrate a camera from photographs of a chessboard
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
-    /// Make a cell's certificates: its CA, one for each node, and the list of those that are revoked
+    /// Make the certificates of a cell: its CA, one per node, and the revocation list
     #[command(subcommand)]
     Pki(pki::PkiCommand),
     /// Print the JSON Schemas of every payload
     Schema,
-    /// Print what a shell needs to complete these commands
+    /// Print a completion script for a shell
     Completions(shell::CompletionsArguments),
     /// Write manual pages
     Man(shell::ManArguments),
 }
 
-/// The commands of `ecod-lab`, which is not installed on vehicles.
+/// Commands of `ecod-lab`, which is not installed on vehicles.
 const LAB_COMMANDS: [&str; 4] = ["bench", "demo", "eval", "testbed"];
 
-/// A command that failed, and how the process says so.
+/// A failed command and the exit code of the process.
 #[derive(Debug)]
 pub struct Failure {
     error: anyhow::Error,
     code: u8,
 }
 
-/// Exit code of a configuration or argument that cannot be used.
+/// Exit code for an unusable configuration or argument.
 const USAGE: u8 = 2;
 
 /// Runs the program with the process's arguments.
@@ -117,8 +133,8 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         Some(Command::Top(_)) => "off",
         Some(_) => "warn",
     };
-    let runs_on = matches!(&cli.command, None | Some(Command::Record(_)));
-    let _export = logging::start(cli.log_format, runs_on, level);
+    let is_service = matches!(&cli.command, None | Some(Command::Record(_)));
+    let _export = logging::start(cli.log_format, is_service, level);
     match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
@@ -135,10 +151,10 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     }
 }
 
-/// Writes to standard output. A reader that has seen enough, such as `head`, is no failure.
+/// Writes to standard output. A reader that closes it early, such as `head`, is no failure.
 ///
 /// # Errors
-/// When it cannot be written to.
+/// When it cannot be written.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut output = std::io::stdout().lock();
     match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {

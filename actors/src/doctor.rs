@@ -1,7 +1,7 @@
-//! What a node needs of its machine, looked at one by one before the node runs.
+//! Checks of what a node needs from its machine.
 //!
-//! Nothing is changed: ports are opened and closed again, files are made beside others and removed, a broker is
-//! connected to and left. While the node itself runs, its own ports are in use, which is said.
+//! The checks change nothing: they close the ports that they open, remove the files that they create, and disconnect
+//! from the broker. While the node itself runs, its ports are reported as in use.
 
 #[cfg(feature = "camera")]
 mod camera;
@@ -16,29 +16,29 @@ use serde::Serialize;
 
 use crate::node::config::NodeConfig;
 
-/// What was found out about one thing.
+/// Result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What was looked at.
+    /// Name of the check.
     pub check: &'static str,
-    /// How it is.
+    /// Outcome.
     pub verdict: CheckResult,
-    /// What was seen.
+    /// Observation.
     pub seen: String,
-    /// What to do about it.
+    /// Suggested fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fix: Option<String>,
 }
 
-/// How something is.
+/// Outcome of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CheckResult {
-    /// As it should be.
+    /// No problem.
     Fine,
-    /// The node runs, but not as well as it could.
+    /// The node runs, but with a limitation.
     Doubtful,
-    /// The node does not run, or not what it is for.
+    /// The node does not run, or cannot fulfil its role.
     Broken,
 }
 
@@ -56,7 +56,7 @@ impl Finding {
     }
 }
 
-/// Looks at everything that the configuration asks for; `config` is taken as valid, `file` is where it was read from.
+/// Runs all checks for a valid configuration that was read from `file`.
 pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     let mut findings = Vec::new();
     #[cfg(feature = "camera")]
@@ -82,7 +82,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 mod tests {
     use std::net::{TcpListener, UdpSocket};
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use ecod::wire::Role;
 
     use super::*;

@@ -1,13 +1,13 @@
-//! A cell in a terminal: who leads, what is where, who is trusted, what was lost. Drawn from what an observer knows.
+//! Terminal view of a cell, as an observer sees it: leader, locations and objects, nodes, losses.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ecod::epoch::Epoch;
 use ecod::leadership::Leadership;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
-use ecod::wire::{Reputations, Role, Verdicts};
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::wire::{Reputations, Verdict, Verdicts};
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Style, Stylize};
@@ -21,21 +21,21 @@ use crate::observe::readiness::{newest_round, patience};
 use crate::telemetry::counters::CounterSnapshot;
 use crate::transport::gossip::Member;
 
-/// Leaderships that are remembered.
+/// Maximum number of leaderships shown.
 const HISTORY: usize = 5;
 
-/// What is known of a cell at one moment.
+/// State of a cell at one moment.
 #[derive(Debug)]
 pub struct CellView {
     /// The cell's name.
     pub cell: NodeName,
-    /// Age beyond which a round is no longer to be relied on, where rounds come by themselves.
+    /// Age from which the newest round counts as stale, if rounds are periodic.
     pub patience: Option<Duration>,
     /// The present time.
     pub now: Timestamp,
-    /// Who leads.
+    /// The leadership.
     pub leadership: Leadership,
-    /// Leaderships whose rounds came, and since when; the newest last.
+    /// Leaderships by their first round, and the time of that round; newest last.
     pub history: VecDeque<(Epoch, Timestamp)>,
     /// The other nodes.
     pub members: Vec<Member>,
@@ -47,12 +47,12 @@ pub struct CellView {
     pub reputations: Option<Received<Reputations>>,
     /// The observer's counters.
     pub counters: CounterSnapshot,
-    /// How many lines of what is where are above the first that is shown.
+    /// Number of lines above the first visible one.
     pub scroll: usize,
 }
 
 impl CellView {
-    /// What `node` knows of the cell of this configuration; `before` hands on the history.
+    /// State of the node's cell; history and scroll position continue from `before`.
     pub fn of(node: &NodeHandle, config: &NodeConfig, before: Option<Self>, now: Timestamp) -> Self {
         let (history, scroll) = before.map(|before| (before.history, before.scroll)).unwrap_or_default();
         let mut view = Self {
@@ -68,12 +68,12 @@ impl CellView {
             counters: node.counters().snapshot(),
             scroll,
         };
-        view.remember();
+        view.update_history();
         view
     }
 
-    /// Takes note of who made the newest round.
-    fn remember(&mut self) {
+    /// Adds the leadership of the newest round to the history.
+    fn update_history(&mut self) {
         let Some((epoch, received_at)) = self.newest_round() else { return };
         if self.history.back().is_none_or(|(newest, _)| *newest != epoch) {
             self.history.push_back((epoch, received_at));
@@ -88,18 +88,18 @@ impl CellView {
     }
 }
 
-/// Draws the cell; scrolls back what was scrolled beyond the end.
+/// Draws the cell, and limits the scroll position to the last line.
 pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
     let [head, places, below, foot] =
         Layout::vertical([Constraint::Length(4), Constraint::Min(5), Constraint::Length(9), Constraint::Length(1)])
             .areas(frame.area());
     let [nodes, losses] = Layout::horizontal([Constraint::Percentage(60), Constraint::Percentage(40)]).areas(below);
-    let what_is_where = landmarks(view, places.height);
+    let table = locations(view, places.height);
     frame.render_widget(summary(view), head);
-    frame.render_widget(what_is_where, places);
+    frame.render_widget(table, places);
     frame.render_widget(vehicles(view), nodes);
     frame.render_widget(counted(view), losses);
-    frame.render_widget(Line::from(" q quits, arrow keys scroll").dim(), foot);
+    frame.render_widget(Line::from(" q: quit, arrow keys: scroll").dim(), foot);
 }
 
 fn summary(view: &CellView) -> Paragraph<'_> {
@@ -110,7 +110,7 @@ fn summary(view: &CellView) -> Paragraph<'_> {
             let standby = view.leadership.standby.as_ref().map_or_else(String::new, |name| format!(", next {name}"));
             Span::from(format!("{leader} leads in term {}{since}{standby}", epoch.term)).bold()
         }
-        _ => Span::from("nobody leads").bold().red(),
+        _ => Span::from("no leader").bold().red(),
     };
     let freshness = match view.newest_round().map(|(_, received_at)| view.now.since(received_at)) {
         Some(age) if view.patience.is_some_and(|patience| age > patience) => {
@@ -125,11 +125,11 @@ fn summary(view: &CellView) -> Paragraph<'_> {
     Paragraph::new(lines).block(Block::bordered().title(format!(" cell {} ", view.cell)))
 }
 
-/// What is where, as far as it finds room in a box of so many lines.
-fn landmarks(view: &mut CellView, height: u16) -> Table<'static> {
-    // The frame and the head take three.
+/// Table of locations and objects that fits a box of this height.
+fn locations(view: &mut CellView, height: u16) -> Table<'static> {
+    // Borders and header take three lines.
     let room = usize::from(height.saturating_sub(3)).max(1);
-    let rows = places(view);
+    let rows = location_rows(view);
     view.scroll = view.scroll.min(rows.len().saturating_sub(room));
     let (first, last) = (view.scroll, rows.len().min(view.scroll + room));
     let title = match rows.len() {
@@ -141,47 +141,30 @@ fn landmarks(view: &mut CellView, height: u16) -> Table<'static> {
     Table::new(rows.into_iter().skip(first).take(room), widths).header(head).block(Block::bordered().title(title))
 }
 
-fn places(view: &CellView) -> Vec<Row<'static>> {
-    let verdicts = view.verdicts.as_ref().map(|received| &received.message.verdicts);
-    let verdict = |id: &str| verdicts?.iter().find(|verdict| verdict.landmark == *id);
-    let mut rows = Vec::new();
-    for entry in view.map.iter().flat_map(|received| &received.map.landmarks) {
-        let voted = verdict(&entry.id).map_or([String::new(), String::new()], |verdict| {
-            [verdict.label.as_deref().unwrap_or("-").to_owned(), format!("{:.2}", verdict.margin)]
-        });
-        let [label, margin] = voted;
+fn location_rows(view: &CellView) -> Vec<Row<'static>> {
+    let verdicts = || view.verdicts.iter().flat_map(|received| &received.message.verdicts);
+    let landmarks = || view.map.iter().flat_map(|received| &received.map.landmarks);
+    let row = |place: String, label: &str, confidence: Option<f64>, verdict: Option<&Verdict>, by: &[NodeName]| {
+        let voted = verdict.map_or("", |verdict| verdict.label.as_deref().unwrap_or("-"));
+        let [confidence, margin] = [confidence, verdict.map(|verdict| verdict.margin)]
+            .map(|number| number.map_or_else(String::new, |number| format!("{number:.2}")));
+        let by = by.iter().map(NodeName::as_str).collect::<Vec<_>>().join(" ");
+        Row::new([place, label.to_owned(), confidence, voted.to_owned(), margin, by])
+    };
+    let mapped = landmarks().map(|entry| {
+        let verdict = verdicts().find(|verdict| verdict.landmark == entry.id);
         let nothing = if entry.observers.is_empty() { "unknown" } else { "empty" };
-        rows.push(Row::new([
-            entry.id.to_string(),
-            entry.label.as_deref().unwrap_or(nothing).to_owned(),
-            format!("{:.2}", entry.confidence),
-            label,
-            margin,
-            listed(&entry.contributors),
-        ]));
-    }
-    let mapped = |id: &str| view.map.iter().flat_map(|received| &received.map.landmarks).any(|entry| entry.id == *id);
-    for verdict in verdicts.into_iter().flatten().filter(|verdict| !mapped(&verdict.landmark)) {
-        rows.push(Row::new([
-            verdict.landmark.to_string(),
-            String::new(),
-            String::new(),
-            verdict.label.as_deref().unwrap_or("-").to_owned(),
-            format!("{:.2}", verdict.margin),
-            listed(&verdict.contributors),
-        ]));
-    }
-    for object in view.map.iter().flat_map(|received| &received.map.objects) {
-        rows.push(Row::new([
-            format!("{:.1}, {:.1} m", object.x_m, object.y_m),
-            object.label.to_string(),
-            format!("{:.2}", object.confidence),
-            String::new(),
-            String::new(),
-            listed(&object.contributors),
-        ]));
-    }
-    rows
+        let label = entry.label.as_deref().unwrap_or(nothing);
+        row(entry.id.to_string(), label, Some(entry.confidence), verdict, &entry.contributors)
+    });
+    let voted_only = verdicts().filter(|verdict| landmarks().all(|entry| entry.id != verdict.landmark));
+    let voted_only =
+        voted_only.map(|verdict| row(verdict.landmark.to_string(), "", None, Some(verdict), &verdict.contributors));
+    let objects = view.map.iter().flat_map(|received| &received.map.objects).map(|object| {
+        let place = format!("{:.1}, {:.1} m", object.x_m, object.y_m);
+        row(place, &object.label, Some(object.confidence), None, &object.contributors)
+    });
+    mapped.chain(voted_only).chain(objects).collect()
 }
 
 fn vehicles(view: &CellView) -> Table<'_> {
@@ -192,19 +175,19 @@ fn vehicles(view: &CellView) -> Table<'_> {
             .map_or_else(String::new, |it| format!("{:.2} {}+ {}-", it.score, it.correct, it.incorrect))
     };
     let members = view.members.iter().map(|member| {
-        let role = match member.role {
-            Role::Auto => "auto",
-            Role::Cav => "cav",
-            Role::Edge => "edge",
-        };
         let part = match &view.leadership {
             it if it.leader() == Some(&member.name) => "leads",
             it if it.standby.as_ref() == Some(&member.name) => "next",
             _ => "",
         };
-        Row::new([member.name.to_string(), role.to_owned(), part.to_owned(), trusted(&member.name)])
+        Row::new([
+            member.name.to_string(),
+            format!("{:?}", member.role).to_lowercase(),
+            part.to_owned(),
+            trusted(&member.name),
+        ])
     });
-    // Vehicles that take part by MQTT alone.
+    // Vehicles that take part over MQTT only.
     let is_member = |node: &NodeName| view.members.iter().any(|member| member.name == *node);
     let others = reputations.into_iter().flat_map(|reputations| reputations.keys()).filter(|node| !is_member(node));
     let others = others.map(|node| Row::new([node.to_string(), "mqtt".to_owned(), String::new(), trusted(node)]));
@@ -224,10 +207,6 @@ fn counted(view: &CellView) -> Table<'_> {
     Table::new(rows, [Constraint::Fill(1), Constraint::Length(10)]).block(Block::bordered().title(title))
 }
 
-fn listed(nodes: &[NodeName]) -> String {
-    nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(" ")
-}
-
 fn span(time: Duration) -> String {
     match time.as_secs() {
         seconds @ 0..120 => format!("{seconds} s"),
@@ -241,7 +220,7 @@ mod tests {
     use std::sync::Arc;
 
     use ecod::leadership::Position;
-    use ecod::wire::{GlobalMap, LandmarkState, SCHEMA_VERSION};
+    use ecod::wire::{GlobalMap, LandmarkState, Role, SCHEMA_VERSION};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
@@ -301,7 +280,7 @@ mod tests {
             counters: Counters::default().snapshot(),
             scroll: 0,
         };
-        view.remember();
+        view.update_history();
         view
     }
 
@@ -341,7 +320,7 @@ mod tests {
         assert!(shown(&mut by_packets, 100, 30).contains("newest round 5000 ms old"));
         let mut alone = CellView { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
         let text = shown(&mut alone, 100, 30);
-        assert!(text.contains("nobody leads") && text.contains("no round yet"), "{text}");
+        assert!(text.contains("no leader") && text.contains("no round yet"), "{text}");
     }
 
     #[test]
@@ -355,7 +334,7 @@ mod tests {
         for (now_us, freshness) in [(7_200_000, "newest round 300 ms old"), (12_000_000, "STALE: no round for 5 s")] {
             let (verdicts, history) = (verdicts.clone(), VecDeque::clone(&history));
             let mut voting = CellView { map: None, verdicts, history, ..view(Timestamp(now_us)) };
-            voting.remember();
+            voting.update_history();
             let text = shown(&mut voting, 100, 30);
             assert!(text.contains(freshness) && text.contains("before: edge@3"), "{text}");
         }

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
 use ecod::leadership::Position;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::config::NodeConfig;

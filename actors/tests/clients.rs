@@ -7,8 +7,8 @@ use std::process::{Command, Output, Stdio};
 use std::thread::{JoinHandle, sleep};
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};

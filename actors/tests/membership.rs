@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;

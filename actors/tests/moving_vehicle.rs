@@ -6,9 +6,9 @@ use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{Limits, ObjectReport, Role, decode};
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};

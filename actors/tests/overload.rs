@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{Encoding, ObjectReport, PerceivedObject, Role, encode};
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{Topic, Topics};
 
 const REGENERATE: &str = "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test schema";

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use ecod::aggregator::Algorithms;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::config::NodeConfig;

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use ecod::aggregator::Algorithms;
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::vote::VoteMode;
 use ecod::wire::{
     ObjectReport, PerceivedObject, RejectReason, ReportKind, Reputation, Reputations, Role, Verdict, decode,

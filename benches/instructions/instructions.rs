@@ -4,13 +4,13 @@
 
 use std::hint::black_box;
 
-use ecod::detection::Detection;
-use ecod::geometry::Pose;
 use ecod::leadership::election::{Election, ElectionEffect, ElectionInput};
-use ecod::names::NodeName;
+use ecod::model::detection::Detection;
+use ecod::model::geometry::Pose;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::pace::Pace;
-use ecod::projection::Projection;
-use ecod::time::Timestamp;
+use ecod::perception::projection::Projection;
 use ecod::vote::Vote;
 use ecod::wire::{Encoding, Limits, ObjectReport, decode_report};
 use ecod_instructions as workload;

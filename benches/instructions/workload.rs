@@ -3,16 +3,16 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
-use ecod::epoch::Epoch;
-use ecod::geometry::Pose;
-use ecod::landmark::{Landmark, LandmarkIndex};
 use ecod::leadership::election::{Body, Candidacy, Election, ElectionConfig, ElectionInput, ElectionMessage, Health};
-use ecod::names::NodeName;
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::epoch::Epoch;
+use ecod::model::geometry::Pose;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig};
-use ecod::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
-use ecod::time::Timestamp;
+use ecod::perception::camera::Intrinsics;
+use ecod::perception::landmark::{Landmark, LandmarkIndex};
+use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
 use ecod::vote::{Vote, VoteConfig};
 use ecod::wire::{Encoding, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, WirePose, encode};
 use nalgebra::Point2;

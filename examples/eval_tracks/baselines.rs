@@ -7,8 +7,8 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use ecod::names::{Label, NodeName};
-use ecod::time::Timestamp;
+use ecod::model::names::{Label, NodeName};
+use ecod::model::time::Timestamp;
 use ecod::wire::ObjectReport;
 use ecod_lab::eval::tracks::SaidObject;
 use nalgebra::{Point2, Vector2};

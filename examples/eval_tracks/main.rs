@@ -21,9 +21,9 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
-use ecod::geometry::Covariance;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::geometry::Covariance;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind, SCHEMA_VERSION};
 use ecod_lab::eval::tracks::{AP_DISTANCES_M, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
 use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ecod::epoch::Epoch;
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role};
 use ecod_actors::messages::actor_slot::ActorSlot;
 use ecod_actors::messages::gateway::GatewayMessage;

@@ -13,8 +13,8 @@ mod cell;
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use ecod::epoch::Epoch;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 use ecod_actors::platform::clock;
 use tokio::runtime::Builder;

@@ -16,9 +16,9 @@ use std::time::Duration;
 
 use anyhow::ensure;
 use ecod::aggregator::FusionConfig;
-use ecod::landmark::{Landmark, LandmarkConfig};
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::{Landmark, LandmarkConfig};
 use ecod::wire::{ObjectReport, PerceivedObject};
 
 use vehicle::{Payload, Vehicle};

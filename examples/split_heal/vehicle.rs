@@ -7,8 +7,6 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
-use ecod::epoch::Epoch;
-use ecod::landmark::Landmark;
 use ecod::leadership::Leadership;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
@@ -16,9 +14,11 @@ use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
 use ecod::leadership::round_filter::RoundFilter;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::Landmark;
 use ecod::reputation::ReputationLedger;
-use ecod::time::Timestamp;
 use ecod::wire::{
     Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, ReportKind, Role, decode, decode_report,
     decode_share, encode,
@@ -124,7 +124,7 @@ impl Vehicle {
         if now >= self.tick_at {
             self.tick_at = now + SHARE_PERIOD;
             let shares = self.resync.tick(&self.ledger, &self.leadership, now);
-            self.share(shares);
+            self.share(&shares);
         }
         self.alarm = self.alarm.min(self.aggregator.deadline());
         if now < self.alarm {
@@ -168,7 +168,7 @@ impl Vehicle {
     fn publish(&mut self, fused: Fused, now: Timestamp) -> anyhow::Result<()> {
         let Fused { epoch, map, evidence, .. } = fused;
         let shares = self.resync.record(&epoch, &evidence, &mut self.ledger);
-        self.share(shares);
+        self.share(&shares);
         *self.settled.entry(epoch).or_default() += evidence.len() as u64;
         let map = map.context("PACE does not run")?;
         self.outbox.push((None, Payload::Map(encode(&map, Encoding::Cbor))));
@@ -192,10 +192,10 @@ impl Vehicle {
         if merged.is_news {
             self.aggregator.adopt(&self.ledger);
         }
-        self.share(merged.shares);
+        self.share(&merged.shares);
     }
 
-    fn share(&mut self, shares: Vec<LedgerShare>) {
+    fn share(&mut self, shares: &[LedgerShare]) {
         let shares = shares.iter().map(|share| (None, Payload::Evidence(encode(share, Encoding::Cbor))));
         self.outbox.extend(shares);
     }
@@ -220,7 +220,7 @@ impl Vehicle {
                 self.news.push(format!("{epoch} leads from #{first_round}"));
                 self.resync.lead(epoch.clone());
                 self.aggregator.lead(epoch, first_round, first, now);
-                self.share(self.resync.snapshot(&self.ledger));
+                self.share(&self.resync.snapshot(&self.ledger));
             }
             Effect::HoldRound => self.aggregator.hold(),
             Effect::StopPublishing { epoch } => {
@@ -228,7 +228,7 @@ impl Vehicle {
                 self.resync.step_down();
                 self.aggregator.step_down();
             }
-            Effect::SendSnapshot { .. } => self.share(self.resync.snapshot(&self.ledger)),
+            Effect::SendSnapshot { .. } => self.share(&self.resync.snapshot(&self.ledger)),
             Effect::Look => {
                 let members = self.members.values().cloned().collect();
                 return Some(Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members });

@@ -6,13 +6,13 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::aggregator::round::FirstRound;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
-use ecod::epoch::Epoch;
-use ecod::landmark::Landmark;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::pace::PaceMode;
-use ecod::round::FirstRound;
-use ecod::time::Timestamp;
+use ecod::perception::landmark::Landmark;
 use ecod::tracking::TracksMode;
 use ecod::vote::VoteMode;
 use ecod::wire::{
@@ -148,7 +148,7 @@ fn object(object: &Object) -> PerceivedObject {
     }
 }
 
-fn label(index: u8) -> ecod::names::Label {
+fn label(index: u8) -> ecod::model::names::Label {
     ["car", "truck", "cup", "EMPTY", "ABCD123"][usize::from(index % 5)].into()
 }
 

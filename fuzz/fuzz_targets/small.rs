@@ -6,8 +6,8 @@
 
 use std::sync::LazyLock;
 
-use ecod::detection::parse_detections;
-use ecod::time::Timestamp;
+use ecod::model::detection::parse_detections;
+use ecod::model::time::Timestamp;
 use ecod_actors::actors::reputation_keeper::read_saved;
 use ecod_actors::camera::vehicle_pose::read_pose;
 use ecod_actors::node::config::NodeConfig;

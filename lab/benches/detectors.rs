@@ -6,11 +6,11 @@ mod figures;
 use std::time::Instant;
 
 use anyhow::Context;
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
-use ecod::geometry::Pose;
-use ecod::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig};
-use ecod::time::Timestamp;
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::geometry::Pose;
+use ecod::model::time::Timestamp;
+use ecod::perception::camera::Intrinsics;
+use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig};
 use ecod_actors::camera::corner_pose::locate_target;
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::coco::{CocoConfig, CocoDetector};

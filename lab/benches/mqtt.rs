@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments, ReportKind};
 use ecod_actors::messages::gateway::GatewayMessage;

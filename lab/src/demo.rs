@@ -18,9 +18,9 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod::aggregator::{Aggregator, Fused};
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ReportKind, Role};
 use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::messages::newest::ReceivedMap;

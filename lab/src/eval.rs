@@ -14,10 +14,10 @@ mod votes;
 
 use std::collections::BTreeMap;
 
-use ecod::landmark::{LandmarkGate, LandmarkIndex};
-use ecod::names::{Label, LandmarkId, NodeName};
+use ecod::model::names::{Label, LandmarkId, NodeName};
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
 use ecod::replay::FusedLine;
-use ecod::time::Timestamp;
 use ecod::wire::{ObjectReport, ReportKind};
 use serde::Serialize;
 

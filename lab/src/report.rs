@@ -2,7 +2,7 @@
 
 pub(crate) mod tracks;
 
-use ecod::landmark::{Landmark, LandmarkIndex};
+use ecod::perception::landmark::{Landmark, LandmarkIndex};
 use ecod::replay::FusedLine;
 use ecod::wire::{ObjectReport, ReportKind};
 use ecod_actors::observe::recorder::LogIdentity;

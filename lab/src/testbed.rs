@@ -19,10 +19,10 @@ pub mod trial;
 
 use std::time::Duration;
 
-use ecod::camera::Intrinsics;
-use ecod::geometry::Pose;
-use ecod::landmark::{Landmark, VacancySign};
-use ecod::names::{Label, LandmarkId, NodeName};
+use ecod::model::geometry::Pose;
+use ecod::model::names::{Label, LandmarkId, NodeName};
+use ecod::perception::camera::Intrinsics;
+use ecod::perception::landmark::{Landmark, VacancySign};
 use nalgebra::Point2;
 
 pub use file::TestbedError;

@@ -23,9 +23,9 @@ mod walk;
 
 use std::time::Duration;
 
-use ecod::geometry::Pose;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::geometry::Pose;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::ObjectReport;
 use nalgebra::Point2;
 use serde::Serialize;

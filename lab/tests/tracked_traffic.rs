@@ -6,7 +6,7 @@ mod baselines;
 use std::sync::Arc;
 
 use ecod::aggregator::{Aggregator, Algorithms, FusionConfig};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
 use ecod_lab::eval::tracks::{TrackEvaluation, TrackTruth};
 use ecod_lab::traffic::{SaidConfig, TrafficConfig, TrafficRecording, TruthFrame, generate};

@@ -8,11 +8,11 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Aggregator, Fused};
-use crate::epoch::Epoch;
-use crate::names::NodeName;
+use crate::aggregator::round::FirstRound;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::reputation::ReputationLedger;
-use crate::round::FirstRound;
-use crate::time::Timestamp;
 use crate::wire::{GlobalMap, Reputation};
 
 /// A call of an aggregator's method of the same name.

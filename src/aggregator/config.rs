@@ -2,13 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::admission::report_window::WindowConfig;
+use crate::aggregator::round::RoundConfig;
 use crate::config::ConfigError;
 use crate::pace::PaceConfig;
 use crate::reputation::ReputationConfig;
-use crate::round::RoundConfig;
 use crate::tracking::{TracksConfig, TracksMode};
 use crate::vote::VoteConfig;
-use crate::window::WindowConfig;
 
 /// The algorithms that a cell runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]

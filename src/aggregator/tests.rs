@@ -1,9 +1,10 @@
-use super::*;
-use crate::round::{RoundClose, RoundConfig};
-use crate::vote::VoteConfig;
-use crate::wire::PerceivedObject;
 use ReportKind::{Detections, VoteDetections};
 use nalgebra::Point2;
+
+use super::*;
+use crate::aggregator::round::{RoundClose, RoundConfig};
+use crate::vote::VoteConfig;
+use crate::wire::PerceivedObject;
 
 const START: u64 = 1_732_154_400_000_000;
 

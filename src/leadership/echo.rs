@@ -5,7 +5,7 @@
 //! does not blame its broker.
 
 use crate::leadership::timers::{ECHO_TIMEOUT, MIN_UNANSWERED};
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Number and age of the messages sent since anything came in on a link.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]

@@ -10,7 +10,7 @@
 //!
 //! - *Machine*: [`Election::new`], [`Election::handle`], [`Election::tick`], [`Election::next_deadline`].
 //! - *Questions*, which change nothing: [`Election::epoch`], [`Election::leader`], [`Election::is_leading`],
-//!   [`Election::standby`], [`Election::floor`].
+//!   [`Election::standby`], [`Election::term`].
 //!
 //! # States
 //!
@@ -21,7 +21,7 @@
 //!
 //! 1. No two leaderships share an [`Epoch`]: a node uses a term once, and the epoch holds its name. The term is handed to
 //!    the disk first; see [`ElectionEffect::Lead`] for a disk that fails.
-//! 2. The epoch that a node follows or leads never goes back while it runs, nor below [`Election::floor`] after a
+//! 2. The epoch that a node follows or leads never goes back while it runs, nor below the saved term after a
 //!    restart.
 //! 3. A component whose links all work both ways, left alone, has exactly one leader: the best candidate by role and
 //!    priority, if one is fit.
@@ -55,16 +55,15 @@ mod message;
 mod peers;
 mod seeking;
 
-use crate::epoch::Epoch;
-use crate::names::NodeName;
-use crate::time::Timestamp;
-use crate::wire::SCHEMA_VERSION;
-
 pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
 pub use interface::{ElectionEffect, ElectionInput, Health};
-pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM};
+pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP};
 
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+use crate::wire::SCHEMA_VERSION;
 use leading::Leading;
 use liveness::Following;
 use peers::Peers;
@@ -239,10 +238,10 @@ impl Election {
     }
 
     fn receive(&mut self, message: ElectionMessage, now: Timestamp) {
-        if message.from == self.id || message.term > MAX_TERM || !self.peers.note(&message, now) {
+        if message.from == self.id || !self.is_plausible(message.term) || !self.peers.note(&message, now) {
             return;
         }
-        self.terms.seen = self.terms.seen.max(message.term);
+        self.learn_term(message.term);
         self.hear_others(&message, now);
         let ElectionMessage { from, epoch, hears_you, .. } = message;
         match message.body {
@@ -259,6 +258,17 @@ impl Election {
             Body::Ready => self.take_ready(&from, now),
             Body::Yield { last_round } => self.take_yield(&from, epoch.as_ref(), last_round, now),
             Body::Resign { epoch, last_round } => self.take_resign(&epoch, last_round, now),
+        }
+    }
+
+    /// Whether a term is near enough to the known ones to be one of this cell.
+    fn is_plausible(&self, term: u64) -> bool {
+        term <= MAX_TERM.min(self.terms.seen + MAX_TERM_STEP)
+    }
+
+    fn learn_term(&mut self, term: u64) {
+        if self.is_plausible(term) {
+            self.terms.seen = self.terms.seen.max(term);
         }
     }
 
@@ -362,3 +372,39 @@ struct Beat {
 
 /// One step of advertised load, in percent.
 const LOAD_QUARTER: u8 = 25;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::Role;
+
+    #[test]
+    fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
+        let now = Timestamp(1_000_000);
+        let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 7, now);
+        let mut hear = |seq, term| {
+            let message = ElectionMessage {
+                schema: SCHEMA_VERSION,
+                from: NodeName::from_static("gauss"),
+                run: 1,
+                seq,
+                candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+                term,
+                epoch: None,
+                hears_you: true,
+                body: Body::Status { over: None },
+            };
+            election.handle(ElectionInput::Receive { message }, now);
+            election.handle(
+                ElectionInput::Round { epoch: Epoch::new(term, NodeName::from_static("gauss")), round: 1 },
+                now,
+            );
+            election.term()
+        };
+        let cell = 5000;
+        assert_eq!(hear(1, cell), cell, "a node that joins learns the cell's term");
+        assert_eq!(hear(2, MAX_TERM), cell);
+        assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), cell);
+        assert_eq!(hear(4, cell + 1), cell + 1);
+    }
+}

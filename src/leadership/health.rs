@@ -11,7 +11,7 @@ use crate::leadership::election::{AwakeClock, Health};
 use crate::leadership::links::{Brokers, DataPlane, LinkState};
 use crate::leadership::readiness::round_timeout;
 use crate::leadership::timers::{HEALTH_PERIOD, LOOK_TOLERANCE};
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// The latest news of the parts.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -11,12 +11,12 @@
 
 use std::collections::BTreeSet;
 
-use crate::epoch::Epoch;
 use crate::leadership::timers::FULL_RESYNC_PAUSE;
 use crate::leadership::view::Leadership;
-use crate::names::NodeName;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::reputation::{EntryKey, Evidence, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION};
 
 /// Number of times that a leader is sent what it was not told, in case it was lost.

@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 
 use crate::leadership::address::BrokerAddress;
 use crate::leadership::timers::LINK_LINGER;
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Brokers that carry a cell's reports and maps.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -24,19 +24,18 @@ use std::time::Duration;
 
 use uuid::Uuid;
 
-use crate::epoch::Epoch;
+pub use interface::{Effect, Input, Member, NodeSettings, Notice};
+
 use crate::leadership::address::BrokerAddress;
 use crate::leadership::election::{Election, ElectionEffect, ElectionInput, Health};
 use crate::leadership::health::HealthMonitor;
 use crate::leadership::links::{Brokers, LinkState, Links};
 use crate::leadership::timers::{DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME};
 use crate::leadership::view::Leadership;
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::{NodeState, NodeStatus};
-
-pub use interface::{Effect, Input, Member, NodeSettings, Notice};
-
 use members::Members;
 
 /// Most nodes whose runs are remembered: brokers may tell of any number of names.

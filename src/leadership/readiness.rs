@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use crate::epoch::Epoch;
 use crate::leadership::timers::PART_TIMEOUT;
 use crate::leadership::view::Leadership;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::time::Timestamp;
 
 /// Readiness of a node, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -59,7 +59,7 @@ impl Readiness {
 mod tests {
     use super::*;
     use crate::leadership::view::Position;
-    use crate::names::NodeName;
+    use crate::model::names::NodeName;
 
     const TIMEOUT: Option<Duration> = Some(Duration::from_secs(2));
 

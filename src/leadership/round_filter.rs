@@ -21,17 +21,17 @@ mod publisher;
 mod staleness;
 mod succession;
 
-use crate::epoch::Epoch;
-use crate::leadership::timers::EPOCH_MEMORY;
-use crate::leadership::view::Leadership;
-use crate::names::NodeName;
-use crate::time::Timestamp;
-use crate::wire::{GlobalMap, RejectReason, Reputations, Verdicts};
-
 pub use epoch_gate::EpochGate;
 pub use publisher::PublisherFilter;
 pub use staleness::StalenessFilter;
 pub use succession::SuccessionFilter;
+
+use crate::leadership::timers::EPOCH_MEMORY;
+use crate::leadership::view::Leadership;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+use crate::wire::{GlobalMap, RejectReason, Reputations, Verdicts};
 
 /// Filter of the maps, verdicts and reputations that arrive at one node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

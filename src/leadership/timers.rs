@@ -5,14 +5,14 @@
 //!
 //! | timer | value | must be | because |
 //! |---|---|---|---|
-//! | [`ElectionConfig::standby_silence`] | `beat * silence_beats`, 200 ms | below [`ELECTED_SILENCE`] | a round of the new leader is accepted when it comes |
-//! | [`ElectionConfig::response_timeout`] | four of these, 800 ms | above a claim, an answer and a retry | it ends what those concerned do at once |
-//! | [`ElectionConfig::given_up_timeout`] | two of these, 400 ms | between both above | the membership's word weighs less than the leader's beats |
-//! | [`ElectionConfig::ask_period`] | one of these, 200 ms | not above an answer's wait | lost questions are repeated in time |
-//! | [`ElectionConfig::answer_time`] | `claim_step * 2`, 120 ms | below [`ElectionConfig::ask_period`] | who is asked answers before the next question |
-//! | [`ElectionConfig::near_beat`] | `beat * 8`, 400 ms | below [`ElectionConfig::response_timeout`] | a second successor hears of a new standby in time |
-//! | [`ElectionConfig::contact_timeout`] | `idle_beat * 5/2`, 6.25 s | above two idle beats | one lost beat is no lost contact |
-//! | [`overdue`], [`missing`] | 3/2 and 5/2 of a round interval | in this order | doubt comes before loss |
+//! | `standby_silence` | `beat * silence_beats`, 200 ms | below [`ELECTED_SILENCE`] | a round of the new leader is accepted when it comes |
+//! | `response_timeout` | four of these, 800 ms | above a claim, an answer and a retry | it ends what those concerned do at once |
+//! | `given_up_timeout` | two of these, 400 ms | between both above | the membership's word weighs less than the leader's beats |
+//! | `ask_period` | one of these, 200 ms | not above an answer's wait | lost questions are repeated in time |
+//! | `answer_time` | `claim_step * 2`, 120 ms | below `ask_period` | who is asked answers before the next question |
+//! | `near_beat` | `beat * 8`, 400 ms | below `response_timeout` | a second successor hears of a new standby in time |
+//! | `contact_timeout` | `idle_beat * 5/2`, 6.25 s | above two idle beats | one lost beat is no lost contact |
+//! | `overdue`, `missing` | 3/2 and 5/2 of a round interval | in this order | doubt comes before loss |
 //! | [`ELECTED_SILENCE`] | 250 ms | above two rounds | one late round is no silence |
 //! | [`SUCCESSOR_CREDIT`] | 500 ms | twice [`ELECTED_SILENCE`] | word of the election comes within it |
 //! | [`EPOCH_MEMORY`] | 3 s | above [`MAX_ROUND_AGE`] and [`SUCCESSOR_CREDIT`] | a forged epoch ends, a queued round does not return |
@@ -28,13 +28,13 @@
 //! | [`PART_TIMEOUT`] | 2 s and three rounds | above [`ECHO_TIMEOUT`] | a stalled broker is found by its missing echo |
 //! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part as long as two looks |
 //! | [`ECHO_TIMEOUT`] | 800 ms | above [`MIN_UNANSWERED`] rounds | both conditions hold at about the same time |
-//! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::round::CONNECT_TIME`] | a planned handover waits for everybody |
+//! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::aggregator::round::CONNECT_TIME`] | a planned handover waits for everybody |
 //! | [`LEDGER_TIMEOUT`] | 1 s | above [`VEHICLE_CONNECT_TIME`], below `handover` | a lost ledger delays a handover and does not end it |
 //! | [`PREPARATION_STEP`] | 50 ms | below [`VEHICLE_CONNECT_TIME`] | it delays a handover by little |
 //! | [`LATE_WAKE`] | 20 ms | below `stall_ms` | messages are read before lateness stops the clock |
 //! | [`DRAIN_TIME`] | 10 ms | below [`LATE_WAKE`] | the delay itself is no late timer |
 //! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is understood after its node was given up |
-//! | [`REDISCOVERY_TIME`] | 2 s | above [`ElectionConfig::response_timeout`] | a membership that restarts costs no leader |
+//! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a membership that restarts costs no leader |
 //! | [`DISK_TIMEOUT`] | 1 s | below `handover` | a hung disk delays a handover and does not end it |
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
 
@@ -208,7 +208,7 @@ impl ElectionConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::round::{CONNECT_TIME, RoundConfig};
+    use crate::aggregator::round::{CONNECT_TIME, RoundConfig};
 
     /// Every line of the table above.
     #[test]

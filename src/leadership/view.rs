@@ -2,9 +2,9 @@
 
 use serde::Serialize;
 
-use crate::epoch::Epoch;
 use crate::leadership::election::Election;
-use crate::names::NodeName;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
 
 /// The leader and its standby, as one node sees them.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]

@@ -29,9 +29,9 @@ use self::consensus::{LabelScores, NamedBelief, WeightedMean};
 use super::assignment::{Pairing, one_to_one};
 use super::grouping::{ByPlace, Grouping, Place};
 use super::{PaceConfig, PaceRound};
-use crate::landmark::{Landmark, LandmarkCandidate, LandmarkIndex};
-use crate::names::{Label, NodeName};
-use crate::time::Timestamp;
+use crate::model::names::{Label, NodeName};
+use crate::model::time::Timestamp;
+use crate::perception::landmark::{Landmark, LandmarkCandidate, LandmarkIndex};
 use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
 
 /// The beliefs about one place; most places are in view of few vehicles.

@@ -1,6 +1,6 @@
 //! Regrouping of items from vehicles to places.
 
-use crate::names::NodeName;
+use crate::model::names::NodeName;
 
 /// Index of something that vehicles observe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]

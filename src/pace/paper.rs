@@ -13,9 +13,9 @@ use smallvec::SmallVec;
 
 use super::grouping::{Grouping, Place, VehicleItems};
 use super::{PaceConfig, PaceRound};
-use crate::landmark::{Landmark, LandmarkIndex};
-use crate::names::{Label, NodeName};
-use crate::time::Timestamp;
+use crate::model::names::{Label, NodeName};
+use crate::model::time::Timestamp;
+use crate::perception::landmark::{Landmark, LandmarkIndex};
 use crate::wire::{LandmarkState, ObjectReport};
 
 /// See the module.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Maximum gap before the last line of a recording.
 const LAST_STEP: Duration = Duration::from_secs(3600);

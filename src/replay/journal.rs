@@ -12,12 +12,12 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::FusedLine;
+use crate::aggregator::round::FirstRound;
 use crate::aggregator::{Aggregator, Command, Fused, FusionConfig};
-use crate::epoch::Epoch;
-use crate::landmark::Landmark;
+use crate::model::epoch::Epoch;
+use crate::model::time::Timestamp;
+use crate::perception::landmark::Landmark;
 use crate::reputation::ReputationLedger;
-use crate::round::FirstRound;
-use crate::time::Timestamp;
 use crate::wire::{ObjectReport, RejectReason, ReportKind};
 
 /// One entry of a journal. Reports are kept beside it.

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::{GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode};
 
 /// One line of a replay's output.

@@ -1,8 +1,8 @@
 use nalgebra::Point2;
 
 use super::*;
-use crate::geometry::Pose;
-use crate::landmark::VacancySign;
+use crate::model::geometry::Pose;
+use crate::perception::landmark::VacancySign;
 use crate::vote::VoteMode;
 use crate::wire::{Encoding, PerceivedObject, WirePose, encode};
 

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::marks::Marks;
 use super::{Counts, Evidence, RememberedVotes, ReputationConfig};
-use crate::epoch::Epoch;
-use crate::names::{Label, NodeName};
+use crate::model::epoch::Epoch;
+use crate::model::names::{Label, NodeName};
 use crate::wire::{LedgerMark, Reputation};
 
 /// The votes of one vehicle in one lane.

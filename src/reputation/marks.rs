@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use super::ledger::{Record, ReputationLedger};
 use super::{Counts, Evidence};
-use crate::epoch::Epoch;
-use crate::names::NodeName;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
 use crate::wire::LedgerMark;
 
 /// Votes from one mark to the next.

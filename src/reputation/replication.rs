@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 
 use super::Counts;
 use super::ledger::{Record, ReputationLedger};
-use crate::epoch::Epoch;
-use crate::names::{Label, NodeName};
+use crate::model::epoch::Epoch;
+use crate::model::names::{Label, NodeName};
 use crate::wire::{LedgerEntry, LedgerMark};
 
 /// Maximum number of lanes: the latest are kept.

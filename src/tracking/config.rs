@@ -5,8 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::registration::BiasPrior;
 use crate::config::{ConfigError, check_range};
-use crate::names::Label;
-use crate::wire::is_label;
+use crate::model::names::{Label, is_label};
 
 /// Cells in which objects at no known location are tracked.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

@@ -6,7 +6,7 @@ use smallvec::SmallVec;
 
 use super::existence::SensorHistory;
 use super::sensors::SensorId;
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Maximum number of vehicles in a track's history.
 const MAX_SLOTS: usize = 32;

@@ -10,7 +10,7 @@ use nalgebra::Vector2;
 
 use super::sensors::SensorId;
 use super::trust::JUDGED_AFTER;
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Time constant in seconds with which evidence fades.
 const MEMORY_S: f64 = 3.0;

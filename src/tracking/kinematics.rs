@@ -9,7 +9,7 @@
 
 use nalgebra::{Matrix2, Vector2};
 
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Measured position of an object in one frame, with its errors.
 #[derive(Debug, Clone, Copy)]

@@ -11,8 +11,8 @@ use super::kinematics::Measurement;
 use super::sensors::Sensors;
 use super::store::{TrackIndex, TrackStore};
 use super::track::Track;
-use crate::geometry::Covariance;
-use crate::time::Timestamp;
+use crate::model::geometry::Covariance;
+use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, GlobalMap, ObjectReport};
 
 /// Maximum distance of two tracks of one object, metres.

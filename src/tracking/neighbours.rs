@@ -5,7 +5,7 @@ use std::time::Duration;
 use smallvec::SmallVec;
 use uuid::Uuid;
 
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Weight of one look in the resolved share.
 const LOOK_WEIGHT: f64 = 0.25;

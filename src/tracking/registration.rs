@@ -16,8 +16,8 @@ use nalgebra::{Matrix2, Matrix4, Rotation2, Vector2, Vector4};
 use super::config::TracksConfig;
 use super::sensors::{SensorId, Sensors};
 use super::store::{TrackIndex, TrackStore};
-use crate::geometry::wrap_angle;
-use crate::time::Timestamp;
+use crate::model::geometry::wrap_angle;
+use crate::model::time::Timestamp;
 use crate::wire::PoseCorrection;
 
 /// Maximum time between two detections of an object that correspond.

@@ -8,10 +8,10 @@ use super::config::TracksConfig;
 use super::coverage::Coverage;
 use super::registration::Registration;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
-use crate::geometry::Covariance;
-use crate::names::NodeName;
+use crate::model::geometry::Covariance;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{ObjectReport, PerceivedObject};
 
 /// Number of a vehicle that is heard. [`Sensors::forget_silent`] frees it for another vehicle.

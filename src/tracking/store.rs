@@ -9,7 +9,7 @@ use super::config::TracksConfig;
 use super::grid::{IndexedTrack, TrackGrid};
 use super::sensors::SensorId;
 use super::track::Track;
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Position of a track in the store. [`TrackStore::retain`] invalidates it; nothing keeps one across that call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

@@ -15,7 +15,7 @@ use uuid::Uuid;
 use super::coverage::Coverage;
 use super::kinematics::{KinematicState, Measurement};
 use super::*;
-use crate::geometry::Covariance;
+use crate::model::geometry::Covariance;
 use crate::reputation::ReputationConfig;
 use crate::wire::{FieldOfView, GlobalMap, ObjectReport, PerceivedObject, SCHEMA_VERSION, WirePose};
 

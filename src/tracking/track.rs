@@ -15,9 +15,9 @@ use super::kinematics::{KinematicState, Measurement};
 use super::neighbours::Neighbours;
 use super::sensors::SensorId;
 use super::store::TrackIndex;
-use crate::geometry::{Covariance, wrap_angle};
-use crate::names::{Label, NodeName};
-use crate::time::Timestamp;
+use crate::model::geometry::{Covariance, wrap_angle};
+use crate::model::names::{Label, NodeName};
+use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, PerceivedObject};
 
 /// Maximum age of another vehicle's detection that confirms a track.

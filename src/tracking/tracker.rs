@@ -10,9 +10,9 @@ use super::sensors::Sensors;
 use super::store::TrackStore;
 use super::update::{ReportOutcome, ReportUpdate};
 use super::{TracksLosses, TracksRound};
-use crate::names::NodeName;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{FusedObject, GlobalMap, ObjectReport, PerceivedObject, PoseCorrection};
 
 /// Tracks objects; see the [module](super).

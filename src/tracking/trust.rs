@@ -11,9 +11,9 @@ use std::time::Duration;
 use super::detection_history::DetectionHistory;
 use super::existence::Statement;
 use super::sensors::SensorId;
-use crate::names::NodeName;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::reputation::ReputationConfig;
-use crate::time::Timestamp;
 
 /// Time between judgements of a vehicle's statement about an object.
 pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);

@@ -16,8 +16,8 @@ use super::sensors::SensorModel;
 use super::store::{TrackIndex, TrackStore};
 use super::track::Track;
 use super::trust::{Fleet, Judgement};
+use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
-use crate::time::Timestamp;
 use crate::wire::{ObjectReport, PerceivedObject};
 
 /// Standard deviation of reported velocities, m/s.

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range, config_section};
-use crate::landmark::check_synonyms;
-use crate::names::Label;
+use crate::model::names::Label;
+use crate::perception::landmark::check_synonyms;
 
 /// Maximum number of labels of a cell.
 pub const MAX_LABELS: usize = 65_535;

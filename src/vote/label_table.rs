@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::confusion::LabelIndex;
-use crate::names::Label;
-use crate::time::Timestamp;
+use crate::model::names::Label;
+use crate::model::time::Timestamp;
 
 /// Inverse share of the labels that is evicted at once, so that the cost per new label stays small.
 const EVICTION_DIVISOR: usize = 8;

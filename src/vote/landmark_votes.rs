@@ -6,7 +6,7 @@ use super::calibration::{Calibration, Weights};
 use super::confusion::LabelIndex;
 use super::dawid_skene::{DawidSkene, WeightedVote};
 use super::dependence::Dependence;
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Independent part of a vehicle's statements: one frame is much like the next.
 const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;

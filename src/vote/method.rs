@@ -1,13 +1,11 @@
-//! The ways to turn votes into verdicts.
+//! A method that turns votes into verdicts, and what all methods share.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::config::{VoteConfig, VoteMode};
-use super::paper::PaperVoting;
-use super::weighted::WeightedVoting;
-use crate::names::{Label, LandmarkId, NodeName};
+use super::config::VoteConfig;
+use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
 
 /// A vote before it is counted.
@@ -64,36 +62,6 @@ pub(super) trait VotingMethod {
 
     /// See [`super::Vote::resume`].
     fn resume(&mut self, _reputations: &BTreeMap<NodeName, Reputation>) {}
-}
-
-/// The configured method.
-#[derive(Debug, Clone)]
-pub(super) enum Method {
-    Paper(PaperVoting),
-    Weighted(Box<WeightedVoting>),
-}
-
-impl Method {
-    pub(super) fn new(config: &VoteConfig) -> Self {
-        match config.mode {
-            VoteMode::Paper => Self::Paper(PaperVoting::new(config.paper.clone())),
-            VoteMode::Weighted => Self::Weighted(Box::new(WeightedVoting::new(config.weighted.clone()))),
-        }
-    }
-
-    pub(super) fn get(&self) -> &dyn VotingMethod {
-        match self {
-            Self::Paper(method) => method,
-            Self::Weighted(method) => &**method,
-        }
-    }
-
-    pub(super) fn get_mut(&mut self) -> &mut dyn VotingMethod {
-        match self {
-            Self::Paper(method) => method,
-            Self::Weighted(method) => &mut **method,
-        }
-    }
 }
 
 /// A verdict with `published` or else the label of the highest score, the first in alphabetical order on a tie.

@@ -9,9 +9,9 @@ use hashbrown::HashMap;
 use super::config::PaperConfig;
 use super::method::{self, NewVote, VotingMethod};
 use super::visibility;
-use crate::names::{Label, LandmarkId, NodeName};
+use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
-use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
 
 /// Lowest and highest reputation: `cap(…, 30, 100)` read as percent, applied to r_v after the change was added.

@@ -21,9 +21,9 @@ use super::landmark_votes::{LandmarkVotes, RecentStatements, StoredVote};
 use super::method::{self, NewVote, VotingMethod};
 use super::paper::REPUTATION_RANGE;
 use super::visibility;
-use crate::names::{LandmarkId, NodeName};
+use crate::model::names::{LandmarkId, NodeName};
+use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
-use crate::time::Timestamp;
 use crate::wire::{Reputation, Verdict};
 
 /// Least weight of a statement among the vehicle's own.

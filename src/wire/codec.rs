@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::compact::{self, is_compact};
 use super::{LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
-use crate::names::NodeName;
+use crate::model::names::NodeName;
 
 /// The encoding of a payload.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -129,7 +129,7 @@ mod tests {
     use proptest::{collection, option};
 
     use super::*;
-    use crate::time::Timestamp;
+    use crate::model::time::Timestamp;
     use crate::wire::{FieldOfView, PerceivedObject, Reputations, WirePose};
 
     fn node() -> NodeName {

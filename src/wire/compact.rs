@@ -14,10 +14,11 @@ use minicbor::encode::{self, Encode, Encoder, Write};
 use smol_str::SmolStr;
 use uuid::Uuid;
 
-use super::RejectReason;
-use crate::names::NodeName;
-use crate::time::Timestamp;
 pub(crate) use number::{CovarianceForm, Half, Millimetres, Single};
+
+use super::RejectReason;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// Whether the first byte of a payload is that of a compact one: an array, where JSON and CBOR with names have a map.
 pub(super) fn is_compact(first: u8) -> bool {

@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
 use super::compact::{CovarianceForm, Form, Half, Millimetres, Single, Text, UuidBytes};
-use crate::geometry::Covariance;
-use crate::names::{Label, LandmarkId, NodeName};
-use crate::time::Timestamp;
+use crate::model::geometry::Covariance;
+use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::time::Timestamp;
 
 /// A detection with its position in the world.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]

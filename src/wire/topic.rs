@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::names::NodeName;
+use crate::model::names::NodeName;
 
 /// What a topic carries.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -10,9 +10,9 @@ use super::{
     FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, NodeStatus, ObjectReport, PerceivedObject,
     PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
 };
-use crate::geometry::Covariance;
-use crate::names::{Label, MAX_NAME_BYTES};
-use crate::time::Timestamp;
+use crate::model::geometry::Covariance;
+use crate::model::names::{Label, is_label};
+use crate::model::time::Timestamp;
 
 /// Bounds of a payload; one beyond them is not decoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -283,11 +283,6 @@ fn check_integers(values: impl IntoIterator<Item = u64>) -> Result<(), RejectRea
 
 fn in_world(coordinate_m: f64) -> bool {
     coordinate_m.abs() <= WORLD_BOUND_M
-}
-
-/// Whether a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
-pub fn is_label(text: &str) -> bool {
-    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
 }
 
 #[cfg(test)]

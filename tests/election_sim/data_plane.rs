@@ -5,12 +5,12 @@
 
 use std::collections::btree_map::Entry;
 
-use ecod::epoch::Epoch;
+use ecod::aggregator::round::FirstRound;
 use ecod::leadership::links::{LinkState, WantedLinks};
 use ecod::leadership::node::Input;
 use ecod::leadership::timers::{EPOCH_MEMORY, MAX_ROUND_AGE};
-use ecod::round::FirstRound;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, LedgerShare, SCHEMA_VERSION};
 
 use crate::node::{Accepted, Arrival, Map, address_of};
@@ -22,8 +22,8 @@ impl World {
         let is_wanted = |broker: &usize| wanted.brokers.contains(&address_of(*broker));
         self.nodes[index].links.retain(|broker, _| is_wanted(broker));
         for broker in (0..self.nodes.len()).filter(is_wanted) {
-            if let Entry::Vacant(entry) = self.nodes[index].links.entry(broker) {
-                entry.insert(LinkState::Down);
+            if let Entry::Vacant(link) = self.nodes[index].links.entry(broker) {
+                link.insert(LinkState::Down);
                 self.plan_connect(index, broker, 0);
             }
         }

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use ecod::epoch::Epoch;
 use ecod::leadership::node::Input;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::reputation::{Evidence, ReputationLedger};
-use ecod::time::Timestamp;
 use ecod::wire::{LedgerEntry, LedgerShare, Role};
 
 use crate::node::Arrival;

@@ -14,6 +14,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use ecod::leadership::election::ElectionConfig;
 use ecod::wire::Role;
+
 use node::Fault;
 use random::Random;
 use world::{MS, World};

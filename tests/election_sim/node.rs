@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ecod::epoch::Epoch;
+use ecod::aggregator::round::{RoundClose, RoundConfig, RoundTrigger};
 use ecod::leadership::election::{Election, ElectionConfig};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::ledger_resync::LedgerResync;
@@ -12,10 +12,10 @@ use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{LeadershipNode, NodeSettings};
 use ecod::leadership::round_filter::{PublisherFilter, RoundFilter};
 use ecod::leadership::{BrokerAddress, Leadership};
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::reputation::ReputationLedger;
-use ecod::round::{RoundClose, RoundConfig, RoundTrigger};
-use ecod::time::Timestamp;
 use ecod::wire::{LedgerShare, NodeStatus};
 use uuid::Uuid;
 

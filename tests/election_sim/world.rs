@@ -5,13 +5,13 @@
 use std::cmp::{Ordering, Reverse};
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
-use ecod::epoch::Epoch;
 use ecod::leadership::Position;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::links::LinkState;
 use ecod::leadership::node::{Effect, Input, Member};
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{Encoding, Role};
 
 use crate::evidence::PUBLISH_PERIOD;

@@ -1,16 +1,16 @@
-//! The actor that looks at frames.
+//! The actor that detects objects in frames.
 //!
 //! ```text
-//! capture threads ── latest frame ──> pump task ── Look ──> Detector ── Report ──> Projector
-//!                                         ▲                     │
-//!                                         └── done with the last one
+//! capture threads ── latest frame ──> pump task ── Detect ──> Detector ── Report ──> Projector
+//!                                         ▲                       │
+//!                                         └── permit, when done ──┘
 //! ```
 //!
-//! The pump takes the latest frame only when the detector is done with the one before, so frames never queue up.
+//! The pump takes the latest frame only when the detector is done with the previous one, so frames never queue.
 
 use std::sync::Arc;
 
-use ecod::detection::Detection;
+use ecod::model::detection::Detection;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::Semaphore;
 use tokio::task::{JoinHandle, spawn_blocking};
@@ -25,41 +25,41 @@ use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
 
-/// What a detector needs at its start.
+/// Arguments of a detector's start.
 pub struct DetectorArguments {
     /// Opens the frame source.
     pub open: Opener,
-    /// When the source counts as stalled.
+    /// Stall timeout and retries of the source.
     pub capture: CaptureConfig,
-    /// Finds the objects.
+    /// The detection algorithm.
     pub detect: Box<dyn Detect>,
-    /// The image that the camera's optics describe; detections are handed on as of this size.
+    /// Image size of the camera's optics, to which detections are scaled.
     pub optics: ImageSize,
-    /// Gets the detections.
+    /// Receiver of the detections.
     pub projector: ActorSlot<ProjectorMessage>,
-    /// Gets the frames that were looked at, to record some.
-    pub pictures: Option<ImageRecorder>,
-    /// The node's counters.
+    /// Records some of the frames.
+    pub images: Option<ImageRecorder>,
+    /// Counters of the node.
     pub counters: Arc<Counters>,
     /// The node's spans.
     pub spans: Spans,
 }
 
-/// Looks at the latest frame, again and again.
+/// Runs the detection algorithm on the latest frame, again and again.
 #[derive(Debug, Default)]
 pub struct Detector;
 
 /// The detector between frames.
 pub struct DetectorState {
-    /// Away only while a frame is being looked at.
+    /// Absent only while a frame is being processed.
     detect: Option<Box<dyn Detect>>,
     optics: ImageSize,
-    /// The last mismatch, told of once.
+    /// The last size mismatch, which is logged once.
     mismatch: Option<SizeMismatch>,
-    /// Whether the last frame could not be looked at: the first in a row is told of.
+    /// Whether the last frame failed; only the first failure in a row is logged.
     failing: bool,
     projector: ActorSlot<ProjectorMessage>,
-    pictures: Option<ImageRecorder>,
+    images: Option<ImageRecorder>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
 }
@@ -74,11 +74,11 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, optics, projector, pictures, counters, spans } = arguments;
+        let DetectorArguments { open, capture, detect, optics, projector, images, counters, spans } = arguments;
         let capture = Capture::start(open, capture)?;
         let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters), spans));
         let detect = Some(detect);
-        Ok(DetectorState { detect, optics, mismatch: None, failing: false, projector, pictures, counters, pump })
+        Ok(DetectorState { detect, optics, mismatch: None, failing: false, projector, images, counters, pump })
     }
 
     async fn handle(
@@ -87,25 +87,25 @@ impl Actor for Detector {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let DetectorMessage::Look { frame, turn } = message;
+        let DetectorMessage::Detect { frame, permit } = message;
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
-        let mut pictures = state.pictures.take();
+        let mut images = state.images.take();
         let span = tracing::info_span!("detect");
-        let (detect, pictures, outcome) = spawn_blocking(move || {
+        let (detect, images, outcome) = spawn_blocking(move || {
             let outcome = span.in_scope(|| detect.detect(&frame));
             drop(span);
-            if let Some(pictures) = &mut pictures {
-                pictures.offer(&frame);
+            if let Some(images) = &mut images {
+                images.offer(&frame);
             }
-            (detect, pictures, outcome)
+            (detect, images, outcome)
         })
         .await?;
-        (state.detect, state.pictures) = (Some(detect), pictures);
+        (state.detect, state.images) = (Some(detect), images);
         match outcome {
             Ok(mut detections) => {
                 state.failing = false;
-                if state.fits(size, &mut detections) {
+                if state.scale(size, &mut detections) {
                     state.counters.count(Event::FrameDetected);
                     state.projector.send(ProjectorMessage::Report { detections, captured_at });
                 } else {
@@ -115,23 +115,23 @@ impl Actor for Detector {
             Err(error) => {
                 state.counters.count(Event::FrameFailed);
                 if !std::mem::replace(&mut state.failing, true) {
-                    tracing::warn!(%error, "frame not used, the first in a row");
+                    tracing::warn!(%error, "cannot use frame, first failure in a row");
                 }
             }
         }
-        drop(turn);
+        drop(permit);
         Ok(())
     }
 }
 
 impl DetectorState {
-    /// Reads the detections in the size that the optics describe; false, and told of once, when that cannot be.
-    fn fits(&mut self, frame: ImageSize, detections: &mut [Detection]) -> bool {
+    /// Scales the detections to the size of the optics; false, and logged once, for a frame of another shape.
+    fn scale(&mut self, frame: ImageSize, detections: &mut [Detection]) -> bool {
         let mismatch = self.optics.fit(frame, detections).err();
         if let Some(error) = mismatch
             && self.mismatch != mismatch
         {
-            tracing::error!(%error, "frames not used");
+            tracing::error!(%error, "cannot use frames");
         }
         self.mismatch = mismatch;
         mismatch.is_none()
@@ -144,12 +144,12 @@ impl Drop for DetectorState {
     }
 }
 
-/// Hands over the latest frame whenever the detector is ready, until the source or the detector ends.
+/// Sends the latest frame whenever the detector is ready, until the source or the detector ends.
 async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>, spans: Spans) {
-    let turns = Arc::new(Semaphore::new(1));
+    let permits = Arc::new(Semaphore::new(1));
     let mut status = capture.status();
     let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
-    while let Ok(turn) = Arc::clone(&turns).acquire_owned().await {
+    while let Ok(permit) = Arc::clone(&permits).acquire_owned().await {
         let frame = loop {
             let frame = tokio::select! {
                 frame = capture.next_frame() => Some(frame),
@@ -168,7 +168,7 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
         };
         let Some(frame) = frame else { return };
         let span = spans.frame(frame.captured_at);
-        if span.in_scope(|| detector.cast(DetectorMessage::Look { frame, turn })).is_err() {
+        if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit })).is_err() {
             return;
         }
     }

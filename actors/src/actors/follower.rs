@@ -17,7 +17,7 @@ use std::sync::Arc;
 use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::{AcceptedRound, Refusal, RoundFilter};
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
@@ -27,10 +27,9 @@ use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
-use crate::observe::recorder::LogSender;
+use crate::observe::recorder::{LogItem, LogSender};
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
-use crate::transport::mqtt::Incoming;
 
 /// What a follower needs at its start.
 pub struct FollowerArguments {
@@ -92,14 +91,12 @@ impl Actor for Follower {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let (FollowerMessage::TakeMap { delivery }
-        | FollowerMessage::TakeVerdicts { delivery }
-        | FollowerMessage::TakeReputations { delivery }) = message;
-        let taken = match &delivery.message {
-            Incoming::Map(map) => state.take_map(map, delivery.received_at),
-            Incoming::Verdicts(verdicts) => state.take_verdicts(verdicts, delivery.received_at),
-            Incoming::Reputations(reputations) => state.take_reputations(reputations, delivery.received_at),
-            _ => Ok(()),
+        let taken = match message {
+            FollowerMessage::TakeMap { delivery } => state.take_map(&delivery.message, delivery.received_at),
+            FollowerMessage::TakeVerdicts { delivery } => state.take_verdicts(&delivery.message, delivery.received_at),
+            FollowerMessage::TakeReputations { delivery } => {
+                state.take_reputations(&delivery.message, delivery.received_at)
+            }
         };
         match taken.map_err(Refusal::reject_reason) {
             Ok(()) => {}
@@ -128,7 +125,7 @@ impl FollowerState {
         self.tell_election(accepted);
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         self.write(&received);
-        self.recording.map(map, received_at);
+        self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
         Ok(())
     }
@@ -137,7 +134,7 @@ impl FollowerState {
         let accepted = self.filter.accept_verdicts(verdicts, received_at, &self.leadership.borrow())?;
         let _accept = self.spans.accept("verdicts", &**verdicts, received_at);
         self.counters.count(Event::VerdictsAccepted);
-        self.recording.verdicts(verdicts, received_at);
+        self.recording.send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
         self.tell_election(accepted);
         self.newest.verdicts.send_replace(Some(Received { received_at, message: Arc::clone(verdicts) }));
         Ok(())
@@ -146,7 +143,7 @@ impl FollowerState {
     fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), Refusal> {
         self.filter.accept_reputations(reputations, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::ReputationsAccepted);
-        self.recording.reputations(reputations, received_at);
+        self.recording.send(received_at, LogItem::Reputations(Arc::clone(reputations)));
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! The actor that closes the rounds: reports in, maps and verdicts out while the node leads.
 //!
 //! ```text
-//! Gateway ── reports ──> Intake ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
+//! Gateway ── reports ──> LatestReportQueue ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
 //! Gateway ── TakeReports ──────────> │ ▲
 //! Follower ── TakeMap ─────────────> │ │
 //! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
@@ -10,40 +10,40 @@
 
 use crate::messages::fuser::FuserMessage;
 
-mod intake;
+mod report_queue;
 #[cfg(test)]
 mod tests;
 
 use std::sync::Arc;
 
+use ecod::aggregator::round::FirstRound;
 use ecod::aggregator::{Aggregator, Command, Fused};
-use ecod::epoch::Epoch;
 use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::replay::JournalEvent;
-use ecod::round::FirstRound;
-use ecod::time::Timestamp;
 use ecod::tracking::TracksLosses;
 use ecod::wire::GlobalMap;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
-pub use intake::{Intake, Put};
+pub use report_queue::{LatestReportQueue, PushOutcome, QueuedReport};
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
-use crate::observe::recorder::LogSender;
+use crate::observe::recorder::{LogItem, LogSender};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::{RoundReports, Spans};
-use crate::transport::mqtt::{Delivery, Incoming};
+use crate::transport::mqtt::Delivery;
 
 /// What a fuser needs at its start.
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
     /// Where vehicles' reports wait.
-    pub intake: Intake,
+    pub report_queue: LatestReportQueue,
     /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
     pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
     /// Where the aggregator's inputs are recorded.
@@ -65,7 +65,7 @@ pub struct Fuser;
 /// The aggregator and its alarm.
 pub struct FuserState {
     aggregator: Aggregator,
-    intake: Intake,
+    report_queue: LatestReportQueue,
     recording: LogSender,
     gateway: ActorSlot<GatewayMessage>,
     keeper: ActorSlot<ReputationKeeperMessage>,
@@ -132,10 +132,11 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
-        let FuserArguments { aggregator, intake, newest, recording, gateway, keeper, counters, spans } = arguments;
+        let FuserArguments { aggregator, report_queue, newest, recording, gateway, keeper, counters, spans } =
+            arguments;
         Self {
             aggregator,
-            intake,
+            report_queue,
             recording,
             gateway,
             keeper,
@@ -150,14 +151,14 @@ impl FuserState {
     }
 
     fn take_reports(&mut self) {
-        for delivery in self.intake.take_all() {
+        for delivery in self.report_queue.drain() {
             self.take(&delivery);
         }
     }
 
-    fn take(&mut self, delivery: &Delivery) {
-        let Incoming::Report { kind, report } = &delivery.message else { return };
-        self.recording.report(*kind, report, delivery.received_at);
+    fn take(&mut self, delivery: &Delivery<QueuedReport>) {
+        let QueuedReport { kind, report } = &delivery.message;
+        self.recording.send(delivery.received_at, LogItem::Report(*kind, Arc::clone(report)));
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
             Ok(fused) => {
@@ -202,7 +203,7 @@ impl FuserState {
         let now = clock::now();
         if command != Command::Tick || now >= self.aggregator.deadline() {
             let fused = self.aggregator.command(&command, now);
-            self.recording.journal(now, JournalEvent::Command(command));
+            self.recording.send(now, LogItem::Journal(JournalEvent::Command(command)));
             self.publish(fused, now);
         }
     }
@@ -226,7 +227,7 @@ impl FuserState {
         let Some(fused) = fused else { return };
         let _round = self.spans.round(&fused, &std::mem::take(&mut self.reports)).entered();
         let Fused { epoch, round, map, verdicts, evidence, reputations } = fused;
-        self.recording.round(round, now);
+        self.recording.send(now, LogItem::Round(round));
         let has_verdicts = verdicts.is_some();
         if let Some(map) = map {
             self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });

@@ -20,7 +20,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, NodeState, NodeStatus, Payload, Topic, Topics, encode};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tracing::Span;

@@ -37,7 +37,6 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::Member;
-use crate::transport::mqtt::Incoming;
 
 /// Where the parts that the election commands or asks are reached.
 #[derive(Debug, Clone, Default)]
@@ -102,9 +101,7 @@ impl Actor for LeaderElection {
         match message {
             LeaderElectionMessage::Membership { event } => driver.take_event(event).await,
             LeaderElectionMessage::TakeStatus { delivery } => {
-                if let Incoming::Status { status, .. } = &delivery.message {
-                    driver.handle(Input::StatusHeard { status: (**status).clone() }).await;
-                }
+                driver.handle(Input::StatusHeard { status: (*delivery.message).clone() }).await;
             }
             LeaderElectionMessage::Note { input } => driver.handle(input).await,
         }

@@ -11,8 +11,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use ring::rand::{SecureRandom, SystemRandom};

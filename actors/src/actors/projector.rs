@@ -1,11 +1,9 @@
-//! The actor that places detections in the world and reports them.
+//! The actor that places detections in the world and publishes them as reports.
 //!
 //! ```text
 //! localisation ── UDP ──> pose feed ── TakePose ──┐
 //! Detector ── Report ────────────────────────> Projector ── PublishReport ──> Gateway
 //! ```
-
-use crate::messages::projector::ProjectorMessage;
 
 mod pose_feed;
 
@@ -13,30 +11,30 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::aggregator::Algorithms;
-use ecod::detection::Detection;
-use ecod::pose_history::PoseHistory;
-use ecod::time::Timestamp;
-use ecod::wire::ObjectReport;
+use ecod::model::detection::Detection;
+use ecod::model::time::Timestamp;
+use ecod::perception::pose_history::PoseHistory;
+use ecod::wire::{ObjectReport, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::JoinSet;
 
 use crate::camera::perception::Perception;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
+use crate::messages::projector::ProjectorMessage;
 use crate::telemetry::counters::{Counters, Event};
-use ecod::wire::ReportKind;
 
-/// What a projector needs at its start.
+/// Arguments of a projector's start.
 pub struct ProjectorArguments {
     /// Camera, pose and known locations.
     pub perception: Perception,
-    /// Where poses are told, of a vehicle that moves.
+    /// UDP address for the poses of a moving vehicle.
     pub poses: Option<SocketAddr>,
-    /// The algorithms that reports are for.
+    /// Algorithms to report for.
     pub algorithms: Algorithms,
-    /// Where reports are published.
+    /// Publisher of the reports.
     pub gateway: ActorSlot<GatewayMessage>,
-    /// The node's counters.
+    /// Counters of the node.
     pub counters: Arc<Counters>,
 }
 
@@ -44,10 +42,10 @@ pub struct ProjectorArguments {
 #[derive(Debug, Default)]
 pub struct Projector;
 
-/// The vehicle as it is now.
+/// Perception and motion of the vehicle.
 pub struct ProjectorState {
     perception: Perception,
-    /// Where a vehicle that moves has been.
+    /// Recent poses of a moving vehicle.
     poses: Option<PoseHistory>,
     algorithms: Algorithms,
     gateway: ActorSlot<GatewayMessage>,
@@ -117,7 +115,7 @@ impl ProjectorState {
     }
 }
 
-/// What a report has to say in a vote: the objects at known locations.
+/// The report as VOTE needs it: objects at known locations only.
 fn votes(report: &ObjectReport) -> ObjectReport {
     let objects = report.objects.iter().filter(|object| object.landmark.is_some()).cloned().collect();
     let ObjectReport { node, seq, captured_at_us, pose, .. } = report;

@@ -1,14 +1,14 @@
-//! The actor that records what its node takes, and from which its aggregator can be run again.
+//! The actor that records the node's messages, so that its aggregator can be rerun.
 //!
 //! ```text
 //! Fuser, Follower, Gateway's subscriber ── LogSender ──> bounded queue ──> writer thread ──> DIR/<node>-<time>.mcap
 //! Recorder ── leadership, counters ───────────┘
 //! ```
 //!
-//! - Nobody waits for the disk. A full queue drops and counts; where the aggregator's inputs were dropped, the log says so.
-//! - Every second the log is handed to the operating system in whole chunks: what ends the process costs a second at
-//!   most, and readers that do not ask for the end of the file read the rest.
-//! - A disk that takes nothing is counted, told of once, and tried again; the node goes on.
+//! - Nothing waits for the disk. A full queue drops and counts entries; the log notes dropped inputs of the aggregator.
+//! - Every second the log is flushed in whole chunks. The end of the process loses one second at most, and readers that
+//!   do not need the end of the file read the rest.
+//! - A failing disk is counted, logged once and tried again; the node goes on.
 
 use std::sync::Arc;
 use std::sync::mpsc::sync_channel;
@@ -26,25 +26,25 @@ use crate::observe::recorder::{LogIdentity, LogSender, RecordConfig};
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 
-/// What a recorder needs at its start.
+/// Arguments of a recorder's start.
 pub struct RecorderArguments {
-    /// What is recorded, and where.
+    /// Configuration of the log.
     pub config: RecordConfig,
-    /// Who records.
+    /// Identity of the log.
     pub identity: LogIdentity,
-    /// Where the node's parts hand over.
+    /// Sender that the node's parts share.
     pub recording: LogSender,
-    /// Who leads.
+    /// The leadership.
     pub leadership: watch::Receiver<Leadership>,
-    /// The node's counters.
+    /// Counters of the node.
     pub counters: Arc<Counters>,
 }
 
-/// Records.
+/// Owner of the thread that writes the log.
 #[derive(Debug, Default)]
 pub struct Recorder;
 
-/// The writer and what is watched.
+/// The writer thread and the recorded states.
 pub struct RecorderState {
     recording: LogSender,
     leadership: watch::Receiver<Leadership>,
@@ -52,10 +52,10 @@ pub struct RecorderState {
     writer: Option<JoinHandle<()>>,
 }
 
-/// How often counters are recorded.
+/// Time between two records of the counters.
 const TICK: Duration = Duration::from_secs(1);
 
-/// How long the last entries may take to the disk.
+/// Maximum time for the last entries to reach the disk.
 const STOP_PATIENCE: Duration = Duration::from_secs(1);
 
 impl Actor for Recorder {
@@ -85,10 +85,10 @@ impl Actor for Recorder {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let item = match message {
-            RecorderMessage::NoteLeadership => LogItem::Leadership(state.leadership.borrow().clone()),
+            RecorderMessage::RecordLeadership => LogItem::Leadership(state.leadership.borrow().clone()),
             RecorderMessage::Tick => LogItem::Counters(state.counters.snapshot()),
         };
-        state.recording.put(clock::now(), item);
+        state.recording.send(clock::now(), item);
         if state.writer.as_ref().is_some_and(JoinHandle::is_finished) { Err("the writer ended".into()) } else { Ok(()) }
     }
 
@@ -97,13 +97,13 @@ impl Actor for Recorder {
         let Some(writer) = state.writer.take() else { return Ok(()) };
         let ended = tokio::task::spawn_blocking(|| writer.join().is_ok());
         if tokio::time::timeout(STOP_PATIENCE, ended).await.is_err() {
-            tracing::warn!("the log's last entries are still on their way to the disk");
+            tracing::warn!("the last log entries are not yet on the disk");
         }
         Ok(())
     }
 }
 
-/// Tells of every change, the present state first; ends with the recorder.
+/// Requests a record of the present leadership and of every change; ends with the recorder.
 async fn watch_leadership(mut leadership: watch::Receiver<Leadership>, recorder: ActorRef<RecorderMessage>) {
-    while recorder.cast(RecorderMessage::NoteLeadership).is_ok() && leadership.changed().await.is_ok() {}
+    while recorder.cast(RecorderMessage::RecordLeadership).is_ok() && leadership.changed().await.is_ok() {}
 }

@@ -7,30 +7,30 @@
 //! ```
 //!
 //! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. What is
-//! published was saved before. What an actor knew outlives it in its [`Book`]; what a node knew outlives it in its state
+//! published was saved before. What an actor knew outlives it in its [`ReputationStore`]; what a node knew outlives it in its state
 //! directory.
 
-mod book;
 mod config;
+mod store;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ecod::epoch::Epoch;
 use ecod::leadership::Leadership;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::timers::DISK_TIMEOUT;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig};
 use ecod::wire::{LedgerShare, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-#[cfg(fuzzing)]
-pub use book::read_saved;
-pub use book::{Book, SharedBook};
 pub use config::ReputationKeeperConfig;
+#[cfg(fuzzing)]
+pub use store::read_saved;
+pub use store::{ReputationStore, SharedReputations};
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
@@ -41,8 +41,8 @@ use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::gossip::Member;
-use crate::transport::mqtt::{Delivery, Incoming};
-use book::Saved;
+use crate::transport::mqtt::Delivery;
+use store::Saved;
 
 /// What a keeper needs at its start.
 pub struct ReputationKeeperArguments {
@@ -55,7 +55,7 @@ pub struct ReputationKeeperArguments {
     /// Its rhythm.
     pub config: ReputationKeeperConfig,
     /// What earlier runs of the actor knew; shared with whoever starts a fuser.
-    pub book: SharedBook,
+    pub reputations: SharedReputations,
     /// Where it is saved, if anywhere.
     pub file: Option<StateFile>,
     /// The newest reputations of the cell.
@@ -98,7 +98,7 @@ impl Actor for ReputationKeeper {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        book::restore(&arguments);
+        store::restore(&arguments);
         myself.send_interval(arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
         Ok(ReputationKeeperState::new(arguments))
     }
@@ -153,11 +153,11 @@ impl ReputationKeeperState {
 
     fn lead(&mut self, epoch: Epoch, last_round: u64) {
         let newest = self.arguments.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.message));
-        let mut book = self.arguments.book.open();
+        let mut store = self.arguments.reputations.open();
         if let Some(newest) = newest.filter(|newest| newest.aggregator.as_ref() != Some(&self.arguments.name)) {
-            book.standing.clone_from(&newest.reputations);
+            store.standing.clone_from(&newest.reputations);
         }
-        self.arguments.fuser.send(FuserMessage::Resume { reputations: book.standing.clone() });
+        self.arguments.fuser.send(FuserMessage::Resume { reputations: store.standing.clone() });
         self.resync.lead(epoch);
         self.last_round = last_round;
     }
@@ -170,23 +170,23 @@ impl ReputationKeeperState {
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     ) {
         self.unsaved |= !evidence.is_empty() || reputations.is_some();
-        let mut book = self.arguments.book.open();
-        let shares = self.resync.record(epoch, evidence, &mut book.ledger);
+        let mut store = self.arguments.reputations.open();
+        let shares = self.resync.record(epoch, evidence, &mut store.ledger);
         if let Some(reputations) = reputations {
-            book.standing = reputations;
+            store.standing = reputations;
         }
-        drop(book);
+        drop(store);
         self.last_round = round;
         self.publish_shares(shares);
     }
 
-    fn merge(&mut self, delivery: &Delivery) {
-        let Incoming::Ledger(share) = &delivery.message else { return };
+    fn merge(&mut self, delivery: &Delivery<Arc<LedgerShare>>) {
+        let share = &delivery.message;
         let candidates = self.candidates();
         let leadership = self.arguments.leadership.borrow().clone();
-        let mut book = self.arguments.book.open();
-        let merged = self.resync.merge(share, &mut book.ledger, &candidates, &leadership, delivery.received_at);
-        drop(book);
+        let mut store = self.arguments.reputations.open();
+        let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, delivery.received_at);
+        drop(store);
         let merged = match merged {
             Ok(merged) => merged,
             Err(reason) => {
@@ -216,15 +216,15 @@ impl ReputationKeeperState {
         self.save().await;
         self.publish();
         let leadership = self.arguments.leadership.borrow().clone();
-        let shares = self.resync.tick(&self.arguments.book.open().ledger, &leadership, clock::now());
+        let shares = self.resync.tick(&self.arguments.reputations.open().ledger, &leadership, clock::now());
         self.publish_shares(shares);
         if std::mem::take(&mut self.unadopted) {
-            let ledger = Arc::new(self.arguments.book.open().ledger.clone());
+            let ledger = Arc::new(self.arguments.reputations.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });
         }
     }
 
-    /// Publishes what the book says, unless it did so after the same round.
+    /// Publishes what the store says, unless it did so after the same round.
     fn publish(&mut self) {
         let Some(epoch) = self.resync.leads() else { return };
         let now = Some((epoch.clone(), self.last_round));
@@ -236,14 +236,14 @@ impl ReputationKeeperState {
             aggregator: Some(epoch.leader.clone()),
             epoch: epoch.term,
             round: self.last_round,
-            reputations: self.arguments.book.open().reputations(&self.arguments.reputation),
+            reputations: self.arguments.reputations.open().reputations(&self.arguments.reputation),
         };
         self.published = now;
         self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
     }
 
     fn send_snapshot(&self) {
-        let shares = self.resync.snapshot(&self.arguments.book.open().ledger);
+        let shares = self.resync.snapshot(&self.arguments.reputations.open().ledger);
         self.publish_shares(shares);
     }
 
@@ -257,7 +257,7 @@ impl ReputationKeeperState {
     async fn save(&mut self) {
         let Some(file) = self.arguments.file.clone().filter(|_| self.unsaved) else { return };
         if self.writing.is_none() {
-            let saved = Saved::of(&self.arguments.book.open(), &self.arguments);
+            let saved = Saved::of(&self.arguments.reputations.open(), &self.arguments);
             self.unsaved = false;
             self.writing = Some(tokio::task::spawn_blocking(move || file.save(&saved)));
         }

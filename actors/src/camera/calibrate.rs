@@ -1,24 +1,25 @@
-//! Camera calibration from photographs of a chessboard, and the file that keeps it.
+//! Camera calibration from photographs of a chessboard, and the calibration file.
 
 use std::path::{Path, PathBuf};
 
-use ecod::camera::Intrinsics;
+use ecod::perception::camera::Intrinsics;
 use opencv::core::{Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector};
 use opencv::{calib3d, imgcodecs, imgproc};
 use serde::{Deserialize, Serialize};
 
 use crate::camera::frame_source::images;
+use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
 
-/// Views of the board below which a calibration is refused.
+/// Minimum number of photographs that show the whole board.
 pub const MIN_VIEWS: usize = 5;
 
 /// A printed chessboard.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chessboard {
-    /// Inner corners along a row: squares less one.
+    /// Inner corners along a row: squares minus one.
     pub columns: u16,
-    /// Inner corners along a column: squares less one.
+    /// Inner corners along a column: squares minus one.
     pub rows: u16,
     /// Side of a square in millimetres.
     pub square_mm: f64,
@@ -44,7 +45,7 @@ pub struct Calibration {
     pub distortion: [f64; 5],
     /// Root mean square distance in pixels between found and reprojected corners; good is below 0.5.
     pub rms_px: f64,
-    /// The photographs it rests on.
+    /// Photographs used.
     pub images: Vec<PathBuf>,
 }
 
@@ -57,82 +58,49 @@ pub struct CalibrationReport {
     pub without_board: Vec<PathBuf>,
 }
 
-/// Why a camera is not calibrated, or a calibration not read.
+/// Error of a calibration or its file.
 #[derive(Debug, thiserror::Error)]
 pub enum CalibrationError {
-    /// The board is too small to be one.
-    #[error("chessboard of {columns}x{rows} inner corners and {square_mm} mm squares: need at least 3x3 and a size")]
-    InvalidBoard {
-        /// Inner corners along a row.
-        columns: u16,
-        /// Inner corners along a column.
-        rows: u16,
-        /// Side of a square in millimetres.
-        square_mm: f64,
-    },
-    /// Not an image that OpenCV reads.
+    /// The board is too small.
+    #[error("chessboard of {columns}x{rows} inner corners and {square_mm} mm squares: need at least 3x3 and a size",
+        columns = .0.columns, rows = .0.rows, square_mm = .0.square_mm)]
+    InvalidBoard(Chessboard),
+    /// OpenCV cannot read the image.
     #[error("cannot read image {0:?}")]
     UnreadableImage(PathBuf),
-    /// All photographs must be of one size.
-    #[error("image {path:?} is {width}x{height}, the others are {expected_width}x{expected_height}")]
+    /// The photographs have different sizes.
+    #[error("image {path:?} is {size}, the others are {expected}")]
     SizeDiffers {
         /// The image.
         path: PathBuf,
-        /// Its width in pixels.
-        width: i32,
-        /// Its height in pixels.
-        height: i32,
-        /// Width of the first image.
-        expected_width: i32,
-        /// Height of the first image.
-        expected_height: i32,
+        /// Its size.
+        size: ImageSize,
+        /// Size of the first image.
+        expected: ImageSize,
     },
-    /// The board was found in too few photographs.
+    /// Too few photographs show the board.
     #[error("the chessboard was found in {found} images, need {MIN_VIEWS}; not in {without_board:?}")]
     TooFewViews {
-        /// Photographs with the board.
+        /// Number of photographs with the board.
         found: usize,
         /// Photographs without.
         without_board: Vec<PathBuf>,
     },
-    /// OpenCV failed, in the named image where it was about one.
-    #[error("opencv failed on {what}")]
-    OpenCv {
-        /// An image or a step.
-        what: String,
-        /// OpenCV's own words.
-        #[source]
-        source: opencv::Error,
-    },
+    /// OpenCV failed on an image or in a step.
+    #[error("opencv failed on {0}")]
+    OpenCv(String, #[source] opencv::Error),
     /// A directory of photographs cannot be listed.
-    #[error("cannot list images in {path:?}")]
-    Directory {
-        /// The directory.
-        path: PathBuf,
-        /// What the system said.
-        #[source]
-        source: std::io::Error,
-    },
+    #[error("cannot list images in {0:?}")]
+    Directory(PathBuf, #[source] std::io::Error),
     /// The calibration file cannot be read or written.
-    #[error("calibration file {path:?}")]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        #[source]
-        source: std::io::Error,
-    },
+    #[error("calibration file {0:?}")]
+    File(PathBuf, #[source] std::io::Error),
     /// The calibration file does not hold a calibration.
-    #[error("calibration file {path:?}: {reason}")]
-    Malformed {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong with it.
-        reason: String,
-    },
+    #[error("calibration file {0:?}: {1}")]
+    Malformed(PathBuf, String),
 }
 
-/// The photographs that are meant by paths of files and directories; a directory gives its images by name.
+/// Photographs among files and directories; those of a directory in the order of their names.
 ///
 /// # Errors
 /// [`CalibrationError::Directory`] when one cannot be listed.
@@ -141,7 +109,7 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
     for path in paths {
         if path.is_dir() {
             let listed = images::in_directory(path);
-            photographs.extend(listed.map_err(|source| CalibrationError::Directory { path: path.clone(), source })?);
+            photographs.extend(listed.map_err(|error| CalibrationError::Directory(path.clone(), error))?);
         } else {
             photographs.push(path.clone());
         }
@@ -149,14 +117,14 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
     Ok(photographs)
 }
 
-/// Calibrates a camera from photographs of a chessboard, held at different angles and all over the image (Zhang 2000).
+/// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and all over the image.
 ///
 /// # Errors
 /// [`CalibrationError`], naming the image it is about.
 pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationReport, CalibrationError> {
     let Chessboard { columns, rows, square_mm } = *board;
     if columns < 3 || rows < 3 || !(square_mm.is_finite() && square_mm > 0.0) {
-        return Err(CalibrationError::InvalidBoard { columns, rows, square_mm });
+        return Err(CalibrationError::InvalidBoard(*board));
     }
     let (mut used, mut without_board) = (Vec::new(), Vec::new());
     let mut views = Vector::<Vector<Point2f>>::new();
@@ -166,19 +134,13 @@ pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationRe
             .ok()
             .filter(|image| !image.empty())
             .ok_or_else(|| CalibrationError::UnreadableImage(path.clone()))?;
-        let found = Size::new(image.cols(), image.rows());
+        let found = ImageSize::of(&image);
         let expected = *size.get_or_insert(found);
         if found != expected {
-            return Err(CalibrationError::SizeDiffers {
-                path: path.clone(),
-                width: found.width,
-                height: found.height,
-                expected_width: expected.width,
-                expected_height: expected.height,
-            });
+            return Err(CalibrationError::SizeDiffers { path: path.clone(), size: found, expected });
         }
-        let corners = find_board(&image, board)
-            .map_err(|source| CalibrationError::OpenCv { what: format!("image {path:?}"), source })?;
+        let corners =
+            find_board(&image, board).map_err(|error| CalibrationError::OpenCv(format!("image {path:?}"), error))?;
         match corners {
             Some(corners) => {
                 views.push(corners);
@@ -187,12 +149,11 @@ pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationRe
             None => without_board.push(path.clone()),
         }
     }
-    let size = size.unwrap_or_default();
-    if used.len() < MIN_VIEWS {
+    let Some(size) = size.filter(|_| used.len() >= MIN_VIEWS) else {
         return Err(CalibrationError::TooFewViews { found: used.len(), without_board });
-    }
-    let calibration = solve(&views, size, board, used)
-        .map_err(|source| CalibrationError::OpenCv { what: "calibration".into(), source })?;
+    };
+    let calibration =
+        solve(&views, size, board, used).map_err(|error| CalibrationError::OpenCv("calibration".into(), error))?;
     Ok(CalibrationReport { calibration, without_board })
 }
 
@@ -209,9 +170,8 @@ impl Calibration {
     /// # Errors
     /// [`CalibrationError::File`] or [`CalibrationError::Malformed`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        let text =
-            std::fs::read_to_string(path).map_err(|source| CalibrationError::File { path: path.to_owned(), source })?;
-        let malformed = |reason| CalibrationError::Malformed { path: path.to_owned(), reason };
+        let text = std::fs::read_to_string(path).map_err(|error| CalibrationError::File(path.to_owned(), error))?;
+        let malformed = |reason| CalibrationError::Malformed(path.to_owned(), reason);
         let read: Self = toml::from_str(&text).map_err(|e| malformed(e.to_string()))?;
         let focal = [read.fx, read.fy].iter().all(|f| f.is_finite() && *f > 0.0);
         let rest = [read.cx, read.cy].iter().chain(&read.distortion).all(|v| v.is_finite());
@@ -226,13 +186,13 @@ impl Calibration {
     /// # Errors
     /// [`CalibrationError::File`] when it cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), CalibrationError> {
-        let text = toml::to_string(self)
-            .map_err(|e| CalibrationError::Malformed { path: path.to_owned(), reason: e.to_string() })?;
-        std::fs::write(path, text).map_err(|source| CalibrationError::File { path: path.to_owned(), source })
+        let text =
+            toml::to_string(self).map_err(|error| CalibrationError::Malformed(path.to_owned(), error.to_string()))?;
+        std::fs::write(path, text).map_err(|error| CalibrationError::File(path.to_owned(), error))
     }
 }
 
-/// The board's inner corners to a fraction of a pixel, if all are there.
+/// Inner corners of the board with subpixel accuracy, if all are visible.
 fn find_board(image: &Mat, board: &Chessboard) -> opencv::Result<Option<Vector<Point2f>>> {
     let mut corners = Vector::<Point2f>::new();
     let pattern = Size::new(board.columns.into(), board.rows.into());
@@ -240,13 +200,13 @@ fn find_board(image: &Mat, board: &Chessboard) -> opencv::Result<Option<Vector<P
         return Ok(None);
     }
     let none = Size::new(-1, -1);
-    imgproc::corner_sub_pix(image, &mut corners, Size::new(5, 5), none, until(30, 1e-3)?)?;
+    imgproc::corner_sub_pix(image, &mut corners, Size::new(5, 5), none, stop_after(30, 1e-3)?)?;
     Ok(Some(corners))
 }
 
 fn solve(
     views: &Vector<Vector<Point2f>>,
-    size: Size,
+    size: ImageSize,
     board: &Chessboard,
     images: Vec<PathBuf>,
 ) -> opencv::Result<Calibration> {
@@ -260,13 +220,13 @@ fn solve(
     let rms_px = calib3d::calibrate_camera(
         &boards,
         views,
-        size,
+        Size::new(size.width as i32, size.height as i32),
         &mut camera,
         &mut distortion,
         &mut Vector::<Mat>::new(),
         &mut Vector::<Mat>::new(),
         0,
-        until(100, 1e-9)?,
+        stop_after(100, 1e-9)?,
     )?;
     let entry = |row, column| camera.at_2d::<f64>(row, column).copied();
     let mut coefficients = [0.0; 5];
@@ -274,8 +234,8 @@ fn solve(
         *coefficient = *distortion.at::<f64>(index)?;
     }
     Ok(Calibration {
-        image_width: size.width.unsigned_abs(),
-        image_height: size.height.unsigned_abs(),
+        image_width: size.width,
+        image_height: size.height,
         fx: entry(0, 0)?,
         fy: entry(1, 1)?,
         cx: entry(0, 2)?,
@@ -286,7 +246,7 @@ fn solve(
     })
 }
 
-fn until(iterations: i32, change: f64) -> opencv::Result<TermCriteria> {
+fn stop_after(iterations: i32, change: f64) -> opencv::Result<TermCriteria> {
     TermCriteria::new(TermCriteria_Type::COUNT as i32 | TermCriteria_Type::EPS as i32, iterations, change)
 }
 

@@ -1,11 +1,11 @@
-//! A vehicle's camera as configured.
+//! Configuration of a vehicle's camera.
 
 use std::path::PathBuf;
 
-use ecod::camera::{Intrinsics, Mount};
 use ecod::config::{ConfigError, check_range};
-use ecod::projection::ProjectionConfig;
-use ecod::view::ViewConfig;
+use ecod::perception::camera::{Intrinsics, Mount};
+use ecod::perception::projection::ProjectionConfig;
+use ecod::perception::view::ViewConfig;
 use serde::{Deserialize, Serialize};
 
 use super::calibrate::{Calibration, CalibrationError};
@@ -14,30 +14,30 @@ use super::frame_source::SourceConfig;
 use super::frame_source::capture::CaptureConfig;
 use super::lens::Lens;
 
-/// A vehicle's camera and what is made of its frames.
+/// A vehicle's camera and the processing of its frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
-    /// Where frames come from.
+    /// Source of frames.
     pub source: SourceConfig,
-    /// When a source counts as stalled and how often it is opened again.
+    /// Stall timeout and retries of the source.
     #[serde(default)]
     pub capture: CaptureConfig,
-    /// Image size and field of view. Frames of another size but the same shape are scaled, others are not used.
+    /// Image size and field of view. Frames of the same aspect ratio are scaled; others are rejected.
     #[serde(default)]
     pub optics: OpticsConfig,
-    /// Where the camera sits on the vehicle.
+    /// Position of the camera on the vehicle.
     #[serde(default)]
     pub mount: MountConfig,
-    /// What finds objects in frames.
+    /// Detector of objects in frames.
     pub detector: DetectorConfig,
-    /// How detections are placed in the world.
+    /// Projection of detections into the world.
     #[serde(default)]
     pub projection: ProjectionConfig,
-    /// What it takes to have a location in view.
+    /// Conditions for a location to be in view.
     #[serde(default)]
     pub view: ViewConfig,
-    /// Whether what stands at known locations is also put to the vote, where the cell runs VOTE. Default true.
+    /// Whether to vote on objects at known locations, in a cell that runs VOTE. Default true.
     #[serde(default = "yes")]
     pub votes: bool,
 }
@@ -50,7 +50,7 @@ fn yes() -> bool {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct OpticsConfig {
-    /// Calibration file made by `ecod-node calibrate`; the other keys are then not used. Default none.
+    /// Calibration file of `ecod-node calibrate`, which replaces the other keys. Default none.
     pub calibration: Option<PathBuf>,
     /// Image width in pixels. Default 640.
     pub width_px: u32,
@@ -62,7 +62,7 @@ pub struct OpticsConfig {
     pub vertical_fov_deg: f64,
 }
 
-/// Where the camera sits on the vehicle.
+/// Position of the camera on the vehicle.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MountConfig {
@@ -108,7 +108,7 @@ impl CameraConfig {
 }
 
 impl OpticsConfig {
-    /// The camera, from the calibration file if there is one.
+    /// Intrinsics and distortion, from the calibration file if there is one.
     ///
     /// # Errors
     /// [`CalibrationError`] when the file cannot be used.

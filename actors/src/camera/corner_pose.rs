@@ -1,28 +1,28 @@
-//! Where a square target stands before the camera, from its four corners.
+//! Position of a square target relative to the camera, from its four corners.
 
-use ecod::camera::Intrinsics;
+use ecod::perception::camera::Intrinsics;
 use nalgebra::{Point2, Point3};
 use opencv::calib3d::{self, SolvePnPMethod};
 use opencv::core::{Mat, MatTraitConstManual, Matx33d, Point2d, Point3d, Vector};
 
 use crate::camera::lens::camera_matrix;
 
-/// A target whose corners give no position.
+/// Error of locating a target.
 #[derive(Debug, thiserror::Error)]
 pub enum CornerPoseError {
-    /// No square seen from its front has its corners there.
-    #[error("no square target seen from its front fits the corners")]
+    /// No square facing the camera fits the corners.
+    #[error("no square target that faces the camera fits the corners")]
     NoSolution,
     /// OpenCV refused the corners.
     #[error("opencv cannot solve the corners")]
     OpenCv(#[from] opencv::Error),
 }
 
-/// The middle of a square target in the camera frame, in metres: x right, y down, z along the axis.
+/// Centre of a square target in the camera frame, in metres: x right, y down, z along the axis.
 ///
-/// `corners` are undistorted pixels in the order of [`ecod::detection::Detection::corners`]; `side_m` is the length of
-/// the side between them. Of the two poses that infinitesimal plane-based pose estimation finds (Collins and Bartoli
-/// 2014, OpenCV's `SOLVEPNP_IPPE_SQUARE`), the one with the smaller reprojection error that faces the camera is taken.
+/// `corners` are undistorted pixels in the order of [`ecod::model::detection::Detection::corners`]; `side_m` is the length of
+/// a side. Infinitesimal plane-based pose estimation finds two poses (Collins and Bartoli 2014, OpenCV's
+/// `SOLVEPNP_IPPE_SQUARE`). The result is the one that faces the camera with the smaller reprojection error.
 ///
 /// # Errors
 /// [`CornerPoseError`] when no such pose exists.
@@ -32,14 +32,14 @@ pub fn locate_target(
     intrinsics: &Intrinsics,
 ) -> Result<Point3<f64>, CornerPoseError> {
     match solve(corners, side_m, intrinsics) {
-        Err(CornerPoseError::NoSolution) => solve(&unsymmetric(corners), side_m, intrinsics),
+        Err(CornerPoseError::NoSolution) => solve(&perturbed(corners), side_m, intrinsics),
         outcome => outcome,
     }
 }
 
-/// The corners with one moved by a thousandth of a pixel: OpenCV finds no finite pose for many that mirror each other,
-/// which corners in whole pixels often do.
-fn unsymmetric(corners: &[Point2<f64>; 4]) -> [Point2<f64>; 4] {
+/// Corners with one moved by a thousandth of a pixel. OpenCV finds no finite pose for many symmetric squares, which
+/// whole-pixel corners often form.
+fn perturbed(corners: &[Point2<f64>; 4]) -> [Point2<f64>; 4] {
     let [first, second, third, fourth] = *corners;
     [Point2::new(first.x + 1e-3, first.y + 2e-3), second, third, fourth]
 }

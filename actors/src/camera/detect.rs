@@ -1,29 +1,28 @@
-//! Detectors: from an image to labels with places in the image. One trait, one file each.
+//! Detectors of objects in images: one trait, one file per detector.
 
 pub mod coco;
 mod config;
 pub mod placard;
 pub mod recorded;
 
-use ecod::detection::Detection;
+use ecod::model::detection::Detection;
 
 pub use config::{CustomDetector, DetectorConfig};
 
 use crate::camera::frame::Frame;
 
-/// Finds objects in images.
+/// Detector of objects in images.
 ///
-/// A detector may keep buffers and what it learned from earlier frames, and may take tens of milliseconds: call it off
-/// the async threads.
+/// A detector may keep state between frames and may take tens of milliseconds: call it off the async threads.
 pub trait Detect: Send {
-    /// What is in the frame, in no particular order; pixels are those of `frame.image`.
+    /// Objects in the frame in any order, in pixels of `frame.image`.
     ///
     /// # Errors
-    /// [`DetectError`] when the image cannot be used or a library fails; the next frame may well succeed.
+    /// [`DetectError`] when the image is unusable or a library fails; the next frame may succeed.
     fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError>;
 }
 
-/// A frame that could not be looked at; the detector stays usable.
+/// Error on one frame; the detector remains usable.
 #[derive(Debug, thiserror::Error)]
 pub enum DetectError {
     /// The image is empty or not 8-bit gray or BGR.
@@ -31,15 +30,15 @@ pub enum DetectError {
     UnusableImage {
         /// The frame's sequence number.
         seq: u64,
-        /// What it holds instead.
+        /// Its content instead.
         found: String,
     },
     /// OpenCV refused an operation.
     #[error("opencv failed in {step}")]
     OpenCv {
-        /// What was being done.
+        /// The step.
         step: &'static str,
-        /// OpenCV's own words.
+        /// OpenCV's error.
         #[source]
         source: opencv::Error,
     },

@@ -1,6 +1,6 @@
-//! A camera image with the time it was taken.
+//! A camera image with its time of capture.
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use opencv::core::Mat;
 
 /// One image of one camera.
@@ -8,8 +8,8 @@ use opencv::core::Mat;
 pub struct Frame {
     /// 8-bit pixels, BGR or gray.
     pub image: Mat,
-    /// When it was captured, by the node's own clock.
+    /// Time of capture by the node's clock.
     pub captured_at: Timestamp,
-    /// Counts up by one with every captured frame, also those that nobody looked at.
+    /// Number of the frame, counting skipped ones.
     pub seq: u64,
 }

@@ -1,4 +1,4 @@
-//! Where frames come from. One trait, one file per family of sources; [`capture`] runs a source on its own thread.
+//! Sources of frames: one trait, one file per kind. [`capture`] runs a source on its own thread.
 
 pub mod capture;
 pub(crate) mod images;
@@ -14,17 +14,16 @@ use self::images::ImageSequence;
 use self::video::Video;
 use crate::camera::frame::Frame;
 
-/// Gives one frame after the other.
+/// Source of successive frames.
 pub trait FrameSource: Send {
-    /// Waits for the next frame; may block for as long as the camera does.
+    /// Waits for the next frame; may block as long as the camera does.
     ///
     /// # Errors
-    /// [`FrameError`]; the source is of no further use and is to be opened again, unless it ended or the error is
-    /// [`FrameError::Unusable`], after which it goes on.
+    /// [`FrameError`]. After [`FrameError::Unusable`] the source continues; after other errors it must be reopened.
     fn next_frame(&mut self) -> Result<Frame, FrameError>;
 }
 
-/// Why there is no frame.
+/// Error of a frame source.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FrameError {
     /// The source cannot be opened.
@@ -32,29 +31,29 @@ pub enum FrameError {
     Open {
         /// Device, pipeline, address or path.
         origin: String,
-        /// What is wrong.
+        /// The problem.
         reason: String,
     },
-    /// One frame of a recording is no image; the next may well be one.
+    /// One frame of a recording is not an image; the source continues.
     #[error("cannot use {origin}: {reason}")]
     Unusable {
         /// Path of the frame.
         origin: String,
-        /// What is wrong.
+        /// The problem.
         reason: String,
     },
-    /// A live source stopped giving frames.
+    /// A live source delivers no more frames.
     #[error("lost {origin}: {reason}")]
     Lost {
         /// Device, pipeline, address or path.
         origin: String,
-        /// What is wrong.
+        /// The problem.
         reason: String,
     },
-    /// A live source gave no frame for too long.
+    /// A live source delivered no frame within the timeout.
     #[error("no frame for {0:?}")]
     Stalled(Duration),
-    /// A file or sequence came to its end.
+    /// A file or sequence ended.
     #[error("{origin} ended")]
     Ended {
         /// Its path.
@@ -62,22 +61,22 @@ pub enum FrameError {
     },
 }
 
-/// One source of frames.
+/// Configuration of a frame source.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub enum SourceConfig {
-    /// A camera of the Linux kernel, such as a USB camera.
+    /// A Video4Linux camera, such as a USB camera.
     V4l2 {
-        /// Device file; default `/dev/video0`.
+        /// Device file. Default `/dev/video0`.
         #[serde(default = "default_device")]
         device: PathBuf,
-        /// Image width in pixels to ask for; default the camera's own.
+        /// Requested image width in pixels. Default the camera's own.
         #[serde(default)]
         width: Option<u32>,
-        /// Image height in pixels to ask for; default the camera's own.
+        /// Requested image height in pixels. Default the camera's own.
         #[serde(default)]
         height: Option<u32>,
-        /// Frames per second to ask for; default the camera's own.
+        /// Requested frames per second. Default the camera's own.
         #[serde(default)]
         fps: Option<f64>,
     },
@@ -91,11 +90,11 @@ pub enum SourceConfig {
         /// Its `rtsp://` or `http://` address.
         url: String,
     },
-    /// A video file, played at its own pace.
+    /// A video file, played at its own rate.
     Video {
         /// The file.
         path: PathBuf,
-        /// Whether to start again at the end; default false.
+        /// Whether to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },
@@ -103,31 +102,31 @@ pub enum SourceConfig {
     Images {
         /// A directory, or a pattern such as `frames/%04d.png` counting up from 0 or 1.
         path: PathBuf,
-        /// Frames per second; default 10.
+        /// Frames per second. Default 10.
         #[serde(default = "default_fps")]
         fps: f64,
-        /// Whether to start again at the end; default false.
+        /// Whether to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },
 }
 
 impl SourceConfig {
-    /// Opens the source; may block for as long as the camera does. A network camera is given `patience`.
+    /// Opens the source; may block as long as the camera does. `timeout` applies to network cameras.
     ///
     /// # Errors
     /// [`FrameError::Open`] naming the source and what is wrong.
-    pub fn open(&self, patience: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
+    pub fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
         match self {
             Self::V4l2 { device, width, height, fps } => Ok(Box::new(Video::device(device, *width, *height, *fps)?)),
             Self::Gstreamer { pipeline } => Ok(Box::new(Video::pipeline(pipeline)?)),
-            Self::Url { url } => Ok(Box::new(Video::url(url, patience)?)),
+            Self::Url { url } => Ok(Box::new(Video::url(url, timeout)?)),
             Self::Video { path, looping } => Ok(Box::new(Video::file(path, *looping)?)),
             Self::Images { path, fps, looping } => Ok(Box::new(ImageSequence::open(path, *fps, *looping)?)),
         }
     }
 
-    /// Takes user and password out of an address; true when there were some.
+    /// Removes user and password from an address; true if there were any.
     pub(crate) fn forget_credentials(&mut self) -> bool {
         let Self::Url { url } = self else { return false };
         let bare = video::without_credentials(url);
@@ -136,7 +135,7 @@ impl SourceConfig {
         had
     }
 
-    /// Checks every value; whether the source exists is found when it is opened.
+    /// Checks every value, but not whether the source exists.
     ///
     /// # Errors
     /// [`ConfigError`] with the first key out of range.
@@ -170,7 +169,7 @@ fn default_fps() -> f64 {
     10.0
 }
 
-/// Lets recorded frames out at their own rate.
+/// Delays recorded frames to their own rate.
 #[derive(Debug)]
 struct FramePacer {
     period: Duration,

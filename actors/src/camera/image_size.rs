@@ -1,9 +1,9 @@
-//! The size of an image, and how detections in one size are read in another.
+//! Image size, and scaling of detections between sizes.
 
 use std::fmt;
 
-use ecod::camera::Intrinsics;
-use ecod::detection::Detection;
+use ecod::model::detection::Detection;
+use ecod::perception::camera::Intrinsics;
 use opencv::core::{Mat, MatTraitConst};
 
 /// Width and height in pixels.
@@ -15,21 +15,21 @@ pub struct ImageSize {
     pub height: u32,
 }
 
-/// A frame that the camera's optics say nothing about: no scaling makes it the image that they describe.
+/// Mismatch of aspect ratios between a frame and the camera's optics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "frame has {frame} pixels and camera.optics describe {optics}, another shape: \
-     have the source give that shape, or set or calibrate the optics for {frame}"
+    "frame has {frame} pixels, but camera.optics describes {optics} with another aspect ratio: \
+     change the source, or set or calibrate the optics for {frame}"
 )]
 pub struct SizeMismatch {
     /// The frame's size.
     pub frame: ImageSize,
-    /// The size that the optics are for.
+    /// The size of the optics.
     pub optics: ImageSize,
 }
 
-/// Largest difference between horizontal and vertical scale that rounding to whole pixels explains.
-const SHAPE_TOLERANCE: f64 = 0.01;
+/// Maximum relative difference between horizontal and vertical scale, which rounding to whole pixels explains.
+const ASPECT_TOLERANCE: f64 = 0.01;
 
 impl ImageSize {
     /// The size of an image.
@@ -37,11 +37,10 @@ impl ImageSize {
         Self { width: image.cols().unsigned_abs(), height: image.rows().unsigned_abs() }
     }
 
-    /// Moves detections in a frame to where a camera with images of this size sees them. A frame of the same shape is
-    /// taken for the whole image, enlarged or reduced.
+    /// Scales detections from a frame's size to this one.
     ///
     /// # Errors
-    /// [`SizeMismatch`] when the frame has another shape; the detections are then unchanged.
+    /// [`SizeMismatch`] for another aspect ratio; the detections are then unchanged.
     pub fn fit(self, frame: Self, detections: &mut [Detection]) -> Result<(), SizeMismatch> {
         if frame == self {
             return Ok(());
@@ -49,7 +48,7 @@ impl ImageSize {
         let scale =
             [(self.width, frame.width), (self.height, frame.height)].map(|(to, from)| f64::from(to) / f64::from(from));
         let [x, y] = scale;
-        if !(x.is_finite() && y.is_finite()) || (x / y - 1.0).abs() > SHAPE_TOLERANCE {
+        if !(x.is_finite() && y.is_finite()) || (x / y - 1.0).abs() > ASPECT_TOLERANCE {
             return Err(SizeMismatch { frame, optics: self });
         }
         for Detection { bounding_box, corners, .. } in detections {
@@ -80,7 +79,7 @@ impl fmt::Display for ImageSize {
 
 #[cfg(test)]
 mod tests {
-    use ecod::detection::BoundingBox;
+    use ecod::model::detection::BoundingBox;
     use nalgebra::Point2;
 
     use super::*;

@@ -1,12 +1,12 @@
-//! A camera's intrinsics with the distortion of its lens, and the removal of that distortion from detections.
+//! Intrinsics and lens distortion of a camera, and the undistortion of detections.
 
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::perception::camera::Intrinsics;
 use nalgebra::Point2;
 use opencv::calib3d;
 use opencv::core::{Mat, Matx33d, Point2d, Vector};
 
-/// A camera as calibrated.
+/// A calibrated camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lens {
     /// Focal lengths and principal point, in pixels.
@@ -21,11 +21,10 @@ impl Lens {
         Self { intrinsics, distortion: None }
     }
 
-    /// Moves boxes and corners to where an ideal lens would have drawn them. A box is moved by the middles of its
-    /// edges.
+    /// Undistorts boxes and corners. A box is undistorted at the midpoints of its edges.
     ///
     /// # Errors
-    /// OpenCV's, when it cannot compute.
+    /// OpenCV's.
     pub fn undistort(&self, detections: &mut [Detection]) -> opencv::Result<()> {
         let Some(distortion) = self.distortion else { return Ok(()) };
         let mut points = Vector::<Point2d>::new();

@@ -1,39 +1,39 @@
-//! One vehicle's way from detections to a report: undistort, range, place, and say what was in view.
+//! Processing of one vehicle's detections into a report: undistortion, ranging, placing, field of view.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::sync::Arc;
 
-use ecod::camera::Mount;
-use ecod::detection::Detection;
-use ecod::geometry::Pose;
-use ecod::landmark::{LandmarkGate, LandmarkIndex};
-use ecod::names::NodeName;
-use ecod::projection::{Projection, ProjectionConfig, Ranging};
-use ecod::time::Timestamp;
-use ecod::view::{ViewConfig, landmarks_in_view};
+use ecod::model::detection::Detection;
+use ecod::model::geometry::Pose;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::camera::Mount;
+use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
+use ecod::perception::projection::{Projection, ProjectionConfig, Ranging};
+use ecod::perception::view::{ViewConfig, landmarks_in_view};
 use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
 
 use crate::camera::corner_pose::locate_target;
 use crate::camera::lens::Lens;
 
-/// Where a vehicle's camera is and what it knows of its world.
+/// A vehicle's camera and the known locations of its cell.
 #[derive(Debug, Clone)]
 pub struct VehicleCamera {
     /// The vehicle's name.
     pub node: NodeName,
     /// The vehicle's pose.
     pub pose: Pose,
-    /// Where the camera sits on the vehicle.
+    /// Position of the camera on the vehicle.
     pub mount: Mount,
-    /// The camera as calibrated.
+    /// The calibrated camera.
     pub lens: Lens,
-    /// The cell's known locations.
+    /// Known locations of the cell.
     pub landmarks: Arc<LandmarkIndex>,
 }
 
-/// Makes the reports of one vehicle.
+/// Producer of one vehicle's reports.
 #[derive(Debug, Clone)]
 pub struct Perception {
     vehicle_camera: VehicleCamera,
@@ -45,25 +45,25 @@ pub struct Perception {
     discarded: DiscardCounts,
 }
 
-/// Detections left out by reason.
+/// Number of discarded detections by reason.
 #[derive(Debug, Clone, Default)]
 struct DiscardCounts(BTreeMap<&'static str, u64>);
 
 impl DiscardCounts {
-    /// Counts one, and tells of the first for each reason.
+    /// Counts one, and logs a warning for the first of each reason.
     fn count(&mut self, reason: &'static str, error: &dyn Display) {
         let times = self.0.entry(reason).or_default();
         *times += 1;
         match *times {
-            1 => tracing::warn!(%error, "detection left out, the first for this reason"),
-            _ => tracing::debug!(%error, "detection left out"),
+            1 => tracing::warn!(%error, "detection discarded, first for this reason"),
+            _ => tracing::debug!(%error, "detection discarded"),
         }
     }
 }
 
 impl Perception {
-    /// A vehicle that has not reported yet; the configurations are taken as valid. `gate` bounds which known location
-    /// an object is taken for.
+    /// A producer without reports yet; the configurations must be valid. `gate` limits the distance between an object
+    /// and its known location.
     pub fn new(
         vehicle_camera: VehicleCamera,
         projection: ProjectionConfig,
@@ -75,13 +75,13 @@ impl Perception {
         Self { vehicle_camera, camera, projection, view, gate, seq: 0, discarded: DiscardCounts::default() }
     }
 
-    /// Tells where the vehicle is from now on.
+    /// Sets the pose of the vehicle.
     pub fn set_pose(&mut self, pose: Pose) {
         self.vehicle_camera.pose = pose;
         self.camera = self.vehicle_camera.mount.camera_pose(&pose);
     }
 
-    /// The report of one frame. A detection that has no position is left out and counted.
+    /// The report of one frame. Detections without a position are discarded and counted.
     pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
         detections.retain(|detection| match self.projection.check_unclipped(detection) {
             Ok(()) => true,
@@ -91,7 +91,7 @@ impl Perception {
             }
         });
         if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
-            tracing::warn!(%error, "distortion not removed");
+            tracing::warn!(%error, "cannot remove distortion");
         }
         let objects: Vec<_> = detections.iter().filter_map(|detection| self.place(detection)).collect();
         let landmarks = self.vehicle_camera.landmarks.landmarks();
@@ -106,7 +106,7 @@ impl Perception {
         }
     }
 
-    /// Detections left out by reason since the start.
+    /// Number of detections discarded by reason since the start.
     pub fn discarded(&self) -> &BTreeMap<&'static str, u64> {
         &self.discarded.0
     }
@@ -118,19 +118,19 @@ impl Perception {
         let target = match target.transpose() {
             Ok(target) => target,
             Err(error) => {
-                tracing::debug!(label = %detection.label, %error, "corners not used");
+                tracing::debug!(label = %detection.label, %error, "cannot use corners");
                 None
             }
         };
         let placed = self.projection.place(detection, target.as_ref(), &self.camera);
         let placed = placed.map_err(|error| self.discarded.count(error.as_str(), &error)).ok()?;
-        // One object that nobody would take must not cost the others of its report.
+        // Receivers reject a report with one invalid object, so this is checked per object.
         placed.validate().map_err(|reason| self.discarded.count(reason.as_str(), &reason)).ok()?;
-        Some(self.at_landmark(placed))
+        Some(self.with_landmark(placed))
     }
 
-    /// Names the known location that the object is taken for.
-    fn at_landmark(&self, object: PerceivedObject) -> PerceivedObject {
+    /// Assigns the object to a known location.
+    fn with_landmark(&self, object: PerceivedObject) -> PerceivedObject {
         let landmarks = &self.vehicle_camera.landmarks;
         let point = Point2::new(object.x_m, object.y_m);
         let best = object.covariance().and_then(|c| landmarks.best(&object.label, &point, &c, &self.gate));
@@ -141,9 +141,9 @@ impl Perception {
 
 #[cfg(test)]
 mod tests {
-    use ecod::camera::Intrinsics;
-    use ecod::detection::BoundingBox;
-    use ecod::projection::{ObjectSize, ObjectSizes};
+    use ecod::model::detection::BoundingBox;
+    use ecod::perception::camera::Intrinsics;
+    use ecod::perception::projection::{ObjectSize, ObjectSizes};
 
     use super::*;
 

@@ -1,10 +1,10 @@
-//! Where a vehicle is: a constant, or told while it moves.
+//! Pose of a vehicle: constant, or received while it moves.
 
 use std::net::SocketAddr;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::geometry::Pose;
-use ecod::time::Timestamp;
+use ecod::model::geometry::Pose;
+use ecod::model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 
 /// The vehicle's pose in the cell's east-north frame; `[pose]` in the configuration file.
@@ -17,8 +17,8 @@ pub struct PoseConfig {
     pub y_m: f64,
     /// Heading in degrees, counter-clockwise from east. Default 0.
     pub heading_deg: f64,
-    /// UDP address on which the vehicle's localisation tells its poses; the keys above are then not used, and a frame
-    /// without a pose near its time is not reported. Default none: the vehicle stands still.
+    /// UDP address that receives poses from the vehicle's localisation. It replaces the keys above, and a frame without
+    /// a pose near its time is not reported. Default none: the vehicle stands still.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listen: Option<SocketAddr>,
 }
@@ -40,27 +40,27 @@ impl PoseConfig {
     }
 }
 
-/// A pose as told; unknown fields are left alone.
+/// A received pose; unknown fields are ignored.
 #[derive(Debug, Deserialize)]
 struct PoseFix {
     x_m: f64,
     y_m: f64,
     heading_rad: f64,
-    /// Unix time by this machine's clock; the time of receipt without it.
+    /// Unix time by this machine's clock. Default the time of receipt.
     captured_at_us: Option<Timestamp>,
 }
 
-/// Farthest from the origin that a vehicle may be, in metres.
+/// Maximum distance from the origin in metres, along each axis.
 const WORLD_M: f64 = 1e8;
 
-/// A pose and its time, as localisation tells it in JSON:
+/// Reads a pose and its time from JSON:
 ///
 /// ```json
 /// {"x_m": 4.2, "y_m": -1.0, "heading_rad": 1.57, "captured_at_us": 1732154400000000}
 /// ```
 ///
 /// # Errors
-/// What is wrong with it, in words.
+/// The problem as text.
 pub fn read_pose(datagram: &[u8], now: Timestamp) -> Result<(Timestamp, Pose), String> {
     let fix: PoseFix = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
     let within = |value: f64, most: f64| value.abs() <= most;

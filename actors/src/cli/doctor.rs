@@ -1,4 +1,4 @@
-//! `ecod-node doctor`: whether a node can run here.
+//! `ecod-node doctor`: checks whether a node can run here.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ use crate::node::config::NodeConfig;
 /// Flags of `doctor`.
 #[derive(Debug, Args)]
 pub(super) struct DoctorArguments {
-    /// Configuration of the node (TOML); `ECOD_…` in the environment counts as it does for the node
+    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
     /// Print JSON for programs
@@ -22,11 +22,11 @@ pub(super) struct DoctorArguments {
     json: bool,
 }
 
-/// Prints one line for each thing; fails if one of them is broken.
+/// Prints one line per check; fails if one is broken.
 pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
     let config =
         NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new()).map_err(Failure::usage)?;
-    let runtime = tokio::runtime::Runtime::new().context("no threads")?;
+    let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
     let findings = runtime.block_on(examine(&config, &arguments.config));
     // A camera may block for good.
     runtime.shutdown_timeout(Duration::ZERO);

@@ -1,4 +1,4 @@
-//! Files of lines, such as recordings, read in bounded memory; `-` stands for standard input and output.
+//! Files of lines, read in bounded memory; `-` stands for standard input and output.
 
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-/// What was read of a line.
+/// Result of reading a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LineRead {
     /// The whole line, without its end.
     Whole,
-    /// More than the limit; the rest was passed over.
+    /// More than the limit; the rest was skipped.
     TooLarge,
-    /// There is no further line.
+    /// The end of the file.
     End,
 }
 
@@ -45,13 +45,13 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
         return Ok(Box::new(io::stdin().lock()));
     }
     let file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
-    if file.metadata().is_ok_and(|facts| facts.is_dir()) {
+    if file.metadata().is_ok_and(|metadata| metadata.is_dir()) {
         bail!("cannot read {}: it is a directory", path.display());
     }
     Ok(Box::new(BufReader::with_capacity(1 << 18, file)))
 }
 
-/// Checks that a file that is to be written is none of `inputs`.
+/// Checks that an output file is none of `inputs`.
 ///
 /// # Errors
 /// Naming the file.
@@ -63,7 +63,7 @@ pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<
     Ok(())
 }
 
-/// Creates a file, or empties it; it must not be one of `inputs`, which are still to be read.
+/// Creates or truncates a file that is none of `inputs`.
 ///
 /// # Errors
 /// Naming the file.

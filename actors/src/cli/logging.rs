@@ -1,4 +1,4 @@
-//! Where the program's log goes, and in which form; and whether its spans are exported.
+//! Format and destination of the program's log, and the export of its spans.
 
 use std::io::{IsTerminal, stderr};
 use std::os::unix::fs::MetadataExt;
@@ -13,32 +13,41 @@ use tracing_subscriber::{EnvFilter, Layer, Registry};
 #[cfg(feature = "otel")]
 use crate::telemetry::otlp::Export;
 
-/// The form of the log.
+/// Help on log formats, printed once by `ecod-node --help`.
+pub(super) const HELP: &str = "\
+Log formats (--log-format):
+  auto     systemd's journal if standard error is connected to it; else JSON for nodes outside a terminal, text otherwise
+  text     lines on standard error
+  json     one JSON object per line on standard error
+  journal  systemd's journal, with fields named ECOD_*
+
+RUST_LOG sets the log level, such as RUST_LOG=debug.";
+
+/// Format of the log.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
-    /// To the journal if it is connected; else text on a terminal and for tools, and JSON for nodes
+    /// The journal if connected; else JSON for nodes outside a terminal, text otherwise
     #[default]
     Auto,
-    /// Lines for people, to standard error
+    /// Lines on standard error
     Text,
-    /// A JSON object a line, to standard error
+    /// One JSON object per line on standard error
     Json,
-    /// To systemd's journal, each field by its name
+    /// systemd's journal, with named fields
     Journal,
 }
 
-/// Collector of spans, the standard variable; without it nothing is exported.
+/// Standard variable with the collector of spans; without it nothing is exported.
 const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
 
-/// What fields of events are called in the journal: `ECOD_` and their name.
+/// Prefix of event fields in the journal, followed by `_`.
 const JOURNAL_PREFIX: &str = "ECOD";
 
-/// Starts the log. `runs_on` tells programs that work until they are told to stop, whose logs machines read, from tools.
-/// `RUST_LOG` goes before `level`. Spans are not logged: a line has the fields of its event alone, without those of the
-/// actor that wrote it, and a span that nothing else records costs nothing. The result is kept until the program ends.
-pub fn start(format: LogFormat, runs_on: bool, level: &str) -> Option<Export> {
+/// Starts the log. A service's log is read by machines, a tool's by people. `RUST_LOG` overrides `level`. Spans are not
+/// logged: a line has the fields of its event only. Keep the result until the program ends.
+pub fn start(format: LogFormat, is_service: bool, level: &str) -> Option<Export> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
-    let (layer, problem) = match resolved(format, runs_on) {
+    let (layer, problem) = match resolved(format, is_service) {
         LogFormat::Journal => match journal() {
             Ok(layer) => (layer, None),
             Err(error) => (json(), Some(error)),
@@ -48,18 +57,18 @@ pub fn start(format: LogFormat, runs_on: bool, level: &str) -> Option<Export> {
     };
     let events = filter_fn(|metadata| metadata.is_event()).with_max_level_hint(LevelFilter::TRACE);
     let mut layers = vec![layer.with_filter(filter.and(events)).boxed()];
-    let exported = if runs_on { export(&mut layers) } else { Ok(None) };
+    let exported = if is_service { export(&mut layers) } else { Ok(None) };
     tracing_subscriber::registry().with(layers).init();
     if let Some(error) = problem {
-        tracing::warn!(%error, "the journal does not answer, logging to standard error");
+        tracing::warn!(%error, "cannot reach the journal, logging to standard error");
     }
     exported.unwrap_or_else(|error| {
-        tracing::warn!(%error, "spans are not exported");
+        tracing::warn!(%error, "cannot export spans");
         None
     })
 }
 
-/// Adds what exports spans, where the environment names a collector.
+/// Adds the export of spans if the environment names a collector.
 fn export(layers: &mut Vec<AnyLayer>) -> anyhow::Result<Option<Export>> {
     if std::env::var_os(ENDPOINT).is_none_or(|endpoint| endpoint.is_empty()) {
         return Ok(None);
@@ -69,17 +78,16 @@ fn export(layers: &mut Vec<AnyLayer>) -> anyhow::Result<Option<Export>> {
     Ok(Some(export))
 }
 
-fn resolved(format: LogFormat, runs_on: bool) -> LogFormat {
+fn resolved(format: LogFormat, is_service: bool) -> LogFormat {
     match format {
         LogFormat::Auto if stderr_is_journal() => LogFormat::Journal,
-        LogFormat::Auto if runs_on && !stderr().is_terminal() => LogFormat::Json,
+        LogFormat::Auto if is_service && !stderr().is_terminal() => LogFormat::Json,
         LogFormat::Auto => LogFormat::Text,
         chosen => chosen,
     }
 }
 
-/// Whether standard error is the stream that the service manager connected to the journal, and not something that an
-/// inherited variable speaks of.
+/// Whether standard error is connected to the journal. The variable alone may be inherited from another process.
 fn stderr_is_journal() -> bool {
     let Some(stream) = std::env::var("JOURNAL_STREAM").ok() else { return false };
     std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))

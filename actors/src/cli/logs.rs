@@ -1,95 +1,77 @@
-//! Which files a log consists of, and whose they are.
+//! Selection of log files by node.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, bail};
 use clap::Args;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 
 use super::Failure;
 use crate::observe::recorder::{LogError, LogReader};
 
-/// Chooses among logs that lie together.
+/// Choice among logs of several nodes.
 #[derive(Debug, Args)]
 pub(super) struct NodeArguments {
-    /// Whose log it is, where those of several nodes are given
+    /// Node whose log to use, among logs of several nodes
     #[arg(long, value_name = "NAME")]
     pub(super) node: Option<NodeName>,
 }
 
-/// The files of one node's log, in order.
+/// Files of one node's log, in order.
 pub(super) struct Logs {
     pub(super) files: Vec<PathBuf>,
-    /// Why a file does not say under which configuration it was written.
+    /// Error of the first file whose configuration is unknown.
     pub(super) unusable: Option<LogError>,
 }
 
-/// A file, and what its beginning says.
-struct LogInput {
-    path: PathBuf,
-    node: Option<NodeName>,
-    unusable: Option<LogError>,
-}
-
 impl Logs {
-    /// Looks into files that are logs, and directories of logs, for those of one node.
+    /// Finds the log files of one node among files and directories. Files without a node's name belong to the only node.
     pub(super) fn find(inputs: &[PathBuf], NodeArguments { node }: &NodeArguments) -> Result<Self, Failure> {
-        let mut logs = Vec::new();
-        for input in inputs {
-            if input.is_dir() {
-                let found =
-                    crate::observe::recorder::files(input).with_context(|| format!("cannot read {}", input.display()));
-                for path in found.map_err(Failure::usage)? {
-                    logs.push(LogInput::look_into(path)?);
-                }
-            } else if LogReader::recognises(input).map_err(Failure::usage)? {
-                logs.push(LogInput::look_into(input.clone())?);
-            } else {
-                return Err(Failure::usage(anyhow!("{} is not a log", input.display())));
+        let paths = log_files(inputs).map_err(Failure::usage)?;
+        let (mut logs, mut nodes) = (Vec::new(), BTreeSet::new());
+        for path in paths {
+            let mut log = LogReader::open(&path).map_err(Failure::usage)?;
+            let unusable = match log.next() {
+                Some(Err(error @ (LogError::Newer { .. } | LogError::Identity { .. }))) => Some(error),
+                _ => None,
+            };
+            nodes.extend(log.node().cloned());
+            if node.is_none() || node.as_ref() == log.node() {
+                logs.push((path, unusable));
             }
         }
-        if logs.is_empty() {
-            return Err(Failure::usage(anyhow!("there is no log in the directory {}", inputs[0].display())));
+        let names = nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(", ");
+        match node {
+            Some(node) if !nodes.contains(node) => {
+                let others = if nodes.is_empty() { "nobody" } else { &names };
+                return Err(Failure::usage(anyhow!("there is no log of {node} here, but of {others}")));
+            }
+            None if nodes.len() > 1 => {
+                return Err(Failure::usage(anyhow!("these are logs of several nodes, {names}: choose one by --node")));
+            }
+            _ => {}
         }
-        let logs = one_node(logs, node.as_ref())?;
-        let (mut files, mut unusable) = (Vec::new(), None);
-        for log in logs {
-            files.push(log.path);
-            unusable = unusable.or(log.unusable);
-        }
-        Ok(Self { files, unusable })
+        let (files, unusable): (Vec<_>, Vec<_>) = logs.into_iter().unzip();
+        Ok(Self { files, unusable: unusable.into_iter().flatten().next() })
     }
 }
 
-impl LogInput {
-    fn look_into(path: PathBuf) -> Result<Self, Failure> {
-        let mut log = LogReader::open(&path).map_err(Failure::usage)?;
-        let unusable = match log.next() {
-            Some(Err(error @ (LogError::Newer { .. } | LogError::Identity { .. }))) => Some(error),
-            _ => None,
-        };
-        let node = log.node().cloned();
-        Ok(Self { path, node, unusable })
+/// Log files among files and directories.
+fn log_files(inputs: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for input in inputs {
+        if input.is_dir() {
+            let files = crate::observe::recorder::files(input);
+            found.extend(files.with_context(|| format!("cannot read {}", input.display()))?);
+        } else if LogReader::recognises(input)? {
+            found.push(input.clone());
+        } else {
+            bail!("{} is not a log", input.display());
+        }
     }
-}
-
-/// Those of the node that is asked for; files that do not say whose they are go with the only one.
-fn one_node(mut logs: Vec<LogInput>, node: Option<&NodeName>) -> Result<Vec<LogInput>, Failure> {
-    let nodes: BTreeSet<_> = logs.iter().filter_map(|log| log.node.clone()).collect();
-    let names = || nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(", ");
-    match node {
-        Some(node) if !nodes.contains(node) => {
-            let others = if nodes.is_empty() { "nobody".into() } else { names() };
-            Err(Failure::usage(anyhow!("there is no log of {node} here, but of {others}")))
-        }
-        Some(node) => {
-            logs.retain(|log| log.node.as_ref() == Some(node));
-            Ok(logs)
-        }
-        None if nodes.len() > 1 => {
-            Err(Failure::usage(anyhow!("these are logs of several nodes, {}: choose one by --node", names())))
-        }
-        None => Ok(logs),
+    if found.is_empty() {
+        bail!("there is no log in the directory {}", inputs[0].display());
     }
+    Ok(found)
 }

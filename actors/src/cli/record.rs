@@ -1,10 +1,10 @@
-//! `ecod-node record`: joins a cell to record what all of it says.
+//! `ecod-node record`: joins a cell and records all its messages.
 
 use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 
 use super::Failure;
 use super::run::{ObserverArguments, run_node};
@@ -15,12 +15,12 @@ use crate::observe::recorder::RecordConfig;
 pub(super) struct RecordArguments {
     #[command(flatten)]
     observer: ObserverArguments,
-    /// Directory of the log; default that of `record` in the configuration
+    /// Directory of the log; default: `record` of the configuration
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
 }
 
-/// Whose log it is, unless the observer is given a name.
+/// Default name of the log.
 const NAME: NodeName = NodeName::from_static("recorder");
 
 /// Records until SIGINT or SIGTERM.
@@ -31,11 +31,13 @@ pub(super) fn run(arguments: &RecordArguments) -> Result<(), Failure> {
         (Some(dir), Some(record)) => RecordConfig { dir: dir.clone(), ..record },
         (Some(dir), None) => RecordConfig::new(dir),
         (None, Some(record)) => record,
-        (None, None) => return Err(Failure::usage(anyhow!("where is recorded? give --dir, or [record] in --config"))),
+        (None, None) => {
+            return Err(Failure::usage(anyhow!("no directory to record to: give --dir, or [record] in --config")));
+        }
     };
-    // A node goes on without its log; an observer that records has nothing else to do.
-    std::fs::create_dir_all(&record.dir).with_context(|| format!("cannot record in {}", record.dir.display()))?;
-    // The name of the process would make every run a log of its own, that none after it deletes or goes on with.
+    // A node runs on without its log, but a recorder has nothing else to do.
+    std::fs::create_dir_all(&record.dir).with_context(|| format!("cannot record to {}", record.dir.display()))?;
+    // A name with the process id would start a new log in every run, which no later run continues or deletes.
     let name = Some(arguments.observer.name().cloned().unwrap_or(NAME));
     config.record = Some(RecordConfig { name, reports: true, ..record });
     run_node(config, false)

@@ -1,4 +1,4 @@
-//! `ecod-node replay`: a recording run again in virtual time.
+//! `ecod-node replay`: fuses a recording again in virtual time.
 
 mod log;
 
@@ -23,20 +23,20 @@ use log::LogReplay;
 /// Flags of `replay`.
 #[derive(Debug, Args)]
 pub(super) struct ReplayArguments {
-    /// Configuration of the cell, or of a node in it (TOML); without it, that of the log, or for reports alone defaults
-    /// and the locations that they name
+    /// Configuration of the cell or of one of its nodes (TOML). Default: that of the log; for reports, the defaults and
+    /// the locations that the reports name
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A log (MCAP), a directory of logs, or reports, one JSON object a line in the order of arrival; `-`
-    /// for standard input; may be given several times for logs
+    /// A log (MCAP), a directory of logs, or reports, one JSON object per line in order of arrival; `-` for standard
+    /// input; may be given several times for logs
     #[arg(long, value_name = "FILE", required = true)]
     input: Vec<PathBuf>,
     #[command(flatten)]
     node: NodeArguments,
-    /// Where maps and verdicts are written, one JSON object a line; `-` for standard output
+    /// File for maps and verdicts, one JSON object per line; `-` for standard output
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
-    /// Go over all votes so many times and write only the verdicts of the last pass
+    /// Repeat VOTE over all evidence N times, and write the verdicts of the last pass only
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     passes: Option<u32>,
 }
@@ -46,21 +46,18 @@ pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
     let given = config.as_deref().map(|path| cell(Some(path))).transpose()?;
     if let Some(lines) = input_of_lines(input, node)? {
         let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
-        let mut sink = lines::create(output, input).map_err(Failure::usage)?;
-        replay_lines(Replay::new(config.clone()), &config, lines, &mut sink, output)?;
-        return Ok(flush(&mut sink).with_context(|| cannot_write(output))?);
+        return replay_lines(config, lines, RoundWriter::create(output, input)?);
     }
     let Logs { files, unusable } = Logs::find(input, node)?;
     if let (Some(unusable), None) = (unusable, &given) {
-        let why = anyhow!("{:#}: say by --config how its reports are fused", anyhow!(unusable));
+        let why = anyhow!("{:#}: give the configuration of the fusion with --config", anyhow!(unusable));
         return Err(Failure::usage(why));
     }
-    let mut sink = lines::create(output, &files).map_err(Failure::usage)?;
-    LogReplay::new(given.as_ref(), *passes).run(&files, &mut sink, output)?;
-    Ok(flush(&mut sink).with_context(|| cannot_write(output))?)
+    let rounds = RoundWriter::create(output, &files)?;
+    LogReplay::new(given.as_ref(), *passes).run(&files, rounds)
 }
 
-/// The file of lines, or standard input, that is to be replayed; none if these are logs.
+/// The input, if it is a file of lines or standard input; none for logs.
 fn input_of_lines<'a>(inputs: &'a [PathBuf], node: &NodeArguments) -> Result<Option<&'a Path>, Failure> {
     let [input] = inputs else { return Ok(None) };
     if input != Path::new("-") && (input.is_dir() || LogReader::recognises(input).map_err(Failure::usage)?) {
@@ -72,31 +69,25 @@ fn input_of_lines<'a>(inputs: &'a [PathBuf], node: &NodeArguments) -> Result<Opt
     Ok(Some(input))
 }
 
-fn replay_lines(
-    mut replay: Replay,
-    config: &ReplayConfig,
-    input: &Path,
-    sink: &mut dyn Write,
-    output: &Path,
-) -> Result<(), Failure> {
+fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> Result<(), Failure> {
     let mut source = lines::open(input).map_err(Failure::usage)?;
-    let mut line = Vec::new();
     let limit = config.limits.payload_bytes;
+    let (mut replay, mut line) = (Replay::new(config), Vec::new());
     loop {
         match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", input.display()))? {
             LineRead::End => break,
             LineRead::TooLarge => replay.oversized_line(),
             LineRead::Whole => {
-                if !write_all(sink, &replay.line(&line), output)? {
+                if !rounds.write(&replay.line(&line))? {
                     return Ok(());
                 }
             }
         }
     }
     let (rest, summary) = replay.finish();
-    write_all(sink, &rest, output)?;
-    report(&summary);
-    Ok(())
+    rounds.write(&rest)?;
+    print_summary(&summary);
+    rounds.finish()
 }
 
 /// The cell that a configuration file describes; without a file, an open one.
@@ -108,7 +99,7 @@ pub fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
     let node = NodeConfig::load_cell(path).map_err(Failure::usage)?;
     let default = ReplayConfig::default();
     Ok(ReplayConfig {
-        // Of a line, its length alone is limited.
+        // Only the length of a line is limited.
         limits: Limits { objects: default.limits.objects, ..node.mqtt.limits() },
         landmarks: node.landmarks(),
         aggregator: node.name.unwrap_or(default.aggregator),
@@ -117,48 +108,58 @@ pub fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
     })
 }
 
-fn cannot_write(path: &Path) -> String {
-    format!("cannot write {}", path.display())
+/// Output of maps and verdicts.
+struct RoundWriter {
+    sink: Box<dyn Write>,
+    path: PathBuf,
 }
 
-/// False when nobody reads any more.
-fn write_all(sink: &mut dyn Write, output: &[FusedLine], path: &Path) -> anyhow::Result<bool> {
-    write(sink, output).with_context(|| cannot_write(path))
-}
+impl RoundWriter {
+    fn create(path: &Path, inputs: &[PathBuf]) -> Result<Self, Failure> {
+        let sink = lines::create(path, inputs).map_err(Failure::usage)?;
+        Ok(Self { sink, path: path.into() })
+    }
 
-fn write(sink: &mut dyn Write, output: &[FusedLine]) -> io::Result<bool> {
-    for line in output {
-        let written = serde_json::to_writer(&mut *sink, line).map_err(io::Error::from);
-        match written.and_then(|()| sink.write_all(b"\n")) {
-            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => return Ok(false),
-            other => other?,
+    /// Writes rounds; false once the reader has closed the output.
+    fn write(&mut self, rounds: &[FusedLine]) -> Result<bool, Failure> {
+        for round in rounds {
+            let written = serde_json::to_writer(&mut *self.sink, round).map_err(io::Error::from);
+            let written = written.and_then(|()| self.sink.write_all(b"\n"));
+            if !self.is_open(written)? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    fn finish(mut self) -> Result<(), Failure> {
+        let flushed = self.sink.flush();
+        self.is_open(flushed).map(drop)
+    }
+
+    fn is_open(&self, written: io::Result<()>) -> Result<bool, Failure> {
+        match written {
+            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
+            written => Ok(written.map(|()| true).with_context(|| format!("cannot write {}", self.path.display()))?),
         }
     }
-    Ok(true)
 }
 
-fn flush(sink: &mut dyn Write) -> io::Result<()> {
-    match sink.flush() {
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        other => other,
-    }
-}
-
-fn report(summary: &Summary) {
+fn print_summary(summary: &Summary) {
     let Summary { lines, rejected, late, ignored_votes, overtaken, tracks, written } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
     for (reason, Rejections { lines, first_line }) in rejected {
         eprintln!("rejected {reason} {lines}, the first in line {first_line}");
     }
     for (what, number) in [
-        ("used although earlier than a line before", *late),
-        ("objects that voted for nothing, or whose labels had to make room", *ignored_votes),
-        ("used for tracks alone, overtaken by a later report of the vehicle", *overtaken),
-        ("reports too late for tracks", tracks.late),
-        ("new objects refused by tracks", tracks.refused),
+        ("reports used although older than an earlier line", *late),
+        ("votes ignored: no usable location, or too many labels", *ignored_votes),
+        ("reports used for tracking only, since a later one of the vehicle came first", *overtaken),
+        ("reports too late for tracking", tracks.late),
+        ("new objects not tracked: too many", tracks.refused),
     ] {
         if number > 0 {
-            eprintln!("{what} {number}");
+            eprintln!("{what}: {number}");
         }
     }
 }

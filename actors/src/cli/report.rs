@@ -1,4 +1,4 @@
-//! `ecod-node report`: a log as one page.
+//! `ecod-node report`: an HTML report about a log.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,12 +14,12 @@ use crate::observe::report::Report;
 /// Which log becomes a page, and where.
 #[derive(Debug, Args)]
 pub struct PageArguments {
-    /// Logs of one node (MCAP) in order, or the directory that they are in
+    /// Log files of one node (MCAP) in order, or their directory
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
     #[command(flatten)]
     node: NodeArguments,
-    /// The page that is written (HTML)
+    /// Report to write (HTML)
     #[arg(short, long, value_name = "FILE", default_value = "report.html")]
     output: PathBuf,
 }
@@ -58,7 +58,7 @@ pub fn page(arguments: &PageArguments, mut report: Report, read: Option<&Path>, 
         eprintln!("{program}: {problem}");
     }
     if report.is_empty() {
-        return Err(anyhow!("there is nothing in the log").into());
+        return Err(anyhow!("the log is empty").into());
     }
     Ok(fs::write(output, report.page()).with_context(|| format!("cannot write {}", output.display()))?)
 }

@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 #[cfg(feature = "camera")]
 use ecod::wire::Role;
-use serde::Serialize;
+use serde_json::{Value, json};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
@@ -21,99 +21,62 @@ use crate::transport::mqtt::BrokerAddress;
 use crate::transport::pki::OBSERVER_MARK;
 
 /// Flags of a node; each overrides the key of its name in the configuration file.
-#[derive(Debug, Default, Args, Serialize)]
-pub struct RunArguments {
-    /// Who leads: `edge` whenever it is there, `auto` if no better candidate is, `cav` never
+#[derive(Debug, Default, Args)]
+pub(super) struct RunArguments {
+    /// When to lead: `edge` whenever possible, `auto` without a better candidate, `cav` never
     #[arg(long, value_parser = ["auto", "cav", "edge"])]
-    #[serde(skip_serializing_if = "Option::is_none")]
     role: Option<String>,
-    /// Configuration file (TOML)
-    #[arg(long, value_name = "FILE")]
-    #[serde(skip)]
-    config: Option<PathBuf>,
-    /// Name of the node, unique in its cell
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    name: Option<NodeName>,
-    /// Name of the cell
-    #[arg(long)]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    cell: Option<NodeName>,
-    /// Where the embedded broker of a node that may lead listens
+    #[command(flatten)]
+    join: JoinArguments,
+    /// Address of the embedded broker, on a node that may lead
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
-    #[serde(skip_serializing_if = "Option::is_none")]
     listen: Option<SocketAddr>,
-    /// An external broker for all data; without one the nodes' own are used
-    #[arg(long, value_name = "HOST:PORT")]
-    #[serde(skip)]
-    broker: Option<BrokerAddress>,
-    /// A node to ask for the cell; may be given several times
-    #[arg(long = "seed", value_name = "HOST:PORT")]
-    #[serde(skip)]
-    seeds: Vec<String>,
-    /// Directory for what survives a restart
+    /// Directory for state that survives a restart
     #[arg(long, value_name = "DIR")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    state_dir: Option<PathBuf>,
-    /// Append every accepted map and its time of receipt to this file, one JSON object a line
+    state_dir: Option<String>,
+    /// Append every accepted map with its time of receipt to this file, one JSON object per line
     #[arg(long, value_name = "FILE")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    map_log: Option<PathBuf>,
-    /// Where the web page with the cell, metrics and health is served: 127.0.0.1:8080 if nothing is said, or a free
-    /// port if that is taken; other addresses than loopback need `dashboard.token`
+    map_log: Option<String>,
+    /// Address of the web page, metrics and health. Default 127.0.0.1:8080, or a free port if that is in use. Addresses
+    /// other than loopback need `dashboard.token`
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1)]
-    #[serde(skip)]
     dashboard: Option<Option<SocketAddr>>,
     /// Serve neither page nor metrics nor health
     #[arg(long, conflicts_with = "dashboard")]
-    #[serde(skip)]
     no_dashboard: bool,
-    /// Record in this directory (MCAP); the table `record` of the configuration file has more
+    /// Record to this directory (MCAP); the configuration table `record` has more options
     #[arg(long, value_name = "DIR")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    record: Option<PathBuf>,
+    record: Option<String>,
     /// Print the configuration that results from file, environment and flags, and exit
     #[arg(long)]
-    #[serde(skip)]
     print_config: bool,
-    /// Stop when standard input ends, as it does when the process that started the node is gone
+    /// Stop when standard input ends, as when the parent process is gone
     #[arg(long, hide = true)]
-    #[serde(skip)]
     stop_at_eof: bool,
+}
+
+/// Flags by which a program finds and joins a cell.
+#[derive(Debug, Clone, Default, Args)]
+struct JoinArguments {
+    /// Configuration file (TOML)
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Name of this node, unique in its cell
+    #[arg(long)]
+    name: Option<NodeName>,
+    /// Name of the cell
+    #[arg(long)]
+    cell: Option<NodeName>,
+    /// External broker for all data; without one, nodes use their own
+    #[arg(long, value_name = "HOST:PORT")]
+    broker: Option<BrokerAddress>,
+    /// Address of a node of the cell; may be given several times
+    #[arg(long = "seed", value_name = "HOST:PORT")]
+    seeds: Vec<String>,
 }
 
 fn ip_and_port(text: &str) -> Result<SocketAddr, &'static str> {
     text.parse().map_err(|_| "must be an IP address and a port, such as 0.0.0.0:1883")
-}
-
-/// Flags as they are laid over the configuration.
-#[derive(Serialize)]
-struct Overrides<'a> {
-    #[serde(flatten)]
-    top: &'a RunArguments,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    mqtt: Option<MqttOverrides<'a>>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    membership: Option<MembershipOverrides<'a>>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    dashboard: Option<DashboardOverrides>,
-}
-
-#[derive(Serialize)]
-struct MqttOverrides<'a> {
-    broker: &'a BrokerAddress,
-}
-
-#[derive(Serialize)]
-struct MembershipOverrides<'a> {
-    seeds: &'a [String],
-}
-
-#[derive(Serialize)]
-struct DashboardOverrides {
-    enabled: bool,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    listen: Option<SocketAddr>,
 }
 
 pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
@@ -126,9 +89,9 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
 
 /// Runs a node until it is told to stop or gives up.
 pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Runtime::new().context("no threads for the node")?;
+    let runtime = tokio::runtime::Runtime::new().context("cannot start threads for the node")?;
     let served = runtime.block_on(serve(config, stop_at_eof));
-    // A detector may be busy for good; whoever restarts the node must not wait for it.
+    // A detector may block for good; a restart of the node must not wait for it.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     #[cfg(feature = "camera")]
     crate::camera::frame_source::capture::wait_for_readers(SHUTDOWN_TIMEOUT);
@@ -138,18 +101,39 @@ pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Fail
 impl RunArguments {
     /// The configuration that results from file, environment and flags.
     fn load(&self) -> Result<NodeConfig, Failure> {
-        let mqtt = self.broker.as_ref().map(|broker| MqttOverrides { broker });
-        let seeds = (!self.seeds.is_empty()).then_some(&*self.seeds);
-        let membership = seeds.map(|seeds| MembershipOverrides { seeds });
-        let wanted = self.dashboard.map(|listen| DashboardOverrides { enabled: true, listen });
-        let dashboard =
-            if self.no_dashboard { Some(DashboardOverrides { enabled: false, listen: None }) } else { wanted };
-        let overrides = Overrides { top: self, mqtt, membership, dashboard };
-        NodeConfig::load(self.config.as_deref(), &overrides).map_err(Failure::usage)
+        NodeConfig::load(self.join.config.as_deref(), &self.overrides()).map_err(Failure::usage)
+    }
+
+    /// The flags that were given, as keys of the configuration.
+    fn overrides(&self) -> Value {
+        let Self { role, join, listen, state_dir, map_log, dashboard, no_dashboard, record, .. } = self;
+        let seeds = Some(&join.seeds).filter(|seeds| !seeds.is_empty());
+        let enabled = if *no_dashboard { Some(false) } else { dashboard.map(|_| true) };
+        let mut keys = json!({
+            "role": role,
+            "name": join.name,
+            "cell": join.cell,
+            "listen": listen,
+            "state_dir": state_dir,
+            "map_log": map_log,
+            "record": record,
+            "mqtt": { "broker": join.broker },
+            "membership": { "seeds": seeds },
+            "dashboard": { "enabled": enabled, "listen": dashboard.flatten() },
+        });
+        remove_nulls(&mut keys);
+        keys
     }
 }
 
-/// How long the threads of a stopped node may take to end.
+fn remove_nulls(value: &mut Value) {
+    if let Value::Object(keys) = value {
+        keys.retain(|_, value| !value.is_null());
+        keys.values_mut().for_each(remove_nulls);
+    }
+}
+
+/// Maximum time for the threads of a stopped node to end.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Runs the node until SIGINT or SIGTERM.
@@ -157,7 +141,7 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     #[cfg(feature = "camera")]
     if config.role == Role::Cav && config.camera.is_none() && config.record.is_none() {
-        tracing::warn!("no [camera] is configured: this vehicle reports nothing, it only follows");
+        tracing::warn!("no [camera] is configured: this vehicle reports nothing and only follows");
     }
     let mut node = node::start(config).await?;
     if let Some(manager) = ServiceManager::from_environment() {
@@ -174,60 +158,34 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// How somebody joins a cell to watch it.
+/// Flags of a program that joins a cell as an observer. The configuration may be that of any node of the cell.
 #[derive(Debug, Args)]
 pub(super) struct ObserverArguments {
-    /// Configuration of a node of the cell (TOML): how the cell is found, its key, its locations
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Name of this observer, unique in the cell
-    #[arg(long)]
-    name: Option<NodeName>,
-    /// Name of the cell
-    #[arg(long)]
-    cell: Option<NodeName>,
-    /// An external broker for all data; without one the nodes' own are used
-    #[arg(long, value_name = "HOST:PORT")]
-    broker: Option<BrokerAddress>,
-    /// A node to ask for the cell; may be given several times
-    #[arg(long = "seed", value_name = "HOST:PORT")]
-    seeds: Vec<String>,
+    #[command(flatten)]
+    join: JoinArguments,
 }
 
 impl ObserverArguments {
-    /// The name that the observer was given.
+    /// Name given to the observer.
     pub(super) fn name(&self) -> Option<&NodeName> {
-        self.name.as_ref()
+        self.join.name.as_ref()
     }
 
-    /// Whose configuration this is.
-    fn holder(&self) -> Result<Option<NodeName>, Failure> {
-        let run = RunArguments { config: self.config.clone(), cell: self.cell.clone(), ..RunArguments::default() };
-        Ok(run.load()?.name)
-    }
-
-    /// The configuration of a node that only listens: it leads nothing, has no camera, keeps nothing, and leaves the
-    /// addresses in the file to the node that they are for. Without a name it has that of the process.
+    /// Configuration of a node that only listens: it never leads, has no camera, keeps no state, and leaves the addresses
+    /// in the file to their node. Its default name is made of `purpose` and the process id.
     pub(super) fn load(&self, purpose: &str) -> Result<NodeConfig, Failure> {
-        let name = format!("{purpose}-{}", std::process::id());
-        let name = self.name.clone().or_else(|| NodeName::new(&name).ok());
-        let run = RunArguments {
-            role: Some("cav".into()),
-            config: self.config.clone(),
-            name,
-            cell: self.cell.clone(),
-            broker: self.broker.clone(),
-            seeds: self.seeds.clone(),
-            ..RunArguments::default()
-        };
-        let mut config = run.load()?;
-        // With the certificate of a node, the observer takes a name below that node's.
-        if config.tls.is_some()
-            && self.name.is_none()
-            && let Some(holder) = self.holder()?
-        {
-            let name = format!("{holder}{OBSERVER_MARK}{purpose}-{}", std::process::id());
-            config.name = Some(NodeName::new(&name).map_err(|error| Failure::usage(anyhow::anyhow!(error)))?);
+        let default_name = format!("{purpose}-{}", std::process::id());
+        let name = self.join.name.clone().or_else(|| NodeName::new(&default_name).ok());
+        let join = JoinArguments { name, ..self.join.clone() };
+        let mut config = RunArguments { role: Some("cav".into()), join, ..RunArguments::default() }.load()?;
+        // With a node's certificate, the observer needs a name below that node's.
+        if config.tls.is_some() && self.join.name.is_none() {
+            let JoinArguments { config: file, cell, .. } = self.join.clone();
+            let join = JoinArguments { config: file, cell, ..JoinArguments::default() };
+            if let Some(holder) = (RunArguments { join, ..RunArguments::default() }).load()?.name {
+                let name = NodeName::new(format!("{holder}{OBSERVER_MARK}{default_name}"));
+                config.name = Some(name.map_err(Failure::usage)?);
+            }
         }
         if let Some(bind) = &mut config.membership.bind {
             bind.set_port(0);
@@ -242,13 +200,13 @@ impl ObserverArguments {
     }
 }
 
-/// Waits for the end of standard input. The thread that reads it is left behind: it cannot be woken.
+/// Waits for the end of standard input. Its reading thread is abandoned, since it cannot be woken.
 async fn input_ended() {
     let (ended, end) = oneshot::channel();
     std::thread::spawn(move || {
         let copied = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());
         tracing::debug!(?copied, "standard input ended");
-        // Nobody waits any more when the node stops for another reason.
+        // The receiver is gone when the node stops for another reason.
         let _ = ended.send(());
     });
     if end.await.is_err() {
@@ -267,8 +225,8 @@ mod tests {
         let text =
             "name = \"euclid\"\n[dashboard]\nlisten = \"127.0.0.1:8080\"\n[membership]\nbind = \"127.0.0.1:17884\"\n";
         std::fs::write(&path, text).unwrap();
-        let arguments =
-            ObserverArguments { config: Some(path), name: None, cell: None, broker: None, seeds: Vec::new() };
+        let join = JoinArguments { config: Some(path), ..JoinArguments::default() };
+        let arguments = ObserverArguments { join };
         let Ok(config) = arguments.load("recorder") else { panic!("the configuration is valid") };
         assert!(!config.dashboard.enabled);
         assert_eq!(config.membership.bind.map(|bind| bind.port()), Some(0));

@@ -7,6 +7,6 @@ use super::{Failure, print};
 
 pub(super) fn run() -> Result<(), Failure> {
     let schemas = wire::schemas();
-    let text = serde_json::to_string_pretty(&schemas).context("schemas are plain JSON")?;
+    let text = serde_json::to_string_pretty(&schemas).context("cannot encode schemas")?;
     Ok(print(&format!("{text}\n"))?)
 }

@@ -1,4 +1,4 @@
-//! `ecod-node completions` and `ecod-node man`: what a package installs beside the program.
+//! `ecod-node completions` and `ecod-node man`: files that a package installs beside the program.
 
 use std::fs;
 use std::path::PathBuf;
@@ -12,18 +12,18 @@ use super::{Failure, print};
 /// Flags of `completions`.
 #[derive(Debug, Args)]
 pub(super) struct CompletionsArguments {
-    /// The shell that completes
+    /// Shell to complete in
     shell: Shell,
 }
 
 /// Flags of `man`.
 #[derive(Debug, Args)]
 pub(super) struct ManArguments {
-    /// Directory for the pages, made if it is not there
+    /// Directory for the pages, created if missing
     dir: PathBuf,
 }
 
-/// Prints what a shell needs to complete the program's arguments.
+/// Prints the completion script of a shell.
 pub(super) fn completions(arguments: &CompletionsArguments, mut program: clap::Command) -> Result<(), Failure> {
     let mut script = Vec::new();
     clap_complete::generate(arguments.shell, &mut program, "ecod-node", &mut script);

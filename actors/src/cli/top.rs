@@ -21,24 +21,24 @@ pub(super) struct TopArguments {
     observer: ObserverArguments,
 }
 
-/// Lines that a page is scrolled by.
+/// Lines per page of scrolling.
 const PAGE: usize = 10;
 
-/// How often the terminal is drawn.
+/// Time between two drawings.
 const PERIOD: Duration = Duration::from_millis(250);
 
-/// Joins the cell and draws it until somebody has seen enough.
+/// Joins the cell and draws it until the user quits.
 pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
     if !std::io::stdout().is_terminal() {
-        return Err(Failure::usage(anyhow!("standard output is no terminal")));
+        return Err(Failure::usage(anyhow!("standard output is not a terminal")));
     }
     let mut config = arguments.observer.load("top")?;
     config.record = None;
-    let runtime = tokio::runtime::Runtime::new().context("no threads for the node")?;
+    let runtime = tokio::runtime::Runtime::new().context("cannot start threads for the node")?;
     let node = runtime.block_on(node::start(config.clone())).map_err(|error| anyhow!(error))?;
     let shown = ratatui::run(|terminal| show(terminal, &node, &config));
     runtime.block_on(node.stop());
-    Ok(shown.context("the terminal cannot be drawn")?)
+    Ok(shown.context("cannot draw to the terminal")?)
 }
 
 fn show(terminal: &mut ratatui::DefaultTerminal, node: &NodeHandle, config: &NodeConfig) -> std::io::Result<()> {

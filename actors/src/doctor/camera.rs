@@ -1,4 +1,4 @@
-//! Camera, calibration and detector.
+//! Checks of camera, calibration and detector.
 
 use std::time::Duration;
 
@@ -8,10 +8,10 @@ use crate::camera::frame_source::SourceConfig;
 use crate::camera::image_size::ImageSize;
 use crate::node::config::NodeConfig;
 
-/// How long a camera may take to its first frame; network cameras take seconds.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// Maximum time until the first frame; network cameras take seconds.
+const TIMEOUT: Duration = Duration::from_secs(10);
 
-/// What the camera gives and whether it can be used; nothing without one.
+/// All checks of a camera, if there is one.
 pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     let Some(camera) = &config.camera else { return Vec::new() };
     vec![frame(camera).await, calibration(camera), detector(camera).await]
@@ -23,26 +23,26 @@ async fn frame(camera: &CameraConfig) -> Finding {
         SourceConfig::V4l2 { .. } => "plug it in, add the user to the group `video`, set `camera.source.device`",
         SourceConfig::Gstreamer { .. } => "try `camera.source.pipeline` with gst-launch-1.0",
         SourceConfig::Url { .. } => "try `camera.source.url` with a player",
-        _ => "set `camera.source` to what is there",
+        _ => "set `camera.source` to an existing source",
     };
     let source = camera.source.clone();
-    // A camera that blocks for good keeps its thread; the program ends all the same.
+    // A camera that blocks forever keeps its thread, but the program ends all the same.
     let (sender, answer) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
         let size =
-            source.open(PATIENCE).and_then(|mut source| source.next_frame()).map(|frame| ImageSize::of(&frame.image));
-        // Nobody waits any more after the patience.
+            source.open(TIMEOUT).and_then(|mut source| source.next_frame()).map(|frame| ImageSize::of(&frame.image));
+        // The receiver is gone after the timeout.
         let _ = sender.send(size);
     });
     let (width, height) = (camera.optics.width_px, camera.optics.height_px);
-    match tokio::time::timeout(PATIENCE, answer).await {
+    match tokio::time::timeout(TIMEOUT, answer).await {
         Ok(Ok(Ok(size))) if size.width * height != size.height * width && camera.optics.calibration.is_none() => {
-            let seen = format!("frames of {}x{}, the optics are of {width}x{height}", size.width, size.height);
-            Finding::broken(check, seen, "set `camera.optics` to the camera's image, or calibrate")
+            let seen = format!("frames of {}x{}, but optics of {width}x{height}", size.width, size.height);
+            Finding::broken(check, seen, "set `camera.optics` to the size of the frames, or calibrate")
         }
         Ok(Ok(Ok(size))) => Finding::fine(check, format!("frames of {}x{}", size.width, size.height)),
         Ok(Ok(Err(error))) => Finding::broken(check, error.to_string(), fix),
-        Ok(Err(_)) | Err(_) => Finding::broken(check, format!("no frame within {PATIENCE:?}"), fix),
+        Ok(Err(_)) | Err(_) => Finding::broken(check, format!("no frame within {TIMEOUT:?}"), fix),
     }
 }
 
@@ -51,12 +51,12 @@ fn calibration(camera: &CameraConfig) -> Finding {
     match (&camera.optics.calibration, camera.optics.lens()) {
         (Some(path), Ok(_)) => Finding::fine(check, path.display().to_string()),
         (_, Err(error)) => {
-            Finding::broken(check, format!("{:#}", anyhow::Error::from(error)), "make one with `ecod-node calibrate`")
+            Finding::broken(check, format!("{:#}", anyhow::Error::from(error)), "create one with `ecod-node calibrate`")
         }
         (None, Ok(_)) => Finding::doubtful(
             check,
-            "none: the data sheet's field of view is used, ranges are off by as much as it is",
-            "make one with `ecod-node calibrate` and set `camera.optics.calibration`",
+            "none: distances are as inaccurate as the field of view from the data sheet",
+            "create one with `ecod-node calibrate` and set `camera.optics.calibration`",
         ),
     }
 }
@@ -66,7 +66,7 @@ async fn detector(camera: &CameraConfig) -> Finding {
     let detector = camera.detector.clone();
     match tokio::task::spawn_blocking(move || detector.build().map(drop)).await {
         Ok(Ok(())) => Finding::fine(check, "loaded"),
-        Ok(Err(error)) => Finding::broken(check, format!("{error:#}"), "set `camera.detector` to files that are there"),
+        Ok(Err(error)) => Finding::broken(check, format!("{error:#}"), "set `camera.detector` to existing files"),
         Err(error) => Finding::broken(check, error.to_string(), "use another model"),
     }
 }

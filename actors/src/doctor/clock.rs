@@ -1,4 +1,4 @@
-//! Whether the clock is set by somebody.
+//! Check of clock synchronisation.
 
 use std::path::Path;
 use std::process::Command;
@@ -7,14 +7,14 @@ use super::Finding;
 
 const CHECK: &str = "clock";
 
-/// A service that keeps the clock writes one of these when it has set it.
+/// Files that time services write when they run or have set the clock.
 const MARKS: [&str; 2] = ["/run/systemd/timesync/synchronized", "/run/chrony/chronyd.pid"];
 
-/// Maps say nothing that needs clocks to agree, and aggregators estimate offsets; but the larger they are the less is
-/// certain, and beyond `fusion.window.max_clock_offset_s` reports are rejected.
+/// Whether a time service keeps the clock. Aggregators estimate clock offsets, but larger ones cost accuracy, and they
+/// reject reports beyond `fusion.window.max_clock_offset_s`.
 pub(super) fn synchronised() -> Finding {
     let fix = "run a time service, such as `apt install chrony` or `timedatectl set-ntp true`";
-    match kernel_says() {
+    match kernel_state() {
         Some(true) => Finding::fine(CHECK, "synchronised"),
         Some(false) => Finding::doubtful(CHECK, "not synchronised", fix),
         None if MARKS.iter().any(|mark| Path::new(mark).exists()) => Finding::fine(CHECK, "a time service runs"),
@@ -22,8 +22,8 @@ pub(super) fn synchronised() -> Finding {
     }
 }
 
-/// What systemd reads from the kernel; `None` where there is no systemd.
-fn kernel_says() -> Option<bool> {
+/// The kernel's state as systemd reports it; `None` without systemd.
+fn kernel_state() -> Option<bool> {
     let arguments = ["show", "--property=NTPSynchronized", "--value"];
     let answer = Command::new("timedatectl").args(arguments).output().ok().filter(|answer| answer.status.success())?;
     match answer.stdout.trim_ascii() {

@@ -1,10 +1,10 @@
-//! Broker, ports and multicast.
+//! Checks of broker, ports, seeds and multicast.
 
 use std::io;
 use std::net::{IpAddr, SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use tokio::time::timeout;
 
 use super::Finding;
@@ -12,28 +12,28 @@ use crate::node::config::NodeConfig;
 use crate::observe::dashboard::DEFAULT_ADDRESS;
 use crate::transport::gossip::DEFAULT_PORT;
 
-/// How long a datagram to oneself may take.
-const PATIENCE: Duration = Duration::from_millis(500);
+/// Maximum time for a multicast datagram to return.
+const MULTICAST_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// How long a name service may take.
-const LOOKUP_PATIENCE: Duration = Duration::from_secs(5);
+/// Maximum time of a name lookup.
+const LOOKUP_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The external broker as it answers, and the port of the embedded one.
+/// Checks the connection to the external broker and the port of the embedded one.
 pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
     let mut findings = Vec::new();
     let plane = config.data_plane();
     if let Some(address) = &plane.external {
         let node = config.name.as_ref().map_or("node", NodeName::as_str);
-        let asked = match config.security() {
+        let answer = match config.security() {
             Ok(security) => crate::transport::mqtt::probe(address, node, &config.mqtt, &security).await,
             Err(error) => Err(error.to_string()),
         };
-        findings.push(match asked {
+        findings.push(match answer {
             Ok(()) => Finding::fine("broker", format!("{address} accepts this node")),
             Err(error) => Finding::broken(
                 "broker",
                 format!("{address}: {error}"),
-                "start it, or set `mqtt.broker`, `mqtt.user`, `mqtt.password`, `mqtt.ca` and `mqtt.version` as it wants them",
+                "start the broker, or correct `mqtt.broker`, `mqtt.user`, `mqtt.password`, `mqtt.ca` and `mqtt.version`",
             ),
         });
     }
@@ -44,56 +44,59 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
     findings
 }
 
-/// The port on which the node gossips.
+/// Checks the gossip port.
 pub(super) fn gossip(config: &NodeConfig) -> Finding {
     let membership = &config.membership;
     let ip = if membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
     let address = membership.bind.unwrap_or(SocketAddr::from((ip, DEFAULT_PORT)));
     let port = Port { check: "gossip port", address, key: "membership.bind" };
     let bound = UdpSocket::bind(address);
-    if membership.bind.is_some() { port.of(bound) } else { port.or_another(bound, "others have this node as a seed") }
+    if membership.bind.is_some() {
+        port.of(bound)
+    } else {
+        port.or_another(bound, "other nodes use this node as a seed")
+    }
 }
 
-/// Whether the seeds have addresses; nothing is sent to them, as they need not be there.
+/// Checks that the seeds have addresses. Sends nothing, as the seeds may be offline.
 pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
     let ipv4 = config.membership.bind.is_none_or(|bind| bind.is_ipv4());
     let mut findings = Vec::new();
     for seed in &config.membership.seeds {
-        let found = timeout(LOOKUP_PATIENCE, crate::transport::gossip::look_up(seed, ipv4)).await;
+        let found = timeout(LOOKUP_TIMEOUT, crate::transport::gossip::look_up(seed, ipv4)).await;
         let found = found.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         findings.push(match found {
             Ok(addresses) => {
                 let addresses: Vec<_> = addresses.iter().map(|address| address.ip().to_string()).collect();
-                Finding::fine("seed", format!("{seed} is at {}", addresses.join(", ")))
+                Finding::fine("seed", format!("{seed} has the address {}", addresses.join(", ")))
             }
             Err(error) => {
-                let fix =
-                    "mend it in `membership.seeds`, or the name service; the node goes on without it, and asks again";
-                Finding::doubtful("seed", format!("{seed}: {}", words(&error)), fix)
+                let fix = "correct `membership.seeds` or the name service; the node runs without this seed and retries";
+                Finding::doubtful("seed", format!("{seed}: {}", describe(&error)), fix)
             }
         });
     }
     findings
 }
 
-/// The port on which a vehicle that moves is told its poses.
+/// Checks the port that receives the poses of a moving vehicle.
 #[cfg(feature = "camera")]
 pub(super) fn poses(config: &NodeConfig) -> Option<Finding> {
     let port = Port { check: "pose port", address: config.pose.listen?, key: "pose.listen" };
     Some(port.of(UdpSocket::bind(port.address)))
 }
 
-/// The address of the dashboard, unless it is switched off.
+/// Checks the address of the dashboard, unless it is disabled.
 pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
     let listen = config.dashboard.listen;
     let port = Port { check: "dashboard", address: listen.unwrap_or(DEFAULT_ADDRESS), key: "dashboard.listen" };
     config.dashboard.enabled.then(|| {
         let bound = TcpListener::bind(port.address);
-        if listen.is_some() { port.of(bound) } else { port.or_another(bound, "its address has to be known") }
+        if listen.is_some() { port.of(bound) } else { port.or_another(bound, "its address must be fixed") }
     })
 }
 
-/// The address of the log's live server, where it is wanted.
+/// Checks the port of the live log server, if configured.
 #[cfg(feature = "foxglove")]
 pub(super) fn live(config: &NodeConfig) -> Option<Finding> {
     let port = config.record.as_ref().and_then(|record| record.live_port)?;
@@ -101,7 +104,7 @@ pub(super) fn live(config: &NodeConfig) -> Option<Finding> {
     Some(port.of(TcpListener::bind(port.address)))
 }
 
-/// An address that the node binds, and the key that says which.
+/// An address that the node binds, and its configuration key.
 #[derive(Clone, Copy)]
 struct Port {
     check: &'static str,
@@ -110,32 +113,32 @@ struct Port {
 }
 
 impl Port {
-    /// What became of binding it.
+    /// Finding for an attempt to bind.
     fn of<T>(self, bound: io::Result<T>) -> Finding {
         let Self { check, address, key } = self;
         let Err(error) = bound else { return Finding::fine(check, format!("{address} is free")) };
         let fix = match error.kind() {
             io::ErrorKind::AddrNotAvailable => format!("set `{key}` to an address of this machine, or 0.0.0.0 for all"),
-            io::ErrorKind::PermissionDenied => format!("set `{key}` to a port from 1024"),
-            _ => format!("stop what uses it, perhaps this node itself, or set `{key}` to another"),
+            io::ErrorKind::PermissionDenied => format!("set `{key}` to port 1024 or higher"),
+            _ => format!("stop the program that uses it (this node, if it runs), or change `{key}`"),
         };
-        Finding::broken(check, format!("{address}: {}", words(&error)), fix)
+        Finding::broken(check, format!("{address}: {}", describe(&error)), fix)
     }
 
-    /// The same where a free port does as well, unless `wanted` is so.
-    fn or_another<T>(self, bound: io::Result<T>, wanted: &str) -> Finding {
+    /// The same where a free port will do, except for the reason `unless`.
+    fn or_another<T>(self, bound: io::Result<T>, unless: &str) -> Finding {
         let Self { check, address, key } = self;
         match bound {
             Err(error) => {
-                let seen = format!("{address}: {}, a free one will be taken", words(&error));
-                Finding::doubtful(check, seen, format!("set `{key}` if {wanted}"))
+                let seen = format!("{address}: {}, the node will take a free one", describe(&error));
+                Finding::doubtful(check, seen, format!("set `{key}` if {unless}"))
             }
             Ok(_) => self.of(bound),
         }
     }
 }
 
-/// Whether a datagram to the group comes back.
+/// Checks that a datagram to the multicast group returns.
 pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
     let multicast = &config.membership.multicast;
     if !multicast.enabled {
@@ -148,7 +151,7 @@ pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
     let returned = || -> io::Result<()> {
         let (receiver, sender) = (UdpSocket::bind((multicast.group, 0))?, UdpSocket::bind((ip, 0))?);
         receiver.join_multicast_v4(&multicast.group, &interface)?;
-        receiver.set_read_timeout(Some(PATIENCE))?;
+        receiver.set_read_timeout(Some(MULTICAST_TIMEOUT))?;
         if !interface.is_unspecified() {
             socket2::SockRef::from(&sender).set_multicast_if_v4(&interface)?;
         }
@@ -157,21 +160,21 @@ pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
     };
     let check = "multicast";
     Some(match returned() {
-        Ok(()) if interface.is_unspecified() => Finding::fine(check, format!("{} comes back", multicast.group)),
-        Ok(()) => Finding::fine(check, format!("{} comes back by {interface}", multicast.group)),
+        Ok(()) if interface.is_unspecified() => Finding::fine(check, format!("{} works", multicast.group)),
+        Ok(()) => Finding::fine(check, format!("{} works on {interface}", multicast.group)),
         Err(error) => Finding::doubtful(
             check,
-            format!("{} by {interface}: {}", multicast.group, words(&error)),
+            format!("{} on {interface}: {}", multicast.group, describe(&error)),
             "set `membership.multicast.interface`, or list nodes in `membership.seeds`",
         ),
     })
 }
 
-fn words(error: &io::Error) -> String {
+fn describe(error: &io::Error) -> String {
     match error.kind() {
         io::ErrorKind::AddrInUse => "in use".into(),
         io::ErrorKind::AddrNotAvailable => "not an address of this machine".into(),
-        io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => "nothing came back".into(),
+        io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => "no answer".into(),
         _ => error.to_string(),
     }
 }

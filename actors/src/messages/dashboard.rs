@@ -1,8 +1,8 @@
-//! Messages to the actor of this name.
+//! Messages to the dashboard.
 
-/// What the dashboard's actor is asked to do.
+/// Requests to the dashboard.
 #[derive(Debug)]
 pub enum DashboardMessage {
-    /// See whether the server still runs; sent by the dashboard to itself.
+    /// Check that the server runs; sent by the dashboard to itself.
     CheckServer,
 }

@@ -1,17 +1,17 @@
-//! Messages to the actor of this name.
+//! Messages to the detector.
 
 use tokio::sync::OwnedSemaphorePermit;
 
 use crate::camera::frame::Frame;
 
-/// What the detector is asked to do.
+/// Requests to the detector.
 #[derive(Debug)]
 pub enum DetectorMessage {
     /// Find the objects in a frame.
-    Look {
+    Detect {
         /// The frame.
         frame: Frame,
-        /// Lets the next frame in when dropped.
-        turn: OwnedSemaphorePermit,
+        /// Admits the next frame when dropped.
+        permit: OwnedSemaphorePermit,
     },
 }

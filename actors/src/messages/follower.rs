@@ -1,23 +1,27 @@
-//! Messages to the actor of this name.
+//! Messages to the follower.
+
+use std::sync::Arc;
+
+use ecod::wire::{GlobalMap, Reputations, Verdicts};
 
 use crate::transport::mqtt::Delivery;
 
-/// What the follower is asked to do.
+/// A message from the cell's leader; the follower accepts or refuses it.
 #[derive(Debug)]
 pub enum FollowerMessage {
-    /// Take a map.
+    /// A map.
     TakeMap {
         /// The map and when it came.
-        delivery: Delivery,
+        delivery: Delivery<Arc<GlobalMap>>,
     },
-    /// Take verdicts.
+    /// Verdicts.
     TakeVerdicts {
         /// The verdicts and when they came.
-        delivery: Delivery,
+        delivery: Delivery<Arc<Verdicts>>,
     },
-    /// Take reputations.
+    /// Reputations.
     TakeReputations {
         /// The reputations and when they came.
-        delivery: Delivery,
+        delivery: Delivery<Arc<Reputations>>,
     },
 }

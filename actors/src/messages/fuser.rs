@@ -3,17 +3,17 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
+use ecod::aggregator::round::FirstRound;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::reputation::ReputationLedger;
-use ecod::round::FirstRound;
-use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputation};
 
 /// What the fuser is asked to do.
 #[derive(Debug)]
 pub enum FuserMessage {
-    /// Fuse the reports that wait in the intake.
+    /// Fuse the reports that wait in its queue.
     TakeReports,
     /// Keep another aggregator's map, which the follower's gate admitted, to go on from when leading.
     TakeMap {

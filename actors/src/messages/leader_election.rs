@@ -1,6 +1,9 @@
 //! Messages to the actor of this name.
 
+use std::sync::Arc;
+
 use ecod::leadership::node::Input;
+use ecod::wire::NodeStatus;
 
 use crate::transport::gossip::MembershipEvent;
 use crate::transport::mqtt::Delivery;
@@ -16,7 +19,7 @@ pub enum LeaderElectionMessage {
     /// A broker passed on a status.
     TakeStatus {
         /// Another node's status, or its last will, and its place among what waits.
-        delivery: Delivery,
+        delivery: Delivery<Arc<NodeStatus>>,
     },
     /// Something else happened at the node.
     Note {

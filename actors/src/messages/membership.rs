@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use bytes::Bytes;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ractor::RpcReplyPort;
 
 /// Requests to the membership.
@@ -13,7 +13,7 @@ pub enum MembershipMessage {
     Send {
         /// The addressee.
         to: NodeName,
-        /// At most [`MAX_PAYLOAD_BYTES`].
+        /// At most [`crate::transport::gossip::MAX_PAYLOAD_BYTES`].
         payload: Bytes,
     },
     /// Query the bound address, which may be unspecified.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Verdicts};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;

@@ -1,24 +1,24 @@
-//! Messages to the actor of this name.
+//! Messages to the projector.
 
-use ecod::detection::Detection;
-use ecod::geometry::Pose;
-use ecod::time::Timestamp;
+use ecod::model::detection::Detection;
+use ecod::model::geometry::Pose;
+use ecod::model::time::Timestamp;
 
-/// What the projector is asked to do.
+/// Requests to the projector.
 #[derive(Debug)]
 pub enum ProjectorMessage {
-    /// Place the detections of one frame and publish them.
+    /// Place the detections of one frame in the world and report them.
     Report {
-        /// What the detector found, in pixels.
+        /// Detections in pixels.
         detections: Vec<Detection>,
-        /// When the frame was captured.
+        /// Time of capture.
         captured_at: Timestamp,
     },
-    /// Note where the vehicle was.
+    /// Take a pose of the vehicle.
     TakePose {
-        /// When it was there, by the clock that stamps frames.
+        /// Time of the pose by the clock that stamps frames.
         at: Timestamp,
-        /// Its pose in the world frame.
+        /// Pose in the world frame.
         pose: Pose,
     },
 }

@@ -1,10 +1,10 @@
-//! Messages to the actor of this name.
+//! Messages to the recorder.
 
-/// What the recorder is asked to do.
+/// Requests to the recorder.
 #[derive(Debug)]
 pub enum RecorderMessage {
-    /// Record who leads now.
-    NoteLeadership,
-    /// Record the counters, and look after the writer.
+    /// Record the present leadership.
+    RecordLeadership,
+    /// Record the counters, and check that the writer runs.
     Tick,
 }

@@ -1,11 +1,12 @@
 //! Messages to the actor of this name.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
 use ecod::reputation::Evidence;
-use ecod::wire::Reputation;
+use ecod::wire::{LedgerShare, Reputation};
 
 use crate::transport::mqtt::Delivery;
 
@@ -35,7 +36,7 @@ pub enum ReputationKeeperMessage {
     /// Take in another candidate's evidence.
     Merge {
         /// The share and when it came.
-        delivery: Delivery,
+        delivery: Delivery<Arc<LedgerShare>>,
     },
     /// Share all evidence: a node needs it to lead, or to remain the leader.
     SendSnapshot {

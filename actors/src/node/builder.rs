@@ -9,8 +9,8 @@ use std::time::Duration;
 use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::PublisherFilter;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::vote::VoteMode;
 use ecod::wire::Topics;
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
@@ -23,14 +23,14 @@ use crate::actors::dashboard::Dashboard;
 #[cfg(feature = "camera")]
 use crate::actors::detector::Detector;
 use crate::actors::follower::Follower;
-use crate::actors::fuser::{Fuser, Intake};
+use crate::actors::fuser::{Fuser, LatestReportQueue};
 use crate::actors::gateway::Gateway;
 use crate::actors::leader_election::LeaderElection;
 use crate::actors::membership::Membership;
 #[cfg(feature = "camera")]
 use crate::actors::projector::{Projector, ProjectorArguments};
 use crate::actors::recorder::Recorder;
-use crate::actors::reputation_keeper::{ReputationKeeper, SharedBook};
+use crate::actors::reputation_keeper::{ReputationKeeper, SharedReputations};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
@@ -58,9 +58,9 @@ pub(super) struct NodeBuilder {
     slots: ActorSlots,
     counters: Arc<Counters>,
     newest: Newest,
-    book: SharedBook,
+    reputations: SharedReputations,
     recording: LogSender,
-    intake: Intake,
+    report_queue: LatestReportQueue,
     broker_address: watch::Sender<Option<SocketAddr>>,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
@@ -92,8 +92,8 @@ impl NodeBuilder {
             recording: LogSender::new(Arc::clone(&counters)),
             counters,
             newest: Newest::default(),
-            intake: Intake::default(),
-            book: SharedBook::new(by_evidence),
+            report_queue: LatestReportQueue::default(),
+            reputations: SharedReputations::new(by_evidence),
             broker_address: watch::Sender::new(None),
             gossip_address: watch::Sender::new(None),
             frames: Arc::default(),
@@ -222,10 +222,10 @@ impl NodeBuilder {
             }
             #[cfg(feature = "camera")]
             ActorKind::Detector => {
-                let pictures = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
+                let images = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
                 let (counters, spans) = (self.counters(), self.spans());
-                let arguments = crate::node::camera::detector(&self.config, projector, pictures, counters, spans);
+                let arguments = crate::node::camera::detector(&self.config, projector, images, counters, spans);
                 let arguments = arguments.map_err(in_full)?;
                 slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }

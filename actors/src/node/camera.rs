@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::Algorithms;
-use ecod::landmark::LandmarkIndex;
+use ecod::perception::landmark::LandmarkIndex;
 
 use crate::actors::detector::DetectorArguments;
 use crate::camera::image_size::ImageSize;
@@ -30,7 +30,7 @@ pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let gate = config.fusion.pace.gate();
     let vehicle_camera = VehicleCamera {
-        node: config.name.clone().unwrap_or(ecod::names::NodeName::from_static("node")),
+        node: config.name.clone().unwrap_or(ecod::model::names::NodeName::from_static("node")),
         pose: config.pose.pose(),
         mount: camera.mount.into(),
         lens: camera.optics.lens().context("key `camera.optics.calibration`")?,
@@ -55,22 +55,22 @@ pub fn algorithms(config: &NodeConfig) -> Algorithms {
 pub fn detector(
     config: &NodeConfig,
     projector: ActorSlot<ProjectorMessage>,
-    pictures: Option<ImageRecorder>,
+    images: Option<ImageRecorder>,
     counters: Arc<Counters>,
     spans: Spans,
 ) -> anyhow::Result<DetectorArguments> {
     let camera = config.camera.as_ref().ok_or(NoCamera)?;
     let source = camera.source.clone();
-    // Somewhat less than the capture waits, so that OpenCV gives up by itself and leaves no thread behind.
-    let patience = Duration::from_secs_f64(0.8 * camera.capture.stall_timeout_s);
+    // Less than the stall timeout, so that OpenCV gives up first and no reader is abandoned.
+    let timeout = Duration::from_secs_f64(0.8 * camera.capture.stall_timeout_s);
     let lens = camera.optics.lens().context("key `camera.optics.calibration`")?;
     Ok(DetectorArguments {
-        open: Arc::new(move || source.open(patience)),
+        open: Arc::new(move || source.open(timeout)),
         capture: camera.capture.clone(),
         detect: camera.detector.build().context("key `camera.detector`")?,
         optics: ImageSize::from(&lens.intrinsics),
         projector,
-        pictures,
+        images,
         counters,
         spans,
     })

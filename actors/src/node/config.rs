@@ -9,9 +9,9 @@ use std::path::PathBuf;
 
 use ecod::aggregator::FusionConfig;
 use ecod::config::ConfigError;
-use ecod::landmark::{Landmark, LandmarkConfig};
 use ecod::leadership::election::ElectionConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::{Landmark, LandmarkConfig};
 use ecod::wire::Role;
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
@@ -366,7 +366,7 @@ mod tests {
             ("kind = \"v4l2\"\nwidth = \"wide\"\nheight = 480", ["`camera.source.width`", "\"wide\"", "u32"]),
             ("kind = \"v4l2\"\nheight = 480\nwidht = 640", ["`camera.source.widht`", "unknown field", "`width`"]),
             ("kind = \"url\"\nurl = 7", ["`camera.source.url`", "text", "quotes"]),
-            ("kind = \"testbed\"\nscenes = \"a\"\ncav = \"b\"", ["`camera.source`", "missing field", "`scene`"]),
+            ("kind = \"testbed\"\nscenes = \"a\"", ["`camera.source.kind`", "testbed", "`images`"]),
             ("kind = \"url\"", ["`camera.source`", "missing field", "`url`"]),
             ("kind = \"eye\"\nwidth = 640", ["`camera.source.kind`", "eye", "`v4l2`"]),
         ] {

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
 /// Most restarts within [`RESTART_SPAN`].
 pub const MAX_RESTARTS: usize = 10;

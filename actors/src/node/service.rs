@@ -7,9 +7,8 @@
 use std::io;
 use std::time::Duration;
 
-use sd_notify::NotifyState;
-
 use ecod::leadership::readiness::Readiness;
+use sd_notify::NotifyState;
 
 /// The service manager of this process.
 #[derive(Debug)]

@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use ecod::aggregator::FusionConfig;
-use ecod::epoch::Epoch;
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::{Readiness, round_timeout};
 use ecod::leadership::timers::READINESS_STEPS;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::vote::VoteMode;
 use ecod::wire::Verdicts;
 use tokio::sync::watch;

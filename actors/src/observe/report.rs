@@ -1,4 +1,4 @@
-//! A log as one page: who led, how late and how steadily rounds came, who saw what, who is trusted, what was lost.
+//! Report about a log as one HTML page: leadership, latency and gaps of rounds, reputations, coverage, losses.
 //!
 //! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`]. A [`Section`] adds to the page.
 
@@ -11,10 +11,10 @@ use std::collections::BTreeMap;
 use std::fmt::Debug;
 use std::path::Path;
 
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::replay::FusedLine;
-use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, ReportKind, Reputations, Verdicts};
 
 pub use page::{drawing, section, table};
@@ -26,9 +26,9 @@ use crate::observe::recorder::{
 use losses::Losses;
 use series::Samples;
 
-/// An additional section of the page, made from what the log holds, in its order.
+/// Additional section of the page, made from the messages of the log in their order.
 pub trait Section: Debug {
-    /// Takes the beginning of a file: whose log it is, under which configuration.
+    /// Takes the identity at the beginning of a file.
     fn identity(&mut self, identity: &LogIdentity);
 
     /// Takes a vehicle's report.
@@ -37,11 +37,11 @@ pub trait Section: Debug {
     /// Takes a map or verdicts.
     fn round(&mut self, round: &FusedLine);
 
-    /// The section as HTML; [`section`], [`table`], [`drawing`] and [`bars`] make it look like the others.
+    /// The section as HTML, made with [`section`], [`table`], [`drawing`] and [`bars`] like the others.
     fn html(&self) -> String;
 }
 
-/// What is gathered of a log; by default, nothing yet.
+/// Statistics of a log; empty by default.
 #[derive(Debug, Default)]
 pub struct Report {
     identity: Option<LogIdentity>,
@@ -49,58 +49,58 @@ pub struct Report {
     last: Timestamp,
     messages: u64,
     problems: Vec<String>,
-    maps: Rounds,
-    verdicts: Rounds,
-    round_runs: Vec<RoundRun>,
+    maps: RoundTimes,
+    verdicts: RoundTimes,
+    leaders: Vec<LeaderRounds>,
     changes: Vec<LeadershipChange>,
-    vehicles: BTreeMap<NodeName, Vehicle>,
+    vehicles: BTreeMap<NodeName, VehicleStatistics>,
     entries: u64,
     reputations: BTreeMap<NodeName, Samples>,
     losses: Losses,
     sections: Vec<Box<dyn Section>>,
 }
 
-/// The rounds of one kind as the recording node took them.
+/// Times of the maps or of the verdicts that the recording node accepted.
 #[derive(Debug, Default)]
-struct Rounds {
+struct RoundTimes {
     count: u64,
     last_at: Option<Timestamp>,
-    /// Seconds since the round before, by time.
+    /// Seconds since the round before, over time.
     gaps: Samples,
-    /// Seconds from the oldest capture, or for verdicts none, to the end of the round.
-    fusing: Vec<f64>,
-    /// Seconds from the end of the round to here.
-    travelling: Vec<f64>,
+    /// Seconds from the oldest capture to the end of the round; empty for verdicts.
+    capture_to_fused: Vec<f64>,
+    /// Seconds from the end of the round to its receipt.
+    fused_to_received: Vec<f64>,
 }
 
-/// A run of rounds by one leader in one term.
+/// Consecutive rounds of one leader in one term.
 #[derive(Debug, Clone, PartialEq)]
-struct RoundRun {
+struct LeaderRounds {
     epoch: Epoch,
     first_at: Timestamp,
     last_at: Timestamp,
     rounds: u64,
 }
 
-/// What one vehicle had to do with it.
+/// Reports and contributions of one vehicle.
 #[derive(Debug, Default)]
-struct Vehicle {
+struct VehicleStatistics {
     reports: u64,
     objects: u64,
     first_at: Option<Timestamp>,
     last_at: Timestamp,
-    /// Entries of maps that rest on its detections.
+    /// Map entries that its detections contributed to.
     contributed: u64,
 }
 
 impl Report {
-    /// A page that begins with this section.
+    /// A report that begins with this section.
     #[must_use]
     pub fn with_section(section: impl Section + 'static) -> Self {
         Self { sections: vec![Box::new(section)], ..Self::default() }
     }
 
-    /// Takes in a file; what cannot be used is named on the page and left out.
+    /// Takes a file. The page lists what is unusable.
     ///
     /// # Errors
     /// [`LogError::Unreadable`].
@@ -108,7 +108,7 @@ impl Report {
         let mut log = LogReader::open(path)?;
         for event in log.by_ref() {
             match event {
-                Ok(LogEvent::Identity(identity)) => self.meet(&identity),
+                Ok(LogEvent::Identity(identity)) => self.begin_file(&identity),
                 Ok(LogEvent::Message(message)) => self.message(&message),
                 Err(error @ LogError::Unreadable { .. }) => return Err(error),
                 Err(error) => self.problems.push(error.to_string()),
@@ -120,22 +120,27 @@ impl Report {
         Ok(())
     }
 
-    /// Whether anything of a cell was found.
+    /// Whether the log has no message.
     pub fn is_empty(&self) -> bool {
         self.messages == 0
     }
 
-    /// What was not used.
+    /// Unusable parts of the log.
     pub fn problems(&self) -> &[String] {
         &self.problems
     }
 
-    /// The page: HTML that needs nothing else.
+    /// The page as self-contained HTML.
     pub fn page(&self) -> String {
         page::write(self)
     }
 
-    fn meet(&mut self, identity: &LogIdentity) {
+    /// Time of the first message.
+    fn start(&self) -> Timestamp {
+        self.first.unwrap_or_default()
+    }
+
+    fn begin_file(&mut self, identity: &LogIdentity) {
         if let Some(known) = self.identity.replace(identity.clone())
             && known.node != identity.node
         {
@@ -148,7 +153,7 @@ impl Report {
         self.messages += 1;
         self.first = Some(self.first.map_or(message.at, |first| first.min(message.at)));
         self.last = self.last.max(message.at);
-        let taken = match message.schema {
+        let is_valid = match message.schema {
             SchemaName::ObjectReport => self.with(message, |report, it| report.report(&message.topic, message.at, &it)),
             SchemaName::GlobalMap => self.with(message, |report, it| report.map(message.at, it)),
             SchemaName::Verdicts => self.with(message, |report, it| report.verdicts(message.at, it)),
@@ -157,12 +162,12 @@ impl Report {
             SchemaName::Counters => self.with(message, Self::counters),
             _ => true,
         };
-        if !taken && self.problems.len() < MAX_PROBLEMS {
+        if !is_valid && self.problems.len() < MAX_PROBLEMS {
             self.problems.push(format!("a message of {} cannot be read", message.schema.as_str()));
         }
     }
 
-    /// False when the message is not what its schema says.
+    /// False if the message does not match its schema.
     fn with<T: serde::de::DeserializeOwned>(&mut self, message: &LogMessage, take: impl FnOnce(&mut Self, T)) -> bool {
         serde_json::from_slice(&message.json).map(|it| take(self, it)).is_ok()
     }
@@ -178,8 +183,8 @@ impl Report {
     }
 
     fn map(&mut self, at: Timestamp, map: GlobalMap) {
-        self.maps.note(at, map.oldest_capture_us, map.fused_at_us);
-        self.note_round(at, Epoch::new(map.epoch, map.aggregator.clone()));
+        self.maps.add(at, map.oldest_capture_us, map.fused_at_us);
+        self.leader(at, Epoch::new(map.epoch, map.aggregator.clone()));
         let labelled = map.landmarks.iter().filter(|entry| entry.label.is_some()).map(|entry| &entry.contributors);
         for contributors in labelled.chain(map.objects.iter().map(|object| &object.contributors)) {
             self.entries += 1;
@@ -191,9 +196,9 @@ impl Report {
     }
 
     fn verdicts(&mut self, at: Timestamp, verdicts: Verdicts) {
-        self.verdicts.note(at, None, verdicts.fused_at_us);
+        self.verdicts.add(at, None, verdicts.fused_at_us);
         if self.maps.count == 0 {
-            self.note_round(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
+            self.leader(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
         }
         self.round(&FusedLine::Verdicts(verdicts));
     }
@@ -209,27 +214,27 @@ impl Report {
     }
 
     fn counters(&mut self, reading: CounterReading) {
-        self.losses.note(self.identity.as_ref().map(|identity| identity.run), reading);
+        self.losses.add(self.identity.as_ref().map(|identity| identity.run), reading);
     }
 
-    fn note_round(&mut self, at: Timestamp, epoch: Epoch) {
-        match self.round_runs.last_mut() {
-            Some(run) if run.epoch == epoch => (run.last_at, run.rounds) = (at, run.rounds + 1),
-            _ => self.round_runs.push(RoundRun { epoch, first_at: at, last_at: at, rounds: 1 }),
+    fn leader(&mut self, at: Timestamp, epoch: Epoch) {
+        match self.leaders.last_mut() {
+            Some(leader) if leader.epoch == epoch => (leader.last_at, leader.rounds) = (at, leader.rounds + 1),
+            _ => self.leaders.push(LeaderRounds { epoch, first_at: at, last_at: at, rounds: 1 }),
         }
     }
 }
 
-/// Most problems that are named.
+/// Maximum number of unreadable messages that are listed.
 const MAX_PROBLEMS: usize = 20;
 
-impl Rounds {
-    fn note(&mut self, at: Timestamp, oldest_capture: Option<Timestamp>, fused_at: Timestamp) {
+impl RoundTimes {
+    fn add(&mut self, at: Timestamp, oldest_capture: Option<Timestamp>, fused_at: Timestamp) {
         self.count += 1;
         if let Some(last) = self.last_at.replace(at) {
             self.gaps.push(at, at.since(last).as_secs_f64());
         }
-        self.fusing.extend(oldest_capture.map(|capture| fused_at.since(capture).as_secs_f64()));
-        self.travelling.push(at.since(fused_at).as_secs_f64());
+        self.capture_to_fused.extend(oldest_capture.map(|capture| fused_at.since(capture).as_secs_f64()));
+        self.fused_to_received.push(at.since(fused_at).as_secs_f64());
     }
 }

@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
 /// The present time in Unix microseconds.

@@ -26,7 +26,7 @@ impl TryFrom<String> for Secret {
 }
 
 impl Secret {
-    /// Takes the text.
+    /// A secret of a text.
     pub fn new(text: impl Into<String>) -> Self {
         Self(text.into())
     }

@@ -5,7 +5,7 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::time::Duration;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
 /// Allows a burst, then one per interval.
 #[derive(Debug, Clone)]

@@ -7,7 +7,7 @@
 use std::cell::Cell;
 use std::time::{Duration, SystemTime};
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use opentelemetry::trace::{
     Link, SpanBuilder, SpanContext, SpanId, TraceContextExt, TraceFlags, TraceId, TraceState, Tracer, TracerProvider,
 };

@@ -20,8 +20,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use ecod::aggregator::Fused;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, Verdicts};
 use tracing::{Level, Span, info_span, span_enabled};
 

@@ -16,8 +16,7 @@ use std::net::SocketAddr;
 #[cfg(fuzzing)]
 pub use connect_packet::read_connect_packet;
 pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
-pub use frontend::AccessPolicy;
-pub use permissions::LeaderCheck;
+pub use permissions::{AccessPolicy, LeaderCheck};
 
 /// State of an embedded broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -20,8 +20,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
 pub use config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
@@ -32,7 +32,7 @@ pub(crate) use seeds::look_up;
 pub use socket::BindError;
 pub(crate) use socket::is_of_this_machine;
 
-/// Largest payload of [`MembershipMessage::Send`] in bytes.
+/// Maximum size in bytes of a payload that the membership sends.
 pub const MAX_PAYLOAD_BYTES: usize = 1200;
 
 /// A node of the cell.

@@ -4,8 +4,8 @@ use std::f64::consts::{PI, TAU};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{Encoding, FieldOfView, ObjectReport, PerceivedObject, Role, WirePose, encode};
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, NodeStatus, Role, encode};
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use serde_json::Value;

@@ -5,9 +5,9 @@ use std::net::{SocketAddr, UdpSocket};
 use std::path::Path;
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
 use ecod::leadership::Leadership;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};

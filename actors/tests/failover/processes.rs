@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};

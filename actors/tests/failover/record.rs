@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use ecod::epoch::Epoch;
+use ecod::model::epoch::Epoch;
 use ecod_actors::messages::newest::ReceivedMap;
 
 /// The maps that a node took, in their order.

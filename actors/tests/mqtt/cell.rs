@@ -4,8 +4,8 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, ReportKind, Role, SCHEMA_VERSION};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;

@@ -6,8 +6,8 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::replay::FusedLine;
 use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role, WirePose};
 use ecod_actors::messages::gateway::GatewayMessage;

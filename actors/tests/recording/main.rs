@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::process::Command;
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::replay::FusedLine;
 use ecod::wire::Role;
 use ecod_actors::observe::recorder::{SchemaName, files};

@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{Limits, Role, Topics};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::{Counters, Event};

@@ -3,7 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{RejectReason, Role};
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};

@@ -6,9 +6,9 @@ use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 
 /// A map that a node accepted.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -8,7 +8,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod_actors::platform::clock;
 use tempfile::TempDir;
 

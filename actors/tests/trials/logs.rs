@@ -5,9 +5,9 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use anyhow::Context;
-use ecod::epoch::Epoch;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use serde::Deserialize;
 
 use crate::analysis::Accepted;

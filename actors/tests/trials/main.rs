@@ -177,7 +177,7 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
     }
 }
 
-fn phase(step: &Step, from: ecod::time::Timestamp, cell: &Cell) -> Phase {
+fn phase(step: &Step, from: ecod::model::time::Timestamp, cell: &Cell) -> Phase {
     let mut measured = if step.measured { cell.vehicles() } else { Default::default() };
     if let Some(unreached) = cell.unreached() {
         measured.remove(unreached);

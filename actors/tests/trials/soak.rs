@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod_actors::platform::clock;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;

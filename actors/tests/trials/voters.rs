@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, ReportKind, Reputations, Role, SCHEMA_VERSION};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;

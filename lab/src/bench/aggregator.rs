@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::Context;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::recorder::RecordConfig;

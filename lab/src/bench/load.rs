@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{ObjectReport, PerceivedObject};
 
 /// A number of vehicles that all report once in a period.

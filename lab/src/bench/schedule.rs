@@ -3,7 +3,7 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod_actors::platform::clock;
 
 /// Ticks of equal length; fixed before the first, whatever becomes of the load.

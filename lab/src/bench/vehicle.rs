@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Limits, Topic, Topics, Verdicts, decode};
 use rumqttc::{AsyncClient, Event, EventLoop, Packet, Publish};
 use tokio::sync::watch;
@@ -199,7 +199,7 @@ const OLDEST_CAPTURE: &[u8] = b"\"oldest_capture_us\":";
 
 #[cfg(test)]
 mod tests {
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use ecod::wire::{Encoding, SCHEMA_VERSION, encode};
 
     use super::*;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::Args;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::vote::VoteMode;
 use ecod_actors::cli::{Failure, print};
 use ecod_actors::node::config::NodeConfig;

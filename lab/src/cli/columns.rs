@@ -1,4 +1,4 @@
-//! Tables for people.
+//! Text tables.
 
 /// Rows under a header, the first column left-aligned and the others right-aligned.
 pub(super) fn columns(rows: &[Vec<String>]) -> String {

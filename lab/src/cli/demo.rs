@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::Args;
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod_actors::cli::{Failure, print};
 use nalgebra::Point2;
 use tokio::signal::unix::{SignalKind, signal};
@@ -128,7 +128,7 @@ fn vehicles(scenes: &[&Scene]) -> String {
 }
 
 /// Where every vehicle placed what it detected.
-fn detections(outcome: &DemoResult) -> Vec<(ecod::names::NodeName, Point2<f64>)> {
+fn detections(outcome: &DemoResult) -> Vec<(ecod::model::names::NodeName, Point2<f64>)> {
     let placed = |observed: &crate::demo::ObservedReport| {
         let node = observed.report.node.clone();
         observed.report.objects.iter().map(move |o| (node.clone(), Point2::new(o.x_m, o.y_m))).collect::<Vec<_>>()

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
-use ecod::landmark::LandmarkIndex;
+use ecod::perception::landmark::LandmarkIndex;
 use ecod::replay::{FusedLine, ReplayConfig, read_report};
 use ecod::wire::GlobalMap;
 use ecod_actors::cli::lines::{self, LineRead, read_line};
@@ -161,7 +161,7 @@ fn summary(name: &str, scores: &Scores) -> Vec<String> {
 fn confusion(name: &str, scores: &Scores) -> String {
     let mut cells: Vec<_> = scores.confusion.iter().collect();
     cells.sort_by_key(|cell| std::cmp::Reverse(cell.count));
-    let name_of = |label: &Option<ecod::names::Label>| label.as_deref().unwrap_or("-").to_owned();
+    let name_of = |label: &Option<ecod::model::names::Label>| label.as_deref().unwrap_or("-").to_owned();
     let mut rows = vec![header(&["truth", "said", "items"])];
     rows.extend(
         cells.iter().take(MAX_CONFUSIONS).map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]),

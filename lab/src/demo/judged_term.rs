@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use ecod::epoch::Epoch;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::wire::GlobalMap;
 use ecod_actors::messages::newest::ReceivedMap;
 
@@ -64,7 +64,7 @@ pub(super) fn judged_terms<'a>(
 mod tests {
     use std::sync::Arc;
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use ecod::wire::SCHEMA_VERSION;
 
     use super::*;

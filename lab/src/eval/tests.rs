@@ -86,7 +86,7 @@ fn a_truth_that_changes_makes_an_item_of_each_span() {
 
 #[test]
 fn reports_that_name_no_location_are_placed_and_translated_as_in_the_cell() {
-    use ecod::landmark::{Landmark, Synonym};
+    use ecod::perception::landmark::{Landmark, Synonym};
     let ball = Landmark {
         id: "ball".into(),
         position: nalgebra::Point2::new(1.0, 0.0),

@@ -18,8 +18,8 @@ mod truth;
 
 use std::collections::BTreeMap;
 
-use ecod::names::Label;
-use ecod::time::Timestamp;
+use ecod::model::names::Label;
+use ecod::model::time::Timestamp;
 use ecod::wire::GlobalMap;
 use hashbrown::HashMap;
 use nalgebra::Point2;

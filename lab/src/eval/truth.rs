@@ -2,9 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ecod::names::{Label, LandmarkId, MAX_NAME_BYTES};
-use ecod::time::Timestamp;
-use ecod::wire::is_label;
+use ecod::model::names::{Label, LandmarkId, MAX_NAME_BYTES, is_label};
+use ecod::model::time::Timestamp;
 use serde::Deserialize;
 use serde_json::Value;
 

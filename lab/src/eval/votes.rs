@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use ecod::geometry::Covariance;
-use ecod::landmark::{Landmark, LandmarkGate, LandmarkIndex};
-use ecod::names::{Label, NodeName};
+use ecod::model::geometry::Covariance;
+use ecod::model::names::{Label, NodeName};
+use ecod::perception::landmark::{Landmark, LandmarkGate, LandmarkIndex};
 use ecod::wire::PerceivedObject;
 use nalgebra::Point2;
 use serde::Serialize;

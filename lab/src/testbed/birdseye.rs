@@ -4,8 +4,8 @@ mod sheet;
 #[cfg(test)]
 mod tests;
 
-use ecod::geometry::Pose;
-use ecod::names::{Label, LandmarkId, NodeName};
+use ecod::model::geometry::Pose;
+use ecod::model::names::{Label, LandmarkId, NodeName};
 use ecod::wire::{GlobalMap, LandmarkState};
 use nalgebra::Point2;
 use svg::Document;

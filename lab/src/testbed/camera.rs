@@ -9,7 +9,7 @@ mod sensor;
 #[cfg(test)]
 mod tests;
 
-use ecod::names::Label;
+use ecod::model::names::Label;
 use opencv::core::Mat;
 
 use crate::testbed::{Cav, Scene, Testbed};

@@ -4,10 +4,9 @@ use std::collections::{BTreeMap, HashSet};
 use std::fmt::Display;
 use std::time::Duration;
 
-use ecod::camera::Intrinsics;
-use ecod::geometry::{Pose, wrap_angle};
-use ecod::names::{Label, MAX_NAME_BYTES, NodeName};
-use ecod::wire::is_label;
+use ecod::model::geometry::{Pose, wrap_angle};
+use ecod::model::names::{Label, MAX_NAME_BYTES, NodeName, is_label};
+use ecod::perception::camera::Intrinsics;
 use nalgebra::{Point2, Vector2};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;

@@ -5,10 +5,10 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
-use ecod::landmark::{Landmark, Synonym};
-use ecod::names::{Label, LandmarkId};
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::names::{Label, LandmarkId};
+use ecod::perception::camera::Intrinsics;
+use ecod::perception::landmark::{Landmark, Synonym};
 use nalgebra::Point2;
 use serde::Deserialize;
 use serde_json::Value;

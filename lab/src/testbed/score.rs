@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use ecod::names::{LandmarkId, NodeName};
+use ecod::model::names::{LandmarkId, NodeName};
 use ecod::wire::{GlobalMap, LandmarkState};
 use serde::{Serialize, Serializer};
 

@@ -3,15 +3,15 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use ecod::admission::report_window::WindowConfig;
+use ecod::aggregator::round::RoundConfig;
 use ecod::aggregator::{Algorithms, FusionConfig};
-use ecod::camera::Mount;
-use ecod::landmark::{LandmarkConfig, LandmarkIndex};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::pace::PaceConfig;
-use ecod::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
-use ecod::round::RoundConfig;
-use ecod::view::ViewConfig;
-use ecod::window::WindowConfig;
+use ecod::perception::camera::Mount;
+use ecod::perception::landmark::{LandmarkConfig, LandmarkIndex};
+use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
+use ecod::perception::view::ViewConfig;
 use ecod::wire::Role;
 use ecod_actors::camera::config::{CameraConfig, MountConfig, OpticsConfig};
 use ecod_actors::camera::detect::DetectorConfig;

@@ -1,7 +1,7 @@
 //! Views of cards, by the geometry: cards stand upright and the axis of the camera is level with their codes, so
 //! that one column of the image meets each card at one depth.
 
-use ecod::geometry::{Pose, wrap_angle};
+use ecod::model::geometry::{Pose, wrap_angle};
 use nalgebra::Vector2;
 
 use super::{Card, Testbed};

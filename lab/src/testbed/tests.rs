@@ -181,5 +181,5 @@ fn a_parked_vehicle_hides_what_is_behind_it() {
 }
 
 fn wrap(angle_rad: f64) -> f64 {
-    ecod::geometry::wrap_angle(angle_rad).abs()
+    ecod::model::geometry::wrap_angle(angle_rad).abs()
 }

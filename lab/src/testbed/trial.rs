@@ -8,8 +8,8 @@ use std::thread;
 
 use anyhow::Context;
 use ecod::aggregator::Aggregator;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, ReportKind};
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};

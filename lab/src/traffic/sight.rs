@@ -1,6 +1,6 @@
 //! Lines of sight: vehicles and buildings hide what is behind them.
 
-use ecod::geometry::wrap_angle;
+use ecod::model::geometry::wrap_angle;
 use nalgebra::{Point2, Vector2};
 
 use super::roads::Building;

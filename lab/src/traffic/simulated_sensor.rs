@@ -5,7 +5,7 @@
 //! so those of what is hardly seen look like those of what is not there. Of an object that is partly hidden, the middle
 //! of what is seen is reported.
 
-use ecod::geometry::{Covariance, Pose, wrap_angle};
+use ecod::model::geometry::{Covariance, Pose, wrap_angle};
 use ecod::wire::{FieldOfView, ObjectReport, PerceivedObject};
 use nalgebra::{Point2, Vector2};
 

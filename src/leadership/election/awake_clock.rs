@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// Clock of the time during which the node was awake, driven by the `now` of its caller.
 ///

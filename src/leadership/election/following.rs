@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
-use crate::epoch::Epoch;
 use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::liveness::Following;
 use crate::leadership::election::message::{Body, ElectionMessage};
 use crate::leadership::election::{Beat, Election, State};
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::Role;
 
 impl Election {

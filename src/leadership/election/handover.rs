@@ -4,12 +4,12 @@
 //! period is left for the few packets that this takes. The new leader goes on with the next round. If all of these packets
 //! are lost for a period, the old leader publishes that round too, and yields again after it.
 
-use crate::epoch::Epoch;
 use crate::leadership::election::interface::ElectionEffect;
-use crate::leadership::election::message::{Body, MAX_TERM};
+use crate::leadership::election::message::Body;
 use crate::leadership::election::{Election, State};
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// A handover as the old leader sees it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -71,7 +71,7 @@ impl Election {
     }
 
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
-        self.terms.seen = self.terms.seen.max(epoch.term.min(MAX_TERM));
+        self.learn_term(epoch.term);
         self.round = self.round.max(round);
         let least = self.config.beat();
         match &mut self.state {

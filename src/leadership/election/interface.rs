@@ -1,9 +1,9 @@
 //! Inputs and effects of the election.
 
-use crate::epoch::Epoch;
+use crate::aggregator::round::FirstRound;
 use crate::leadership::election::message::ElectionMessage;
-use crate::names::NodeName;
-use crate::round::FirstRound;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
 
 /// Something that happened around the node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use crate::epoch::Epoch;
 use crate::leadership::election::handover::Handover;
 use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
 use crate::leadership::election::{Election, State};
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::Role;
 
 /// A node that leads.

@@ -17,12 +17,12 @@
 
 use std::time::Duration;
 
-use crate::epoch::Epoch;
+use crate::aggregator::round::EARLY_ROUNDS;
 use crate::leadership::config::ElectionConfig;
 use crate::leadership::timers::{REGULAR_GAPS, missing, overdue};
-use crate::names::NodeName;
-use crate::round::EARLY_ROUNDS;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// A node that follows a leader, by its beats or by others' evidence.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -4,8 +4,8 @@ use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::epoch::Epoch;
-use crate::names::NodeName;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
 use crate::wire::{self, Encoding, Limits, RejectReason, Role};
 
 /// Most successors that a leader names, the standby first.
@@ -13,6 +13,10 @@ pub const MAX_SUCCESSORS: usize = 3;
 
 /// Largest term taken from the wire: the largest integer that every JSON reader keeps exactly.
 pub const MAX_TERM: u64 = (1 << 53) - 1;
+
+/// Largest step by which one message raises the highest known term. A cell uses one term per change of leader, so it
+/// never gets so far ahead of a node. A forged term near [`MAX_TERM`] would end elections for good.
+pub const MAX_TERM_STEP: u64 = 1 << 20;
 
 /// Largest encoded message in bytes; it fits one Ethernet frame with room for the membership's seal.
 pub const MAX_MESSAGE_BYTES: usize = 1200;

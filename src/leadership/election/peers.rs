@@ -4,11 +4,11 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::epoch::Epoch;
 use crate::leadership::config::ElectionConfig;
 use crate::leadership::election::message::{Candidacy, ElectionMessage};
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::Role;
 
 /// Rank that is worth a handover: edge before auto, then the higher priority.

@@ -3,14 +3,14 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use crate::epoch::Epoch;
+use crate::aggregator::round::FirstRound;
 use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::leading::Leading;
 use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
 use crate::leadership::election::{Election, State};
-use crate::names::NodeName;
-use crate::round::FirstRound;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// A node that knows of no leader.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -3,14 +3,14 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use crate::epoch::Epoch;
+use crate::aggregator::round::FirstRound;
 use crate::leadership::address::BrokerAddress;
 use crate::leadership::election::{ElectionConfig, ElectionMessage, Health};
 use crate::leadership::health::HealthSample;
 use crate::leadership::links::{DataPlane, LinkState, WantedLinks};
 use crate::leadership::view::Leadership;
-use crate::names::NodeName;
-use crate::round::FirstRound;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
 use crate::wire::{NodeStatus, Role};
 
 /// Settings of one node's leadership.

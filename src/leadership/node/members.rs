@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use crate::leadership::address::BrokerAddress;
 use crate::leadership::node::Member;
 use crate::leadership::timers::{DEPARTED_TIME, REDISCOVERY_TIME};
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// The living members, and those that were given up a moment ago.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]

@@ -1,6 +1,6 @@
 //! The order of rounds: neither epochs nor the rounds of one epoch go back.
 
-use crate::epoch::Epoch;
+use crate::model::epoch::Epoch;
 use crate::wire::RejectReason;
 
 /// Admits the rounds of one topic so that neither epoch nor, within an epoch, round ever goes back.
@@ -45,7 +45,7 @@ impl EpochGate {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::names::NodeName;
+    use crate::model::names::NodeName;
 
     fn epoch(term: u64, leader: &str) -> Epoch {
         Epoch::new(term, NodeName::new(leader).unwrap())

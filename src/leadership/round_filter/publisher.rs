@@ -2,8 +2,8 @@
 
 use crate::leadership::timers::FAREWELL_TIME;
 use crate::leadership::view::Leadership;
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// Rule by which a broker passes maps, verdicts and reputations on.
 ///
@@ -49,8 +49,8 @@ impl PublisherFilter {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::epoch::Epoch;
     use crate::leadership::view::Position;
+    use crate::model::epoch::Epoch;
 
     #[test]
     fn the_leader_publishes_and_the_one_before_says_farewell() {

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use crate::delay::MinimumDelay;
-use crate::epoch::Epoch;
+use crate::admission::minimum_delay::MinimumDelay;
 use crate::leadership::timers::{LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT};
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::time::Timestamp;
 
 /// Filter that tells rounds that have just been made from those that waited.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
@@ -69,7 +69,7 @@ impl StalenessFilter {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::names::NodeName;
+    use crate::model::names::NodeName;
 
     const NOON: u64 = 1_732_154_400_000_000;
 

@@ -3,12 +3,12 @@
 //! A superseded leader is refused, and so is one that was not elected. Nobody is refused for good: word of an election may
 //! be lost, and who reaches a broker may forge any epoch.
 
-use crate::epoch::Epoch;
 use crate::leadership::round_filter::{EpochGate, Refusal};
 use crate::leadership::timers::{ELECTED_SILENCE, EPOCH_MEMORY, SUCCESSOR_CREDIT};
 use crate::leadership::view::Leadership;
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 
 /// Number of terms above the highest known one that the next leader may use: a restarted node skips the term that it may
 /// have used before.
@@ -64,7 +64,7 @@ impl Elected {
 
 impl SuccessionFilter {
     /// A filter that refuses terms below `floor` at first. While nobody is known to lead it also refuses terms below the
-    /// highest known one, or more than [`TERMS_AHEAD`] above it, until they were published for a while.
+    /// highest known one, or more than `TERMS_AHEAD` above it, until they were published for a while.
     pub fn new(floor: u64) -> Self {
         Self {
             gate: EpochGate::new(floor),

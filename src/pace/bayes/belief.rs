@@ -3,12 +3,12 @@
 use nalgebra::Point2;
 use smallvec::SmallVec;
 
-use crate::geometry::Covariance;
-use crate::landmark::LandmarkCandidate;
-use crate::names::{Label, NodeName};
+use crate::model::geometry::Covariance;
+use crate::model::names::{Label, NodeName};
+use crate::model::time::Timestamp;
 use crate::pace::PaceConfig;
 use crate::pace::grouping::{Place, VehicleItems};
-use crate::time::Timestamp;
+use crate::perception::landmark::LandmarkCandidate;
 use crate::wire::PerceivedObject;
 
 /// Places of `bayes` PACE: the object and the vacancy sign of each landmark, in configuration order.

@@ -4,8 +4,8 @@ use nalgebra::{Point2, Vector2};
 use smallvec::SmallVec;
 
 use super::belief::Belief;
-use crate::geometry::Covariance;
-use crate::names::{Label, NodeName};
+use crate::model::geometry::Covariance;
+use crate::model::names::{Label, NodeName};
 
 /// A vehicle and its belief about one place.
 pub(super) type NamedBelief<'a> = (&'a NodeName, &'a Belief);

@@ -3,9 +3,9 @@
 use std::collections::BTreeSet;
 
 use super::{LandmarkVotes, StoredVote, WeightedVoting};
-use crate::names::{Label, LandmarkId, NodeName};
+use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::time::Timestamp;
 use crate::reputation::Counts;
-use crate::time::Timestamp;
 use crate::vote::confusion::LabelIndex;
 use crate::vote::dawid_skene::VehicleEvidence;
 

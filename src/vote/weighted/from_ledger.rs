@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 
 use super::WeightedVoting;
-use crate::names::{Label, NodeName};
+use crate::model::names::{Label, NodeName};
 use crate::reputation::{RememberedVotes, ReputationLedger};
 use crate::vote::config::VoteConfig;
 use crate::vote::confusion::{Confusion, LabelIndex};

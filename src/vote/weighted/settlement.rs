@@ -1,9 +1,9 @@
 //! The life of a vote: live evidence while it is fresh, then settled evidence that fades.
 
 use super::{StoredVote, WeightedVoting};
-use crate::names::LandmarkId;
+use crate::model::names::LandmarkId;
+use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
-use crate::time::Timestamp;
 use crate::vote::landmark_votes::probability;
 
 impl WeightedVoting {

@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use uuid::Uuid;
 
 use super::*;
-use crate::names::{Label, NodeName};
+use crate::model::names::{Label, NodeName};
 use crate::wire::{Encoding, NodeState, Reputation, Role, decode, encode};
 
 fn edge() -> NodeName {

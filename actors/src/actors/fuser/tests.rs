@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use ecod::aggregator::FusionConfig;
 use ecod::leadership::{Leadership, Position};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::SCHEMA_VERSION;
 
 use super::*;
@@ -37,7 +37,7 @@ fn spans() -> Spans {
 
 fn map(epoch: Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
     let map = global_map(epoch, round);
-    FollowerMessage::TakeMap { delivery: Delivery::local(Incoming::Map(map), received_at) }
+    FollowerMessage::TakeMap { delivery: Delivery::local(map, received_at) }
 }
 
 #[tokio::test]
@@ -69,7 +69,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
 
         let mut fuser = FuserState::new(FuserArguments {
             aggregator: Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
-            intake: Intake::default(),
+            report_queue: LatestReportQueue::default(),
             newest: None,
             recording: LogSender::default(),
             gateway: ActorSlot::default(),

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::Encoding;
 use ractor::ActorRef;
 use tokio::sync::watch;

@@ -108,7 +108,7 @@ async fn write_all(file: StateFile, mut terms: watch::Receiver<u64>, answers: wa
 mod tests {
     use std::path::Path;
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
 
     use super::*;
 

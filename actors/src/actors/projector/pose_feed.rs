@@ -1,4 +1,4 @@
-//! Takes a moving vehicle's poses from its localisation: one a datagram.
+//! Receiver of a moving vehicle's poses from its localisation, one per datagram.
 
 use std::io;
 use std::net::SocketAddr;
@@ -13,20 +13,20 @@ use crate::messages::projector::ProjectorMessage;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 
-/// Time before the address is tried again.
+/// Wait before the address is tried again.
 const RETRY: Duration = Duration::from_secs(1);
 
-/// Longest datagram, in bytes.
+/// Maximum length of a datagram in bytes.
 const MAX_BYTES: usize = 1024;
 
-/// Tells the projector of every pose, for ever. An address that cannot be listened on is tried again.
+/// Sends every pose to the projector; never ends. An address that cannot be bound is tried again.
 pub(super) async fn listen(address: SocketAddr, projector: ActorRef<ProjectorMessage>, counters: Arc<Counters>) {
-    let mut is_told = false;
+    let mut is_logged = false;
     loop {
         if let Err(error) = receive(address, &projector, &counters).await
-            && !std::mem::replace(&mut is_told, true)
+            && !std::mem::replace(&mut is_logged, true)
         {
-            tracing::warn!(%error, %address, "no poses can be taken, trying on");
+            tracing::warn!(%error, %address, "cannot receive poses, trying again");
         }
         tokio::time::sleep(RETRY).await;
     }
@@ -34,9 +34,9 @@ pub(super) async fn listen(address: SocketAddr, projector: ActorRef<ProjectorMes
 
 async fn receive(address: SocketAddr, projector: &ActorRef<ProjectorMessage>, counters: &Counters) -> io::Result<()> {
     let socket = UdpSocket::bind(address).await?;
-    tracing::info!(%address, "taking poses");
+    tracing::info!(%address, "receiving poses");
     let mut datagram = [0; MAX_BYTES];
-    let mut is_told = false;
+    let mut is_logged = false;
     loop {
         let length = socket.recv(&mut datagram).await?;
         match read_pose(datagram.get(..length).unwrap_or_default(), clock::now()) {
@@ -47,8 +47,8 @@ async fn receive(address: SocketAddr, projector: &ActorRef<ProjectorMessage>, co
             }
             Err(reason) => {
                 counters.count(Event::PoseRejected);
-                if !std::mem::replace(&mut is_told, true) {
-                    tracing::warn!(reason, "pose not taken, the first");
+                if !std::mem::replace(&mut is_logged, true) {
+                    tracing::warn!(reason, "pose rejected, further ones are only counted");
                 }
             }
         }

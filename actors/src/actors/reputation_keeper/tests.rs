@@ -3,7 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 
 use ecod::leadership::Position;
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::LedgerEntry;
 
 use super::*;
@@ -22,9 +22,9 @@ fn counted(epoch: u64, aggregator: &str) -> LedgerEntry {
     LedgerEntry { epoch, aggregator, node, label, correct: 0, incorrect: 1 }
 }
 
-fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> Delivery {
+fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> Delivery<Arc<LedgerShare>> {
     let share = LedgerShare { schema: SCHEMA_VERSION, node: name(from), epoch: leads, entries, marks: Vec::new() };
-    Delivery::local(Incoming::Ledger(Arc::new(share)), Timestamp(0))
+    Delivery::local(Arc::new(share), Timestamp(0))
 }
 
 #[tokio::test]
@@ -39,7 +39,7 @@ async fn evidence_of_others_is_judged_counted_and_answered() {
         cell: name("lot"),
         reputation: ReputationConfig::default(),
         config: ReputationKeeperConfig::default(),
-        book: SharedBook::new(true),
+        reputations: SharedReputations::new(true),
         file: None,
         newest: watch::channel(None).1,
         members: watch::channel(members).1,
@@ -49,14 +49,14 @@ async fn evidence_of_others_is_judged_counted_and_answered() {
         counters: Arc::clone(&counters),
     });
     let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
-    keeper.arguments.book.open().ledger.record(3, &name("euclid"), &own);
+    keeper.arguments.reputations.open().ledger.record(3, &name("euclid"), &own);
 
     keeper.merge(&share("mallory", None, vec![counted(7, "mallory")]));
     keeper.merge(&share("edge", Some(7), vec![counted(7, "edge"), counted(8, "edge")]));
     assert_eq!(counters.rejects(RejectReason::NotCandidate), 1);
     assert_eq!(counters.rejects(RejectReason::UnknownTerm), 1);
     assert_eq!(counters.events(Event::LedgerMerged), 1);
-    assert_eq!(keeper.arguments.book.open().ledger.totals()[&name("gauss")], (1, 1));
+    assert_eq!(keeper.arguments.reputations.open().ledger.totals()[&name("gauss")], (1, 1));
     assert!(keeper.unsaved && keeper.unadopted);
 
     gateway.get().unwrap().drain_and_wait(None).await.unwrap();

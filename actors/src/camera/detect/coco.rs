@@ -1,4 +1,4 @@
-//! Everyday objects by SSDLite-MobileNetV2 with the 80 classes of COCO, run by OpenCV.
+//! Detector of the 80 COCO classes: SSDLite-MobileNetV2 run by OpenCV.
 //!
 //! The weights are compiled into the program; see `models/README.md` for their source, inputs and outputs.
 
@@ -8,7 +8,7 @@ mod labels;
 use std::path::PathBuf;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::detection::{BoundingBox, Detection};
+use ecod::model::detection::{BoundingBox, Detection};
 use opencv::core::{CV_8UC1, CV_8UC3, CV_32F, Mat, Rect, Rect2d, Scalar, Size, Vector};
 use opencv::dnn::{self, Net};
 use opencv::imgproc;
@@ -19,17 +19,17 @@ use self::anchors::Anchor;
 use super::{Detect, DetectError};
 use crate::camera::frame::Frame;
 
-/// How COCO objects are found.
+/// Configuration of the COCO detector.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CocoConfig {
-    /// ONNX file with the inputs and outputs of the built-in weights; default none: the built-in weights.
+    /// ONNX file with the inputs and outputs of the built-in model. Default none: the built-in model.
     pub model: Option<PathBuf>,
-    /// Least confidence of a detection; default 0.4. Less finds more, also what is not there.
+    /// Minimum confidence of a detection. Default 0.4. Trade-off: lower values find more objects and more false ones.
     pub threshold: f64,
-    /// Overlap (intersection over union) from which two boxes of one class are the same object; default 0.5.
+    /// Intersection over union above which two boxes of one class count as the same object. Default 0.5.
     pub max_overlap: f64,
-    /// Whether to run_network at four overlapping quarters of the image besides the whole; default false. Finds objects of
+    /// Whether to also search four overlapping quarters of the image. Default false. Finds objects of
     /// half the size and takes five times as long.
     pub tiling: bool,
 }
@@ -51,7 +51,7 @@ impl CocoConfig {
     }
 }
 
-/// A model that cannot be used.
+/// Error of loading a model.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// The file cannot be read.
@@ -59,16 +59,16 @@ pub enum ModelError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         #[source]
         source: std::io::Error,
     },
-    /// OpenCV does not take the file for a network, or the network does not fit the detector.
-    #[error("model {path} is no ssdlite network that opencv can run: {reason}")]
+    /// OpenCV cannot run the file, or its inputs and outputs differ.
+    #[error("model {path} is not an ssdlite network that opencv can run: {reason}")]
     Unusable {
         /// The file, or `built-in`.
         path: String,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
 }
@@ -78,12 +78,12 @@ static BUILT_IN: &[u8] =
 
 /// Side of the network's input in pixels.
 const INPUT_PX: i32 = 300;
-/// Share of the image's sides that a tile takes, so that neighbours share a fifth of it.
+/// Side of a tile as a share of the image's side: neighbouring tiles overlap by a fifth of the image.
 const TILE_SHARE: f64 = 0.6;
-/// A box this near to a tile's inner edge, as a share of the tile's side, is taken as cut by it.
+/// Distance from a tile's inner edge, as a share of the tile's side, below which a box counts as cut.
 const CUT_SHARE: f64 = 0.02;
 
-/// Finds COCO objects.
+/// Detector of COCO objects.
 pub struct CocoDetector {
     config: CocoConfig,
     net: Net,
@@ -91,7 +91,7 @@ pub struct CocoDetector {
 }
 
 impl CocoDetector {
-    /// Loads the model and runs it once, so that a wrong one is found now.
+    /// Loads the model and runs it once to check it.
     ///
     /// # Errors
     /// [`ModelError`] naming the file.
@@ -113,7 +113,7 @@ impl CocoDetector {
         Ok(detector)
     }
 
-    /// Runs the network on one image; boxes are shares of its sides.
+    /// Runs the network on one image. Boxes are in shares of its sides.
     fn run_network(&mut self, image: &Mat) -> opencv::Result<Vec<ScoredBox>> {
         let (scale, middle) = (1.0 / 127.5, Scalar::all(127.5));
         let blob = dnn::blob_from_image(image, scale, Size::new(INPUT_PX, INPUT_PX), middle, true, false, CV_32F)?;
@@ -165,7 +165,7 @@ impl CocoDetector {
         Ok(found)
     }
 
-    /// The best box of every object, class by class.
+    /// Non-maximum suppression per class.
     fn suppress(&self, candidates: &[ScoredBox]) -> opencv::Result<Vec<Detection>> {
         let mut detections = Vec::new();
         for (class, label) in labels::all() {
@@ -209,7 +209,7 @@ impl Detect for CocoDetector {
     }
 }
 
-/// What one anchor sees.
+/// A box of one anchor before suppression.
 #[derive(Debug, Clone, Copy)]
 struct ScoredBox {
     class: usize,
@@ -221,7 +221,7 @@ fn best_class(scores: &[f32]) -> Option<(usize, f32)> {
     scores.iter().copied().enumerate().skip(1).max_by(|a, b| a.1.total_cmp(&b.1))
 }
 
-/// A box given as shares of a tile's sides, in pixels of the image.
+/// Converts a box from shares of a tile's sides to pixels of the image.
 fn placed(b: &BoundingBox, x: f64, y: f64, width: f64, height: f64) -> BoundingBox {
     BoundingBox {
         x_min: x + b.x_min * width,
@@ -231,7 +231,7 @@ fn placed(b: &BoundingBox, x: f64, y: f64, width: f64, height: f64) -> BoundingB
     }
 }
 
-/// Whether an inner edge of a tile cuts the box; the neighbour or the whole image shows all of it.
+/// Whether an inner edge of a tile cuts the box. A neighbouring tile or the image shows all of it.
 fn is_cut(b: &BoundingBox, right: bool, lower: bool) -> bool {
     let cut = |low: f64, high: f64, second: bool| if second { low < CUT_SHARE } else { high > 1.0 - CUT_SHARE };
     cut(b.x_min, b.x_max, right) || cut(b.y_min, b.y_max, lower)

@@ -1,4 +1,4 @@
-//! Which detector a camera has.
+//! Choice of a camera's detector.
 
 use std::fmt;
 use std::sync::Arc;
@@ -21,19 +21,19 @@ pub enum DetectorConfig {
     Coco(CocoConfig),
     /// Detections from a file.
     Recorded(RecordedConfig),
-    /// A detector of the program's own; not for files.
+    /// A detector of the embedding program; not available in files.
     #[serde(skip)]
     Custom(CustomDetector),
 }
 
-/// Makes a detector that this crate does not know, anew for every start of the detector's actor.
+/// Factory of a detector outside this crate, called at every start of the detector's actor.
 #[derive(Clone)]
 pub struct CustomDetector {
     build: Arc<dyn Fn() -> anyhow::Result<Box<dyn Detect>> + Send + Sync>,
 }
 
 impl CustomDetector {
-    /// Takes the maker; if it fails, such as for want of a file, the detector does not start and the node fails.
+    /// A factory. If it fails, as without a file, the node fails.
     pub fn new(build: impl Fn() -> anyhow::Result<Box<dyn Detect>> + Send + Sync + 'static) -> Self {
         Self { build: Arc::new(build) }
     }

@@ -1,11 +1,11 @@
-//! Placards: square QR codes that name a slot or a vehicle, read by zxing-cpp.
+//! Detector of placards: square QR codes that name a slot or a vehicle, read by zxing-cpp.
 //!
-//! The frame is read as it is and then enlarged, pass by pass. A code that was read is painted over before the next
-//! pass, so that no code is read twice and later passes only search for what is still missing.
+//! Each pass reads the frame at a larger size. Codes that were read are painted over before the next pass, so that no
+//! code is read twice.
 
 use ecod::config::{ConfigError, check_range};
-use ecod::detection::{BoundingBox, Detection};
-use ecod::names::{Label, MAX_NAME_BYTES};
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::names::{Label, MAX_NAME_BYTES};
 use nalgebra::Point2;
 use opencv::core::{CV_8UC1, CV_8UC3, Mat, Point, Scalar, Size, Vector};
 use opencv::imgproc;
@@ -16,22 +16,22 @@ use zxingcpp::{Barcode, BarcodeFormat, BarcodeReader, ImageFormat, ImageView};
 use super::{Detect, DetectError};
 use crate::camera::frame::Frame;
 
-/// How placards are read.
+/// Configuration of the placard detector.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PlacardConfig {
-    /// Enlargements of the frame to read, cheapest first; default 1x1, 2x2 and 4x2. More passes read smaller and more
+    /// Enlargements of the frame, cheapest first. Default 1x1, 2x2 and 4x2. Trade-off: more passes read smaller and more
     /// slanted codes; the time of a pass grows with its area.
     pub passes: Vec<Pass>,
-    /// Most codes to read in one frame, 1 to 255; default 32. The passes end early once they are found.
+    /// Maximum number of codes in one frame, 1 to 255. Default 32. Reaching it ends the passes.
     pub max_codes: u8,
 }
 
-/// One reading of the whole frame, enlarged by cubic interpolation.
+/// One reading of the frame, enlarged by cubic interpolation.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pass {
-    /// Horizontal enlargement, 1 to 4. Codes on upright placards seen at a slant are narrow, so this one is the larger.
+    /// Horizontal enlargement, 1 to 4. Slanted views make codes narrow, so this is usually the larger one.
     pub stretch_x: f64,
     /// Vertical enlargement, 1 to 4.
     pub stretch_y: f64,
@@ -61,23 +61,22 @@ impl PlacardConfig {
     }
 }
 
-/// Most passes a configuration may ask for.
+/// Maximum number of passes.
 const MAX_PASSES: usize = 8;
-/// Module sizes between which confidence rises, in pixels.
+/// Module sizes in pixels between which confidence rises.
 const CONFIDENCE_MODULES_PX: (f64, f64) = (1.0, 4.0);
 /// Confidence at those sizes.
 const CONFIDENCES: (f64, f64) = (0.5, 0.99);
 
-/// Reads placards.
+/// Detector of placards.
 ///
-/// A decoded text is checked by the code's own error correction, so a detection is hardly ever wrong. Its confidence
-/// says how far to trust its corners: it rises from 0.5 for modules of one pixel along the code's shortest side to 0.99
-/// for modules of four pixels.
+/// Error correction of the code makes wrong texts very rare. Confidence therefore describes the corners: it rises from
+/// 0.5 for modules of one pixel along the code's shortest side to 0.99 for modules of four pixels.
 ///
-/// The lower right corner has no finder pattern and is extrapolated by the decoder: in codes of version 1 it is
-/// typically off by 0.45 modules, the other corners by 0.2.
+/// The decoder extrapolates the lower right corner, which has no finder pattern. In codes of version 1 it is typically
+/// off by 0.45 modules, the other corners by 0.2.
 ///
-/// Texts that could not be a label are left out: empty, longer than 64 bytes, not UTF-8, or with control characters.
+/// Texts that cannot be a label are skipped: empty, longer than 64 bytes, not UTF-8, or with control characters.
 pub struct PlacardDetector {
     config: PlacardConfig,
 }
@@ -116,7 +115,7 @@ impl Detect for PlacardDetector {
     }
 }
 
-/// Codes in one enlargement of the image, with corners in pixels of the image itself.
+/// Codes in one enlargement of the image, with corners in pixels of the original.
 fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, DetectError> {
     let opencv_error = |source| DetectError::OpenCv { step: "enlarging a frame", source };
     let enlarged = enlarge(image, pass).map_err(opencv_error)?;
@@ -167,7 +166,7 @@ fn confidence(corners: &[Point2<f64>; 4], modules: f64) -> f64 {
     CONFIDENCES.0 + share * (CONFIDENCES.1 - CONFIDENCES.0)
 }
 
-/// The frame in shades of gray, in memory of its own without gaps.
+/// A continuous grayscale copy of the frame.
 fn gray(frame: &Frame) -> Result<Mat, DetectError> {
     let image = &frame.image;
     let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };

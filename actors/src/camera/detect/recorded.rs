@@ -1,7 +1,7 @@
 //! Detections from a file, in place of a detector: for recordings and for nodes without a usable model.
 //!
 //! The file is JSON Lines: line n holds what was detected in frame n, as an array of
-//! [`ecod::detection::Detection`]s, empty when nothing was:
+//! [`ecod::model::detection::Detection`]s, empty when nothing was:
 //!
 //! ```text
 //! [{"label":"cup","confidence":0.93,"bounding_box":{"x_min":12.5,"y_min":80,"x_max":96,"y_max":171}}]
@@ -10,7 +10,7 @@
 
 use std::path::{Path, PathBuf};
 
-use ecod::detection::{Detection, parse_detections};
+use ecod::model::detection::{Detection, parse_detections};
 use serde::{Deserialize, Serialize};
 
 use super::{Detect, DetectError};
@@ -92,7 +92,7 @@ fn read_line(path: &Path, line: usize, text: &str) -> Result<Vec<Detection>, Rec
 mod tests {
     use std::io::Write;
 
-    use ecod::time::Timestamp;
+    use ecod::model::time::Timestamp;
     use opencv::core::Mat;
 
     use super::*;

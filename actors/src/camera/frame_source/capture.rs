@@ -1,11 +1,11 @@
-//! Runs a source on threads of its own: latest frame wins, and a source that fails or stalls is opened again.
+//! Runs a source on its own threads: the latest frame wins, and a source that fails or stalls is reopened.
 //!
 //! ```text
-//! reader thread (one per opening) --frames, errors--> keeper thread --latest frame--> slot --> detector
+//! reader thread (one per opening) --frames, errors--> capture thread --latest frame--> slot --> detector
 //! ```
 //!
-//! OpenCV may block for good. The keeper then leaves the reader behind, which ends as soon as OpenCV returns, and
-//! opens the source on a new one.
+//! OpenCV may block forever. The capture thread then abandons the reader, which ends when OpenCV returns, and reopens
+//! the source on a new one.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -21,16 +21,15 @@ use super::{FrameError, FrameSource};
 use crate::camera::frame::Frame;
 use crate::platform::latest_slot::LatestSlot;
 
-/// When a source counts as stalled and how often it is opened again.
+/// Stall timeout and retries of a source.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CaptureConfig {
-    /// Seconds without a frame, also while opening, after which a source is opened again; default 5. Must exceed the
-    /// time that the camera takes to start.
+    /// Seconds without a frame after which a source is reopened. Default 5. Must exceed the start time of the camera.
     pub stall_timeout_s: f64,
-    /// Seconds before the first new attempt; doubles with each failure in a row; default 0.5.
+    /// Seconds before the first retry. Default 0.5. Doubles with each failure in a row.
     pub retry_min_s: f64,
-    /// Most seconds between two attempts; default 30.
+    /// Maximum seconds between two attempts. Default 30.
     pub retry_max_s: f64,
 }
 
@@ -51,38 +50,38 @@ impl CaptureConfig {
         check_range("retry_max_s", self.retry_max_s, self.retry_min_s, 3600.0)
     }
 
-    /// The wait after `failures` failures in a row, from 1.
+    /// Wait after this many failures in a row, from 1.
     fn retry_after(&self, failures: u32) -> Duration {
         let doubled = self.retry_min_s * 2f64.powi(failures.saturating_sub(1).min(60) as i32);
         Duration::from_secs_f64(doubled.min(self.retry_max_s))
     }
 }
 
-/// How a source is doing.
+/// State of a source.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum CaptureStatus {
-    /// Opened, without a frame yet.
+    /// No frame yet.
     #[default]
     Opening,
-    /// Frames come.
+    /// Frames arrive.
     Running,
-    /// It failed and will be opened again.
+    /// The source failed and will be reopened.
     Failed {
-        /// What happened.
+        /// The error.
         error: FrameError,
         /// Failures in a row.
         failures: u32,
         /// Time to the next attempt.
         retry_after: Duration,
     },
-    /// A file came to its end.
+    /// A file ended.
     Ended,
 }
 
-/// Opens a source, again and again.
+/// Opens a source, for the first time or again.
 pub type Opener = Arc<dyn Fn() -> Result<Box<dyn FrameSource>, FrameError> + Send + Sync>;
 
-/// A running capture; ends when dropped.
+/// A running capture; stops when dropped.
 #[derive(Debug)]
 pub struct Capture {
     slot: Arc<LatestSlot<Frame>>,
@@ -93,15 +92,15 @@ pub struct Capture {
 }
 
 impl Capture {
-    /// Starts to capture; `open` is called on threads of the capture.
+    /// Starts to capture. `open` is called on threads of the capture.
     ///
     /// # Errors
-    /// The system's, when it has no thread to give.
+    /// When the operating system gives no thread.
     pub fn start(open: Opener, config: CaptureConfig) -> std::io::Result<Self> {
         let slot = Arc::new(LatestSlot::default());
         let (status_sender, status) = watch::channel(CaptureStatus::default());
         let (events, inbox) = mpsc::sync_channel(1);
-        let keeper = CaptureLoop {
+        let capture = CaptureLoop {
             open,
             config,
             slot: Arc::clone(&slot),
@@ -114,32 +113,32 @@ impl Capture {
             unusable: Arc::default(),
             failures: Arc::default(),
         };
-        let (unusable, failures) = (Arc::clone(&keeper.unusable), Arc::clone(&keeper.failures));
-        thread::Builder::new().name("capture".into()).spawn(move || keeper.run())?;
+        let (unusable, failures) = (Arc::clone(&capture.unusable), Arc::clone(&capture.failures));
+        thread::Builder::new().name("capture".into()).spawn(move || capture.run())?;
         Ok(Self { slot, status, events, unusable, failures })
     }
 
-    /// The latest frame, waiting for one; `None` once the source has ended. Frames are numbered across openings.
+    /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source is reopened.
     pub async fn next_frame(&self) -> Option<Frame> {
         self.slot.take().await
     }
 
-    /// Frames that were replaced by a later one before anyone took them.
+    /// Number of frames replaced by a later one before the detector took them.
     pub fn skipped(&self) -> u64 {
         self.slot.skipped()
     }
 
-    /// Frames of a recording that were no images and were passed over.
+    /// Number of frames of a recording that are not images.
     pub fn unusable(&self) -> u64 {
         self.unusable.load(Ordering::Relaxed)
     }
 
-    /// How often the source failed or stalled and was to be opened again.
+    /// Number of failures and stalls.
     pub fn failures(&self) -> u64 {
         self.failures.load(Ordering::Relaxed)
     }
 
-    /// How the source is doing, now and from now on.
+    /// State of the source as it changes.
     pub fn status(&self) -> watch::Receiver<CaptureStatus> {
         self.status.clone()
     }
@@ -147,48 +146,48 @@ impl Capture {
 
 impl Drop for Capture {
     fn drop(&mut self) {
-        // The keeper is gone already when the source has ended.
+        // The capture thread is gone if the source has ended.
         let _ = self.events.send(Event::Stop);
     }
 }
 
-/// Readers of this process that may be in OpenCV.
+/// Number of readers in this process that may be inside OpenCV.
 static READERS: AtomicUsize = AtomicUsize::new(0);
 
-/// Counts a reader as long as it runs.
-struct Running;
+/// Counts a reader while it runs.
+struct ReaderGuard;
 
-impl Running {
-    fn begin() -> Self {
+impl ReaderGuard {
+    fn new() -> Self {
         READERS.fetch_add(1, Ordering::SeqCst);
         Self
     }
 }
 
-impl Drop for Running {
+impl Drop for ReaderGuard {
     fn drop(&mut self) {
         READERS.fetch_sub(1, Ordering::SeqCst);
     }
 }
 
-/// Waits until no reader runs, `patience` at most: a process that ends takes down OpenCV, which must not be in use then.
-pub fn wait_for_readers(patience: Duration) {
-    let until = Instant::now() + patience;
+/// Waits at most `timeout` until no reader runs, because OpenCV must not be in use while the process ends.
+pub fn wait_for_readers(timeout: Duration) {
+    let until = Instant::now() + timeout;
     while READERS.load(Ordering::SeqCst) > 0 && Instant::now() < until {
         thread::sleep(Duration::from_millis(2));
     }
 }
 
-/// Blocked readers from which on no new one is started.
+/// Maximum number of blocked readers.
 const MAX_ABANDONED: usize = 4;
 
 enum Event {
-    /// From the reader of the given opening.
+    /// A result of the reader with this number.
     Read(u64, Result<Frame, FrameError>),
     Stop,
 }
 
-/// Why a reader is no longer listened to.
+/// Reason for the end of a reader.
 enum Outcome {
     Failed(FrameError),
     Stopped,
@@ -201,7 +200,7 @@ struct CaptureLoop {
     status: watch::Sender<CaptureStatus>,
     events: SyncSender<Event>,
     inbox: Receiver<Event>,
-    /// The opening whose reader is listened to.
+    /// Number of the present opening and its reader.
     opening: Arc<AtomicU64>,
     abandoned: Vec<JoinHandle<()>>,
     captured: u64,
@@ -213,7 +212,7 @@ impl CaptureLoop {
     fn run(mut self) {
         let mut failures = 0;
         loop {
-            let captured = self.captured;
+            let before = self.captured;
             let outcome = self.read_until_failure();
             self.opening.fetch_add(1, Ordering::SeqCst);
             let error = match outcome {
@@ -225,7 +224,7 @@ impl CaptureLoop {
                 }
                 Outcome::Failed(error) => error,
             };
-            failures = if self.captured > captured { 1 } else { failures + 1 };
+            failures = if self.captured > before { 1 } else { failures + 1 };
             let retry_after = self.config.retry_after(failures);
             self.failures.fetch_add(1, Ordering::Relaxed);
             tracing::warn!(%error, failures, ?retry_after, "frame source failed");
@@ -238,7 +237,7 @@ impl CaptureLoop {
         self.slot.close();
     }
 
-    /// Opens the source and passes its frames on.
+    /// Opens the source and passes on its frames.
     fn read_until_failure(&mut self) -> Outcome {
         let stall_timeout = Duration::from_secs_f64(self.config.stall_timeout_s);
         self.abandoned.retain(|reader| !reader.is_finished());
@@ -248,7 +247,7 @@ impl CaptureLoop {
         let opening = self.opening.load(Ordering::SeqCst);
         let reader = Reader { opening, current: Arc::clone(&self.opening), events: self.events.clone() };
         let open = Arc::clone(&self.open);
-        let running = Running::begin();
+        let running = ReaderGuard::new();
         let read = move || {
             let _running = running;
             reader.run(&open);
@@ -264,7 +263,7 @@ impl CaptureLoop {
                 Err(RecvTimeoutError::Timeout) => return Outcome::Failed(FrameError::Stalled(stall_timeout)),
                 Ok(Event::Read(from, _)) if from != opening => {}
                 Ok(Event::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
-                    tracing::warn!(%error, "frame passed over");
+                    tracing::warn!(%error, "frame skipped");
                     self.unusable.fetch_add(1, Ordering::Relaxed);
                 }
                 Ok(Event::Read(_, Err(error))) => return Outcome::Failed(error),
@@ -295,7 +294,7 @@ impl CaptureLoop {
     }
 }
 
-/// Reads one opening of the source until it fails or is left behind.
+/// Reads one opening of the source until it fails or is abandoned.
 struct Reader {
     opening: u64,
     current: Arc<AtomicU64>,
@@ -306,20 +305,20 @@ impl Reader {
     fn run(self, open: &Opener) {
         let mut source = match open() {
             Ok(source) => source,
-            Err(error) => return self.tell(Err(error)),
+            Err(error) => return self.send(Err(error)),
         };
         while self.current.load(Ordering::SeqCst) == self.opening {
             let read = source.next_frame();
             let failed = read.as_ref().is_err_and(|error| !matches!(error, FrameError::Unusable { .. }));
-            self.tell(read);
+            self.send(read);
             if failed {
                 return;
             }
         }
     }
 
-    fn tell(&self, read: Result<Frame, FrameError>) {
-        // Nobody listens any more once the keeper has ended.
+    fn send(&self, read: Result<Frame, FrameError>) {
+        // The receiver is gone once the capture has ended.
         let _ = self.events.send(Event::Read(self.opening, read));
     }
 }

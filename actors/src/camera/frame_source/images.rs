@@ -17,7 +17,7 @@ pub(super) struct ImageSequence {
     files: Vec<PathBuf>,
     looping: bool,
     pace: FramePacer,
-    /// Files looked at, also those that were no images.
+    /// Number of files read, including unusable ones.
     next: u64,
 }
 
@@ -32,7 +32,7 @@ impl ImageSequence {
             in_directory(path).map_err(|e| failed(e.to_string()))?
         };
         if files.is_empty() {
-            return Err(failed("no images there".into()));
+            return Err(failed("no images found".into()));
         }
         Ok(Self { origin, files, looping, pace: FramePacer::new(fps), next: 0 })
     }
@@ -71,7 +71,7 @@ pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// The files of `before%04dafter` that exist, counting up without a gap.
+/// Existing files of a pattern like `before%04dafter`, counting up to the first gap.
 fn numbered(pattern: &str) -> Option<Vec<PathBuf>> {
     let (before, rest) = pattern.split_once('%')?;
     let (digits, after) = rest.split_once('d')?;

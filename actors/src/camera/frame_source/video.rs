@@ -12,7 +12,7 @@ use super::{FrameError, FramePacer, FrameSource};
 use crate::camera::frame::Frame;
 use crate::platform::clock;
 
-/// Rate of a video file that does not say.
+/// Rate of a video file without one.
 const FALLBACK_FPS: f64 = 25.0;
 
 /// An open capture.
@@ -23,7 +23,7 @@ pub(super) struct Video {
     seq: u64,
 }
 
-/// What a file has beyond a live source.
+/// Playback of a file.
 struct Playback {
     pace: FramePacer,
     looping: bool,
@@ -49,7 +49,7 @@ impl Video {
             if let Some(value) = wish
                 && !video.capture.set(property, value).unwrap_or(false)
             {
-                tracing::debug!(camera = video.origin, property, value, "camera does not take a setting");
+                tracing::debug!(camera = video.origin, property, value, "camera rejects a setting");
             }
         }
         Ok(video)
@@ -59,11 +59,11 @@ impl Video {
         Self::live(pipeline.into(), || VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER))
     }
 
-    /// A network camera that may take `patience` to open, and as long for each frame.
-    pub(super) fn url(url: &str, patience: Duration) -> Result<Self, FrameError> {
-        let patience_ms = i32::try_from(patience.as_millis()).unwrap_or(i32::MAX);
+    /// A network camera with a timeout for opening it and for each frame.
+    pub(super) fn url(url: &str, timeout: Duration) -> Result<Self, FrameError> {
+        let timeout_ms = i32::try_from(timeout.as_millis()).unwrap_or(i32::MAX);
         let properties = [videoio::CAP_PROP_OPEN_TIMEOUT_MSEC, videoio::CAP_PROP_READ_TIMEOUT_MSEC];
-        let timeouts: Vec<i32> = properties.into_iter().flat_map(|property| [property, patience_ms]).collect();
+        let timeouts: Vec<i32> = properties.into_iter().flat_map(|property| [property, timeout_ms]).collect();
         Self::live(without_credentials(url), || {
             VideoCapture::from_file_with_params(url, videoio::CAP_FFMPEG, &Vector::from_slice(&timeouts))
         })
@@ -82,12 +82,12 @@ impl Video {
         let failed = |reason: String| FrameError::Open { origin: origin.clone(), reason };
         let capture = open().map_err(|e| failed(e.message))?;
         if !capture.is_opened().map_err(|e| failed(e.message))? {
-            return Err(failed("opencv finds no video there".into()));
+            return Err(failed("opencv finds no video".into()));
         }
         Ok(Self { origin, capture, playback: None, seq: 0 })
     }
 
-    /// The next image; `None` when there is none.
+    /// The next image, if there is one.
     fn read(&mut self) -> Result<Option<Mat>, FrameError> {
         let mut image = Mat::default();
         let read = self.capture.read(&mut image);
@@ -118,7 +118,7 @@ impl FrameSource for Video {
     }
 }
 
-/// An address as it may be logged: `rtsp://user:secret@camera/1` without user and secret.
+/// An address that may be logged: `rtsp://user:secret@camera/1` without user and secret.
 pub(super) fn without_credentials(url: &str) -> String {
     match url.split_once("://") {
         Some((scheme, rest)) => {
@@ -130,7 +130,7 @@ pub(super) fn without_credentials(url: &str) -> String {
     }
 }
 
-/// The system's own words for a file that is missing or forbidden; OpenCV has none.
+/// The operating system's error for a missing or forbidden file, since OpenCV reports none.
 fn readable(path: &Path, origin: &str) -> Result<(), FrameError> {
     let failed = |e: std::io::Error| FrameError::Open { origin: origin.to_owned(), reason: e.to_string() };
     File::open(path).map(drop).map_err(failed)

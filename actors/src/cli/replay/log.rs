@@ -1,48 +1,46 @@
-//! Logs run again: by the journal of the node's aggregator where it has one, else by the reports that an observer took.
+//! Replay of logs: from the aggregator's journal if there is one, else from an observer's reports.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::anyhow;
-use ecod::landmark::Landmark;
+use ecod::perception::landmark::Landmark;
 use ecod::replay::{FusedLine, JournalEntry, JournalReplay, Replay, ReplayConfig};
 use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
 
-use super::{Failure, report, write_all};
+use super::{Failure, RoundWriter, print_summary};
 use crate::observe::recorder::{LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName};
 
-/// What was live was within the limits of its node; here they only bound memory.
+/// Bounds of memory only: the node checked its own limits when it recorded.
 const LIMITS: Limits = Limits { payload_bytes: 1 << 28, map_bytes: 1 << 28, objects: usize::MAX };
 
-/// The machine that runs the reports again.
+/// Way of replaying a log.
 enum ReplayEngine {
-    /// Nothing has been read that says which.
-    Undecided,
-    /// The aggregator's journal.
+    /// From the aggregator's journal.
     Journal(Box<JournalReplay>),
-    /// Reports by their time of receipt.
+    /// From reports by their time of receipt.
     Reports(Box<Replay>),
 }
 
-/// Runs the files of a log again, in their order.
+/// Replay of the files of a log, in their order.
 pub(super) struct LogReplay<'a> {
     /// Replaces the configuration in the log.
     cell: Option<&'a ReplayConfig>,
     passes: Option<u32>,
     identity: Option<LogIdentity>,
-    machine: ReplayEngine,
+    /// Chosen by the first journal entry or report.
+    engine: Option<ReplayEngine>,
     unreadable: BTreeMap<RejectReason, u64>,
 }
 
 impl<'a> LogReplay<'a> {
     pub(super) fn new(cell: Option<&'a ReplayConfig>, passes: Option<u32>) -> Self {
-        Self { cell, passes, identity: None, machine: ReplayEngine::Undecided, unreadable: BTreeMap::new() }
+        Self { cell, passes, identity: None, engine: None, unreadable: BTreeMap::new() }
     }
 
-    /// Reads the files and writes what comes of them; what cannot be used is told of and left out.
-    pub(super) fn run(mut self, files: &[PathBuf], sink: &mut dyn Write, output: &Path) -> Result<(), Failure> {
+    /// Reads the files and writes their rounds. Unusable parts are reported and skipped.
+    pub(super) fn run(mut self, files: &[PathBuf], mut rounds: RoundWriter) -> Result<(), Failure> {
         for file in files {
             let mut log = LogReader::open(file).map_err(Failure::usage)?;
             for event in log.by_ref() {
@@ -54,48 +52,48 @@ impl<'a> LogReplay<'a> {
                         continue;
                     }
                 };
-                if !write_all(sink, &lines, output)? {
+                if !rounds.write(&lines)? {
                     return Ok(());
                 }
             }
             for (schema, messages) in log.unknown() {
-                eprintln!("{}: {messages} messages of {schema:?} are not known and left out", file.display());
+                eprintln!("{}: {messages} messages of {schema:?} are not known and skipped", file.display());
             }
         }
-        self.finish(sink, output)
+        self.finish(rounds)
     }
 
     fn event(&mut self, event: LogEvent, file: &Path) -> Result<Vec<FusedLine>, Failure> {
         match event {
-            LogEvent::Identity(identity) => self.meet(*identity, file),
+            LogEvent::Identity(identity) => self.identity(*identity, file),
             LogEvent::Message(message) => Ok(self.message(&message)),
         }
     }
 
-    fn meet(&mut self, identity: LogIdentity, file: &Path) -> Result<Vec<FusedLine>, Failure> {
+    fn identity(&mut self, identity: LogIdentity, file: &Path) -> Result<Vec<FusedLine>, Failure> {
         let known = self.identity.take();
         if let Some(known) = &known
             && known.node != identity.node
         {
             let (one, other) = (&known.node, &identity.node);
-            let what = format!("{} is of node {other}, files before it of {one}", file.display());
+            let what = format!("{} is of node {other}, earlier files are of {one}", file.display());
             return Err(Failure::usage(anyhow!("{what}: give the files of one node at a time")));
         }
         let (file, version) = (file.display(), &identity.version);
         if version != env!("CARGO_PKG_VERSION") && known.as_ref().is_none_or(|known| known.version != *version) {
-            eprintln!("{file} was written by version {version}: rounds may differ from what that version made of it");
+            eprintln!("{file} was written by version {version}: its rounds may differ");
         }
         let identity = self.identity.insert(identity);
         let Some(known) = known.filter(|known| known.run != identity.run) else { return Ok(Vec::new()) };
         let is_as_before = (&known.fusion, &known.landmarks) == (&identity.fusion, &identity.landmarks);
         let config = self.config();
-        match &mut self.machine {
-            ReplayEngine::Journal(rerun) => rerun.restart(config.fusion, config.landmarks),
-            ReplayEngine::Reports(replay) if self.cell.is_none() && !is_as_before => {
-                eprintln!("{file} is of a run under another configuration: from there on reports are fused anew");
+        match &mut self.engine {
+            Some(ReplayEngine::Journal(rerun)) => rerun.restart(config.fusion, config.landmarks),
+            Some(ReplayEngine::Reports(replay)) if self.cell.is_none() && !is_as_before => {
+                eprintln!("{file} is of a run under another configuration: fusion starts again there");
                 return Ok(end(std::mem::replace(&mut **replay, Replay::new(config))));
             }
-            ReplayEngine::Reports(_) | ReplayEngine::Undecided => {}
+            _ => {}
         }
         Ok(Vec::new())
     }
@@ -106,13 +104,15 @@ impl<'a> LogReplay<'a> {
                 let Ok(entry) = serde_json::from_slice::<JournalEntry>(&message.json) else {
                     return self.reject(RejectReason::Malformed);
                 };
-                self.journal_replay().map(|rerun| rerun.entry(&entry)).unwrap_or_default()
+                match self.engine(SchemaName::JournalEntry) {
+                    ReplayEngine::Journal(rerun) => rerun.entry(&entry),
+                    ReplayEngine::Reports(_) => Vec::new(),
+                }
             }
             SchemaName::ObjectReport => match read_report(message) {
-                Ok((kind, report)) => match self.machine() {
+                Ok((kind, report)) => match self.engine(SchemaName::ObjectReport) {
                     ReplayEngine::Journal(rerun) => rerun.report(kind, &Arc::new(report), message.at),
                     ReplayEngine::Reports(replay) => replay.report(kind, report, message.at),
-                    ReplayEngine::Undecided => Vec::new(),
                 },
                 Err(reason) => self.reject(reason),
             },
@@ -125,23 +125,20 @@ impl<'a> LogReplay<'a> {
         Vec::new()
     }
 
-    /// A journal precedes the reports that it is about.
-    fn journal_replay(&mut self) -> Option<&mut JournalReplay> {
-        if matches!(self.machine, ReplayEngine::Undecided) {
-            let ReplayConfig { fusion, landmarks, .. } = self.config();
-            self.machine = ReplayEngine::Journal(Box::new(JournalReplay::new(fusion, landmarks)));
-        }
-        if let ReplayEngine::Journal(rerun) = &mut self.machine { Some(rerun) } else { None }
+    /// The engine, which the first message chooses: a journal precedes its reports.
+    fn engine(&mut self, first: SchemaName) -> &mut ReplayEngine {
+        let engine = match (self.engine.take(), first) {
+            (Some(engine), _) => engine,
+            (None, SchemaName::JournalEntry) => {
+                let ReplayConfig { fusion, landmarks, .. } = self.config();
+                ReplayEngine::Journal(Box::new(JournalReplay::new(fusion, landmarks)))
+            }
+            (None, _) => ReplayEngine::Reports(Box::new(Replay::new(self.config()))),
+        };
+        self.engine.insert(engine)
     }
 
-    fn machine(&mut self) -> &mut ReplayEngine {
-        if matches!(self.machine, ReplayEngine::Undecided) {
-            self.machine = ReplayEngine::Reports(Box::new(Replay::new(self.config())));
-        }
-        &mut self.machine
-    }
-
-    /// What the present run is run again under.
+    /// Configuration of the present run.
     fn config(&self) -> ReplayConfig {
         let config = match (self.cell, &self.identity) {
             (Some(cell), _) => cell.clone(),
@@ -156,41 +153,41 @@ impl<'a> LogReplay<'a> {
         ReplayConfig { passes: self.passes, limits: LIMITS, ..config }
     }
 
-    fn finish(self, sink: &mut dyn Write, output: &Path) -> Result<(), Failure> {
+    fn finish(self, mut rounds: RoundWriter) -> Result<(), Failure> {
         for (reason, messages) in &self.unreadable {
             eprintln!("rejected {reason} {messages}");
         }
-        match self.machine {
-            ReplayEngine::Undecided => eprintln!("there is no report and no journal in the log"),
-            ReplayEngine::Reports(replay) => {
-                write_all(sink, &end(*replay), output)?;
+        match self.engine {
+            None => eprintln!("the log holds no report and no journal"),
+            Some(ReplayEngine::Reports(replay)) => {
+                rounds.write(&end(*replay))?;
             }
-            ReplayEngine::Journal(rerun) => say(&rerun),
+            Some(ReplayEngine::Journal(rerun)) => print_rerun(&rerun),
         }
-        Ok(())
+        rounds.finish()
     }
 }
 
-/// What comes of a log, by its journal or its reports; only built for the fuzz targets.
+/// Rounds of a log; only built for the fuzz targets.
 #[cfg(fuzzing)]
 pub fn rounds_of_log(file: &Path) -> Vec<FusedLine> {
     let mut replay = LogReplay::new(None, None);
     let Ok(log) = LogReader::open(file) else { return Vec::new() };
     let mut rounds: Vec<_> = log.flatten().map_while(|event| replay.event(event, file).ok()).flatten().collect();
-    if let ReplayEngine::Reports(machine) = replay.machine {
-        rounds.extend(machine.finish().0);
+    if let Some(ReplayEngine::Reports(engine)) = replay.engine {
+        rounds.extend(engine.finish().0);
     }
     rounds
 }
 
-/// The last that comes of reports, and what became of them.
+/// The last rounds of a replay of reports, whose summary is printed.
 fn end(replay: Replay) -> Vec<FusedLine> {
     let (lines, summary) = replay.finish();
-    report(&summary);
+    print_summary(&summary);
     lines
 }
 
-fn say(rerun: &JournalReplay) {
+fn print_rerun(rerun: &JournalReplay) {
     let summary = rerun.summary();
     let used = summary.reports - summary.rejected.values().sum::<u64>();
     eprintln!("{} reports, {used} used, {} written", summary.reports, summary.written);
@@ -198,15 +195,10 @@ fn say(rerun: &JournalReplay) {
         eprintln!("rejected {reason} {reports}");
     }
     if summary.continued {
-        eprintln!(
-            "the log begins in the middle of a run: its first rounds rest on less evidence than the live ones did"
-        );
+        eprintln!("the log begins in the middle of a run: its first rounds use less evidence than the live ones did");
     }
     if summary.missing > 0 {
-        eprintln!(
-            "{} entries are missing in the log: rounds after them may differ from the live ones",
-            summary.missing
-        );
+        eprintln!("{} entries are missing in the log: later rounds may differ from the live ones", summary.missing);
     }
 }
 

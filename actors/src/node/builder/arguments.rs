@@ -4,18 +4,18 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
-use ecod::epoch::Epoch;
-use ecod::landmark::Landmark;
 use ecod::leadership::Position;
 use ecod::leadership::election::ElectionConfig;
 use ecod::leadership::node::{Input, NodeSettings};
+use ecod::model::epoch::Epoch;
+use ecod::perception::landmark::Landmark;
 use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus};
 
 use super::NodeBuilder;
 use crate::actors::dashboard::DashboardArguments;
 use crate::actors::follower::FollowerArguments;
-use crate::actors::fuser::FuserArguments;
+use crate::actors::fuser::{FuserArguments, QueuedReport};
 use crate::actors::gateway::GatewayArguments;
 use crate::actors::leader_election::{LeaderElectionArguments, Parts, saved_term};
 use crate::actors::membership::MembershipArguments;
@@ -30,7 +30,7 @@ use crate::node::config::NodeConfig;
 use crate::node::slots::ActorKind;
 use crate::observe::dashboard::{LandmarkFacts, NodeFacts, NodeSources};
 use crate::observe::readiness::{Vitals, patience};
-use crate::observe::recorder::LogIdentity;
+use crate::observe::recorder::{LogIdentity, LogItem};
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
@@ -105,13 +105,13 @@ impl NodeBuilder {
         let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
         let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
-        let (intake, counters) = (self.intake.clone(), self.counters());
+        let (report_queue, counters) = (self.report_queue.clone(), self.counters());
         Arc::new(move |delivery| {
             let at = delivery.received_at;
             live_state.update(&delivery.message, at);
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
-                    recording.report(*kind, report, at);
+                    recording.send(at, LogItem::Report(*kind, Arc::clone(report)));
                     true
                 }
                 // Evidence is for those that lead now or next; others that get it only look at it.
@@ -124,33 +124,45 @@ impl NodeBuilder {
                 }
                 Incoming::Report { kind, report } => {
                     let (kind, report) = (*kind, Arc::clone(report));
-                    let put = intake.put(kind, &report, delivery);
-                    if put.has_replaced {
-                        counters.shed(ShedReason::ReportReplaced, report.node.as_str());
+                    let node = report.node.clone();
+                    let outcome = report_queue.push(delivery.map(|_| QueuedReport { kind, report }));
+                    if outcome.has_replaced {
+                        counters.shed(ShedReason::ReportReplaced, node.as_str());
                     }
-                    !put.is_first || fuser.send(FuserMessage::TakeReports)
+                    !outcome.is_first || fuser.send(FuserMessage::TakeReports)
                 }
-                Incoming::Map(_) => follower.send(FollowerMessage::TakeMap { delivery }),
-                Incoming::Verdicts(_) => follower.send(FollowerMessage::TakeVerdicts { delivery }),
-                Incoming::Reputations(_) => follower.send(FollowerMessage::TakeReputations { delivery }),
+                Incoming::Map(map) => {
+                    let map = Arc::clone(map);
+                    follower.send(FollowerMessage::TakeMap { delivery: delivery.map(|_| map) })
+                }
+                Incoming::Verdicts(verdicts) => {
+                    let verdicts = Arc::clone(verdicts);
+                    follower.send(FollowerMessage::TakeVerdicts { delivery: delivery.map(|_| verdicts) })
+                }
+                Incoming::Reputations(reputations) => {
+                    let reputations = Arc::clone(reputations);
+                    follower.send(FollowerMessage::TakeReputations { delivery: delivery.map(|_| reputations) })
+                }
                 Incoming::Ledger(share) if !fuses => {
-                    recording.share(share, at);
+                    recording.send(at, LogItem::Share(Arc::clone(share)));
                     true
                 }
                 Incoming::Ledger(share) => {
-                    recording.share(share, at);
+                    recording.send(at, LogItem::Share(Arc::clone(share)));
                     let input = Input::EvidenceReceived { from: share.node.clone() };
                     election.send(LeaderElectionMessage::Note { input });
-                    keeper.send(ReputationKeeperMessage::Merge { delivery })
+                    let share = Arc::clone(share);
+                    keeper.send(ReputationKeeperMessage::Merge { delivery: delivery.map(|_| share) })
                 }
                 Incoming::Link { broker, state } => {
-                    recording.link(broker, *state, at);
+                    recording.send(at, LogItem::Link(broker.clone(), *state));
                     let input = Input::LinkChanged { broker: broker.clone(), state: *state };
                     election.send(LeaderElectionMessage::Note { input })
                 }
                 Incoming::Status { status, .. } => {
-                    recording.status(status, at);
-                    election.send(LeaderElectionMessage::TakeStatus { delivery })
+                    recording.send(at, LogItem::Status(Arc::clone(status)));
+                    let status = Arc::clone(status);
+                    election.send(LeaderElectionMessage::TakeStatus { delivery: delivery.map(|_| status) })
                 }
             };
         })
@@ -176,7 +188,7 @@ impl NodeBuilder {
             cell: self.config.cell.clone(),
             reputation: self.config.fusion.reputation.clone(),
             config: self.config.reputations.clone(),
-            book: self.book.clone(),
+            reputations: self.reputations.clone(),
             file: self.state_file("reputations"),
             newest: self.newest.reputations.subscribe(),
             members: self.members(),
@@ -190,14 +202,14 @@ impl NodeBuilder {
     /// A fuser starts with the evidence that the keeper has, and goes on with the objects of the newest map.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
-        let (now, ledger) = (clock::now(), Arc::new(self.book.open().ledger.clone()));
+        let (now, ledger) = (clock::now(), Arc::new(self.reputations.open().ledger.clone()));
         let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
-        self.recording.journal(now, JournalEvent::Start { ledger });
+        self.recording.send(now, LogItem::Journal(JournalEvent::Start { ledger }));
         FuserArguments {
             aggregator,
             recording: self.recording.clone(),
-            intake: self.intake.clone(),
+            report_queue: self.report_queue.clone(),
             newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
@@ -287,10 +299,10 @@ impl NodeBuilder {
 
 #[cfg(test)]
 mod tests {
-    use ecod::time::Timestamp;
+    use ecod::model::time::Timestamp;
     use ecod::wire::{GlobalMap, Role, SCHEMA_VERSION};
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use tokio::sync::watch;
 
     use super::*;

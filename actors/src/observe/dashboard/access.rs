@@ -5,7 +5,7 @@ use std::net::{IpAddr, SocketAddr};
 use axum::http::header::{self, AUTHORIZATION, COOKIE, HOST};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Uri};
 use base64::prelude::{BASE64_URL_SAFE_NO_PAD, Engine};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ring::hmac;
 
 use crate::platform::secret::Secret;

@@ -3,10 +3,10 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use ecod::epoch::Epoch;
 use ecod::leadership::{Leadership, Position};
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::Reputations;
 use serde::Serialize;
 

@@ -1,6 +1,6 @@
 //! Latency of maps as histograms over the whole run.
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use prometheus_client::metrics::histogram::Histogram;
 
 /// Upper bounds of the buckets in seconds.

@@ -50,7 +50,7 @@ pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
 }
 
 fn node(registry: &mut Registry, monitor: &NodeMonitor) {
-    let (sources, probe) = (&monitor.sources, monitor.probe());
+    let (sources, probe) = (&monitor.sources, monitor.observed().probe.clone());
     let facts = &sources.node;
     let labels = vec![
         ("node", facts.name.to_string()),
@@ -86,7 +86,7 @@ fn election(registry: &mut Registry, monitor: &NodeMonitor) {
     let term = leadership.epoch.as_ref().map_or(0, |epoch| i64::try_from(epoch.term).unwrap_or(i64::MAX));
     gauge(registry, "election_epoch", "Highest term of leadership known", term);
     let failovers = Counter::<u64>::default();
-    failovers.inc_by(monitor.failovers());
+    failovers.inc_by(monitor.observed().history.failovers);
     registry.register("election_failovers", "Changes of the leader seen since the node started", failovers);
 }
 

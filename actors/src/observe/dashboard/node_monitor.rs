@@ -5,11 +5,10 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::epoch::Epoch;
 use ecod::leadership::Position;
 use ecod::leadership::readiness::Readiness;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
 use tokio::sync::watch;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
 
@@ -36,10 +35,13 @@ pub(crate) struct NodeMonitor {
     event: ResponseCache<Bytes>,
 }
 
+/// Everything that the monitor remembers.
 #[derive(Debug, Default)]
-struct Observed {
-    history: History,
-    probe: Probe,
+pub(crate) struct Observed {
+    /// Terms of leadership and samples.
+    pub(crate) history: History,
+    /// Latest answers of gateway and broker.
+    pub(crate) probe: Probe,
     /// Nodes that answer, or answered and still have a status at a broker.
     met: BTreeSet<NodeName>,
 }
@@ -66,21 +68,6 @@ impl NodeMonitor {
             observed: Mutex::default(),
             event: ResponseCache::new(Duration::from_secs_f64(1.0 / max_rate_hz)),
         }
-    }
-
-    /// The history as JSON, with the samples after `time` only.
-    pub(crate) fn history_since(&self, time: Timestamp) -> Vec<u8> {
-        self.observed().history.json_since(time)
-    }
-
-    /// Changes of the leader since the node started.
-    pub(crate) fn failovers(&self) -> u64 {
-        self.observed().history.failovers
-    }
-
-    /// Latest answers of gateway and broker.
-    pub(crate) fn probe(&self) -> Probe {
-        self.observed().probe.clone()
     }
 
     /// Latest snapshot as a server-sent event, updated while any such receiver exists.
@@ -121,7 +108,7 @@ impl NodeMonitor {
     fn snapshot(&self) -> Snapshot {
         let (sources, now, readiness) = (&self.sources, clock::now(), self.readiness());
         let newest = &sources.vitals.newest;
-        let map = newest.map.borrow().clone();
+        let (leadership, map) = (sources.vitals.leadership.borrow().clone(), newest.map.borrow().clone());
         let observed = self.observed();
         let Observed { history, probe, met } = &*observed;
         let since = history.terms.back().filter(|term| term.until_us.is_none()).map(|term| term.from_us);
@@ -135,7 +122,14 @@ impl NodeMonitor {
             now_us: now,
             node: sources.node.clone(),
             readiness,
-            leadership: LeadershipFacts::new(&sources.vitals.leadership.borrow(), since, history.failovers),
+            leadership: LeadershipFacts {
+                position: leadership.position,
+                leader: leadership.leader().cloned(),
+                epoch: leadership.epoch.as_ref().map(|epoch| epoch.term),
+                standby: leadership.standby.clone(),
+                since_us: since.filter(|_| leadership.leader().is_some()),
+                failovers: history.failovers,
+            },
             map: map.map(|newest| Received { received_at: newest.received_at, message: newest.map }),
             verdicts: newest.verdicts.borrow().clone(),
             reputations: newest.reputations.borrow().clone(),
@@ -239,7 +233,8 @@ impl NodeMonitor {
         }
     }
 
-    fn observed(&self) -> MutexGuard<'_, Observed> {
+    /// Locks the memory; not to be held across an await.
+    pub(crate) fn observed(&self) -> MutexGuard<'_, Observed> {
         self.observed.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use ecod::names::{LandmarkId, NodeName};
-use ecod::time::Timestamp;
+use ecod::model::names::{LandmarkId, NodeName};
+use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 use serde::Serialize;
 use tokio::sync::watch;

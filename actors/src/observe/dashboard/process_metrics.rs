@@ -2,7 +2,7 @@
 
 use std::sync::atomic::AtomicU64;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeVal;
 use prometheus_client::metrics::counter::Counter;

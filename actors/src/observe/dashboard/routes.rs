@@ -12,7 +12,7 @@ use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use futures_util::stream;
 
 use super::access::{AccessDecision, AccessPolicy, HEADERS};
@@ -152,7 +152,7 @@ async fn show_snapshot(State(api): Api) -> Response {
 /// The history, with the samples after `?since=` only.
 async fn show_history(State(api): Api, uri: Uri) -> Response {
     let since = uri.query().and_then(|query| query.strip_prefix("since=")).and_then(|time| time.parse().ok());
-    typed(JSON, api.monitor.history_since(Timestamp(since.unwrap_or(0))))
+    typed(JSON, api.monitor.observed().history.json_since(Timestamp(since.unwrap_or(0))))
 }
 
 async fn show_landmarks(State(api): Api) -> Response {

@@ -2,10 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use ecod::leadership::Position;
 use ecod::leadership::readiness::Readiness;
-use ecod::leadership::{Leadership, Position};
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
 use serde::Serialize;
 
@@ -83,19 +83,6 @@ pub(crate) struct NodeEntry {
     pub fit: Option<bool>,
     /// Version of its software.
     pub version: Option<String>,
-}
-
-impl LeadershipFacts {
-    pub(crate) fn new(leadership: &Leadership, since_us: Option<Timestamp>, failovers: u64) -> Self {
-        Self {
-            position: leadership.position,
-            leader: leadership.leader().cloned(),
-            epoch: leadership.epoch.as_ref().map(|epoch| epoch.term),
-            standby: leadership.standby.clone(),
-            since_us: since_us.filter(|_| leadership.leader().is_some()),
-            failovers,
-        }
-    }
 }
 
 /// A value as JSON; truncated where it cannot be encoded, which is logged.

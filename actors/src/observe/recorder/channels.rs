@@ -1,128 +1,101 @@
-//! The channels of a log: JSON messages under stable schema names.
+//! Channels of a log: JSON messages under stable schema names.
 //!
-//! `ecod.*` are the payloads of the cell and what a node knows about itself, `foxglove.*` what viewers draw. Topics are
-//! those of the cell without its root, `detections/euclid`, and `node/…`, `scene/…`, `tf`, `log` and `camera` for what is
-//! on no topic.
+//! `ecod.*` are payloads of the cell and facts about the recording node; `foxglove.*` are drawings for viewers. Topics
+//! are those of the cell without its root, such as `detections/euclid`. Messages without a topic in the cell are on
+//! `node/…`, `scene/…`, `tf`, `log` and `camera`.
 
 use std::collections::BTreeMap;
 
-use ecod::epoch::Epoch;
 use ecod::leadership::{Leadership, Position};
-use ecod::names::NodeName;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::replay::JournalEntry;
-use ecod::time::Timestamp;
+use ecod::wire;
 use schemars::{JsonSchema, Schema};
 use serde::{Deserialize, Serialize};
 
 use super::foxglove;
 use super::viewer_schema::schema_of;
 
-/// A channel's schema by its name in the log.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SchemaName {
+/// Lists every schema once: its name in the code, its message, its name in the log.
+macro_rules! schemas {
+    ($($(#[$doc:meta])* $schema:ident($message:ty) = $name:literal,)*) => {
+        /// A channel's schema; the names in the log are stable.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        pub enum SchemaName {
+            $($(#[$doc])* $schema,)*
+        }
+
+        impl SchemaName {
+            /// All schemas.
+            pub const ALL: [Self; [$($name),*].len()] = [$(Self::$schema),*];
+
+            /// The name in the log.
+            pub fn as_str(self) -> &'static str {
+                match self {
+                    $(Self::$schema => $name,)*
+                }
+            }
+
+            /// The JSON Schema of the messages, in the form that viewers read.
+            pub(crate) fn json_schema(self) -> Schema {
+                match self {
+                    $(Self::$schema => schema_of::<$message>(),)*
+                }
+            }
+        }
+    };
+}
+
+schemas! {
     /// A vehicle's report.
-    ObjectReport,
+    ObjectReport(wire::ObjectReport) = "ecod.ObjectReport",
     /// The map of a round.
-    GlobalMap,
+    GlobalMap(wire::GlobalMap) = "ecod.GlobalMap",
     /// The verdicts of a round.
-    Verdicts,
-    /// How far vehicles are trusted.
-    Reputations,
+    Verdicts(wire::Verdicts) = "ecod.Verdicts",
+    /// The reputations of all vehicles.
+    Reputations(wire::Reputations) = "ecod.Reputations",
     /// Another candidate's evidence.
-    LedgerShare,
-    /// What a node says about itself.
-    NodeStatus,
-    /// Who leads, as the recording node sees it: [`LeadershipChange`].
-    Leadership,
-    /// The recording node's counters: [`CounterReading`].
-    Counters,
-    /// What the recording node's aggregator was told: [`JournalEntry`].
-    JournalEntry,
-    /// Things in the world to be drawn.
-    SceneUpdate,
-    /// Where a vehicle stands.
-    FrameTransform,
-    /// What happened, in words.
-    Log,
-    /// A picture of the camera.
-    CompressedImage,
+    LedgerShare(wire::LedgerShare) = "ecod.LedgerShare",
+    /// A node's status.
+    NodeStatus(wire::NodeStatus) = "ecod.NodeStatus",
+    /// A change of the leadership as the recording node sees it.
+    Leadership(LeadershipChange) = "ecod.Leadership",
+    /// Counters of the recording node.
+    Counters(CounterReading) = "ecod.Counters",
+    /// An input of the recording node's aggregator.
+    JournalEntry(JournalEntry) = "ecod.JournalEntry",
+    /// A drawing of map or report.
+    SceneUpdate(foxglove::SceneUpdate) = "foxglove.SceneUpdate",
+    /// A vehicle's pose.
+    FrameTransform(foxglove::FrameTransform) = "foxglove.FrameTransform",
+    /// A log line.
+    Log(foxglove::Log) = "foxglove.Log",
+    /// A camera image.
+    CompressedImage(foxglove::CompressedImage) = "foxglove.CompressedImage",
 }
 
 impl SchemaName {
-    /// All of them.
-    pub const ALL: [Self; 13] = [
-        Self::ObjectReport,
-        Self::GlobalMap,
-        Self::Verdicts,
-        Self::Reputations,
-        Self::LedgerShare,
-        Self::NodeStatus,
-        Self::Leadership,
-        Self::Counters,
-        Self::JournalEntry,
-        Self::SceneUpdate,
-        Self::FrameTransform,
-        Self::Log,
-        Self::CompressedImage,
-    ];
-
-    /// The name in the log; it stays as it is.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::ObjectReport => "ecod.ObjectReport",
-            Self::GlobalMap => "ecod.GlobalMap",
-            Self::Verdicts => "ecod.Verdicts",
-            Self::Reputations => "ecod.Reputations",
-            Self::LedgerShare => "ecod.LedgerShare",
-            Self::NodeStatus => "ecod.NodeStatus",
-            Self::Leadership => "ecod.Leadership",
-            Self::Counters => "ecod.Counters",
-            Self::JournalEntry => "ecod.JournalEntry",
-            Self::SceneUpdate => "foxglove.SceneUpdate",
-            Self::FrameTransform => "foxglove.FrameTransform",
-            Self::Log => "foxglove.Log",
-            Self::CompressedImage => "foxglove.CompressedImage",
-        }
-    }
-
-    /// The schema of that name.
+    /// The schema of that name in the log.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|schema| schema.as_str() == name)
     }
-
-    /// The JSON Schema of its messages, as viewers read it.
-    pub(crate) fn json_schema(self) -> Schema {
-        use ecod::wire;
-        match self {
-            Self::ObjectReport => schema_of::<wire::ObjectReport>(),
-            Self::GlobalMap => schema_of::<wire::GlobalMap>(),
-            Self::Verdicts => schema_of::<wire::Verdicts>(),
-            Self::Reputations => schema_of::<wire::Reputations>(),
-            Self::LedgerShare => schema_of::<wire::LedgerShare>(),
-            Self::NodeStatus => schema_of::<wire::NodeStatus>(),
-            Self::Leadership => schema_of::<LeadershipChange>(),
-            Self::Counters => schema_of::<CounterReading>(),
-            Self::JournalEntry => schema_of::<JournalEntry>(),
-            Self::SceneUpdate => schema_of::<foxglove::SceneUpdate>(),
-            Self::FrameTransform => schema_of::<foxglove::FrameTransform>(),
-            Self::Log => schema_of::<foxglove::Log>(),
-            Self::CompressedImage => schema_of::<foxglove::CompressedImage>(),
-        }
-    }
 }
 
-/// Who leads, as the recording node sees it from now on.
+/// The leadership from now on, as the recording node sees it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LeadershipChange {
     /// The recording node.
     pub node: NodeName,
-    /// Since when, by its clock.
+    /// Time of the change by its clock.
     pub at_us: Timestamp,
     /// `seeking`, `following`, `standing_by` or `leading`.
     pub position: String,
     /// The highest leadership that was followed or led so far.
     pub epoch: Option<Epoch>,
-    /// Who leads next.
+    /// The node that leads next.
     pub standby: Option<NodeName>,
 }
 
@@ -138,11 +111,11 @@ impl LeadershipChange {
         Self { node, at_us, position: position.into(), epoch, standby }
     }
 
-    /// The change in words.
+    /// The change as text.
     pub(crate) fn in_words(&self) -> String {
         match (self.position.as_str(), &self.epoch) {
             ("leading", Some(epoch)) => format!("leads in term {}", epoch.term),
-            ("seeking", _) => "knows of no leader".into(),
+            ("seeking", _) => "knows no leader".into(),
             (_, Some(epoch)) => format!("follows {} in term {}", epoch.leader, epoch.term),
             (position, None) => position.into(),
         }
@@ -154,13 +127,13 @@ impl LeadershipChange {
 pub struct CounterReading {
     /// The recording node.
     pub node: NodeName,
-    /// When, by its clock.
+    /// Time of the reading by its clock.
     pub at_us: Timestamp,
-    /// What happened, by name.
+    /// Counted events by name.
     pub events: BTreeMap<String, u64>,
     /// Payloads that were not used, by reason.
     pub rejects: BTreeMap<String, u64>,
-    /// What was left out under overload, by reason; none in logs of earlier versions.
+    /// Messages discarded under overload, by reason; empty in logs of earlier versions.
     #[serde(default)]
     pub shed: BTreeMap<String, u64>,
 }

@@ -1,53 +1,52 @@
-//! What is recorded, where, and how much of it is kept.
+//! Configuration of the log: directory, contents and limits.
 
 use std::fmt;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{MapAccess, Visitor};
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// The log of a node; `record = "DIR"` stands for a table with `dir` alone.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+/// The log of a node; `record = "DIR"` is short for a table with `dir` alone.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(remote = "Self", default, deny_unknown_fields)]
 pub struct RecordConfig {
-    /// Directory of the log; it is made when it is not there. Required.
+    /// Directory of the log, created if missing. Required.
     pub dir: PathBuf,
-    /// Whose log it is said to be; default the node's. Observers are named for their process, their logs are not.
+    /// Name under which the log is kept. Default the node's; an observer's own name would differ in every process.
     #[serde(skip)]
     pub name: Option<NodeName>,
-    /// A file is closed and the next begun when it has as many megabytes; default 256. Smaller files lose less to a
-    /// broken disk and copy sooner, larger ones are fewer.
+    /// Maximum size of a file in megabytes. Default 256. Trade-off: smaller files lose less to a broken disk and copy
+    /// faster; larger ones are fewer.
     pub max_file_mb: u64,
-    /// A file is closed and the next begun after so many seconds; default 3600.
+    /// Maximum age of a file in seconds. Default 3600.
     pub max_file_s: u64,
-    /// Most megabytes of this node's files in the directory; default 4096. The oldest are deleted first.
+    /// Maximum megabytes of this node's files in the directory. Default 4096. The oldest are deleted first.
     pub max_total_mb: u64,
-    /// Megabytes that must stay free on the disk; default 256. With less, recording pauses, which is counted.
+    /// Megabytes that must stay free on the disk. Default 256. With less, recording pauses and losses are counted.
     pub min_free_mb: u64,
-    /// Entries that may wait for the disk; default 4096. When full, new ones are dropped and counted.
+    /// Maximum entries that wait for the disk. Default 4096. Further ones are dropped and counted.
     pub queue: usize,
-    /// Whether scenes and transforms are written that Foxglove and Lichtblick draw; default true. They double the log.
+    /// Whether to write scenes and transforms for Foxglove and Lichtblick. Default true. They double the log.
     pub drawable: bool,
-    /// Whether a node that never leads takes all reports of its cell to record them; default false. A node that may
-    /// lead takes them anyway.
+    /// Whether a node that never leads records all reports of its cell. Default false. A node that may lead always does.
     pub reports: bool,
-    /// ImageRecorder of the camera a second, as JPEG; default 0, none. Each has some 50 to 100 kB at 640x480.
+    /// Camera images a second, as JPEG. Default 0, none. Each takes 50 to 100 kB at 640x480.
     pub camera_hz: f64,
-    /// Port on 127.0.0.1 where Foxglove and Lichtblick see live what is recorded; default none. 8765 is what they ask
-    /// for, 0 a free one.
+    /// Port on 127.0.0.1 that serves the log live to Foxglove and Lichtblick. Default none. They expect 8765; 0 takes a
+    /// free port.
     #[cfg(feature = "foxglove")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub live_port: Option<u16>,
 }
 
-impl RecordConfig {
-    /// The defaults, in `dir`.
-    pub fn new(dir: impl Into<PathBuf>) -> Self {
+impl Default for RecordConfig {
+    fn default() -> Self {
         Self {
-            dir: dir.into(),
+            dir: PathBuf::new(),
             name: None,
             max_file_mb: 256,
             max_file_s: 3600,
@@ -61,8 +60,15 @@ impl RecordConfig {
             live_port: None,
         }
     }
+}
 
-    /// Checks every value; whether the directory can be written shows when it is.
+impl RecordConfig {
+    /// The defaults, in `dir`.
+    pub fn new(dir: impl Into<PathBuf>) -> Self {
+        Self { dir: dir.into(), ..Self::default() }
+    }
+
+    /// Checks every value, but not whether the directory can be written.
     ///
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
@@ -86,7 +92,7 @@ impl RecordConfig {
         Duration::from_secs(self.max_file_s)
     }
 
-    /// What older files may use beside the one being written.
+    /// Maximum bytes of all files beside the one being written.
     pub(crate) fn max_old_bytes(&self) -> u64 {
         (self.max_total_mb - self.max_file_mb) * MEGABYTE
     }
@@ -98,40 +104,9 @@ impl RecordConfig {
 
 const MEGABYTE: u64 = 1_000_000;
 
-/// The table; every key but `dir` may be left out.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Table {
-    dir: PathBuf,
-    max_file_mb: Option<u64>,
-    max_file_s: Option<u64>,
-    max_total_mb: Option<u64>,
-    min_free_mb: Option<u64>,
-    queue: Option<usize>,
-    drawable: Option<bool>,
-    reports: Option<bool>,
-    camera_hz: Option<f64>,
-    #[cfg(feature = "foxglove")]
-    live_port: Option<u16>,
-}
-
-impl From<Table> for RecordConfig {
-    fn from(table: Table) -> Self {
-        let default = Self::new(table.dir);
-        Self {
-            max_file_mb: table.max_file_mb.unwrap_or(default.max_file_mb),
-            max_file_s: table.max_file_s.unwrap_or(default.max_file_s),
-            max_total_mb: table.max_total_mb.unwrap_or(default.max_total_mb),
-            min_free_mb: table.min_free_mb.unwrap_or(default.min_free_mb),
-            queue: table.queue.unwrap_or(default.queue),
-            drawable: table.drawable.unwrap_or(default.drawable),
-            reports: table.reports.unwrap_or(default.reports),
-            camera_hz: table.camera_hz.unwrap_or(default.camera_hz),
-            #[cfg(feature = "foxglove")]
-            live_port: table.live_port,
-            dir: default.dir,
-            name: None,
-        }
+impl Serialize for RecordConfig {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        Self::serialize(self, serializer)
     }
 }
 
@@ -155,7 +130,8 @@ impl<'de> Visitor<'de> for DirectoryOrTable {
     }
 
     fn visit_map<M: MapAccess<'de>>(self, map: M) -> Result<RecordConfig, M::Error> {
-        Table::deserialize(MapAccessDeserializer::new(map)).map(RecordConfig::from)
+        // The derived function, which takes a table only.
+        RecordConfig::deserialize(MapAccessDeserializer::new(map))
     }
 }
 

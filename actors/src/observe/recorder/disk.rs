@@ -1,43 +1,42 @@
-//! The files of a log: their names, and how much of the disk they use.
+//! Files of a log on disk: names, free space and deletion.
 
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
 use chrono::DateTime;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use rustix::fs::statvfs;
 
-/// How a file of a log ends.
+/// Extension of log files.
 pub const EXTENSION: &str = "mcap";
 
-/// Most files that one second gives a name to.
-const NAMES_A_SECOND: u32 = 1000;
+/// Maximum number of files that begin in the same second.
+const MAX_FILES_PER_SECOND: u32 = 1000;
 
-/// Creates the file of a log that begins `at`, such as `euclid-20261121T100500Z-000.mcap`. By name they are in the
-/// order of time.
+/// Creates a log file that begins `at`, such as `euclid-20261121T100500Z-000.mcap`. Names sort by time.
 ///
 /// # Errors
-/// What the operating system said, and when there is less room than `min_free` bytes.
+/// The operating system's, and when fewer than `min_free` bytes are free.
 pub(crate) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) -> io::Result<(PathBuf, File)> {
     check_room(dir, min_free)?;
     let seconds = i64::try_from(at.micros() / 1_000_000).unwrap_or_default();
     let time = DateTime::from_timestamp(seconds, 0).unwrap_or_default().format("%Y%m%dT%H%M%SZ");
-    for number in 0..NAMES_A_SECOND {
+    for number in 0..MAX_FILES_PER_SECOND {
         let path = dir.join(format!("{node}-{time}-{number:03}.{EXTENSION}"));
         match File::create_new(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
             created => return created.map(|file| (path, file)),
         }
     }
-    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{NAMES_A_SECOND} files began in the same second")))
+    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{MAX_FILES_PER_SECOND} files began in the same second")))
 }
 
-/// Whether there is room for a log.
+/// Checks that the disk has room for a log.
 ///
 /// # Errors
-/// What the operating system said, and when there is less room than `min_free` bytes.
+/// The operating system's, and when fewer than `min_free` bytes are free.
 pub(crate) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
     let free = free_bytes(dir)?;
     if free < min_free {
@@ -47,19 +46,19 @@ pub(crate) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
     Ok(())
 }
 
-/// Bytes that programs without privileges may still write where `dir` is.
+/// Bytes on the disk of `dir` that an unprivileged program may still write.
 ///
 /// # Errors
-/// What the operating system said.
+/// The operating system's.
 pub fn free_bytes(dir: &Path) -> io::Result<u64> {
-    let facts = statvfs(dir)?;
-    Ok(facts.f_bavail.saturating_mul(facts.f_frsize))
+    let disk = statvfs(dir)?;
+    Ok(disk.f_bavail.saturating_mul(disk.f_frsize))
 }
 
-/// The files of a log, the oldest first.
+/// The log files of a directory in the order of their names.
 ///
 /// # Errors
-/// What the operating system said about the directory.
+/// The operating system's about the directory.
 pub fn files(dir: &Path) -> io::Result<Vec<PathBuf>> {
     let is_log = |path: &PathBuf| path.extension().is_some_and(|extension| extension == EXTENSION);
     let mut files: Vec<_> = fs::read_dir(dir)?.filter_map(|entry| Some(entry.ok()?.path())).filter(is_log).collect();
@@ -67,10 +66,10 @@ pub fn files(dir: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Deletes this node's oldest files until the rest has at most `max_bytes`; says how many are gone.
+/// Deletes this node's oldest files until the rest has at most `max_bytes`; returns the number deleted.
 ///
 /// # Errors
-/// What the operating system said.
+/// The operating system's.
 pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<usize> {
     let mut kept = 0;
     let mut deleted = 0;
@@ -84,7 +83,7 @@ pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<u
     Ok(deleted)
 }
 
-/// A node's name may begin with another's: what follows it is a time and a number, without a further `-` between.
+/// Whether a file belongs to the node: exactly a time and a number follow, as one name may begin with another.
 fn is_of(path: &Path, node: &NodeName) -> bool {
     let name = path.file_stem().and_then(|stem| stem.to_str());
     let rest = name.and_then(|name| name.strip_prefix(node.as_str())?.strip_prefix('-'));

@@ -1,12 +1,13 @@
-//! What an entry is in messages: the payloads themselves, and what viewers draw of them.
+//! Encoding of log entries as JSON messages: the payloads themselves, and drawings of them for viewers.
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 
 use base64::prelude::{BASE64_STANDARD, Engine};
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::replay::{JournalEntry, JournalEvent};
-use ecod::time::Timestamp;
-use ecod::wire::{ObjectReport, ReportKind, Topic};
+use ecod::wire::Topic;
 use mcap::McapResult;
 use serde::Serialize;
 
@@ -20,148 +21,139 @@ use crate::transport::mqtt::LinkState;
 pub(crate) struct EncodedMessage<'a> {
     pub(crate) schema: SchemaName,
     pub(crate) topic: &'a str,
-    /// When the node took it.
+    /// Time of receipt by the node.
     pub(crate) at: Timestamp,
-    /// When it was captured, or the round ended.
+    /// Time of capture, or of the end of the round.
     pub(crate) made_at: Timestamp,
     pub(crate) json: &'a [u8],
 }
 
-/// Where messages go.
+/// Destination of messages: a file or the live viewers.
 pub(crate) trait MessageSink {
     /// Takes a message.
     ///
     /// # Errors
-    /// When it cannot be kept; the rest of its entry is then left out.
+    /// When it cannot be kept; the remaining messages of its entry are then skipped.
     fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()>;
 }
 
-/// Makes messages of entries, in the name of the recording node.
+/// Encodes entries on behalf of the recording node.
 pub(crate) struct EntryEncoder {
     node: NodeName,
     drawable: bool,
-    /// Reused for every message.
+    /// Buffer reused for every message.
     json: Vec<u8>,
 }
 
 impl EntryEncoder {
+    /// An encoder that also draws entries if they are to be `drawable`.
     pub(crate) fn new(node: NodeName, drawable: bool) -> Self {
         Self { node, drawable, json: Vec::new() }
     }
 
-    /// Writes an entry and what is drawn of it.
-    pub(crate) fn write(&mut self, LogEntry { at, item }: &LogEntry, to: &mut impl MessageSink) -> McapResult<()> {
-        let at = *at;
+    /// Writes the messages of an entry.
+    pub(crate) fn write(&mut self, LogEntry { at, item }: &LogEntry, sink: &mut impl MessageSink) -> McapResult<()> {
+        let (at, node) = (*at, self.node.clone());
+        let mut output = Output { encoder: self, at, sink };
         match item {
-            LogItem::Report { kind, report } => self.report(*kind, report, at, to),
-            LogItem::Journal(event) => self.journal(at, event, to),
+            LogItem::Report(kind, report) => {
+                let (vehicle, captured_at) = (&report.node, report.captured_at_us);
+                output.put(SchemaName::ObjectReport, kind.topic(vehicle.clone()), captured_at, report)?;
+                let scene = || SceneUpdate::of_report(report);
+                output.draw(SchemaName::SceneUpdate, format_args!("scene/{vehicle}"), captured_at, scene)?;
+                let Some(pose) = report.pose else { return Ok(()) };
+                let transform = || FrameTransform::of(vehicle, pose, captured_at);
+                output.draw(SchemaName::FrameTransform, "tf", captured_at, transform)
+            }
+            LogItem::Journal(event) => output.journal(event),
             LogItem::Round(_) => Ok(()),
             LogItem::Map(map) => {
-                self.put(SchemaName::GlobalMap, &Topic::GlobalDetections.to_string(), at, map.fused_at_us, map, to)?;
-                self.draw(SchemaName::SceneUpdate, "scene/map", at, map.fused_at_us, || SceneUpdate::of_map(map), to)
+                output.put(SchemaName::GlobalMap, Topic::GlobalDetections, map.fused_at_us, map)?;
+                output.draw(SchemaName::SceneUpdate, "scene/map", map.fused_at_us, || SceneUpdate::of_map(map))
             }
             LogItem::Verdicts(verdicts) => {
-                let fused_at = verdicts.fused_at_us;
-                self.put(SchemaName::Verdicts, &Topic::GlobalVerdicts.to_string(), at, fused_at, verdicts, to)
+                output.put(SchemaName::Verdicts, Topic::GlobalVerdicts, verdicts.fused_at_us, verdicts)
             }
             LogItem::Reputations(reputations) => {
-                self.put(SchemaName::Reputations, &Topic::Reputations.to_string(), at, at, reputations, to)
+                output.put(SchemaName::Reputations, Topic::Reputations, at, reputations)
             }
-            LogItem::Share(share) => {
-                self.put(SchemaName::LedgerShare, &Topic::Ledger(share.node.clone()).to_string(), at, at, share, to)
-            }
+            LogItem::Share(share) => output.put(SchemaName::LedgerShare, Topic::Ledger(share.node.clone()), at, share),
             LogItem::Status(status) => {
-                self.put(SchemaName::NodeStatus, &Topic::Nodes(status.node.clone()).to_string(), at, at, status, to)
+                output.put(SchemaName::NodeStatus, Topic::Nodes(status.node.clone()), at, status)
             }
             LogItem::Leadership(leadership) => {
-                let change = LeadershipChange::new(self.node.clone(), at, leadership);
-                self.put(SchemaName::Leadership, "node/leadership", at, at, &change, to)?;
-                self.say(Level::Info, at, || change.in_words(), to)
+                let change = LeadershipChange::new(node, at, leadership);
+                output.put(SchemaName::Leadership, "node/leadership", at, &change)?;
+                output.log(Level::Info, || change.in_words())
             }
-            LogItem::Link { broker, state } => {
+            LogItem::Link(broker, state) => {
                 let level = if *state == LinkState::Up { Level::Info } else { Level::Warning };
-                self.say(level, at, || format!("link to {broker} is {state:?}").to_lowercase(), to)
+                output.log(level, || format!("link to {broker} is {state:?}").to_lowercase())
             }
             LogItem::Counters(snapshot) => {
                 let named = |counts: &BTreeMap<&str, u64>| counts.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect();
-                let (events, rejects) = (named(&snapshot.events), named(&snapshot.rejects));
-                let shed = named(&snapshot.shed);
-                let reading = CounterReading { node: self.node.clone(), at_us: at, events, rejects, shed };
-                self.put(SchemaName::Counters, "node/counters", at, at, &reading, to)
+                let [events, rejects, shed] = [&snapshot.events, &snapshot.rejects, &snapshot.shed].map(named);
+                let reading = CounterReading { node, at_us: at, events, rejects, shed };
+                output.put(SchemaName::Counters, "node/counters", at, &reading)
             }
-            LogItem::Picture(jpeg) => self.picture(jpeg, at, to),
+            LogItem::Image(jpeg) => {
+                let data = BASE64_STANDARD.encode(jpeg);
+                let image = CompressedImage { timestamp: at.into(), frame_id: node, data, format: "jpeg" };
+                output.put(SchemaName::CompressedImage, "camera", at, &image)
+            }
         }
     }
 
-    /// Writes what happened to the aggregator.
+    /// Writes an input of the aggregator.
     pub(crate) fn journal(
         &mut self,
-        at_us: Timestamp,
+        at: Timestamp,
         event: &JournalEvent,
-        to: &mut impl MessageSink,
+        sink: &mut impl MessageSink,
     ) -> McapResult<()> {
-        let entry = JournalEntry { at_us, event: event.clone() };
-        self.put(SchemaName::JournalEntry, "node/journal", at_us, at_us, &entry, to)
+        Output { encoder: self, at, sink }.journal(event)
+    }
+}
+
+/// The sink of one entry.
+struct Output<'a, S> {
+    encoder: &'a mut EntryEncoder,
+    at: Timestamp,
+    sink: &'a mut S,
+}
+
+impl<S: MessageSink> Output<'_, S> {
+    fn journal(&mut self, event: &JournalEvent) -> McapResult<()> {
+        let entry = JournalEntry { at_us: self.at, event: event.clone() };
+        self.put(SchemaName::JournalEntry, "node/journal", self.at, &entry)
     }
 
-    fn report(
-        &mut self,
-        kind: ReportKind,
-        report: &ObjectReport,
-        at: Timestamp,
-        to: &mut impl MessageSink,
-    ) -> McapResult<()> {
-        let captured_at = report.captured_at_us;
-        self.put(SchemaName::ObjectReport, &kind.topic(report.node.clone()).to_string(), at, captured_at, report, to)?;
-        let topic = format!("scene/{}", report.node);
-        self.draw(SchemaName::SceneUpdate, &topic, at, captured_at, || SceneUpdate::of_report(report), to)?;
-        let Some(pose) = report.pose else { return Ok(()) };
-        let transform = || FrameTransform::of(&report.node, pose, captured_at);
-        self.draw(SchemaName::FrameTransform, "tf", at, captured_at, transform, to)
-    }
-
-    fn picture(&mut self, jpeg: &[u8], at: Timestamp, to: &mut impl MessageSink) -> McapResult<()> {
-        let data = BASE64_STANDARD.encode(jpeg);
-        let frame_id = self.node.clone();
-        let image = CompressedImage { timestamp: at.into(), frame_id, data, format: "jpeg" };
-        self.put(SchemaName::CompressedImage, "camera", at, at, &image, to)
-    }
-
-    fn say(
-        &mut self,
-        level: Level,
-        at: Timestamp,
-        message: impl FnOnce() -> String,
-        to: &mut impl MessageSink,
-    ) -> McapResult<()> {
-        let name = self.node.to_string();
-        let log = || Log { timestamp: at.into(), level, message: message(), name, file: String::new(), line: 0 };
-        self.draw(SchemaName::Log, "log", at, at, log, to)
+    fn log(&mut self, level: Level, message: impl FnOnce() -> String) -> McapResult<()> {
+        let (timestamp, name) = (self.at.into(), self.encoder.node.to_string());
+        let log = || Log { timestamp, level, message: message(), name, file: String::new(), line: 0 };
+        self.draw(SchemaName::Log, "log", self.at, log)
     }
 
     fn draw<T: Serialize>(
         &mut self,
         schema: SchemaName,
-        topic: &str,
-        at: Timestamp,
+        topic: impl Display,
         made_at: Timestamp,
-        message: impl FnOnce() -> T,
-        to: &mut impl MessageSink,
+        drawing: impl FnOnce() -> T,
     ) -> McapResult<()> {
-        if self.drawable { self.put(schema, topic, at, made_at, &message(), to) } else { Ok(()) }
+        if self.encoder.drawable { self.put(schema, topic, made_at, &drawing()) } else { Ok(()) }
     }
 
     fn put(
         &mut self,
         schema: SchemaName,
-        topic: &str,
-        at: Timestamp,
+        topic: impl Display,
         made_at: Timestamp,
         message: &impl Serialize,
-        to: &mut impl MessageSink,
     ) -> McapResult<()> {
-        self.json.clear();
-        serde_json::to_writer(&mut self.json, message).map_err(std::io::Error::from)?;
-        to.put(EncodedMessage { schema, topic, at, made_at, json: &self.json })
+        let json = &mut self.encoder.json;
+        json.clear();
+        serde_json::to_writer(&mut *json, message).map_err(std::io::Error::from)?;
+        self.sink.put(EncodedMessage { schema, topic: &topic.to_string(), at: self.at, made_at, json })
     }
 }

@@ -1,21 +1,21 @@
-//! Messages that Foxglove and Lichtblick draw, under the names and fields of their published schemas; fields of theirs
-//! that are always empty here are written as empty lists.
+//! Drawings for Foxglove and Lichtblick, with the names and fields of their published schemas. Unused list fields are
+//! written as empty lists.
 //!
-//! The fixed frame is `map`: east, north, up in metres. Every vehicle that reports its pose has a frame of its name.
+//! The fixed frame is `map`: east, north, up in metres. Each vehicle with a pose has a frame of its own name.
 
 use std::borrow::Cow;
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, WirePose};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Serialize;
 
-/// The frame of the cell.
+/// Name of the cell's frame.
 const MAP: &str = "map";
 
-/// A point in time or a span.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, JsonSchema)]
+/// A point in time or a duration.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, JsonSchema)]
 #[schemars(title = "time")]
 pub(crate) struct Time {
     sec: u64,
@@ -80,7 +80,7 @@ pub(crate) struct Log {
     pub(crate) line: u32,
 }
 
-/// How much an entry of the log matters.
+/// Severity of a log line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(into = "u8")]
 pub(crate) enum Level {
@@ -123,7 +123,7 @@ pub(crate) struct SceneUpdate {
     entities: Vec<SceneEntity>,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, JsonSchema)]
 struct SceneEntity {
     timestamp: Time,
     frame_id: &'static str,
@@ -175,10 +175,10 @@ struct Text {
     text: String,
 }
 
-/// How long a thing is drawn after it was last said to be there.
+/// Time for which an entity is drawn after its last update.
 const LIFETIME: Time = Time { sec: 1, nsec: 0 };
 
-/// Sizes in metres: of what stands at a location, of what one vehicle detected, of a vehicle, and of text in pixels.
+/// Diameters of fused objects and of single detections, length of a vehicle, size of text.
 const FUSED_M: f64 = 0.3;
 const DETECTED_M: f64 = 0.12;
 const VEHICLE_M: f64 = 0.6;
@@ -190,10 +190,10 @@ const DETECTED: Color = Color { r: 0.90, g: 0.55, b: 0.10, a: 0.6 };
 const VEHICLE: Color = Color { r: 0.15, g: 0.40, b: 0.80, a: 1.0 };
 
 impl SceneUpdate {
-    /// The known locations and what stands there, and the objects of the open world.
+    /// Known locations with their labels, and tracked objects.
     pub(crate) fn of_map(map: &GlobalMap) -> Self {
         let landmarks = map.landmarks.iter().map(|landmark| {
-            let pose = placed(landmark.x_m, landmark.y_m, 0.0);
+            let pose = plane_pose(landmark.x_m, landmark.y_m, 0.0);
             let color = if landmark.label.is_some() { FUSED } else { EMPTY };
             let label = landmark.label.as_deref().unwrap_or("-");
             SceneEntity::new(map.fused_at_us, format!("landmark/{}", landmark.id))
@@ -203,7 +203,7 @@ impl SceneUpdate {
                 .note("contributors", listed(&landmark.contributors))
         });
         let objects = map.objects.iter().map(|object| {
-            let pose = placed(object.x_m, object.y_m, 0.0);
+            let pose = plane_pose(object.x_m, object.y_m, 0.0);
             SceneEntity::new(map.fused_at_us, format!("object/{}", object.id))
                 .sphere(pose, FUSED_M, FUSED)
                 .text(pose, object.label.to_string())
@@ -212,17 +212,17 @@ impl SceneUpdate {
         Self { deletions: [], entities: landmarks.chain(objects).collect() }
     }
 
-    /// A vehicle and what it detected.
+    /// A vehicle and its detections.
     pub(crate) fn of_report(report: &ObjectReport) -> Self {
         let at = report.captured_at_us;
         let vehicle = report.pose.map(|pose| {
-            let pose = placed(pose.x_m, pose.y_m, pose.heading_rad);
+            let pose = plane_pose(pose.x_m, pose.y_m, pose.heading_rad);
             let entity = SceneEntity::new(at, format!("vehicle/{}", report.node));
             entity.arrow(pose, VEHICLE_M, VEHICLE).text(pose, report.node.to_string())
         });
         let objects = report.objects.iter().enumerate().map(|(number, object)| {
             SceneEntity::new(at, format!("detection/{}/{number}", report.node))
-                .sphere(placed(object.x_m, object.y_m, 0.0), DETECTED_M, DETECTED)
+                .sphere(plane_pose(object.x_m, object.y_m, 0.0), DETECTED_M, DETECTED)
                 .note("label", object.label.to_string())
         });
         Self { deletions: [], entities: vehicle.into_iter().chain(objects).collect() }
@@ -230,37 +230,16 @@ impl SceneUpdate {
 }
 
 impl FrameTransform {
-    /// Where a vehicle stands.
+    /// A vehicle's pose.
     pub(crate) fn of(node: &NodeName, pose: WirePose, at: Timestamp) -> Self {
-        let Pose { position, orientation } = placed(pose.x_m, pose.y_m, pose.heading_rad);
-        Self {
-            timestamp: at.into(),
-            parent_frame_id: MAP,
-            child_frame_id: node.clone(),
-            translation: position,
-            rotation: orientation,
-        }
+        let Pose { position: translation, orientation: rotation } = plane_pose(pose.x_m, pose.y_m, pose.heading_rad);
+        Self { timestamp: at.into(), parent_frame_id: MAP, child_frame_id: node.clone(), translation, rotation }
     }
 }
 
 impl SceneEntity {
     fn new(at: Timestamp, id: String) -> Self {
-        Self {
-            timestamp: at.into(),
-            frame_id: MAP,
-            id,
-            lifetime: LIFETIME,
-            frame_locked: false,
-            metadata: Vec::new(),
-            arrows: Vec::new(),
-            cubes: [],
-            spheres: Vec::new(),
-            cylinders: [],
-            lines: [],
-            triangles: [],
-            texts: Vec::new(),
-            models: [],
-        }
+        Self { timestamp: at.into(), frame_id: MAP, id, lifetime: LIFETIME, ..Self::default() }
     }
 
     fn arrow(mut self, pose: Pose, length_m: f64, color: Color) -> Self {
@@ -292,8 +271,8 @@ impl SceneEntity {
     }
 }
 
-/// East and north in metres, heading in radians counter-clockwise from east: a rotation about the vertical.
-fn placed(x: f64, y: f64, heading_rad: f64) -> Pose {
+/// Pose in the plane: east and north in metres, heading in radians counter-clockwise from east.
+fn plane_pose(x: f64, y: f64, heading_rad: f64) -> Pose {
     let (z, w) = (heading_rad / 2.0).sin_cos();
     Pose { position: Vector3 { x, y, z: 0.0 }, orientation: Quaternion { x: 0.0, y: 0.0, z, w } }
 }

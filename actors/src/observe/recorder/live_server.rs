@@ -1,13 +1,12 @@
-//! What is recorded, live for Foxglove and Lichtblick on this machine.
+//! Live view of the log for Foxglove and Lichtblick.
 //!
-//! The protocol knows no passwords: the server is reached from this machine only. A viewer that is too slow loses
-//! messages.
+//! The protocol has no passwords, so the server listens on loopback only. A viewer that is too slow loses messages.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use foxglove::{
     ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle,
 };
@@ -17,13 +16,13 @@ use super::channels::SchemaName;
 use super::entry_encoder::{EncodedMessage, EntryEncoder, MessageSink};
 use super::log_sender::LogEntry;
 
-/// The address of viewers.
+/// Address of the server.
 const LOOPBACK: &str = "127.0.0.1";
 
-/// How long a port that was busy is left alone.
+/// Wait before a busy port is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
-/// A server that starts with the first entry.
+/// Server that starts with the first entry.
 pub(crate) struct LiveServer {
     port: u16,
     encoder: EntryEncoder,
@@ -35,7 +34,7 @@ enum State {
     Up(Channels),
 }
 
-/// The running server; it ends when dropped.
+/// The running server; stops when dropped.
 struct Channels {
     _server: WebSocketServerHandle,
     context: Arc<Context>,
@@ -47,7 +46,7 @@ impl LiveServer {
         Self { port, encoder: EntryEncoder::new(node, true), state: State::Down { retry_at: None } }
     }
 
-    /// Shows an entry to whoever looks; a port that is busy is tried again.
+    /// Sends an entry to all viewers. A busy port is tried again.
     pub(crate) fn show(&mut self, entry: &LogEntry) {
         if let State::Down { retry_at } = self.state
             && retry_at.is_none_or(|at| Instant::now() >= at)
@@ -56,17 +55,17 @@ impl LiveServer {
         }
         let State::Up(channels) = &mut self.state else { return };
         if let Err(error) = self.encoder.write(entry, channels) {
-            tracing::debug!(%error, "not shown to viewers");
+            tracing::debug!(%error, "entry not sent to viewers");
         }
     }
 
-    fn start(&self, tell: bool) -> State {
+    fn start(&self, is_first: bool) -> State {
         match Channels::start(self.port) {
             Ok(channels) => State::Up(channels),
             Err(error) => {
-                if tell {
+                if is_first {
                     let port = self.port;
-                    tracing::warn!(port, %error, "not live for viewers; tried again every {RETRY_AFTER:?}");
+                    tracing::warn!(port, %error, "cannot serve the log live; trying again every {RETRY_AFTER:?}");
                 }
                 State::Down { retry_at: Some(Instant::now() + RETRY_AFTER) }
             }
@@ -79,7 +78,7 @@ impl Channels {
         let context = Context::new();
         let server = WebSocketServer::new().name("ecod-node").bind(LOOPBACK, port).context(&context);
         let server = server.start_blocking()?;
-        tracing::info!(port = server.port(), "live for Foxglove and Lichtblick");
+        tracing::info!(port = server.port(), "log is served live for Foxglove and Lichtblick");
         Ok(Self { _server: server, context, by_topic: HashMap::new() })
     }
 }

@@ -1,4 +1,4 @@
-//! One file of a log while it is written.
+//! A log file while it is written.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
@@ -6,7 +6,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, McapResult, WriteOptions, Writer};
 
@@ -14,12 +14,12 @@ use super::channels::SchemaName;
 use super::entry_encoder::{EncodedMessage, MessageSink};
 use super::log_identity::LogIdentity;
 
-/// A file being written; what was written up to the last [`LogFile::flush`] survives the process.
+/// A file being written. Messages up to the last [`LogFile::flush`] survive the end of the process.
 pub(crate) struct LogFile {
     writer: Writer<BufWriter<File>>,
     path: PathBuf,
-    /// Whether any message is in the file for good.
-    holds: bool,
+    /// Whether the disk holds any message.
+    has_messages: bool,
     opened: Instant,
     channels: HashMap<(SchemaName, String), Channel>,
 }
@@ -30,12 +30,12 @@ struct Channel {
 }
 
 impl LogFile {
-    /// Begins a file that tells who writes it; where that fails, there is none.
+    /// Begins a file with its identity; removes the file on failure.
     pub(crate) fn begin(path: &Path, file: File, identity: &LogIdentity) -> McapResult<Self> {
-        Self::introduce(path.into(), file, identity).inspect_err(|_| remove(path))
+        Self::create(path.into(), file, identity).inspect_err(|_| remove(path))
     }
 
-    fn introduce(path: PathBuf, file: File, identity: &LogIdentity) -> McapResult<Self> {
+    fn create(path: PathBuf, file: File, identity: &LogIdentity) -> McapResult<Self> {
         let options = WriteOptions::new()
             .profile("")
             .library(concat!("ecod-node ", env!("CARGO_PKG_VERSION")))
@@ -45,7 +45,7 @@ impl LogFile {
         let mut writer = options.create(BufWriter::with_capacity(1 << 16, file))?;
         writer.write_metadata(&Metadata { name: LogIdentity::RECORD.into(), metadata: identity.to_map() })?;
         writer.flush()?;
-        Ok(Self { writer, path, holds: false, opened: Instant::now(), channels: HashMap::new() })
+        Ok(Self { writer, path, has_messages: false, opened: Instant::now(), channels: HashMap::new() })
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -56,10 +56,10 @@ impl LogFile {
         self.opened
     }
 
-    /// Closes the chunk and hands all bytes to the operating system; says how large the file is.
+    /// Closes the chunk and hands all bytes to the operating system; returns the size of the file.
     pub(crate) fn flush(&mut self) -> McapResult<u64> {
         self.writer.flush()?;
-        self.holds |= !self.channels.is_empty();
+        self.has_messages |= !self.channels.is_empty();
         Ok(std::fs::metadata(&self.path)?.len())
     }
 
@@ -70,10 +70,10 @@ impl LogFile {
         Ok(())
     }
 
-    /// Leaves the file as it is, such as when the disk takes no more; a file that holds nothing is removed.
+    /// Leaves the file as it is, as when the disk is full. A file without messages is removed.
     pub(crate) fn abandon(self) {
         drop(self.writer.into_inner().into_parts());
-        if !self.holds {
+        if !self.has_messages {
             remove(&self.path);
         }
     }
@@ -81,7 +81,7 @@ impl LogFile {
 
 fn remove(path: &Path) {
     if let Err(error) = std::fs::remove_file(path) {
-        tracing::debug!(file = %path.display(), %error, "a log that holds nothing cannot be removed");
+        tracing::debug!(file = %path.display(), %error, "cannot remove empty log");
     }
 }
 
@@ -107,14 +107,14 @@ impl MessageSink for LogFile {
     }
 }
 
-/// Unix nanoseconds; the log's times are exact microseconds.
+/// Unix nanoseconds; times in the log are whole microseconds.
 fn nanoseconds(at: Timestamp) -> u64 {
     at.micros().saturating_mul(1000)
 }
 
 #[cfg(test)]
 mod tests {
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use uuid::Uuid;
 
     use super::*;

@@ -1,16 +1,16 @@
-//! Who wrote a log and under which configuration its aggregator ran; a metadata record of every file.
+//! Identity of a log: the recording node and its configuration, a metadata record of every file.
 
 use std::collections::BTreeMap;
 
 use ecod::aggregator::FusionConfig;
-use ecod::landmark::LandmarkConfig;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
 use uuid::Uuid;
 
-/// Who wrote a log.
+/// The recording node and the configuration of its aggregator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LogIdentity {
-    /// Version of the form of the log, [`LogIdentity::VERSION`].
+    /// Version of the log format, [`LogIdentity::VERSION`].
     pub log: u64,
     /// The recording node.
     pub node: NodeName,
@@ -20,9 +20,9 @@ pub struct LogIdentity {
     pub run: Uuid,
     /// Version of the program.
     pub version: String,
-    /// How reports are fused.
+    /// Configuration of the fusion.
     pub fusion: FusionConfig,
-    /// The cell's known locations.
+    /// Known locations of the cell.
     pub landmarks: Vec<LandmarkConfig>,
 }
 
@@ -34,19 +34,19 @@ pub enum LogIdentityError {
     Key {
         /// The key.
         key: &'static str,
-        /// Why.
+        /// The problem.
         reason: String,
     },
 }
 
 impl LogIdentity {
-    /// Version of the form of the logs that this program writes; it reads this and earlier ones.
+    /// Version of the log format that this program writes; it also reads earlier ones.
     pub const VERSION: u64 = 1;
 
     /// Name of the metadata record.
     pub const RECORD: &'static str = "ecod.log";
 
-    /// The identity of a log that this program writes for `node`.
+    /// Identity of a log that this program writes for `node`.
     pub fn new(
         node: NodeName,
         run: Uuid,
@@ -74,12 +74,12 @@ impl LogIdentity {
         .into()
     }
 
-    /// The version that a record claims to have, if it says so.
+    /// Version in a record, if it has one.
     pub(crate) fn version_in(map: &BTreeMap<String, String>) -> Option<u64> {
         map.get("log")?.parse().ok()
     }
 
-    /// Whose log it is, whatever else the record has.
+    /// Node in a record, even if the rest is unusable.
     pub(crate) fn node_in(map: &BTreeMap<String, String>) -> Option<NodeName> {
         NodeName::new(map.get("node")?).ok()
     }
@@ -106,7 +106,7 @@ impl LogIdentity {
 }
 
 fn text<'a>(map: &'a BTreeMap<String, String>, key: &'static str) -> Result<&'a str, LogIdentityError> {
-    map.get(key).map(String::as_str).ok_or_else(|| unusable(key, &"it is missing"))
+    map.get(key).map(String::as_str).ok_or_else(|| unusable(key, &"missing"))
 }
 
 fn json<T: serde::de::DeserializeOwned>(

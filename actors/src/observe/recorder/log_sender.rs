@@ -1,78 +1,80 @@
-//! Where the parts of a node hand over what is to be recorded; they never wait.
+//! Queue from the parts of a node to the recorder. Sending never waits.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
-use ecod::epoch::Epoch;
 use ecod::leadership::Leadership;
+use ecod::model::epoch::Epoch;
+use ecod::model::time::Timestamp;
 use ecod::replay::JournalEvent;
-use ecod::time::Timestamp;
 use ecod::wire::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
 
 use crate::telemetry::counters::{CounterSnapshot, Counters, Event};
 use crate::transport::mqtt::{BrokerAddress, LinkState};
 
-/// Something to be recorded and when it happened, by the node's clock.
+/// An item to record with its time by the node's clock.
 #[derive(Debug, Clone)]
 pub(crate) struct LogEntry {
     pub(crate) at: Timestamp,
     pub(crate) item: LogItem,
 }
 
-/// Something to be recorded.
+/// An item to record.
 #[derive(Debug, Clone)]
-pub(crate) enum LogItem {
-    /// A report as the aggregator took it, or as an observer saw it.
-    Report {
-        kind: ReportKind,
-        report: Arc<ObjectReport>,
-    },
-    /// What the aggregator was told beside reports.
+pub enum LogItem {
+    /// A report as the aggregator took it, or as an observer received it.
+    Report(ReportKind, Arc<ObjectReport>),
+    /// An input of the aggregator other than a report.
     Journal(JournalEvent),
-    /// The aggregator made this round; not written.
+    /// Number of a round that the aggregator closed; not written.
     Round(u64),
+    /// A map that the node accepted.
     Map(Arc<GlobalMap>),
+    /// Verdicts that the node accepted.
     Verdicts(Arc<Verdicts>),
+    /// Reputations that the node accepted.
     Reputations(Arc<Reputations>),
+    /// Another candidate's evidence.
     Share(Arc<LedgerShare>),
+    /// Another node's status.
     Status(Arc<NodeStatus>),
+    /// A change of the leadership.
     Leadership(Leadership),
-    Link {
-        broker: BrokerAddress,
-        state: LinkState,
-    },
+    /// A change of the link to a broker.
+    Link(BrokerAddress, LinkState),
+    /// The node's counters.
     Counters(CounterSnapshot),
-    /// A picture of the camera as JPEG.
-    Picture(Vec<u8>),
+    /// A camera image as JPEG.
+    Image(Vec<u8>),
 }
 
 impl LogItem {
-    /// Whether there is anything of it in the log.
+    /// Whether the log holds anything of it.
     pub(crate) fn is_written(&self) -> bool {
         !matches!(self, Self::Round(_))
     }
 
-    /// Whether the aggregator cannot be run again exactly without it.
+    /// Whether an exact rerun of the aggregator needs it.
     pub(crate) fn is_of_journal(&self) -> bool {
-        matches!(self, Self::Report { .. } | Self::Journal(_))
+        matches!(self, Self::Report(..) | Self::Journal(_))
     }
 }
 
-/// Takes what is to be recorded; clones lead to the same place. Nothing is recorded until a [`super::Recorder`] runs.
+/// Sends items to the recorder. Clones share one queue; items are discarded until a recorder runs.
 #[derive(Debug, Clone, Default)]
 pub struct LogSender(Arc<Shared>);
 
 #[derive(Debug, Default)]
 struct Shared {
     queue: RwLock<Option<SyncSender<LogEntry>>>,
-    /// Journal entries that were lost and have not been told of in the log.
+    /// Journal entries that were lost and are not yet noted in the log.
     missing: AtomicU64,
     aggregator_state: Mutex<AggregatorState>,
     counters: Arc<Counters>,
 }
 
-/// How the aggregator stands after the last entry that was taken from the queue.
+/// State of the aggregator after the last entry taken from the queue.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct AggregatorState {
     pub(crate) runs: bool,
@@ -81,77 +83,28 @@ pub(crate) struct AggregatorState {
 }
 
 impl LogSender {
-    /// Counts in `counters`.
+    /// A sender that counts losses in `counters`.
     pub fn new(counters: Arc<Counters>) -> Self {
         Self(Arc::new(Shared { counters, ..Shared::default() }))
     }
 
-    /// What the aggregator was told beside reports.
-    pub fn journal(&self, at: Timestamp, event: JournalEvent) {
-        self.put(at, LogItem::Journal(event));
-    }
-
-    /// A report as the aggregator takes it, or as an observer sees it.
-    pub fn report(&self, kind: ReportKind, report: &Arc<ObjectReport>, at: Timestamp) {
-        self.put(at, LogItem::Report { kind, report: Arc::clone(report) });
-    }
-
-    /// The aggregator made this round.
-    pub fn round(&self, round: u64, at: Timestamp) {
-        self.put(at, LogItem::Round(round));
-    }
-
-    /// A map that the node took.
-    pub fn map(&self, map: &Arc<GlobalMap>, at: Timestamp) {
-        self.put(at, LogItem::Map(Arc::clone(map)));
-    }
-
-    /// Verdicts that the node took.
-    pub fn verdicts(&self, verdicts: &Arc<Verdicts>, at: Timestamp) {
-        self.put(at, LogItem::Verdicts(Arc::clone(verdicts)));
-    }
-
-    /// Reputations that the node took.
-    pub fn reputations(&self, reputations: &Arc<Reputations>, at: Timestamp) {
-        self.put(at, LogItem::Reputations(Arc::clone(reputations)));
-    }
-
-    /// Another candidate's evidence.
-    pub fn share(&self, share: &Arc<LedgerShare>, at: Timestamp) {
-        self.put(at, LogItem::Share(Arc::clone(share)));
-    }
-
-    /// What another node says about itself.
-    pub fn status(&self, status: &Arc<NodeStatus>, at: Timestamp) {
-        self.put(at, LogItem::Status(Arc::clone(status)));
-    }
-
-    /// A link changed.
-    pub fn link(&self, broker: &BrokerAddress, state: LinkState, at: Timestamp) {
-        self.put(at, LogItem::Link { broker: broker.clone(), state });
-    }
-
-    /// A picture of the camera as JPEG.
-    pub fn picture(&self, jpeg: Vec<u8>, at: Timestamp) {
-        self.put(at, LogItem::Picture(jpeg));
-    }
-
-    pub(crate) fn put(&self, at: Timestamp, item: LogItem) {
+    /// Queues an item. A full queue drops and counts it.
+    pub fn send(&self, at: Timestamp, item: LogItem) {
         let queue = self.0.queue.read().unwrap_or_else(PoisonError::into_inner);
         let Some(queue) = &*queue else { return };
         let is_of_journal = item.is_of_journal();
         if queue.try_send(LogEntry { at, item }).is_err() {
-            self.lost(1, u64::from(is_of_journal));
+            self.count_lost(1, u64::from(is_of_journal));
         }
     }
 
-    /// Counts entries that are not in the log, and those of the journal that the log is to tell of.
-    pub(crate) fn lost(&self, entries: u64, of_journal: u64) {
+    /// Counts lost entries, and those of the journal that the log must note.
+    pub(crate) fn count_lost(&self, entries: u64, of_journal: u64) {
         self.0.counters.add(Event::RecordDropped, entries);
         self.0.missing.fetch_add(of_journal, Ordering::Relaxed);
     }
 
-    /// Journal entries that were lost since the last call.
+    /// Journal entries lost since the last call.
     pub(crate) fn take_missing(&self) -> u64 {
         self.0.missing.swap(0, Ordering::Relaxed)
     }
@@ -164,7 +117,7 @@ impl LogSender {
         &self.0.counters
     }
 
-    /// Sends to another queue from now on, or to none.
+    /// Replaces the queue; `None` disconnects the recorder.
     pub(crate) fn connect(&self, queue: Option<SyncSender<LogEntry>>) {
         *self.0.queue.write().unwrap_or_else(PoisonError::into_inner) = queue;
     }

@@ -1,12 +1,12 @@
-//! A log read in the order in which it was written, in bounded memory.
+//! Reader of log files, in the order in which they were written and in bounded memory.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
@@ -14,16 +14,16 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use super::channels::SchemaName;
 use super::log_identity::{LogIdentity, LogIdentityError};
 
-/// How a file of this kind begins.
+/// First bytes of an MCAP file.
 const MAGIC: &[u8] = b"\x89MCAP0\r\n";
 
-/// Longest record that is read: a chunk, or a map of the largest cells.
+/// Maximum length of a record: a chunk, or a map of the largest cells.
 const MAX_RECORD_BYTES: usize = 1 << 28;
 
-/// What a log holds.
+/// An event of a log.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LogEvent {
-    /// Who wrote it, at its beginning.
+    /// Identity of the log, at its beginning.
     Identity(Box<LogIdentity>),
     /// A message.
     Message(LogMessage),
@@ -32,39 +32,39 @@ pub enum LogEvent {
 /// One message of a log.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LogMessage {
-    /// What it is.
+    /// Its schema.
     pub schema: SchemaName,
     /// The topic without the cell's root.
     pub topic: String,
-    /// When the recording node took it, by its clock.
+    /// Time of receipt by the recording node's clock.
     pub at: Timestamp,
     /// The message in JSON.
     pub json: Vec<u8>,
 }
 
-/// What of a log cannot be used. All of it but [`LogError::Unreadable`] leaves the rest usable.
+/// An unusable part of a log. After all errors but [`LogError::Unreadable`] the rest remains usable.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
-    /// The file is not there or cannot be read.
+    /// The file cannot be read.
     #[error("cannot read {path}")]
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the operating system said.
+        /// The operating system's error.
         source: std::io::Error,
     },
-    /// The file ends in the middle, as it does when its writer was killed.
-    #[error("{path} was not finished: what was written last is not in it")]
+    /// The file has no end, as after its writer was killed.
+    #[error("{path} was not finished: it ends before its last messages")]
     Truncated {
         /// The file.
         path: PathBuf,
     },
-    /// The file is damaged from some place on.
-    #[error("{path} is damaged, nothing after the damage is used")]
+    /// The file is damaged from some position on.
+    #[error("{path} is damaged: messages after the damage are ignored")]
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The damage.
         source: McapError,
     },
     /// A later version of the program wrote it.
@@ -80,12 +80,12 @@ pub enum LogError {
     Identity {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The problem.
         source: LogIdentityError,
     },
 }
 
-/// Reads one file of a log.
+/// Reader of one file.
 pub struct LogReader {
     path: PathBuf,
     source: BufReader<File>,
@@ -96,7 +96,7 @@ pub struct LogReader {
     /// Whether the data section was read to its end.
     complete: bool,
     ended: bool,
-    /// Messages of schemas that are not known here.
+    /// Number of messages by unknown schema.
     unknown: BTreeMap<String, u64>,
 }
 
@@ -107,7 +107,7 @@ struct Channel {
 }
 
 impl LogReader {
-    /// Whether the file begins as a log does.
+    /// Whether the file is in MCAP format.
     ///
     /// # Errors
     /// [`LogError::Unreadable`].
@@ -141,17 +141,17 @@ impl LogReader {
         })
     }
 
-    /// Whose log it is, as far as it was read; also where nothing else of its identity can be used.
+    /// Recording node, once its identity was read, even if that is otherwise unusable.
     pub fn node(&self) -> Option<&NodeName> {
         self.node.as_ref()
     }
 
-    /// Messages that were passed over because their schema is not known here, by its name.
+    /// Number of messages skipped by name of their unknown schema.
     pub fn unknown(&self) -> &BTreeMap<String, u64> {
         &self.unknown
     }
 
-    /// The next event; errors are part of the sequence, and but for damage it goes on after them.
+    /// The next event or error. Reading continues after errors other than damage.
     fn step(&mut self) -> Option<Result<LogEvent, LogError>> {
         loop {
             let event = match self.reader.next_event() {
@@ -172,7 +172,7 @@ impl LogReader {
                     Err(error) => return self.end(Some(error)),
                     Ok(record) => {
                         let record = record.into_owned();
-                        if let Some(event) = self.take(record) {
+                        if let Some(event) = self.process(record) {
                             return Some(event);
                         }
                     }
@@ -181,7 +181,7 @@ impl LogReader {
         }
     }
 
-    fn take(&mut self, record: Record<'static>) -> Option<Result<LogEvent, LogError>> {
+    fn process(&mut self, record: Record<'static>) -> Option<Result<LogEvent, LogError>> {
         match record {
             Record::Metadata(metadata) if metadata.name == LogIdentity::RECORD => {
                 Some(self.identity(&metadata.metadata))

@@ -1,15 +1,15 @@
-//! JSON Schemas as viewers read them.
+//! JSON Schemas in the form that Foxglove and Lichtblick read.
 //!
-//! Foxglove and Lichtblick go through a channel's schema field by field and leave the channel out where a field is not as
-//! they know it: it has one `type`, an array says what is in it, alternatives are named numbers, and no reference is
-//! followed. What may be null says so by `nullable`, as in OpenAPI 3.0. Alternatives below `anyOf` are not looked at.
+//! They drop a channel whose schema has a field that they do not understand. A field needs one `type`, an array needs
+//! `items`, alternatives are named numbers, and references are not followed. Optional fields are `nullable`, as in
+//! OpenAPI 3.0. Alternatives below `anyOf` are ignored.
 
 use schemars::generate::SchemaSettings;
 use schemars::transform::transform_subschemas;
 use schemars::{JsonSchema, Schema};
 use serde_json::{Map, Value, json};
 
-/// The schema of a channel with these messages.
+/// Schema of a channel with these messages.
 pub(crate) fn schema_of<T: JsonSchema>() -> Schema {
     let settings = SchemaSettings::default().with(|settings| {
         settings.meta_schema = None;
@@ -23,7 +23,7 @@ fn simplify(schema: &mut Schema) {
     let Some(schema) = schema.as_object_mut() else { return };
     for key in ["anyOf", "oneOf"] {
         if let Some(Value::Array(alternatives)) = schema.remove(key) {
-            choose(schema, alternatives);
+            merge_alternatives(schema, alternatives);
         }
     }
     if let Some(Value::Array(types)) = schema.get_mut("type") {
@@ -34,14 +34,14 @@ fn simplify(schema: &mut Schema) {
             schema.insert("nullable".into(), true.into());
         }
     }
-    let is_never_filled = schema.get("maxItems").is_some_and(|most| most == 0);
-    if is_never_filled && !schema.contains_key("items") {
+    let is_always_empty = schema.get("maxItems").is_some_and(|most| most == 0);
+    if is_always_empty && !schema.contains_key("items") {
         schema.insert("items".into(), json!({ "type": "object" }));
     }
 }
 
-/// Says of a field what its alternatives have in common.
-fn choose(schema: &mut Map<String, Value>, mut alternatives: Vec<Value>) {
+/// Reduces the alternatives of a field to what they have in common.
+fn merge_alternatives(schema: &mut Map<String, Value>, mut alternatives: Vec<Value>) {
     if alternatives.iter().all(|alternative| alternative["const"].is_number()) {
         schema.insert("oneOf".into(), alternatives.into());
         return;

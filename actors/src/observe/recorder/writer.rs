@@ -1,4 +1,4 @@
-//! The thread that writes the log: it alone waits for the disk.
+//! Thread that writes the log and alone waits for the disk.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
@@ -17,13 +17,13 @@ use super::log_identity::LogIdentity;
 use super::log_sender::{AggregatorState, LogEntry, LogItem, LogSender};
 use crate::telemetry::counters::Event;
 
-/// How often the log is made safe from the end of the process.
+/// Time between two flushes. The end of the process loses at most this.
 const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 
-/// How long a disk that took nothing is left alone.
+/// Wait after a failure before the disk is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
-/// Takes entries from the queue to the disk.
+/// Writes the entries of the queue to files.
 pub(crate) struct LogWriter {
     config: RecordConfig,
     identity: LogIdentity,
@@ -35,15 +35,15 @@ pub(crate) struct LogWriter {
     pending: Pending,
     flush_due: Instant,
     retry_at: Option<Instant>,
-    /// A failure is told of once, until something is on the disk again.
+    /// Whether the last write failed; only the first failure is logged.
     failing: bool,
 }
 
-/// What was put in the file since it was last flushed, which a failure takes away again.
+/// Number of entries since the last flush, which a failure loses.
 #[derive(Debug, Default)]
 struct Pending {
     entries: u64,
-    /// Of these, or lost before and only told of in them, entries of the journal.
+    /// Journal entries among them, including earlier losses that they report.
     of_journal: u64,
 }
 
@@ -68,11 +68,11 @@ impl LogWriter {
         }
     }
 
-    /// Writes until nobody can send any more.
+    /// Writes until all senders are gone.
     pub(crate) fn run(mut self, queue: &Receiver<LogEntry>) {
         loop {
             match queue.recv_timeout(self.flush_due.saturating_duration_since(Instant::now())) {
-                Ok(entry) => self.take(&entry),
+                Ok(entry) => self.write(&entry),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }
@@ -87,31 +87,31 @@ impl LogWriter {
         }
     }
 
-    fn take(&mut self, entry: &LogEntry) {
+    fn write(&mut self, entry: &LogEntry) {
         #[cfg(feature = "foxglove")]
         if let Some(live) = &mut self.live {
             live.show(entry);
         }
         if !entry.item.is_written() {
-            return self.follow(&entry.item);
+            return self.track_aggregator(&entry.item);
         }
         self.open(entry);
-        self.follow(&entry.item);
+        self.track_aggregator(&entry.item);
         let of_journal = u64::from(entry.item.is_of_journal());
-        let Some(file) = &mut self.file else { return self.recording.lost(1, of_journal) };
+        let Some(file) = &mut self.file else { return self.recording.count_lost(1, of_journal) };
         let missing = self.recording.take_missing();
         self.pending.entries += 1;
         self.pending.of_journal += of_journal + missing;
-        let told = match missing {
+        let noted = match missing {
             0 => Ok(()),
             entries => self.encoder.journal(entry.at, &JournalEvent::Missing { entries }, file),
         };
-        if let Err(error) = told.and_then(|()| self.encoder.write(entry, file)) {
+        if let Err(error) = noted.and_then(|()| self.encoder.write(entry, file)) {
             self.failed(&error);
         }
     }
 
-    /// Begins the next file if there is none, unless the last attempt has just failed.
+    /// Begins the next file if there is none, unless an attempt has just failed.
     fn open(&mut self, entry: &LogEntry) {
         if self.file.is_some() || self.retry_at.is_some_and(|at| Instant::now() < at) {
             return;
@@ -129,9 +129,9 @@ impl LogWriter {
     fn begin(&mut self, entry: &LogEntry) -> McapResult<LogFile> {
         let (dir, node) = (&self.config.dir, &self.identity.node);
         std::fs::create_dir_all(dir)?;
-        // First, as it may make the room that there must be; what cannot be deleted does not end the log.
+        // Deletion comes first, since it may free the space that is needed. Its failure does not end the log.
         if let Err(error) = disk::prune(dir, node, self.config.max_old_bytes()) {
-            tracing::warn!(dir = %dir.display(), %error, "old logs cannot be deleted");
+            tracing::warn!(dir = %dir.display(), %error, "cannot delete old logs");
         }
         let (path, file) = disk::create(dir, node, entry.at, self.config.min_free_bytes())?;
         let mut file = LogFile::begin(&path, file, &self.identity)?;
@@ -142,8 +142,8 @@ impl LogWriter {
         Ok(file)
     }
 
-    /// Keeps up with the aggregator, for files that begin in the middle of its run.
-    fn follow(&self, item: &LogItem) {
+    /// Follows the state of the aggregator, for files that begin in the middle of its run.
+    fn track_aggregator(&self, item: &LogItem) {
         let mut aggregator_state = self.recording.aggregator_state();
         match item {
             LogItem::Journal(JournalEvent::Start { .. }) => {
@@ -167,7 +167,7 @@ impl LogWriter {
         self.recording.counters().add(Event::Recorded, std::mem::take(&mut self.pending).entries);
         self.failing = false;
         if let Err(error) = disk::check_room(&self.config.dir, self.config.min_free_bytes()) {
-            // All that was taken is in the file: it only has to end.
+            // All entries are in the file, which only needs its end.
             let ended = self.file.take().map_or(Ok(()), LogFile::finish);
             return self.failed(&ended.err().unwrap_or(error.into()));
         }
@@ -176,22 +176,22 @@ impl LogWriter {
         }
     }
 
-    /// Counts a failure, and leaves file and disk alone for a while.
+    /// Counts a failure, gives up the file and schedules the next attempt.
     fn failed(&mut self, error: &McapError) {
         self.recording.counters().count(Event::RecordFailed);
         if let Some(file) = self.file.take() {
             file.abandon();
         }
         let Pending { entries, of_journal } = std::mem::take(&mut self.pending);
-        self.recording.lost(entries, of_journal);
+        self.recording.count_lost(entries, of_journal);
         self.retry_at = Some(Instant::now() + RETRY_AFTER);
         if !std::mem::replace(&mut self.failing, true) {
             let directory = self.config.dir.display();
             let error = match error {
-                McapError::Io(of_disk) => of_disk.to_string(),
+                McapError::Io(disk) => disk.to_string(),
                 other => other.to_string(),
             };
-            tracing::warn!(%directory, error, "not recording, the node goes on; tried again every {RETRY_AFTER:?}");
+            tracing::warn!(%directory, error, "not recording, the node goes on; trying again every {RETRY_AFTER:?}");
         }
     }
 }
@@ -204,9 +204,9 @@ mod tests {
     use std::sync::Arc;
     use std::sync::mpsc::sync_channel;
 
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
+    use ecod::model::time::Timestamp;
     use ecod::replay::JournalEntry;
-    use ecod::time::Timestamp;
     use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
     use uuid::Uuid;
 
@@ -263,12 +263,12 @@ mod tests {
         let counters = Arc::new(Counters::default());
         let entry = second(100, LogItem::Counters(counters.snapshot()));
         let all = kept();
-        writer(config(1_000_000_000), &counters).take(&entry);
+        writer(config(1_000_000_000), &counters).write(&entry);
         assert_eq!(counters.events(Event::RecordFailed), 1);
         assert_eq!(kept(), all[20..], "the oldest are gone, though there is still no room for another");
         for starts in 1..=3 {
             let mut writer = writer(config(0), &counters);
-            writer.take(&entry);
+            writer.write(&entry);
             writer.flush();
             assert_eq!(counters.events(Event::Recorded), starts);
             let bytes: u64 = kept().iter().map(|path| path.metadata().unwrap().len()).sum();
@@ -281,13 +281,13 @@ mod tests {
         let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
         let mut writer = writer(in_directory(directory.path()), &counters);
         let entry = |seconds: u64| second(seconds, LogItem::Counters(counters.snapshot()));
-        writer.take(&entry(1));
+        writer.write(&entry(1));
         writer.flush();
         assert_eq!(counters.events(Event::RecordFailed), 0);
         writer.config.min_free_mb = 1_000_000_000;
-        writer.take(&entry(2));
+        writer.write(&entry(2));
         writer.flush();
-        writer.take(&entry(3));
+        writer.write(&entry(3));
         let [recorded, failed, dropped] = [Event::Recorded, Event::RecordFailed, Event::RecordDropped];
         assert_eq!([recorded, failed, dropped].map(|event| counters.events(event)), [2, 1, 1]);
         let path = &files(directory.path()).unwrap()[0];
@@ -306,21 +306,21 @@ mod tests {
         let disk = memory.try_clone().unwrap();
         writer.file = Some(LogFile::begin(Path::new(&path), memory, &writer.identity).unwrap());
         let tick = |seconds| second(seconds, LogItem::Journal(JournalEvent::Command(Command::Tick)));
-        writer.take(&tick(1));
+        writer.write(&tick(1));
         assert_eq!(counts(), [0, 0], "it is not on the disk yet");
         writer.flush();
         assert_eq!(counts(), [1, 0]);
 
         fcntl_add_seals(&disk, SealFlags::GROW).unwrap();
-        writer.recording.lost(1, 1);
-        writer.take(&tick(2));
-        writer.take(&second(3, LogItem::Counters(counters.snapshot())));
-        writer.take(&tick(4));
+        writer.recording.count_lost(1, 1);
+        writer.write(&tick(2));
+        writer.write(&second(3, LogItem::Counters(counters.snapshot())));
+        writer.write(&tick(4));
         writer.flush();
         assert_eq!(counts(), [1, 4]);
 
         writer.retry_at = None;
-        writer.take(&tick(5));
+        writer.write(&tick(5));
         writer.flush();
         assert_eq!(counts(), [2, 4]);
         let next = messages(&files(directory.path()).unwrap()[0]);
@@ -334,13 +334,13 @@ mod tests {
         let mut writer = writer(in_directory(directory.path()), &counters);
         let (sender, queue) = sync_channel(1);
         writer.recording.connect(Some(sender));
-        writer.recording.lost(3, 3);
-        writer.recording.round(7, Timestamp(99_000_000));
+        writer.recording.count_lost(3, 3);
+        writer.recording.send(Timestamp(99_000_000), LogItem::Round(7));
         let round = queue.recv().unwrap();
         assert_eq!(round.at, Timestamp(99_000_000));
-        writer.take(&round);
+        writer.write(&round);
         assert!(files(directory.path()).unwrap().is_empty());
-        writer.take(&second(100, LogItem::Journal(JournalEvent::Command(Command::Tick))));
+        writer.write(&second(100, LogItem::Journal(JournalEvent::Command(Command::Tick))));
         writer.flush();
         let path = &files(directory.path()).unwrap()[0];
         assert_eq!(path.file_name().unwrap(), "cav-19700101T000140Z-000.mcap");

@@ -1,4 +1,4 @@
-//! What was lost or refused while a log was recorded, in all runs of its node.
+//! Losses while a log was recorded, in all runs of its node.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use super::series::Samples;
 use crate::observe::recorder::CounterReading;
 use crate::telemetry::counters::Event;
 
-/// Counted events that mean that something was lost or refused.
+/// Events that count as losses.
 const EVENTS: [Event; 23] = [
     Event::PublishRefused,
     Event::PublishTooLarge,
@@ -35,7 +35,7 @@ const EVENTS: [Event; 23] = [
     Event::ClientExpelled,
 ];
 
-/// Sums over readings of counters, which begin at zero in every run of the node.
+/// Sums of counters, which start at zero in every run of the node.
 #[derive(Debug, Default)]
 pub(super) struct Losses {
     by_reason: BTreeMap<String, u64>,
@@ -44,13 +44,12 @@ pub(super) struct Losses {
 }
 
 impl Losses {
-    /// Takes the next reading. What the first one has was lost before; the runs that follow are counted from their
-    /// beginnings.
-    pub(super) fn note(&mut self, run: Option<Uuid>, reading: CounterReading) {
+    /// Takes the next reading. The first one is the baseline; later runs count from zero.
+    pub(super) fn add(&mut self, run: Option<Uuid>, reading: CounterReading) {
         if let Some((run_before, before)) = &self.newest {
             let before: BTreeMap<_, _> = counts(before).filter(|_| *run_before == run).collect();
             for (name, times) in counts(&reading) {
-                // What counts less than before has begun anew.
+                // A lower value than before means that the counter was reset.
                 let base = before.get(name).copied().filter(|base| *base <= times).unwrap_or_default();
                 if times > base {
                     *self.by_reason.entry(name.to_owned()).or_default() += times - base;
@@ -61,23 +60,23 @@ impl Losses {
         self.newest = Some((run, reading));
     }
 
-    /// Whether there was any reading.
+    /// Whether the log has any reading.
     pub(super) fn are_known(&self) -> bool {
         self.newest.is_some()
     }
 
-    /// How much was lost or refused, by reason; no zeros.
+    /// Number of losses by reason, without zeros.
     pub(super) fn by_reason(&self) -> &BTreeMap<String, u64> {
         &self.by_reason
     }
 
-    /// How much until then, over time.
+    /// Cumulative number of losses over time.
     pub(super) fn over_time(&self) -> &Samples {
         &self.over_time
     }
 }
 
-/// Counts of what was lost or refused; copies that came a second way are neither.
+/// Losses in a reading. Copies through a second broker (`out_of_order`) are none.
 fn counts(reading: &CounterReading) -> impl Iterator<Item = (&str, u64)> {
     let is_loss = |name: &str| EVENTS.iter().any(|event| event.as_str() == name);
     let events = reading.events.iter().filter(move |(name, _)| is_loss(name));
@@ -87,8 +86,8 @@ fn counts(reading: &CounterReading) -> impl Iterator<Item = (&str, u64)> {
 
 #[cfg(test)]
 mod tests {
-    use ecod::names::NodeName;
-    use ecod::time::Timestamp;
+    use ecod::model::names::NodeName;
+    use ecod::model::time::Timestamp;
 
     use super::*;
 
@@ -103,7 +102,7 @@ mod tests {
             events.insert("published".into(), 1000 * second as u64);
             let node = NodeName::from_static("cav");
             let at_us = Timestamp(second as u64 * 1_000_000);
-            losses.note(
+            losses.add(
                 run,
                 CounterReading { node, at_us, events, rejects: counts("stale", stale), shed: BTreeMap::new() },
             );

@@ -1,19 +1,20 @@
-//! The page itself.
+//! HTML of the report.
 
-use std::fmt::{Display, Write};
+use std::fmt::Display;
 
 use chrono::DateTime;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 
 use super::plot::{Axis, Curve, Plot, bars, class};
-use super::series::{distribution, quantile};
-use super::{Report, Rounds};
+use super::series::{Samples, distribution, quantile};
+use super::{Report, RoundTimes};
 
-/// How finely time is shown.
-const PARTS: usize = 700;
+/// Number of time slices in a plot.
+const SLICES: usize = 700;
 
-/// Most curves of a plot; a table has all.
-const MOST_CURVES: usize = 12;
+/// Maximum number of curves in a plot; a table has all.
+const MAX_CURVES: usize = 12;
 
 /// Writes the page.
 pub(super) fn write(report: &Report) -> String {
@@ -40,7 +41,7 @@ pub(super) fn write(report: &Report) -> String {
 }
 
 fn summary(report: &Report) -> String {
-    let first = report.first.unwrap_or_default();
+    let first = report.start();
     let mut rows = vec![
         ("recorded".to_owned(), format!("{} to {} UTC, {}", clock(first), clock(report.last), span(report))),
         ("messages".into(), report.messages.to_string()),
@@ -59,47 +60,48 @@ fn problems(report: &Report) -> String {
         return String::new();
     }
     let items: String = report.problems.iter().map(|problem| format!("<li>{}</li>\n", escape(problem))).collect();
-    format!("<section class=\"warning\">\n<h2>Not used</h2>\n<ul>\n{items}</ul>\n</section>\n")
+    format!("<section class=\"warning\">\n<h2>Unusable parts of the log</h2>\n<ul>\n{items}</ul>\n</section>\n")
 }
 
 fn leadership(report: &Report) -> String {
     let rows: Vec<_> = report
-        .round_runs
+        .leaders
         .iter()
         .map(|run| {
-            let lasted = run.last_at.since(run.first_at).as_secs_f64();
-            let cells = [run.epoch.leader.to_string(), run.epoch.term.to_string(), clock(run.first_at)];
-            cells.into_iter().chain([format!("{lasted:.1}"), run.rounds.to_string()]).collect()
+            let lasted = format!("{:.1}", run.last_at.since(run.first_at).as_secs_f64());
+            let (leader, term) = (run.epoch.leader.to_string(), run.epoch.term.to_string());
+            vec![leader, term, clock(run.first_at), lasted, run.rounds.to_string()]
         })
         .collect();
     let changes: Vec<_> = report
         .changes
         .iter()
         .map(|change| {
-            let leader = change.epoch.as_ref().map_or("-".to_owned(), ToString::to_string);
-            let standby = change.standby.as_ref().map_or("-".to_owned(), ToString::to_string);
+            let [leader, standby] =
+                [change.epoch.as_ref().map(ToString::to_string), change.standby.as_ref().map(ToString::to_string)]
+                    .map(|name| name.unwrap_or("-".into()));
             vec![clock(change.at_us), change.position.replace('_', " "), leader, standby]
         })
         .collect();
-    let mut text = table(&["leader", "term", "first round, UTC", "lasted s", "rounds taken"], &rows);
+    let mut text = table(&["leader", "term", "first round, UTC", "duration s", "rounds accepted"], &rows);
     if !changes.is_empty() {
         let all = table(&["UTC", "this node is", "leader@term", "standby"], &changes);
-        text += &format!("<details><summary>What this node knew of it</summary>\n{all}</details>\n");
+        text += &format!("<details><summary>Changes as this node saw them</summary>\n{all}</details>\n");
     }
-    section("Leadership", "Whose rounds this node took.", &text)
+    section("Leadership", "Leaders whose rounds this node accepted.", &text)
 }
 
 fn latency(report: &Report) -> String {
-    let Rounds { fusing, travelling, .. } = &report.maps;
+    let RoundTimes { capture_to_fused, fused_to_received, .. } = &report.maps;
     let kinds = [
-        ("maps: oldest capture to end of round", fusing),
-        ("maps: end of round to this node", travelling),
-        ("verdicts: end of round to this node", &report.verdicts.travelling),
+        ("maps: oldest capture to end of round", capture_to_fused),
+        ("maps: end of round to this node", fused_to_received),
+        ("verdicts: end of round to this node", &report.verdicts.fused_to_received),
     ];
     let kinds: Vec<_> = kinds.into_iter().filter(|(_, values)| !values.is_empty()).collect();
     let rows: Vec<_> = kinds.iter().map(|(name, values)| quantiles(name, values)).collect();
     let curves = |&(name, values): &(&str, &Vec<f64>)| {
-        let points = distribution(values, PARTS).into_iter().map(|(value, share)| (value * 1000.0, share));
+        let points = distribution(values, SLICES).into_iter().map(|(value, share)| (value * 1000.0, share));
         Curve { name: name.to_owned(), points: points.collect() }
     };
     let plot = Plot {
@@ -111,42 +113,41 @@ fn latency(report: &Report) -> String {
         x: Axis::Logarithmic,
     };
     let text = shown(&plot) + &table(&QUANTILES, &rows);
-    section("Latency", "By the clocks of aggregator and recording node, as far apart as these are.", &text)
+    section("Latency", "Measured by the clocks of aggregator and recording node, whose offset is included.", &text)
 }
 
 fn gaps(report: &Report) -> String {
-    let start = report.first.unwrap_or_default();
+    let start = report.start();
     let kinds = [("maps", &report.maps.gaps), ("verdicts", &report.verdicts.gaps)];
     let kinds: Vec<_> = kinds.into_iter().filter(|(_, gaps)| gaps.newest().is_some()).collect();
     let rows: Vec<_> = kinds.iter().map(|(name, gaps)| quantiles(name, &gaps.values())).collect();
-    let curve = |&(name, gaps): &(&str, &super::Samples)| {
-        // A gap lasts from the round before to the one that ends it.
-        let points = gaps.points(start, seconds(report), PARTS).into_iter();
+    let curve = |&(name, gaps): &(&str, &Samples)| {
+        // A gap extends from the round before to the round that ends it.
+        let points = gaps.points(start, seconds(report), SLICES).into_iter();
         let points = points.flat_map(|(x, gap)| [(x - gap, gap * 1000.0), (x, gap * 1000.0)]);
         Curve { name: name.to_owned(), points: points.collect() }
     };
     let plot = over_time(report, "time between rounds", "ms since the round before", kinds.iter().map(curve).collect());
     let text = shown(&plot) + &table(&QUANTILES, &rows);
-    section("Gaps", "Time between rounds as this node took them; dotted lines are changes of leader.", &text)
+    section("Gaps", "Time between rounds that this node accepted; dotted lines mark changes of leader.", &text)
 }
 
 fn reputations(report: &Report) -> String {
     if report.reputations.is_empty() {
-        return section("Reputations", "None were published: the cell does not run VOTE, or nobody voted.", "");
+        return section("Reputations", "None were published: the cell rates no vehicles, or has no evidence yet.", "");
     }
-    let start = report.first.unwrap_or_default();
-    let curve = |(node, samples): (&ecod::names::NodeName, &super::Samples)| Curve {
+    let start = report.start();
+    let curve = |(node, samples): (&NodeName, &Samples)| Curve {
         name: node.to_string(),
-        points: samples.points(start, seconds(report), PARTS),
+        points: samples.points(start, seconds(report), SLICES),
     };
-    let curves: Vec<_> = report.reputations.iter().take(MOST_CURVES).map(curve).collect();
-    let newest = |(node, samples): (&ecod::names::NodeName, &super::Samples)| {
-        Some(vec![node.to_string(), format!("{:.3}", samples.newest()?)])
-    };
+    let curves: Vec<_> = report.reputations.iter().take(MAX_CURVES).map(curve).collect();
+    let newest =
+        |(node, samples): (&NodeName, &Samples)| Some(vec![node.to_string(), format!("{:.3}", samples.newest()?)]);
     let rows: Vec<_> = report.reputations.iter().filter_map(newest).collect();
     let text =
         shown(&over_time(report, "reputations", "weight of votes", curves)) + &table(&["vehicle", "last"], &rows);
-    section("Reputations", "How far each vehicle's votes are trusted.", &text)
+    section("Reputations", "Weight of each vehicle's votes.", &text)
 }
 
 fn coverage(report: &Report) -> String {
@@ -165,10 +166,10 @@ fn coverage(report: &Report) -> String {
             [node.to_string()].into_iter().chain(counts).collect()
         })
         .collect();
-    let head = ["vehicle", "reports", "a second", "objects each", "entries contributed to"];
+    let head = ["vehicle", "reports", "per second", "objects each", "entries contributed to"];
     let text = if report.entries == 0 { String::new() } else { drawing(&bars("coverage per vehicle", &shares)) };
-    let about = "Share of the objects and labelled locations of all maps that rest on a vehicle's detections; reports of \
-                 all kinds, as often as they came.";
+    let about = "Share of the objects and labelled locations of all maps that a vehicle contributed to, and its reports \
+                 of all kinds.";
     section("Coverage", about, &(text + &table(&head, &rows)))
 }
 
@@ -180,22 +181,23 @@ fn drops(report: &Report) -> String {
     let row = |(name, times): (&String, &u64)| vec![name.replace('_', " "), times.to_string()];
     let rows: Vec<_> = losses.by_reason().iter().map(row).collect();
     if rows.is_empty() {
-        return section("Drops", "Nothing was lost or refused while this was recorded.", "");
+        return section("Drops", "Nothing was lost or rejected while this log was recorded.", "");
     }
-    let points = losses.over_time().points(report.first.unwrap_or_default(), seconds(report), PARTS);
-    let curve = Curve { name: "lost or refused so far".into(), points };
-    let text = shown(&over_time(report, "drops", "lost or refused", vec![curve])) + &table(&["reason", "times"], &rows);
-    section("Drops", "What this node lost or refused while this was recorded, by reason.", &text)
+    let points = losses.over_time().points(report.start(), seconds(report), SLICES);
+    let curve = Curve { name: "lost or rejected so far".into(), points };
+    let text =
+        shown(&over_time(report, "drops", "lost or rejected", vec![curve])) + &table(&["reason", "times"], &rows);
+    section("Drops", "Messages lost or rejected by this node while this log was recorded, by reason.", &text)
 }
 
 fn over_time<'a>(report: &Report, title: &'a str, y_label: &'a str, curves: Vec<Curve>) -> Plot<'a> {
-    let start = report.first.unwrap_or_default();
-    let marks = report.round_runs.iter().skip(1);
+    let start = report.start();
+    let marks = report.leaders.iter().skip(1);
     let marks = marks.map(|run| (run.first_at.since(start).as_secs_f64(), run.epoch.to_string())).collect();
     Plot { title, x_label: "s", y_label, curves, marks, x: Axis::Linear(seconds(report)) }
 }
 
-/// The plot with its legend; nothing without points.
+/// A plot with its legend; empty without points.
 fn shown(plot: &Plot<'_>) -> String {
     if plot.curves.iter().all(|curve| curve.points.is_empty()) {
         return String::new();
@@ -227,21 +229,13 @@ pub fn section(title: &str, about: &str, content: &str) -> String {
 
 /// Rows under a header.
 pub fn table(head: &[&str], rows: &[Vec<String>]) -> String {
-    let mut text = String::new();
-    let cell = |text: &mut String, tag: &str, content: &str| {
-        // Writing to a string does not fail.
-        let _ = write!(text, "<{tag}>{}</{tag}>", escape(content));
+    let cells = |tag: &str, cells: &mut dyn Iterator<Item = &str>| -> String {
+        let cells: String = cells.map(|content| format!("<{tag}>{}</{tag}>", escape(content))).collect();
+        format!("<tr>{cells}</tr>")
     };
-    text.push_str("<div class=\"scroll\"><table>\n<thead><tr>");
-    head.iter().for_each(|content| cell(&mut text, "th", content));
-    text.push_str("</tr></thead>\n<tbody>\n");
-    for row in rows {
-        text.push_str("<tr>");
-        row.iter().for_each(|content| cell(&mut text, "td", content));
-        text.push_str("</tr>\n");
-    }
-    text.push_str("</tbody>\n</table></div>\n");
-    text
+    let head = cells("th", &mut head.iter().copied());
+    let rows: String = rows.iter().map(|row| cells("td", &mut row.iter().map(String::as_str)) + "\n").collect();
+    format!("<div class=\"scroll\"><table>\n<thead>{head}</thead>\n<tbody>\n{rows}</tbody>\n</table></div>\n")
 }
 
 fn seconds(report: &Report) -> f64 {
@@ -257,7 +251,7 @@ fn clock(at: Timestamp) -> String {
     time.format("%Y-%m-%d %H:%M:%S%.3f").to_string()
 }
 
-/// Text of others in HTML.
+/// Text escaped for HTML.
 fn escape(text: &(impl Display + ?Sized)) -> String {
     text.to_string().replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

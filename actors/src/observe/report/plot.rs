@@ -1,24 +1,24 @@
-//! Plots as SVG that take their colours from the page.
+//! SVG plots, coloured by the page's style sheet.
 
 use svg::Document;
 use svg::node::element::{Group, Line, Polyline, Rectangle, Text, Title};
 
-/// A line of a plot.
+/// A curve of a plot.
 #[derive(Debug)]
 pub(super) struct Curve {
     pub(super) name: String,
     pub(super) points: Vec<(f64, f64)>,
 }
 
-/// Lines over a common axis.
+/// Curves over a common axis.
 #[derive(Debug)]
 pub(super) struct Plot<'a> {
-    /// What it shows, for those who do not see it.
+    /// Description for screen readers.
     pub(super) title: &'a str,
     pub(super) x_label: &'a str,
     pub(super) y_label: &'a str,
     pub(super) curves: Vec<Curve>,
-    /// Vertical lines and what happened there.
+    /// Vertical lines and their descriptions.
     pub(super) marks: Vec<(f64, String)>,
     /// The horizontal axis.
     pub(super) x: Axis,
@@ -29,11 +29,11 @@ pub(super) struct Plot<'a> {
 pub(super) enum Axis {
     /// From 0 to this.
     Linear(f64),
-    /// Powers of ten, from the one below the least point to the one above the largest, six at most.
+    /// Powers of ten around all points, six at most.
     Logarithmic,
 }
 
-/// How many colours the page has; further curves take the same ones dashed.
+/// Number of colours; further curves repeat them dashed.
 pub(super) const COLOURS: usize = 6;
 
 const WIDTH: f64 = 720.0;
@@ -83,14 +83,14 @@ impl Plot<'_> {
     }
 }
 
-/// Where values are on a horizontal axis.
+/// Mapping of values to a horizontal axis.
 #[derive(Debug)]
 enum Scale {
     Linear { max: f64 },
-    Logarithmic { least: i32, most: i32 },
+    Logarithmic { min: i32, max: i32 },
 }
 
-/// Powers of ten on a logarithmic axis.
+/// Maximum powers of ten on a logarithmic axis.
 const DECADES: i32 = 6;
 
 impl Scale {
@@ -98,23 +98,23 @@ impl Scale {
         match axis {
             Axis::Linear(max) => Self::Linear { max: max.max(1e-9) },
             Axis::Logarithmic => {
-                let (least, most) = values
+                let (min, max) = values
                     .filter(|value| *value > 0.0)
-                    .fold((f64::INFINITY, 0.0), |(least, most), value| (value.min(least), value.max(most)));
-                let most = if most > 0.0 { most.log10().ceil() as i32 } else { 0 };
-                let least = if least.is_finite() { least.log10().floor() as i32 } else { most };
-                Self::Logarithmic { least: least.clamp(most - DECADES, most - 1), most }
+                    .fold((f64::INFINITY, 0.0), |(min, max): (f64, f64), value| (value.min(min), value.max(max)));
+                let max = if max > 0.0 { max.log10().ceil() as i32 } else { 0 };
+                let min = if min.is_finite() { min.log10().floor() as i32 } else { max };
+                Self::Logarithmic { min: min.clamp(max - DECADES, max - 1), max }
             }
         }
     }
 
-    /// The place of a value, 0 to 1; values before the beginning are at the beginning.
+    /// Position of a value from 0 to 1; smaller values are at 0.
     fn share(&self, value: f64) -> f64 {
         match self {
             Self::Linear { max } => value / max,
-            Self::Logarithmic { least, most } => {
-                let least = f64::from(*least);
-                (value.max(10f64.powf(least)).log10() - least) / (f64::from(*most) - least)
+            Self::Logarithmic { min, max } => {
+                let min = f64::from(*min);
+                (value.max(10f64.powf(min)).log10() - min) / (f64::from(*max) - min)
             }
         }
     }
@@ -126,12 +126,12 @@ impl Scale {
     fn ticks(&self) -> Vec<f64> {
         match *self {
             Self::Linear { max } => ticks(step(max), max).collect(),
-            Self::Logarithmic { least, most } => (least..=most).map(|power| 10f64.powi(power)).collect(),
+            Self::Logarithmic { min, max } => (min..=max).map(|power| 10f64.powi(power)).collect(),
         }
     }
 }
 
-/// Shares in percent as bars.
+/// Horizontal bars of shares in percent.
 pub fn bars(title: &str, shares: &[(String, f64)]) -> String {
     let height = BAR * shares.len() as f64 + 8.0;
     let (left, width) = (160.0, WIDTH - 160.0 - 60.0);
@@ -175,7 +175,7 @@ fn text(class: &str, anchor: &str, x: f64, y: f64, content: &str) -> Text {
     text.set("x", format!("{x:.1}")).set("y", format!("{y:.1}"))
 }
 
-/// 1, 2 or 5 times a power of ten, so that an axis has a handful of ticks.
+/// Step between ticks: 1, 2 or 5 times a power of ten.
 fn step(max: f64) -> f64 {
     let rough = max / TICKS;
     let power = 10f64.powf(rough.log10().floor());
@@ -186,7 +186,7 @@ fn ticks(step: f64, max: f64) -> impl Iterator<Item = f64> {
     (0..=(max / step + 1e-6) as u32).map(move |n| f64::from(n) * step)
 }
 
-/// As many digits as a tick needs.
+/// A number without trailing zeros.
 pub(super) fn number(value: f64) -> String {
     let rounded = format!("{value:.4}");
     let short = rounded.trim_end_matches('0').trim_end_matches('.');

@@ -1,8 +1,8 @@
-//! Values over time, and their distribution.
+//! Time series and distributions.
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
-/// Values in the order of time.
+/// Values in order of time.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Samples {
     values: Vec<(Timestamp, f64)>,
@@ -13,22 +13,13 @@ impl Samples {
         self.values.push((at, value));
     }
 
-    /// Points with seconds since `start`, thinned out to at most two in each of `parts` of the time: the least and the
-    /// largest, so that no peak is lost.
+    /// Points by seconds since `start`. Of each of `parts` time slices, only minimum and maximum remain, so that peaks
+    /// survive.
     pub(super) fn points(&self, start: Timestamp, seconds: f64, parts: usize) -> Vec<(f64, f64)> {
-        let mut points: Vec<(f64, f64)> = Vec::new();
-        let mut part: Option<(usize, Vec<(f64, f64)>)> = None;
-        for (at, value) in &self.values {
-            let x = at.since(start).as_secs_f64();
-            let number = (x / seconds.max(1e-9) * parts as f64) as usize;
-            match &mut part {
-                Some((current, held)) if *current == number => held.push((x, *value)),
-                _ => points
-                    .extend(part.replace((number, vec![(x, *value)])).into_iter().flat_map(|(_, held)| ends(held))),
-            }
-        }
-        points.extend(part.into_iter().flat_map(|(_, held)| ends(held)));
-        points
+        let points = self.values.iter().map(|(at, value)| (at.since(start).as_secs_f64(), *value));
+        let points: Vec<_> = points.collect();
+        let slice = |x: f64| (x / seconds.max(1e-9) * parts as f64) as usize;
+        points.chunk_by(|a, b| slice(a.0) == slice(b.0)).flat_map(extremes).collect()
     }
 
     /// The values alone.
@@ -42,19 +33,17 @@ impl Samples {
     }
 }
 
-/// The least and the largest, in the order of time.
-fn ends(held: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
+/// Minimum and maximum in order of time.
+fn extremes(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let by_value = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
-    let (Some(least), Some(largest)) = (held.iter().min_by(by_value), held.iter().max_by(by_value)) else {
-        return held;
-    };
-    let mut ends = vec![*least, *largest];
-    ends.sort_by(|a, b| a.0.total_cmp(&b.0));
-    ends.dedup();
-    ends
+    let extremes = points.iter().min_by(by_value).into_iter().chain(points.iter().max_by(by_value));
+    let mut extremes: Vec<_> = extremes.copied().collect();
+    extremes.sort_by(|a, b| a.0.total_cmp(&b.0));
+    extremes.dedup();
+    extremes
 }
 
-/// The value below which `share` of all are, or the nearest; `None` without values.
+/// The quantile for `share`, by nearest rank; `None` without values.
 pub(super) fn quantile(values: &[f64], share: f64) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -62,7 +51,7 @@ pub(super) fn quantile(values: &[f64], share: f64) -> Option<f64> {
     sorted.get(place).copied()
 }
 
-/// By value, the share in percent of all that are not above it, in at most `parts` steps.
+/// Cumulative distribution in percent, in at most `parts` steps.
 pub(super) fn distribution(values: &[f64], parts: usize) -> Vec<(f64, f64)> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);

@@ -5,7 +5,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use tokio::sync::oneshot;
 
 use crate::platform::clock;

@@ -3,7 +3,7 @@
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::{Mutex, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -17,13 +17,12 @@ use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
-use super::frontend::{AccessPolicy, BrokerFrontend};
+use super::frontend::BrokerFrontend;
 use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
-use super::permissions::Permissions;
+use super::permissions::{AccessPolicy, MAX_TOPIC_LEVELS, Permissions};
 use super::publish_throttle::PublishThrottle;
 use super::retained::RetainedMessages;
 use crate::platform::clock;
-use crate::telemetry::counters::Counters;
 
 /// An MQTT broker that lives inside the process.
 pub trait MqttBroker: Send {
@@ -43,7 +42,7 @@ pub trait MqttBroker: Send {
     /// Stops it and starts it at the address where it serves, or else at `fallback`. Retained messages are lost.
     ///
     /// # Errors
-    /// As [`Mqtt::start`]; the broker is then stopped.
+    /// As [`MqttBroker::start`]; the broker is then stopped.
     fn restart(&mut self, fallback: SocketAddr) -> Result<SocketAddr, BrokerError> {
         let address = match self.health() {
             BrokerHealth::Serving(address) => address,
@@ -159,7 +158,6 @@ impl BrokerConfig {
 pub struct EmbeddedBroker {
     config: BrokerConfig,
     policy: Option<AccessPolicy>,
-    counters: Arc<Counters>,
     running: Option<RunningBroker>,
 }
 
@@ -176,19 +174,8 @@ struct RunningBroker {
 /// Largest packet in bytes without a configured limit: the default maps and their topics.
 const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
 
-/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
-const MAX_TOPIC_LEVELS: usize = 32;
-
-/// Maximum length of a topic or filter in bytes.
-const MAX_TOPIC_BYTES: usize = 512;
-
 /// Maximum subscriptions of one client.
 const MAX_SUBSCRIPTIONS: usize = 256;
-
-/// Whether rmqtt can hold a topic or filter.
-pub(super) fn is_topic_bounded(topic: &str) -> bool {
-    topic.len() <= MAX_TOPIC_BYTES && topic.split('/').count() <= MAX_TOPIC_LEVELS
-}
 
 /// Time for connections to end when the broker stops. Afterwards their tasks are abandoned.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
@@ -199,27 +186,12 @@ const END_TIMEOUT: Duration = Duration::from_millis(1500);
 impl EmbeddedBroker {
     /// A broker without a frontend, not started: every client may log in.
     pub fn new(config: BrokerConfig) -> Self {
-        Self { config, policy: None, counters: Arc::default(), running: None }
+        Self { config, policy: None, running: None }
     }
 
     /// A broker behind a frontend with an access policy, not started.
     pub fn protected(config: BrokerConfig, policy: AccessPolicy) -> Self {
-        let counters = Arc::clone(&policy.counters);
-        Self { config, policy: Some(policy), counters, running: None }
-    }
-
-    fn listener(&self, address: SocketAddr) -> Builder {
-        Builder::new()
-            .name("ecod")
-            .laddr(address)
-            // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
-            .reuseaddr(Some(true))
-            .nodelay(true)
-            .max_packet_size(self.config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
-            .max_connections(self.config.max_clients)
-            .max_mqueue_len(self.config.max_waiting)
-            .max_subscriptions(MAX_SUBSCRIPTIONS)
-            .handshake_timeout(Duration::from_secs(5))
+        Self { config, policy: Some(policy), running: None }
     }
 }
 
@@ -233,18 +205,11 @@ impl MqttBroker for EmbeddedBroker {
         let (ready, started) = mpsc::channel();
         let (ending, ended) = mpsc::channel();
         let heartbeat = ThreadHeartbeat::default();
-        let plan = ThreadSetup {
-            address,
-            listener: self.listener(address),
-            config: self.config.clone(),
-            policy: self.policy.clone(),
-            counters: Arc::clone(&self.counters),
-            beats: heartbeat.beats(),
-        };
+        let (config, policy, beats) = (self.config.clone(), self.policy.clone(), heartbeat.beats());
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
             .spawn(move || {
-                serve(plan, &ready, stopped);
+                serve(address, &config, policy, &beats, &ready, stopped);
                 drop::<mpsc::Sender<()>>(ending);
             })
             .map_err(thread_error)?;
@@ -293,20 +258,15 @@ impl Drop for EmbeddedBroker {
     }
 }
 
-/// Arguments of the broker's thread.
-struct ThreadSetup {
-    address: SocketAddr,
-    listener: Builder,
-    config: BrokerConfig,
-    policy: Option<AccessPolicy>,
-    counters: Arc<Counters>,
-    /// Counter that the thread increments while it does not hang.
-    beats: Arc<AtomicU64>,
-}
-
 /// Body of the broker's thread. It owns the tokio runtime, which must not be dropped within the caller's async code.
-fn serve(plan: ThreadSetup, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>, stopped: oneshot::Receiver<()>) {
-    let (address, beats) = (plan.address, Arc::clone(&plan.beats));
+fn serve(
+    address: SocketAddr,
+    config: &BrokerConfig,
+    policy: Option<AccessPolicy>,
+    beats: &AtomicU64,
+    ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>,
+    stopped: oneshot::Receiver<()>,
+) {
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(source) => {
@@ -315,7 +275,7 @@ fn serve(plan: ThreadSetup, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>
         }
     };
     runtime.block_on(async {
-        let (server, frontend, bound) = match prepare(plan).await {
+        let (server, frontend, bound) = match prepare(address, config, policy).await {
             Ok(prepared) => prepared,
             Err(error) => {
                 let reason = error.root_cause().to_string();
@@ -347,30 +307,43 @@ fn serve(plan: ThreadSetup, ready: &mpsc::Sender<Result<SocketAddr, BrokerError>
 }
 
 /// Opens the sockets. rmqtt's own is public without a frontend, and else on loopback.
-async fn prepare(plan: ThreadSetup) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr)> {
-    let ThreadSetup { address, listener, config, policy, counters, .. } = plan;
-    let behind = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+async fn prepare(
+    address: SocketAddr,
+    config: &BrokerConfig,
+    policy: Option<AccessPolicy>,
+) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr)> {
+    let listener = Builder::new()
+        .name("ecod")
+        // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
+        .reuseaddr(Some(true))
+        .nodelay(true)
+        .max_packet_size(config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
+        .max_connections(config.max_clients)
+        .max_mqueue_len(config.max_waiting)
+        .max_subscriptions(MAX_SUBSCRIPTIONS)
+        .handshake_timeout(Duration::from_secs(5));
     let listener = match &policy {
         // Without anonymous clients, rmqtt asks the hooks about each login.
-        Some(_) => listener.laddr(behind).allow_anonymous(false),
-        None => listener.max_topic_levels(MAX_TOPIC_LEVELS),
+        Some(_) => listener.laddr((Ipv4Addr::LOCALHOST, 0).into()).allow_anonymous(false),
+        None => listener.laddr(address).max_topic_levels(MAX_TOPIC_LEVELS),
     };
     let listener = listener.bind().and_then(Listener::tcp)?;
     let own = listener.local_addr()?;
     // rmqtt's own overload check looks at the whole machine's load, which a vehicle's camera would exceed.
     let context = ServerContext::new().busy_check_enable(false).build().await;
-    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(&config));
+    *context.extends.retain_mut().await = Box::new(RetainedMessages::new(config));
     let (frontend, bound) = match &policy {
         Some(policy) => {
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
-            let frontend = BrokerFrontend::new(public, own, policy, &config);
+            let frontend = BrokerFrontend::new(public, own, policy, config);
             Permissions { principals: frontend.principals(), policy: policy.clone() }.install(&context).await;
             (Some(frontend), bound)
         }
         None => (None, own),
     };
     let principals = frontend.as_ref().map(BrokerFrontend::principals).unwrap_or_default();
+    let counters = policy.map(|policy| policy.counters).unwrap_or_default();
     PublishThrottle::new(config.max_messages_hz, principals, counters).install(&context).await;
     Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), frontend, bound))
 }

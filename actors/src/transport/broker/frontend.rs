@@ -14,7 +14,6 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::wire::{Limits, Topics};
 use rustls::pki_types::{CertificateDer, UnixTime};
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
@@ -24,27 +23,12 @@ use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
 use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
-use super::permissions::LeaderCheck;
+use super::permissions::AccessPolicy;
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
 use super::{BrokerConfig, connect_packet};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::pki::{CertificateSubject, Credentials, LoadedCredentials};
-
-/// Rules of access to an embedded broker.
-#[derive(Clone)]
-pub struct AccessPolicy {
-    /// The node's certificates. Without them every client may log in and publish anything, within limits.
-    pub credentials: Option<Arc<Credentials>>,
-    /// The cell's topics.
-    pub topics: Topics,
-    /// Largest payloads that the cell's nodes accept.
-    pub limits: Limits,
-    /// Decides which node may publish maps, verdicts and reputations.
-    pub elected: LeaderCheck,
-    /// The node's counters.
-    pub counters: Arc<Counters>,
-}
 
 /// Public side of a broker.
 pub(super) struct BrokerFrontend {
@@ -58,7 +42,7 @@ struct FrontendState {
     credentials: Option<Arc<Credentials>>,
     principals: PrincipalRegistry,
     /// Address of rmqtt's own listener.
-    behind: SocketAddr,
+    backend: SocketAddr,
     places: Arc<Semaphore>,
     quota: ConnectionQuota,
     handshake_timeout: Duration,
@@ -82,13 +66,18 @@ const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl BrokerFrontend {
     /// A frontend on a listener, for a broker that listens at `behind`.
-    pub(super) fn new(listener: TcpListener, behind: SocketAddr, policy: &AccessPolicy, config: &BrokerConfig) -> Self {
+    pub(super) fn new(
+        listener: TcpListener,
+        backend: SocketAddr,
+        policy: &AccessPolicy,
+        config: &BrokerConfig,
+    ) -> Self {
         let interval = Duration::from_secs(1) / config.connects_per_s;
         let current = policy.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
         let shared = FrontendState {
             credentials: policy.credentials.clone(),
             principals: PrincipalRegistry::default(),
-            behind,
+            backend,
             places: Arc::new(Semaphore::new(config.max_clients)),
             quota: ConnectionQuota::new(config.max_clients_each),
             handshake_timeout: Duration::from_millis(config.handshake_timeout_ms),
@@ -109,8 +98,8 @@ impl BrokerFrontend {
 
     /// Accepts clients; never ends.
     pub(super) async fn run(self) {
-        let mut looks = interval(RELOAD_INTERVAL);
-        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut reloads = interval(RELOAD_INTERVAL);
+        reloads.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut checked = Instant::now();
         loop {
             tokio::select! {
@@ -121,7 +110,7 @@ impl BrokerFrontend {
                         sleep(ACCEPT_PAUSE).await;
                     }
                 },
-                _ = looks.tick() => self.look(&mut checked),
+                _ = reloads.tick() => self.recheck(&mut checked),
             }
         }
     }
@@ -144,7 +133,7 @@ impl BrokerFrontend {
     }
 
     /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
-    fn look(&self, checked: &mut Instant) {
+    fn recheck(&self, checked: &mut Instant) {
         let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) else { return };
         let current = credentials.current();
         if checked.elapsed() >= RECHECK_INTERVAL || !Arc::ptr_eq(&current, &sender.borrow()) {
@@ -238,12 +227,12 @@ impl FrontendState {
         socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
         // Registered before rmqtt can ask for it, and until the port may be reused.
         let _pass = self.principals.register(socket.local_addr()?, principal);
-        let mut behind = socket.connect(self.behind).await?;
-        behind.set_nodelay(true)?;
-        behind.write_all(&connect.packet).await?;
+        let mut backend = socket.connect(self.backend).await?;
+        backend.set_nodelay(true)?;
+        backend.write_all(&connect.packet).await?;
         let _visit = slot.log_in();
         tokio::select! {
-            () = relay(stream, behind) => Ok(()),
+            () = relay(stream, backend) => Ok(()),
             error = certificate_invalidated(current, &certificates) => Err(ClientRejection::CertificateInvalidated(error)),
         }
     }

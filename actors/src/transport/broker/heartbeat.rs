@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
 /// Heartbeat of a thread, checked from time to time.
 #[derive(Debug, Default)]

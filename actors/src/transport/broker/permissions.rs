@@ -15,22 +15,35 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use ecod::names::NodeName;
-use ecod::wire::{Limits, Topic};
+use ecod::model::names::NodeName;
+use ecod::wire::{Limits, Topic, Topics};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, SubscribeAclResult, TopicFilter};
 
-use super::AccessPolicy;
-use super::embedded::is_topic_bounded;
 use super::principal::{Principal, PrincipalRegistry};
-use crate::telemetry::counters::Event;
+use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::ENVELOPE_BYTES;
-use crate::transport::pki::CertificateSubject;
+use crate::transport::pki::{CertificateSubject, Credentials};
 
 /// Decides whether a node may publish maps, verdicts and reputations.
 pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
+
+/// Rules of access to an embedded broker.
+#[derive(Clone)]
+pub struct AccessPolicy {
+    /// The node's certificates. Without them every client may log in and publish anything, within limits.
+    pub credentials: Option<Arc<Credentials>>,
+    /// The cell's topics.
+    pub topics: Topics,
+    /// Largest payloads that the cell's nodes accept.
+    pub limits: Limits,
+    /// Decides which node may publish maps, verdicts and reputations.
+    pub elected: LeaderCheck,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
 
 /// Hooks of rmqtt that check logins, messages and filters.
 #[derive(Clone)]
@@ -89,6 +102,17 @@ impl Permissions {
                 .as_ref()
                 .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.policy.elected)))
     }
+}
+
+/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
+pub(super) const MAX_TOPIC_LEVELS: usize = 32;
+
+/// Maximum length of a topic or filter in bytes.
+const MAX_TOPIC_BYTES: usize = 512;
+
+/// Whether rmqtt can hold a topic or filter.
+pub(super) fn is_topic_bounded(topic: &str) -> bool {
+    topic.len() <= MAX_TOPIC_BYTES && topic.split('/').count() <= MAX_TOPIC_LEVELS
 }
 
 #[async_trait]
@@ -161,7 +185,7 @@ fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
 mod tests {
     use std::time::Duration;
 
-    use ecod::wire::{Role, Topics};
+    use ecod::wire::Role;
 
     use super::*;
     use crate::platform::clock;

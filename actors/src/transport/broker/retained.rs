@@ -9,25 +9,25 @@ use rmqtt::types::{Retain, TopicFilter, TopicName};
 use tokio::sync::Mutex;
 
 use super::BrokerConfig;
-use super::embedded::is_topic_bounded;
+use super::permissions::is_topic_bounded;
 use crate::transport::pki::OBSERVER_MARK;
 
 /// Retained messages, bounded in number and in bytes.
 pub(super) struct RetainedMessages {
     storage: DefaultRetainStorage,
-    register: Mutex<RetainedIndex>,
+    index: Mutex<RetainedIndex>,
 }
 
 impl RetainedMessages {
     pub(super) fn new(config: &BrokerConfig) -> Self {
-        let register = RetainedIndex {
-            kept: BTreeMap::new(),
+        let index = RetainedIndex {
+            entries: BTreeMap::new(),
             bytes: 0,
             max_topics: config.max_retained,
             max_bytes: config.max_retained_bytes,
-            pruned: None,
+            pruned_at: None,
         };
-        Self { storage: DefaultRetainStorage::new(), register: Mutex::new(register) }
+        Self { storage: DefaultRetainStorage::new(), index: Mutex::new(index) }
     }
 }
 
@@ -47,10 +47,10 @@ impl RetainStorage for RetainedMessages {
         let properties = message.publish.properties.as_ref();
         let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));
         let (now, bytes) = (Instant::now(), message.publish.payload.len());
-        let mut register = self.register.lock().await;
+        let mut index = self.index.lock().await;
         let has_room = is_topic_bounded(topic)
-            && (bytes == 0 || register.keep(topic, bytes, expiry.map(|expiry| now + expiry), now));
-        let has_pruned = register.pruned == Some(now);
+            && (bytes == 0 || index.insert(topic, bytes, expiry.map(|expiry| now + expiry), now));
+        let has_pruned = index.pruned_at == Some(now);
         if has_pruned {
             self.storage.remove_expired_messages().await;
         }
@@ -62,7 +62,7 @@ impl RetainStorage for RetainedMessages {
             return Ok(());
         }
         if bytes == 0 {
-            register.forget(topic);
+            index.remove(topic);
         }
         self.storage.set_with_timeout(topic, message, expiry).await
     }
@@ -89,38 +89,39 @@ const PRUNE_INTERVAL: Duration = Duration::from_secs(1);
 /// Bytes and expiry of each retained topic.
 #[derive(Debug)]
 struct RetainedIndex {
-    kept: BTreeMap<String, (usize, Option<Instant>)>,
+    entries: BTreeMap<String, (usize, Option<Instant>)>,
     bytes: usize,
     max_topics: usize,
     max_bytes: usize,
-    pruned: Option<Instant>,
+    pruned_at: Option<Instant>,
 }
 
 impl RetainedIndex {
     /// Records a message in place of its topic's last; false when there is no room.
-    fn keep(&mut self, topic: &str, bytes: usize, until: Option<Instant>, now: Instant) -> bool {
-        if !self.has_room(topic, bytes) && self.pruned.is_none_or(|pruned| now.duration_since(pruned) >= PRUNE_INTERVAL)
+    fn insert(&mut self, topic: &str, bytes: usize, until: Option<Instant>, now: Instant) -> bool {
+        if !self.has_room(topic, bytes)
+            && self.pruned_at.is_none_or(|pruned_at| now.duration_since(pruned_at) >= PRUNE_INTERVAL)
         {
-            self.pruned = Some(now);
-            self.kept.retain(|_, (_, until)| until.is_none_or(|until| until > now));
-            self.bytes = self.kept.values().map(|(bytes, _)| bytes).sum();
+            self.pruned_at = Some(now);
+            self.entries.retain(|_, (_, until)| until.is_none_or(|until| until > now));
+            self.bytes = self.entries.values().map(|(bytes, _)| bytes).sum();
         }
         let has_room = self.has_room(topic, bytes);
         if has_room {
-            self.forget(topic);
-            self.kept.insert(topic.to_owned(), (bytes, until));
+            self.remove(topic);
+            self.entries.insert(topic.to_owned(), (bytes, until));
             self.bytes += bytes;
         }
         has_room
     }
 
-    fn forget(&mut self, topic: &str) {
-        self.bytes -= self.kept.remove(topic).map_or(0, |(bytes, _)| bytes);
+    fn remove(&mut self, topic: &str) {
+        self.bytes -= self.entries.remove(topic).map_or(0, |(bytes, _)| bytes);
     }
 
     fn has_room(&self, topic: &str, bytes: usize) -> bool {
-        let before = self.kept.get(topic).map(|(bytes, _)| bytes);
-        let is_crowded = || self.kept.len() >= self.max_topics || self.observers_beside(topic) >= MAX_OBSERVERS;
+        let before = self.entries.get(topic).map(|(bytes, _)| bytes);
+        let is_crowded = || self.entries.len() >= self.max_topics || self.observers_beside(topic) >= MAX_OBSERVERS;
         self.bytes - before.unwrap_or(&0) + bytes <= self.max_bytes && (before.is_some() || !is_crowded())
     }
 
@@ -129,7 +130,7 @@ impl RetainedIndex {
         let name = topic.rfind('/').map_or(0, |slash| slash + 1);
         let mark = topic.get(name..).and_then(|name| name.find(OBSERVER_MARK));
         let Some(principal) = mark.and_then(|mark| topic.get(..name + mark + OBSERVER_MARK.len())) else { return 0 };
-        self.kept.range(principal.to_owned()..).take_while(|(topic, _)| topic.starts_with(principal)).count()
+        self.entries.range(principal.to_owned()..).take_while(|(topic, _)| topic.starts_with(principal)).count()
     }
 }
 
@@ -137,38 +138,38 @@ impl RetainedIndex {
 mod tests {
     use super::*;
 
-    fn register(max_topics: usize, max_bytes: usize) -> RetainedIndex {
-        RetainedIndex { kept: BTreeMap::new(), bytes: 0, max_topics, max_bytes, pruned: None }
+    fn index(max_topics: usize, max_bytes: usize) -> RetainedIndex {
+        RetainedIndex { entries: BTreeMap::new(), bytes: 0, max_topics, max_bytes, pruned_at: None }
     }
 
     #[test]
     fn topics_and_bytes_are_bounded_and_what_is_there_may_change() {
-        let mut register = register(2, 100);
+        let mut index = index(2, 100);
         let now = Instant::now();
-        assert!(register.keep("a", 60, None, now) && !register.keep("b", 50, None, now), "bytes");
-        assert!(register.keep("a", 100, None, now) && register.keep("a", 50, None, now), "in its own place");
-        assert!(register.keep("b", 50, None, now) && !register.keep("c", 0, None, now), "topics");
-        register.forget("a");
-        assert!(register.keep("c", 50, None, now));
-        assert_eq!(register.bytes, 100);
+        assert!(index.insert("a", 60, None, now) && !index.insert("b", 50, None, now), "bytes");
+        assert!(index.insert("a", 100, None, now) && index.insert("a", 50, None, now), "in its own place");
+        assert!(index.insert("b", 50, None, now) && !index.insert("c", 0, None, now), "topics");
+        index.remove("a");
+        assert!(index.insert("c", 50, None, now));
+        assert_eq!(index.bytes, 100);
     }
 
     #[test]
     fn what_has_expired_makes_room() {
-        let mut register = register(1, 100);
+        let mut index = index(1, 100);
         let (now, second) = (Instant::now(), Duration::from_secs(1));
-        assert!(register.keep("a", 100, Some(now + second), now) && !register.keep("b", 1, None, now));
-        assert!(register.keep("b", 1, None, now + 2 * second));
+        assert!(index.insert("a", 100, Some(now + second), now) && !index.insert("b", 1, None, now));
+        assert!(index.insert("b", 1, None, now + 2 * second));
     }
 
     #[test]
     fn one_certificate_does_not_use_up_the_topics() {
-        let mut register = register(1000, 1000);
+        let mut index = index(1000, 1000);
         let now = Instant::now();
-        let kept = (0..200).filter(|n| register.keep(&format!("c--1/nodes/gauss--{n}"), 1, None, now)).count();
-        assert_eq!(kept, MAX_OBSERVERS);
+        let entries = (0..200).filter(|n| index.insert(&format!("c--1/nodes/gauss--{n}"), 1, None, now)).count();
+        assert_eq!(entries, MAX_OBSERVERS);
         for other in ["c--1/nodes/gauss", "c--1/nodes/euclid", "c--1/nodes/euclid--top"] {
-            assert!(register.keep(other, 1, None, now), "{other}");
+            assert!(index.insert(other, 1, None, now), "{other}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The membership's settings.
+//! Configuration of the membership.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use crate::platform::secret::Secret;
 /// UDP port on which a node gossips unless told otherwise.
 pub const DEFAULT_PORT: u16 = 17_884;
 
-/// Where a node gossips, how it finds others, and how quickly it misses them; `[membership]` in the configuration file.
+/// Gossip address, discovery and timings of failure detection; `[membership]` in the configuration file.
 ///
 /// Key, multicast group and timings must be the same on every node of a cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -22,7 +22,7 @@ pub struct MembershipConfig {
     /// 12 characters. Default none: anyone can take part, and the node gossips on loopback only unless `bind` is set.
     /// Never printed.
     pub key: Option<Secret>,
-    /// A file that holds the key; white space around it is left out. Default none. Excludes `key`.
+    /// A file with the key; white space around it is ignored. Default none. Excludes `key`.
     pub key_file: Option<PathBuf>,
     /// Address and UDP port to gossip on; port 0 takes any free one. Default port 17884, or a free one if another node
     /// of this machine has it, on all interfaces with a key and on 127.0.0.1 without. With an IPv6 address all of the
@@ -36,21 +36,23 @@ pub struct MembershipConfig {
     pub seeds: Vec<String>,
     /// Discovery by multicast.
     pub multicast: MulticastConfig,
-    /// Time between two probes of one other node, in ms. Default 100. Shorter notices death sooner and costs packets.
+    /// Time between two probes of one other node, in ms. Default 100. Trade-off: shorter detects failures sooner and costs
+    /// packets.
     pub probe_ms: u64,
     /// Time within which a probed node must answer before others are asked to probe it, in ms. Default 30; must be less
     /// than half of `probe_ms`. Longer suits slower networks.
     pub reply_ms: u64,
-    /// How long a suspected node has to show that it lives, in ms. Default 200. Longer gives up fewer living nodes and
-    /// notices death later.
+    /// Time in ms within which a suspected node must show that it is alive. Default 200. Trade-off: longer declares fewer
+    /// living nodes down and detects failures later.
     pub suspect_ms: u64,
-    /// Time between two spreads of news, in ms. Default 50; nothing is sent when there is none.
+    /// Time between two rounds of gossip, in ms. Default 50; nothing is sent without news.
     pub gossip_ms: u64,
-    /// Time between two greetings, in ms: to every seed that is not there, and to the multicast group, to that ten
-    /// times as rarely in company. Default 500, and at most half of the election's `join_ms`, for a seed that returns
-    /// to hear of its cell before it leads on its own. Shorter heals split cells sooner and costs packets.
+    /// Time between two greetings, in ms, to every absent seed and to the multicast group. Once other nodes are alive,
+    /// the group is greeted a tenth as often. Default 500, and at most half of the election's `join_ms`: a returning
+    /// seed must hear of its cell before it leads on its own. Trade-off: shorter heals split cells sooner and costs
+    /// packets.
     pub hello_ms: u64,
-    /// Most nodes that are known at a time. Default 256.
+    /// Maximum known nodes. Default 256.
     pub max_peers: usize,
 }
 
@@ -121,12 +123,12 @@ impl MembershipConfig {
         check_range("max_peers", self.max_peers as f64, 1.0, 4096.0)
     }
 
-    /// Whether the node has a key of its own, or one that everybody knows.
+    /// Whether a key is configured. Without one the key is public.
     pub fn has_key(&self) -> bool {
         self.key.is_some() || self.key_file.is_some()
     }
 
-    /// Where to gossip when `bind` does not say.
+    /// Gossip address without `bind`.
     pub(crate) fn default_ip(&self) -> IpAddr {
         IpAddr::V4(if self.has_key() { Ipv4Addr::UNSPECIFIED } else { Ipv4Addr::LOCALHOST })
     }

@@ -10,7 +10,7 @@
 
 use std::net::SocketAddr;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use serde::{Deserialize, Serialize};
 
 use super::MAX_PAYLOAD_BYTES;
@@ -114,7 +114,7 @@ pub(crate) struct FrameHeader {
 }
 
 impl FrameHeader {
-    /// Reads the head of a frame; its body is what follows [`HEAD_BYTES`].
+    /// Reads the head of a frame; its body is what follows the head.
     pub(crate) fn read(frame: &[u8], cell: [u8; 4]) -> Result<Self, FrameEvent> {
         if frame.len() > MAX_FRAME_BYTES {
             return Err(FrameEvent::Oversized);

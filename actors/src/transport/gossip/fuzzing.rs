@@ -1,12 +1,12 @@
-//! What the fuzz targets need of the membership: only built for them.
+//! Access to the membership for the fuzz targets. Only built for them.
 
 use std::collections::VecDeque;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
 use super::config::MembershipConfig;
@@ -62,13 +62,13 @@ impl Listener {
         Self { own, key: key(), now, forged: 1 << 32 }
     }
 
-    /// Takes a datagram from the peer's address.
+    /// Processes a datagram from the peer's address.
     pub fn hear(&mut self, frame: &[u8]) {
         self.own.receive(frame, address(1), self.now);
         self.settle();
     }
 
-    /// Takes a body under the peer's seal.
+    /// Processes a body sealed by the peer.
     pub fn hear_sealed(&mut self, kind: u8, body: &[u8]) {
         let (kind, to) = match kind % 4 {
             0 => (FrameKind::Hello, BROADCAST),

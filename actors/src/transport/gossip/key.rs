@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU32;
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ring::{aead, digest, hkdf, hmac, pbkdf2};
 
 use super::config::MembershipConfig;
@@ -27,7 +27,7 @@ pub enum KeyError {
     Unreadable {
         /// The file.
         path: std::path::PathBuf,
-        /// What the operating system said.
+        /// The operating system's error.
         source: std::io::Error,
     },
     /// The key file holds less than a key.
@@ -72,7 +72,7 @@ impl CellKey {
         Ok(Self::new(text.trim(), cell))
     }
 
-    /// Takes 64 hexadecimal digits as they are and stretches any other text.
+    /// The key of a text: 64 hexadecimal digits as they are, any other text stretched by PBKDF2.
     pub(crate) fn new(text: &str, cell: &NodeName) -> Self {
         let mut secret = [0; 32];
         if hex::decode_to_slice(text, &mut secret).is_err() && !text.is_empty() {

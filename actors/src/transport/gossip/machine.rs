@@ -2,8 +2,8 @@
 //!
 //! # Call order
 //!
-//! [`Machine::new`], then [`Machine::receive`] for every datagram, [`Machine::tick`] at [`Machine::next_deadline`], and
-//! the commands at any time. After each, [`Machine::poll`] until nothing is left. A caller that was stalled hands in
+//! [`GossipMachine::new`], then [`GossipMachine::receive`] for every datagram, [`GossipMachine::tick`] at [`GossipMachine::next_deadline`], and
+//! the commands at any time. After each, [`GossipMachine::poll`] until nothing is left. A caller that was stalled hands in
 //! all datagrams that wait before it ticks; the time of the stall does not count.
 
 use std::collections::{HashMap, VecDeque};
@@ -13,8 +13,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::leadership::election::AwakeClock;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -23,7 +23,7 @@ use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameKind, Introduction, NameClaim};
 use super::key::{CellKey, SessionId};
 use super::node_id::NodeId;
-use super::sessions::{FrameContent, LocalView, Sessions};
+use super::sessions::{Arrival, FrameContent, Sessions};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
 
@@ -122,8 +122,8 @@ impl GossipMachine {
             return;
         }
         let gossip = &self.gossip;
-        let view = LocalView { own: gossip.own(), known: &|name| gossip.known(name) };
-        let taken = match self.sessions.open(datagram, from, at, &view) {
+        let arrival = Arrival { from, now: at, own: gossip.own(), known: &|name| gossip.known(name) };
+        let taken = match self.sessions.open(datagram, &arrival) {
             Ok(opened) => self.take(opened, from, at, now),
             Err(reason) => Err(reason),
         };

@@ -2,7 +2,7 @@
 
 use std::net::{IpAddr, SocketAddr};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use serde::{Deserialize, Serialize};
 
@@ -18,7 +18,7 @@ pub(crate) struct NodeId {
     /// Counts up from when the membership started, whenever the node returns from the dead or its addresses change.
     pub(crate) life: u64,
     pub(crate) role: Role,
-    /// Where it gossips; unspecified while the node does not know.
+    /// Address of its gossip socket; unspecified while the node does not know it.
     pub(crate) gossip: SocketAddr,
     pub(crate) broker: Option<SocketAddr>,
 }

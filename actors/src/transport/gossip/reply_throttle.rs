@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
 use super::key::SessionId;
 use crate::platform::throttle::{KeyedThrottle, TokenBucket};

@@ -10,8 +10,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -62,9 +62,13 @@ pub(crate) struct KnownMember {
     pub(crate) alive: bool,
 }
 
-/// This node's identity and its gossip's knowledge, as input of a handshake.
-pub(crate) struct LocalView<'a> {
+/// Circumstances of a datagram's arrival.
+pub(crate) struct Arrival<'a> {
+    pub(crate) from: SocketAddr,
+    pub(crate) now: Timestamp,
+    /// This node's identity.
     pub(crate) own: &'a NodeId,
+    /// State of a name in this node's gossip.
     pub(crate) known: &'a dyn Fn(&NodeName) -> Option<KnownMember>,
 }
 
@@ -127,18 +131,18 @@ impl Sessions {
     /// A frame for the node of a name, and its address.
     pub(crate) fn seal(&mut self, to: &NodeName, kind: FrameKind, body: &[u8]) -> Option<(SocketAddr, Vec<u8>)> {
         let head = self.head(kind);
-        let peer = self.peers.get(self.session_by_name.get(to)?)?;
+        let peer = self.peer(to)?;
         Some((peer.address, head.write(self.key.tag(), body, &peer.to)))
     }
 
     /// Address of the node of a name.
     pub(crate) fn address(&self, name: &NodeName) -> Option<SocketAddr> {
-        Some(self.peers.get(self.session_by_name.get(name)?)?.address)
+        Some(self.peer(name)?.address)
     }
 
     /// Address of the node of a name, if it was heard lately.
     pub(crate) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
-        let peer = self.peers.get(self.session_by_name.get(name)?)?;
+        let peer = self.peer(name)?;
         (now.since(peer.heard) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
     }
 
@@ -157,39 +161,33 @@ impl Sessions {
     }
 
     /// Processes a datagram. An error means junk, which changed nothing.
-    pub(crate) fn open(
-        &mut self,
-        frame: &[u8],
-        from: SocketAddr,
-        now: Timestamp,
-        view: &LocalView<'_>,
-    ) -> Result<FrameContent, FrameEvent> {
+    pub(crate) fn open(&mut self, frame: &[u8], arrival: &Arrival<'_>) -> Result<FrameContent, FrameEvent> {
         let head = FrameHeader::read(frame, self.key.tag())?;
         if head.sender == self.own {
             return if head.kind == FrameKind::Hello { Ok(FrameContent::Nothing) } else { Err(FrameEvent::Replayed) };
         }
         let Some(body) = self.unseal(&head, frame) else {
-            self.note_other_key(head.kind, from);
+            self.note_other_key(head.kind, arrival.from);
             return Err(FrameEvent::BadSeal);
         };
         if head.kind == FrameKind::Hello {
-            return self.handle_hello(&head, &decode(&body)?, from, now, view);
+            return self.handle_hello(&head, &decode(&body)?, arrival);
         }
         let known = self.peers.get_mut(&head.sender).map(|peer| {
             let new = peer.window.take(head.counter);
-            peer.heard = if new { now } else { peer.heard };
+            peer.heard = if new { arrival.now } else { peer.heard };
             new
         });
         if known == Some(false) {
             return Err(FrameEvent::Replayed);
         }
         match head.kind {
-            FrameKind::Handshake => self.handle_handshake(&head, decode(&body)?, from, now, view),
+            FrameKind::Handshake => self.handle_handshake(&head, decode(&body)?, arrival),
             _ if known.is_none() => {
                 self.counters.count(FrameEvent::Unestablished);
                 Ok(FrameContent::Stranger)
             }
-            kind => self.handle_body(&head.sender, kind, body, now),
+            kind => self.handle_body(&head.sender, kind, body, arrival.now),
         }
     }
 
@@ -198,6 +196,10 @@ impl Sessions {
         if kind == FrameKind::Hello && !std::mem::replace(&mut self.other_key_seen, true) {
             tracing::warn!(%from, "a node of this cell has another key, or none; its frames are ignored");
         }
+    }
+
+    fn peer(&self, name: &NodeName) -> Option<&PeerSession> {
+        self.peers.get(self.session_by_name.get(name)?)
     }
 
     fn unseal(&self, head: &FrameHeader, frame: &[u8]) -> Option<Vec<u8>> {
@@ -216,21 +218,18 @@ impl Sessions {
         &mut self,
         head: &FrameHeader,
         hello: &Hello,
-        from: SocketAddr,
-        now: Timestamp,
-        view: &LocalView<'_>,
+        arrival: &Arrival<'_>,
     ) -> Result<FrameContent, FrameEvent> {
-        let speaks = self.session_by_name.get(&hello.name) == Some(&head.sender);
-        let there = self.peers.get(&head.sender).is_some_and(|peer| peer.address == from);
-        if speaks && there && (view.known)(&hello.name).is_some_and(|known| known.alive) {
+        let is_accepted = self.session_by_name.get(&hello.name) == Some(&head.sender);
+        let is_there = self.peers.get(&head.sender).is_some_and(|peer| peer.address == arrival.from);
+        if is_accepted && is_there && (arrival.known)(&hello.name).is_some_and(|known| known.alive) {
             return Ok(FrameContent::Nothing);
         }
-        if !self.challenges.allow(&head.sender, now) {
-            self.throttled();
+        if !self.challenges.allow(&head.sender, arrival.now) && !self.throttled() {
             return Ok(FrameContent::Nothing);
         }
-        let cookie = self.cookies.issue(&head.sender, from, slot(now));
-        let challenge = Handshake::Challenge { cookie, name: view.own.name.clone() };
+        let cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
+        let challenge = Handshake::Challenge { cookie, name: arrival.own.name.clone() };
         Ok(FrameContent::Answer(self.handshake(&head.sender, &challenge)))
     }
 
@@ -238,23 +237,20 @@ impl Sessions {
         &mut self,
         head: &FrameHeader,
         message: Handshake,
-        from: SocketAddr,
-        now: Timestamp,
-        view: &LocalView<'_>,
+        arrival: &Arrival<'_>,
     ) -> Result<FrameContent, FrameEvent> {
+        let Arrival { from, now, own, known } = *arrival;
         let (echo, cookie, introduction) = match message {
             Handshake::Challenge { cookie: echo, name } => {
-                if !self.proofs.allow(&head.sender, now) {
-                    self.throttled();
+                if !self.proofs.allow(&head.sender, now) && !self.throttled() {
                     return Ok(FrameContent::Nothing);
                 }
                 let cookie = self.cookies.issue(&head.sender, from, slot(now));
-                let over = (view.known)(&name).filter(|known| !known.alive);
+                let over = known(&name).filter(|known| !known.alive);
                 let claim = over.map_or(NameClaim::Free, |known| NameClaim::After(known.life));
-                let introduction = Introduction { id: view.own.clone(), seen_at: from, claim };
-                return Ok(FrameContent::Answer(
-                    self.handshake(&head.sender, &Handshake::Proof { echo, cookie, introduction }),
-                ));
+                let introduction = Introduction { id: own.clone(), seen_at: from, claim };
+                let proof = Handshake::Proof { echo, cookie, introduction };
+                return Ok(FrameContent::Answer(self.handshake(&head.sender, &proof)));
             }
             Handshake::Proof { echo, cookie, introduction } => (echo, Some(cookie), introduction),
             Handshake::Accept { echo, introduction } => (echo, None, introduction),
@@ -262,12 +258,12 @@ impl Sessions {
         if !self.is_fresh(&head.sender, from, &echo, now) {
             return Err(FrameEvent::Replayed);
         }
-        if introduction.id.name == view.own.name {
+        if introduction.id.name == own.name {
             return Ok(FrameContent::NameTaken(introduction.id.name));
         }
-        let claim = self.admit(head, &introduction.id, from, now, (view.known)(&introduction.id.name))?;
+        let claim = self.admit(head, &introduction.id, from, now, known(&introduction.id.name))?;
         let answer = cookie.map(|echo| {
-            let introduction = Introduction { id: view.own.clone(), seen_at: from, claim };
+            let introduction = Introduction { id: own.clone(), seen_at: from, claim };
             self.handshake(&head.sender, &Handshake::Accept { echo, introduction })
         });
         Ok(FrameContent::Met { introduction, answer, speaks: claim != NameClaim::Taken })
@@ -296,14 +292,17 @@ impl Sessions {
         };
         if !self.peers.contains_key(&head.sender) {
             self.make_room(now)?;
-            let (to, from) = (self.key.seal(&self.own, &head.sender), self.key.seal(&head.sender, &self.own));
-            let window = ReplayWindow::after(head.counter);
-            let name = id.name.clone();
-            let run = id.run;
-            self.peers.insert(
-                head.sender,
-                PeerSession { name, run, address, to, from, window, heard: now, superseded: None },
-            );
+            let peer = PeerSession {
+                name: id.name.clone(),
+                run: id.run,
+                address,
+                to: self.key.seal(&self.own, &head.sender),
+                from: self.key.seal(&head.sender, &self.own),
+                window: ReplayWindow::after(head.counter),
+                heard: now,
+                superseded: None,
+            };
+            self.peers.insert(head.sender, peer);
         }
         let taken = claim == NameClaim::Taken;
         if let Some(peer) = self.peers.get_mut(&head.sender) {
@@ -328,10 +327,9 @@ impl Sessions {
         if self.peers.len() < self.max_peers {
             return Ok(());
         }
-        let silent = self.peers.iter().min_by_key(|(_, peer)| peer.heard).map(|(session, peer)| (*session, peer.heard));
-        let Some((session, _)) = silent.filter(|(_, heard)| now.since(*heard) >= SESSION_IDLE_TIMEOUT) else {
-            return Err(FrameEvent::TooManyPeers);
-        };
+        let longest_idle = self.peers.iter().min_by_key(|(_, peer)| peer.heard);
+        let may_go = longest_idle.filter(|(_, peer)| now.since(peer.heard) >= SESSION_IDLE_TIMEOUT);
+        let session = may_go.map(|(session, _)| *session).ok_or(FrameEvent::TooManyPeers)?;
         if let Some(peer) = self.peers.remove(&session)
             && self.session_by_name.get(&peer.name) == Some(&session)
         {
@@ -365,6 +363,7 @@ impl Sessions {
         head.write(self.key.tag(), &encode(message), &self.key.seal(&self.own, to))
     }
 
+    /// Counts a frame that is not sent; always false.
     fn throttled(&self) -> bool {
         self.counters.count(FrameEvent::Throttled);
         false

@@ -31,7 +31,7 @@ pub struct MqttConfig {
     /// Whether payloads are signed with the cell's key and unsigned ones rejected; default false. For an external broker
     /// that others use too. Must be the same on every node. Other subscribers have to skip the signature.
     pub sign: bool,
-    /// How payloads are written: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a
+    /// Encoding of sent payloads: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a
     /// quarter of the bytes, rounded to millimetres and 0.05 %).
     pub encoding: Encoding,
     /// Keep-alive in seconds: silence after which the broker is pinged; default 5. Trade-off: shorter notices a dead

@@ -56,84 +56,78 @@ pub(crate) enum Packet {
 /// Reason for the end of a connection.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ConnectionError {
+    /// Nothing listens at the address: the broker's process is gone.
     #[error("{0}")]
-    V311(Box<rumqttc::ConnectionError>),
+    NotListening(String),
+    /// The broker rejected the login, or one side rejected the other's certificate.
     #[error("{0}")]
-    V5(Box<v5::ConnectionError>),
+    Rejected(String),
+    /// A packet larger than [`MqttConfig::max_packet_bytes`] arrived.
+    #[error("{0}")]
+    Oversized(String),
     #[error("nothing within {0:?}")]
     Timeout(Duration),
     #[error("the broker's certificate is no longer valid: {0}")]
     BrokerInvalidated(rustls::Error),
     #[error(transparent)]
     Credentials(#[from] Box<CredentialsError>),
+    #[error("{0}")]
+    Other(String),
 }
 
 impl ConnectionError {
-    /// Whether nothing listens at the address: the broker's process is gone.
-    pub(crate) fn is_refused(&self) -> bool {
-        let refused = |error: &io::Error| error.kind() == io::ErrorKind::ConnectionRefused;
+    /// The reason why the broker rejected this node, or this node the broker.
+    pub(crate) fn rejection(&self) -> Option<String> {
         match self {
-            Self::V311(error) => matches!(&**error, rumqttc::ConnectionError::Io(io) if refused(io)),
-            Self::V5(error) => matches!(&**error, v5::ConnectionError::Io(io) if refused(io)),
-            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => false,
+            Self::Rejected(reason) => Some(reason.clone()),
+            Self::BrokerInvalidated(error) => Some(error.to_string()),
+            _ => None,
         }
     }
 
-    /// The broker's reason for refusing the login, or this node's reason for not trusting the broker.
-    pub(crate) fn refusal(&self) -> Option<String> {
-        if let Some(reason) = self.certificate_error() {
-            return Some(reason);
-        }
-        match self {
-            Self::V311(error) => match &**error {
-                rumqttc::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
-                _ => None,
-            },
-            Self::V5(error) => match &**error {
-                v5::ConnectionError::ConnectionRefused(code) => Some(format!("{code:?}")),
-                _ => None,
-            },
-            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => None,
-        }
-    }
-
-    /// The error in one side's certificate.
-    fn certificate_error(&self) -> Option<String> {
-        let mut next: Option<&(dyn Error + 'static)> = match self {
-            Self::V311(error) => Some(&**error),
-            Self::V5(error) => Some(&**error),
-            Self::BrokerInvalidated(error) => return Some(error.to_string()),
-            Self::Timeout(_) | Self::Credentials(_) => None,
+    /// An error that is the same in both versions of the protocol.
+    fn of(error: &(dyn Error + 'static)) -> Self {
+        let causes = || std::iter::successors(Some(error), |&error| error.source());
+        let io_errors = || causes().filter_map(|error| error.downcast_ref::<io::Error>());
+        let rejected_certificate = |error: &io::Error| {
+            let error = error.get_ref()?.downcast_ref()?;
+            matches!(error, rustls::Error::InvalidCertificate(_) | rustls::Error::AlertReceived(_))
+                .then(|| error.to_string())
         };
-        while let Some(error) = next {
-            let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
-            if let Some(rustls::Error::InvalidCertificate(_) | rustls::Error::AlertReceived(_)) =
-                inner.and_then(|inner| inner.downcast_ref())
-            {
-                return inner.map(ToString::to_string);
-            }
-            next = error.source();
+        if let Some(reason) = io_errors().find_map(rejected_certificate) {
+            Self::Rejected(reason)
+        } else if io_errors().any(|error| error.kind() == io::ErrorKind::ConnectionRefused) {
+            Self::NotListening(error.to_string())
+        } else {
+            Self::Other(error.to_string())
         }
-        None
     }
+}
 
-    /// Whether a packet larger than [`MqttConfig::max_packet_bytes`] arrived.
-    pub(crate) fn is_oversized(&self) -> bool {
-        match self {
-            Self::V311(error) => matches!(
-                **error,
-                rumqttc::ConnectionError::MqttState(rumqttc::StateError::Deserialization(
-                    rumqttc::Error::PayloadSizeLimitExceeded(_)
-                ))
-            ),
-            Self::V5(error) => matches!(
-                **error,
-                v5::ConnectionError::MqttState(
-                    v5::StateError::Deserialization(v5::mqttbytes::Error::PayloadSizeLimitExceeded { .. })
-                        | v5::StateError::IncomingPacketTooLarge { .. }
-                )
-            ),
-            Self::Timeout(_) | Self::BrokerInvalidated(_) | Self::Credentials(_) => false,
+impl From<rumqttc::ConnectionError> for ConnectionError {
+    fn from(error: rumqttc::ConnectionError) -> Self {
+        use rumqttc::{ConnectionError, Error, StateError};
+        match &error {
+            ConnectionError::ConnectionRefused(code) => Self::Rejected(format!("{code:?}")),
+            ConnectionError::MqttState(StateError::Deserialization(Error::PayloadSizeLimitExceeded(_))) => {
+                Self::Oversized(error.to_string())
+            }
+            _ => Self::of(&error),
+        }
+    }
+}
+
+impl From<v5::ConnectionError> for ConnectionError {
+    fn from(error: v5::ConnectionError) -> Self {
+        use rumqttc::v5::mqttbytes::Error::PayloadSizeLimitExceeded;
+        use rumqttc::v5::{ConnectionError, StateError};
+        match &error {
+            ConnectionError::ConnectionRefused(code) => Self::Rejected(format!("{code:?}")),
+            ConnectionError::MqttState(
+                StateError::Deserialization(PayloadSizeLimitExceeded { .. })
+                | StateError::IncomingPacketTooLarge { .. },
+            ) => Self::Oversized(error.to_string()),
+            _ => Self::of(&error),
         }
     }
 }
@@ -267,7 +261,7 @@ impl Connection {
 
     async fn poll(&mut self) -> Result<Packet, ConnectionError> {
         Ok(match self {
-            Self::V311(events) => match events.poll().await.map_err(|e| ConnectionError::V311(Box::new(e)))? {
+            Self::V311(events) => match events.poll().await? {
                 rumqttc::Event::Incoming(rumqttc::Packet::ConnAck(_)) => Packet::Accepted,
                 rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) => {
                     Packet::Message { topic: publish.topic.into(), payload: publish.payload }
@@ -281,7 +275,7 @@ impl Connection {
                 rumqttc::Event::Outgoing(_) => Packet::Sent,
                 rumqttc::Event::Incoming(_) => Packet::Other,
             },
-            Self::V5(events) => match events.poll().await.map_err(|e| ConnectionError::V5(Box::new(e)))? {
+            Self::V5(events) => match events.poll().await? {
                 v5::Event::Incoming(v5::Incoming::ConnAck(_)) => Packet::Accepted,
                 v5::Event::Incoming(v5::Incoming::Publish(publish)) => {
                     Packet::Message { topic: publish.topic, payload: publish.payload }

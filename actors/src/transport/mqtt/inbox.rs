@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::links::LinkState;
-use ecod::names::NodeName;
-use ecod::time::Timestamp;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{
     GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind, Reputations, Topic,
     Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
@@ -60,18 +60,23 @@ pub enum Incoming {
 
 /// A message on its way to a receiver. It occupies a place in the inbox until it is dropped: keep it until it is processed.
 #[derive(Debug)]
-pub struct Delivery {
+pub struct Delivery<T = Incoming> {
     /// The message.
-    pub message: Incoming,
+    pub message: T,
     /// Time when its packet was read from the socket, or when it was delivered in-process.
     pub received_at: Timestamp,
     _place: Option<OwnedSemaphorePermit>,
 }
 
-impl Delivery {
+impl<T> Delivery<T> {
     /// A message of this node itself. It occupies no place: the node's own pace bounds it.
-    pub(crate) fn local(message: Incoming, at: Timestamp) -> Self {
+    pub(crate) fn local(message: T, at: Timestamp) -> Self {
         Self { message, received_at: at, _place: None }
+    }
+
+    /// The same delivery of a part of its message: time and place stay.
+    pub(crate) fn map<U>(self, part: impl FnOnce(T) -> U) -> Delivery<U> {
+        Delivery { message: part(self.message), received_at: self.received_at, _place: self._place }
     }
 }
 

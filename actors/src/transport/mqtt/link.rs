@@ -7,7 +7,7 @@ use bytes::Bytes;
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::echo::EchoMonitor;
 use ecod::leadership::links::LinkState;
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use ecod::wire::RejectReason;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -81,7 +81,7 @@ impl Link {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
         let (hearing, at) = (Arc::<Hearing>::default(), broker.clone());
         let task =
-            Task { id, broker: at, setup, report, hearing, reported_refusal: None, has_reported_oversized: false };
+            LinkTask { id, broker: at, setup, report, hearing, reported_refusal: None, has_reported_oversized: false };
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
         let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
@@ -104,8 +104,8 @@ impl Link {
 
     /// Sends the queued messages and DISCONNECT, so that there is no last will, within `patience`.
     pub(crate) async fn leave(mut self, patience: Duration) {
-        let said = self.client.as_ref().is_some_and(Client::disconnect);
-        if said
+        let is_sent = self.client.as_ref().is_some_and(Client::disconnect);
+        if is_sent
             && let Some(task) = self.task.take()
             && tokio::time::timeout(patience, task).await.is_err()
         {
@@ -128,7 +128,7 @@ const FIRST_RETRIES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), 
 /// be tried without pause.
 const MIN_SESSION: Duration = Duration::from_millis(200);
 
-struct Task {
+struct LinkTask {
     id: LinkId,
     broker: BrokerAddress,
     setup: Arc<LinkSetup>,
@@ -139,7 +139,7 @@ struct Task {
     has_reported_oversized: bool,
 }
 
-impl Task {
+impl LinkTask {
     async fn run(mut self, mut backoff: Backoff) {
         // A session that outlived this was in use. One that ends sooner, such as by an oversized retained packet, must
         // not be tried again at full speed.
@@ -151,12 +151,15 @@ impl Task {
                 Ok(()) => return,
                 Err(error) => error,
             };
-            let state = if error.is_refused() { LinkState::Refused } else { LinkState::Down };
+            let state = match error {
+                ConnectionError::NotListening(_) => LinkState::Refused,
+                _ => LinkState::Down,
+            };
             tracing::debug!(broker = %self.broker, %error, "link lost");
-            if let Some(reason) = error.refusal() {
+            if let Some(reason) = error.rejection() {
                 self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }
-            if error.is_oversized() {
+            if matches!(error, ConnectionError::Oversized(_)) {
                 self.setup.counters.reject(RejectReason::TooLarge);
                 if !std::mem::replace(&mut self.has_reported_oversized, true) {
                     let limit = self.setup.config.max_packet_bytes();

@@ -26,7 +26,7 @@ pub async fn probe(
         match connection.next(patience).await {
             Ok(Packet::Accepted) => break,
             Ok(_) => {}
-            Err(error) => return Err(error.refusal().unwrap_or_else(|| error.to_string())),
+            Err(error) => return Err(error.rejection().unwrap_or_else(|| error.to_string())),
         }
     }
     if client.disconnect() {

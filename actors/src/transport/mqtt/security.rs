@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use ecod::leadership::BrokerAddress;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ring::hmac;
 
 use super::config::MqttConfig;
@@ -135,7 +135,7 @@ fn signed(topic: &[u8], payload: &[u8]) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
 
     use super::*;
     use crate::transport::gossip::MembershipConfig;

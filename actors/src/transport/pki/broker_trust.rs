@@ -143,7 +143,7 @@ impl ServerCertVerifier for RecordingVerifier {
 
 #[cfg(test)]
 mod tests {
-    use ecod::names::NodeName;
+    use ecod::model::names::NodeName;
     use ecod::wire::Role;
     use rustls::pki_types::pem::PemObject;
 

@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 use anyhow::Context;
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, ObjectReport, PerceivedObject, encode};
 use ecod_actors::platform::clock;
 use rand::{Rng, RngExt, SeedableRng};

@@ -3,7 +3,7 @@
 use std::fs;
 
 use anyhow::Context;
-use ecod::names::Label;
+use ecod::model::names::Label;
 use ecod_actors::cli::{Failure, print};
 use tracing::subscriber::NoSubscriber;
 

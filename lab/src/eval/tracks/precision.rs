@@ -12,7 +12,7 @@
 
 use std::collections::BTreeMap;
 
-use ecod::names::Label;
+use ecod::model::names::Label;
 
 use super::matching::{Pair, near_pairs};
 use super::{AP_DISTANCES_M, Frame, MATCH_DISTANCE_M};

@@ -1,5 +1,5 @@
-use ecod::geometry::Covariance;
-use ecod::names::NodeName;
+use ecod::model::geometry::Covariance;
+use ecod::model::names::NodeName;
 use ecod::wire::{FusedObject, SCHEMA_VERSION};
 
 use super::matching::Pair;

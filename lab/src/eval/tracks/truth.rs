@@ -1,7 +1,7 @@
 //! Where everything really was, frame by frame.
 
-use ecod::names::{Label, MAX_NAME_BYTES};
-use ecod::time::Timestamp;
+use ecod::model::names::{Label, MAX_NAME_BYTES};
+use ecod::model::time::Timestamp;
 use hashbrown::{HashMap, HashSet};
 use nalgebra::Point2;
 use serde::Deserialize;

@@ -1,4 +1,4 @@
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 
 use super::*;
 

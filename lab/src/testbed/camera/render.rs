@@ -3,7 +3,7 @@
 //! Cards stand upright and the axis of the camera is level, so that a column of samples meets each card at one depth:
 //! cards are sorted once per column and looked up per row.
 
-use ecod::geometry::Pose;
+use ecod::model::geometry::Pose;
 use nalgebra::{Point2, Vector2};
 use opencv::core::{CV_8UC3, Mat, Scalar, Vec3b};
 use opencv::prelude::*;

@@ -7,9 +7,9 @@
 
 use std::ops::RangeInclusive;
 
-use ecod::camera::Intrinsics;
-use ecod::detection::{BoundingBox, Detection};
-use ecod::geometry::Pose;
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::geometry::Pose;
+use ecod::perception::camera::Intrinsics;
 use nalgebra::{Point2, Vector2};
 use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{RngExt, SeedableRng};

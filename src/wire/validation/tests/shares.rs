@@ -1,6 +1,6 @@
 //! Shares of the ledger: the largest one fits, and each flaw has its reason.
 
-use crate::names::NodeName;
+use crate::model::names::NodeName;
 use crate::wire::{
     Encoding, LedgerEntry, LedgerShare, Limits, MAX_INTEGER, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION,
     decode_share, encode,

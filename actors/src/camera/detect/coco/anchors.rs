@@ -1,10 +1,10 @@
-//! The boxes that the network corrects, as in TensorFlow's `create_ssd_anchors`.
+//! Anchor boxes of the network, as in TensorFlow's `create_ssd_anchors`.
 
-use ecod::detection::BoundingBox;
+use ecod::model::detection::BoundingBox;
 
 /// Cells a side of each feature map.
 const MAPS: [u16; 6] = [19, 10, 5, 3, 2, 1];
-/// Size of the anchors of each feature map as a share of the image, and one more for the last geometric mean.
+/// Anchor size per feature map as a share of the image, and one more for the last geometric mean.
 const SCALES: [f64; 7] = [0.2, 0.35, 0.5, 0.65, 0.8, 0.95, 1.0];
 
 /// A box in shares of the image's sides.
@@ -17,7 +17,7 @@ pub(super) struct Anchor {
 }
 
 impl Anchor {
-    /// The box that the network means by its four numbers ty, tx, th, tw.
+    /// The box for the network's four outputs ty, tx, th, tw.
     pub(super) fn decode(&self, offsets: &[f32]) -> BoundingBox {
         let [ty, tx, th, tw] = std::array::from_fn(|i| f64::from(offsets[i]));
         let (center_x, center_y) = (self.center_x + tx / 10.0 * self.width, self.center_y + ty / 10.0 * self.height);

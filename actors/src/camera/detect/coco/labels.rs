@@ -1,4 +1,4 @@
-//! The classes of COCO in its numbering of 91 ids, of which 80 are in use.
+//! COCO classes by id: 91 ids, of which 80 are in use.
 
 /// Scores per anchor, with class 0 for background.
 pub(super) const CLASSES: usize = 91;

@@ -1,4 +1,4 @@
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use opencv::imgcodecs;
 
 use super::*;
@@ -82,7 +82,7 @@ fn an_unusable_model_is_named() {
         std::fs::write(file.path(), junk).unwrap();
         let config = CocoConfig { model: Some(file.path().to_owned()), ..CocoConfig::default() };
         let error = CocoDetector::new(config).err().expect("junk").to_string();
-        assert!(error.contains("no ssdlite network") && error.contains(file.path().to_str().unwrap()), "{error}");
+        assert!(error.contains("not an ssdlite network") && error.contains(file.path().to_str().unwrap()), "{error}");
     }
 }
 

@@ -1,5 +1,5 @@
-use ecod::camera::Intrinsics;
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
+use ecod::perception::camera::Intrinsics;
 use nalgebra::{Point3, Rotation3, Vector3};
 use opencv::core::{BORDER_TRANSPARENT, CV_8U, CV_16SC1, CV_16UC1, Point2f, Rect, add, randn, set_rng_seed};
 use qrcode::{Color, EcLevel, QrCode};

@@ -1,7 +1,7 @@
 use std::collections::VecDeque;
 use std::sync::Mutex;
 
-use ecod::time::Timestamp;
+use ecod::model::time::Timestamp;
 use opencv::core::Mat;
 
 use super::*;

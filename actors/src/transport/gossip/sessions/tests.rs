@@ -26,7 +26,7 @@ impl End {
 
     fn open(&mut self, frame: &[u8], from: SocketAddr, now: Timestamp) -> Result<FrameContent, FrameEvent> {
         let known = self.known;
-        self.sessions.open(frame, from, now, &LocalView { own: &self.id, known: &|_| known })
+        self.sessions.open(frame, &Arrival { from, now, own: &self.id, known: &|_| known })
     }
 }
 

@@ -3,8 +3,7 @@
 use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 
-use crate::names::{Label, MAX_NAME_BYTES};
-use crate::wire::is_label;
+use crate::model::names::{Label, MAX_NAME_BYTES, is_label};
 
 /// An axis-aligned box in pixels; x grows to the right, y downwards.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

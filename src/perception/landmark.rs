@@ -10,7 +10,7 @@ pub(crate) use config::check_synonyms;
 pub use config::{LandmarkConfig, VacancyConfig};
 pub use index::{LandmarkCandidate, LandmarkGate, LandmarkIndex};
 
-use crate::names::{Label, LandmarkId};
+use crate::model::names::{Label, LandmarkId};
 
 /// A known location at which an object may stand.
 #[derive(Debug, Clone, PartialEq)]

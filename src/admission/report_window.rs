@@ -12,10 +12,10 @@ use std::time::Duration;
 
 use schemars::JsonSchema;
 
+use crate::admission::minimum_delay::MinimumDelay;
 use crate::config::config_section;
-use crate::delay::MinimumDelay;
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::{ObjectReport, RejectReason};
 
 config_section! {

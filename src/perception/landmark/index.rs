@@ -7,8 +7,8 @@ use nalgebra::Point2;
 
 use super::Landmark;
 use super::grid::{Grid, GridPoint};
-use crate::geometry::Covariance;
-use crate::names::{Label, LandmarkId};
+use crate::model::geometry::Covariance;
+use crate::model::names::{Label, LandmarkId};
 
 /// Landmarks in configuration order with a spatial index of the positions of objects and vacancy signs.
 #[derive(Debug, Clone)]

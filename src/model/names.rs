@@ -99,6 +99,11 @@ pub type Label = SmolStr;
 /// The id of a known location, such as `slot-0`. Cheap to clone.
 pub type LandmarkId = SmolStr;
 
+/// Whether a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
+pub fn is_label(text: &str) -> bool {
+    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

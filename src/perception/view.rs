@@ -5,12 +5,12 @@
 
 use nalgebra::{Point2, Point3, Vector2};
 
-use crate::camera::Intrinsics;
 use crate::config::config_section;
-use crate::geometry::{Pose, wrap_angle};
-use crate::landmark::Landmark;
-use crate::names::LandmarkId;
-use crate::projection::ObjectSizes;
+use crate::model::geometry::{Pose, wrap_angle};
+use crate::model::names::LandmarkId;
+use crate::perception::camera::Intrinsics;
+use crate::perception::landmark::Landmark;
+use crate::perception::projection::ObjectSizes;
 use crate::wire::PerceivedObject;
 
 config_section! {

@@ -2,7 +2,7 @@ use nalgebra::{Point2, Point3, Vector2};
 use proptest::prelude::*;
 
 use super::*;
-use crate::detection::BoundingBox;
+use crate::model::detection::BoundingBox;
 
 const SIDE_M: f64 = 0.05;
 

@@ -9,7 +9,7 @@ use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::names::NodeName;
+use crate::model::names::NodeName;
 
 /// One leadership: ordered by term, then by the leader's name; no two leaderships share one.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]

@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use crate::geometry::{Pose, wrap_angle};
-use crate::time::Timestamp;
+use crate::model::geometry::{Pose, wrap_angle};
+use crate::model::time::Timestamp;
 
 /// Maximum time between two poses for interpolation between them.
 const MAX_GAP: Duration = Duration::from_secs(1);

@@ -1,8 +1,8 @@
 //! Ranging by the width of the box.
 
 use super::{EDGE_PX, LineOfSight, ObjectSize};
-use crate::camera::Intrinsics;
-use crate::detection::BoundingBox;
+use crate::model::detection::BoundingBox;
+use crate::perception::camera::Intrinsics;
 
 /// Whether the image's left or right edge cuts the box.
 pub(super) fn is_clipped(bounds: &BoundingBox, camera: &Intrinsics) -> bool {

@@ -1,18 +1,18 @@
-//! What is known about vehicles, in memory and on disk.
+//! Evidence and reputations of vehicles, in memory and on disk.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use ecod::names::NodeName;
+use ecod::model::names::NodeName;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
 use ecod::wire::{LedgerEntry, LedgerMark, Reputation, SCHEMA_VERSION};
 use serde::{Deserialize, Serialize};
 
 use super::ReputationKeeperArguments;
 
-/// What is known about vehicles; it outlives the runs of the actor that keeps it.
+/// Evidence about vehicles; it outlives the runs of the actor that keeps it.
 #[derive(Debug)]
-pub struct Book {
+pub struct ReputationStore {
     /// The evidence.
     pub ledger: ReputationLedger,
     /// In VOTE's `paper` mode, the reputations themselves.
@@ -21,7 +21,7 @@ pub struct Book {
     restored: bool,
 }
 
-impl Book {
+impl ReputationStore {
     pub(super) fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
         if self.by_evidence { self.ledger.reputations(config) } else { self.standing.clone() }
     }
@@ -33,24 +33,25 @@ impl Book {
     }
 }
 
-/// A [`Book`] that several hold.
+/// A [`ReputationStore`] with several owners.
 #[derive(Debug, Clone)]
-pub struct SharedBook(Arc<Mutex<Book>>);
+pub struct SharedReputations(Arc<Mutex<ReputationStore>>);
 
-impl SharedBook {
-    /// A book in which nothing is written yet; reputations go `by_evidence` unless VOTE runs in `paper` mode.
+impl SharedReputations {
+    /// An empty store; reputations follow `by_evidence` unless VOTE runs in `paper` mode.
     pub fn new(by_evidence: bool) -> Self {
-        let book = Book { ledger: Default::default(), standing: BTreeMap::new(), by_evidence, restored: false };
-        Self(Arc::new(Mutex::new(book)))
+        let store =
+            ReputationStore { ledger: Default::default(), standing: BTreeMap::new(), by_evidence, restored: false };
+        Self(Arc::new(Mutex::new(store)))
     }
 
-    /// The book, for a moment.
-    pub fn open(&self) -> MutexGuard<'_, Book> {
+    /// Locks the store.
+    pub fn open(&self) -> MutexGuard<'_, ReputationStore> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// A book on disk.
+/// The store on disk.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Saved {
@@ -64,14 +65,14 @@ pub(super) struct Saved {
 }
 
 impl Saved {
-    pub(super) fn of(book: &Book, arguments: &ReputationKeeperArguments) -> Self {
+    pub(super) fn of(store: &ReputationStore, arguments: &ReputationKeeperArguments) -> Self {
         Self {
             schema: SCHEMA_VERSION,
             cell: arguments.cell.clone(),
             node: arguments.name.clone(),
-            entries: book.ledger.entries().collect(),
-            marks: book.ledger.marks().collect(),
-            standing: book.standing.clone(),
+            entries: store.ledger.entries().collect(),
+            marks: store.ledger.marks().collect(),
+            standing: store.standing.clone(),
         }
     }
 
@@ -80,10 +81,10 @@ impl Saved {
     }
 }
 
-/// Reads the file into the book, once in a book's life.
+/// Reads the file into the store, once in its life.
 pub(super) fn restore(arguments: &ReputationKeeperArguments) {
-    let mut book = arguments.book.open();
-    if std::mem::replace(&mut book.restored, true) {
+    let mut store = arguments.reputations.open();
+    if std::mem::replace(&mut store.restored, true) {
         return;
     }
     let Some(file) = &arguments.file else {
@@ -92,16 +93,16 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments) {
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
         tracing::info!(path = %file.path().display(), entries = saved.entries.len(), "reputations restored");
-        book.take(saved);
+        store.take(saved);
     }
 }
 
-/// Takes what a file holds into an empty book; only built for the fuzz targets.
+/// Restores an empty store from the bytes of a file; only built for the fuzz targets.
 #[cfg(fuzzing)]
 pub fn read_saved(bytes: &[u8]) {
     if let Ok(saved) = serde_json::from_slice(bytes) {
-        let book = SharedBook::new(true);
-        book.open().take(saved);
-        drop(book.open().reputations(&ReputationConfig::default()));
+        let store = SharedReputations::new(true);
+        store.open().take(saved);
+        drop(store.open().reputations(&ReputationConfig::default()));
     }
 }

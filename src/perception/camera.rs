@@ -6,7 +6,7 @@
 
 use nalgebra::{Point2, Point3};
 
-use crate::geometry::Pose;
+use crate::model::geometry::Pose;
 
 /// Focal lengths and principal point of an image, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]

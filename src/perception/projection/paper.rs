@@ -10,8 +10,8 @@
 //! - tan α takes the far leg of a right triangle, 2 tan(α/2) the base of an isosceles one.
 
 use super::{LineOfSight, ObjectSize, ProjectionError};
-use crate::camera::Intrinsics;
-use crate::detection::Detection;
+use crate::model::detection::Detection;
+use crate::perception::camera::Intrinsics;
 
 pub(super) fn line_of_sight(
     detection: &Detection,

@@ -7,8 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Landmark, Synonym, VacancySign};
 use crate::config::{ConfigError, check_range};
-use crate::names::{Label, LandmarkId, MAX_NAME_BYTES};
-use crate::wire::is_label;
+use crate::model::names::{Label, LandmarkId, MAX_NAME_BYTES, is_label};
 
 /// One known location.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -3,7 +3,7 @@
 use nalgebra::Point3;
 
 use super::{LineOfSight, ProjectionError};
-use crate::detection::Detection;
+use crate::model::detection::Detection;
 
 /// The line of sight to the middle of the target, which is given in the camera frame in metres.
 pub(super) fn line_of_sight(detection: &Detection, target: &Point3<f64>) -> Result<LineOfSight, ProjectionError> {

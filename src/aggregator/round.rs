@@ -17,8 +17,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::config::config_section;
-use crate::names::NodeName;
-use crate::time::Timestamp;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::ReportKind;
 
 config_section! {

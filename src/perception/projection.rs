@@ -17,10 +17,10 @@ use nalgebra::Point3;
 
 pub use config::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 
-use crate::camera::Intrinsics;
-use crate::detection::Detection;
-use crate::geometry::{Covariance, Pose};
-use crate::names::Label;
+use crate::model::detection::Detection;
+use crate::model::geometry::{Covariance, Pose};
+use crate::model::names::Label;
+use crate::perception::camera::Intrinsics;
 use crate::wire::PerceivedObject;
 
 /// The reason why a detection has no position.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::time::Timestamp;
+use crate::model::time::Timestamp;
 
 /// The minimum delay from sending to receipt over the last one to two spans of ten seconds.
 ///

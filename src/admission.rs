@@ -1,0 +1,4 @@
+//! Reports that count: the freshest of each vehicle, their age, and the offset of its clock.
+
+pub mod minimum_delay;
+pub mod report_window;

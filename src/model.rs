@@ -1,0 +1,7 @@
+//! The vocabulary of a cell: names, time, geometry, epochs, detections. Imports no other room but `config`.
+
+pub mod detection;
+pub mod epoch;
+pub mod geometry;
+pub mod names;
+pub mod time;

@@ -1,0 +1,7 @@
+//! From pixels to positions: cameras, projection, fields of view, known locations, poses over time.
+
+pub mod camera;
+pub mod landmark;
+pub mod pose_history;
+pub mod projection;
+pub mod view;
