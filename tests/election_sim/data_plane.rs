@@ -16,6 +16,9 @@ use ecod::wire::{GlobalMap, LedgerShare, SCHEMA_VERSION};
 use crate::node::{Accepted, Arrival, Map, address_of};
 use crate::world::{MS, World};
 
+/// Shares that a full queue or a link that is just made loses, in percent.
+const LOST_SHARES_PERCENT: u64 = 10;
+
 impl World {
     /// Makes the links what the machine wants.
     pub(crate) fn set_links(&mut self, index: usize, wanted: &WantedLinks) {
@@ -122,11 +125,14 @@ impl World {
         }
     }
 
-    /// A node's share goes to all candidates that have a link to one of the brokers that it publishes to.
+    /// Sends shares to all candidates that have a link to one of the brokers that the node publishes to; some are lost.
     pub(crate) fn share(&mut self, index: usize, shares: Vec<LedgerShare>) {
         for share in shares {
             for broker in self.brokers_of(index) {
                 for to in self.clients_of(broker).into_iter().filter(|to| *to != index) {
+                    if self.random.chance(LOST_SHARES_PERCENT) {
+                        continue;
+                    }
                     let after = self.hop() + self.hop();
                     self.push_to(to, after, Arrival::Share { share: Box::new(share.clone()) });
                 }

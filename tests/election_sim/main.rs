@@ -217,11 +217,19 @@ fn no_evidence_is_lost_or_counted_twice() {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);
         let nodes = world.nodes.len();
+        let has_disks = world.random.chance(50);
+        world.nodes.iter_mut().for_each(|node| node.has_disk = has_disks);
         start_all(&mut world);
         for _ in 0..world.random.between(1, 6) {
             plan_fault(&mut world, nodes);
         }
-        world.run_for(10 * SECOND);
+        let leaders_end = world.random.between(6 * SECOND, 10 * SECOND);
+        world.run_for(leaders_end);
+        // What they learnt last only some candidates have heard of.
+        for leader in world.leaders() {
+            world.plan(0, Fault::Kill { node: leader, seen: true });
+        }
+        world.run_for(10 * SECOND - leaders_end + SECOND);
         end_faults(&mut world);
         check(&mut world, seed, |world| {
             world.run_for(MS);

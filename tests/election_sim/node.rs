@@ -142,6 +142,8 @@ pub(crate) struct Node {
     pub(crate) ledger: ReputationLedger,
     /// The ledger on disk.
     pub(crate) saved: ReputationLedger,
+    /// Whether ledgers survive the process; terms do in any case.
+    pub(crate) has_disk: bool,
     /// The leadership as the machine told it.
     pub(crate) leadership: Leadership,
     pub(crate) accepted: Vec<Accepted>,
@@ -184,6 +186,7 @@ impl Node {
             publishers: PublisherFilter::default(),
             ledger: ReputationLedger::default(),
             saved: ReputationLedger::default(),
+            has_disk: true,
             leadership: Leadership::default(),
             accepted: Vec::new(),
             refused: 0,
@@ -221,7 +224,7 @@ impl Node {
         self.closed = (0, now);
         self.publishers = PublisherFilter::default();
         self.resync = LedgerResync::new(self.name.clone(), TICKS_PER_SNAPSHOT);
-        self.ledger.clone_from(&self.saved);
+        self.ledger = if self.has_disk { self.saved.clone() } else { ReputationLedger::default() };
         (self.known, self.members, self.links) = Default::default();
         self.leadership = Leadership::default();
         self.filter = RoundFilter::new(self.persisted);

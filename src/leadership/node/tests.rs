@@ -26,7 +26,7 @@ fn status(role: Role) -> NodeStatus {
 struct Scene {
     machine: LeadershipNode,
     now: Timestamp,
-    rounds_closed: u64,
+    rounds_due: u64,
     members: Vec<Member>,
     effects: Vec<Effect>,
     seq: u64,
@@ -44,7 +44,7 @@ impl Scene {
         };
         let machine = LeadershipNode::new(settings, 0, &Leadership::default(), START);
         let (members, effects) = (Vec::new(), Vec::new());
-        let mut scene = Self { machine, now: START, rounds_closed: 0, members, effects, seq: 0 };
+        let mut scene = Self { machine, now: START, rounds_due: 0, members, effects, seq: 0 };
         if role != Role::Cav {
             scene.take(Input::OwnBroker { address: Some(broker(1)) });
             scene.take(Input::LinkChanged { broker: broker(1).into(), state: LinkState::Up });
@@ -71,7 +71,7 @@ impl Scene {
         for effect in self.machine.handle(input, self.now) {
             let answer = match effect {
                 Effect::Look => {
-                    Input::Looked { rounds_closed: self.rounds_closed, load_percent: 0, members: self.members.clone() }
+                    Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members: self.members.clone() }
                 }
                 Effect::AskParts => Input::PartsAnswered {
                     sample: HealthSample { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true },
@@ -89,7 +89,7 @@ impl Scene {
         let end = self.now + Duration::from_millis(ms);
         while self.machine.next_deadline() <= end {
             self.now = self.now.max(self.machine.next_deadline());
-            self.rounds_closed = self.now.since(START).as_millis() as u64 / 100;
+            self.rounds_due = self.now.since(START).as_millis() as u64 / 100;
             self.take(Input::Wake);
         }
         self.now = end;
