@@ -101,6 +101,7 @@ impl SensorHistory {
 
     /// Records a detection whose confidence is worth `nats`. `rates` are `None` for the detection that spawns a track:
     /// it is no evidence that a known object was found again.
+    #[inline]
     pub(super) fn hit(&mut self, at: Timestamp, position: Vector2<f64>, nats: f64, rates: Option<DetectionRates>) {
         let share = self.look(at);
         if let Some(rates) = rates {
