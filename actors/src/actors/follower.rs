@@ -17,6 +17,7 @@ use std::sync::Arc;
 use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::{AcceptedRound, Refusal, RoundFilter};
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
@@ -28,7 +29,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::{LogItem, LogSender};
-use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::telemetry::spans::Spans;
 
 /// What a follower needs at its start.
@@ -91,16 +92,23 @@ impl Actor for Follower {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let taken = match message {
-            FollowerMessage::TakeMap { delivery } => state.take_map(&delivery.message, delivery.received_at),
-            FollowerMessage::TakeVerdicts { delivery } => state.take_verdicts(&delivery.message, delivery.received_at),
+        let (taken, sender) = match message {
+            FollowerMessage::TakeMap { delivery } => {
+                let map = &delivery.message;
+                (state.take_map(map, delivery.received_at), Some(map.aggregator.clone()))
+            }
+            FollowerMessage::TakeVerdicts { delivery } => {
+                let verdicts = &delivery.message;
+                (state.take_verdicts(verdicts, delivery.received_at), Some(verdicts.aggregator.clone()))
+            }
             FollowerMessage::TakeReputations { delivery } => {
-                state.take_reputations(&delivery.message, delivery.received_at)
+                let reputations = &delivery.message;
+                (state.take_reputations(reputations, delivery.received_at), reputations.aggregator.clone())
             }
         };
         match taken.map_err(Refusal::reject_reason) {
             Ok(()) => {}
-            Err(Some(reason)) => state.counters.reject(reason),
+            Err(Some(reason)) => state.counters.reject(reason, sender.as_ref().map_or(OTHERS, NodeName::as_str)),
             Err(None) => state.counters.count(Event::Repeated),
         }
         Ok(())

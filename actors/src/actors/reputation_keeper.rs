@@ -191,12 +191,12 @@ impl ReputationKeeperState {
             Ok(merged) => merged,
             Err(reason) => {
                 tracing::debug!(node = %share.node, %reason, "evidence not used");
-                return self.arguments.counters.reject(reason);
+                return self.arguments.counters.reject(reason, share.node.as_str());
             }
         };
         if merged.has_unknown_terms {
             tracing::debug!(node = %share.node, term = leadership.term, "evidence of a later term");
-            self.arguments.counters.reject(RejectReason::UnknownTerm);
+            self.arguments.counters.reject(RejectReason::UnknownTerm, share.node.as_str());
         }
         if merged.is_news {
             self.arguments.counters.count(Event::LedgerMerged);

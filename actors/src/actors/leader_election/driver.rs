@@ -70,7 +70,7 @@ impl ElectionDriver {
             MembershipEvent::Received { from, payload, .. } => match ElectionMessage::decode(&payload) {
                 Ok(message) => Input::Receive { from, message },
                 Err(reason) => {
-                    self.counters.reject(reason);
+                    self.counters.reject(reason, from.as_str());
                     return tracing::debug!(%from, %reason, "election message dropped");
                 }
             },
