@@ -234,6 +234,7 @@ impl Cell {
             | Effect::SetLinks { .. }
             | Effect::PublishStatus { .. }
             | Effect::SendSnapshot { .. }
+            | Effect::CountImplausible { .. }
             | Effect::Log { .. } => {}
         }
         None

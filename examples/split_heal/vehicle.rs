@@ -242,6 +242,7 @@ impl Vehicle {
             Effect::PersistTerm { .. }
             | Effect::SetLinks { .. }
             | Effect::PublishStatus { .. }
+            | Effect::CountImplausible { .. }
             | Effect::Log { .. } => {}
         }
         None

@@ -214,6 +214,7 @@ impl LeadershipNode {
                 ElectionEffect::HoldRound => Effect::HoldRound,
                 ElectionEffect::StopPublishing { epoch } => Effect::StopPublishing { epoch },
                 ElectionEffect::SendSnapshot { to } => Effect::SendSnapshot { to },
+                ElectionEffect::CountImplausible { from } => Effect::CountImplausible { from },
                 ElectionEffect::Lead { epoch, first_round, first } => {
                     self.preparation = None;
                     self.tell_leadership();

@@ -66,6 +66,8 @@ pub enum Refusal {
     Superseded,
     /// The election names another leader.
     NotElected,
+    /// Its number is further ahead than rounds can have been published.
+    Implausible,
     /// It was under way for too long.
     Stale,
 }
@@ -77,6 +79,7 @@ impl Refusal {
             Self::Repeated => None,
             Self::Superseded => Some(RejectReason::Superseded),
             Self::NotElected => Some(RejectReason::NotElected),
+            Self::Implausible => Some(RejectReason::OutOfRange),
             Self::Stale => Some(RejectReason::Stale),
         }
     }

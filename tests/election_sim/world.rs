@@ -356,7 +356,7 @@ impl World {
                 let after = if answers { self.random.between(MS, 20 * MS) } else { 1000 * MS };
                 self.push_to(index, after, Arrival::Answered);
             }
-            Effect::PublishStatus { .. } | Effect::Log { .. } => {}
+            Effect::PublishStatus { .. } | Effect::CountImplausible { .. } | Effect::Log { .. } => {}
         }
         None
     }

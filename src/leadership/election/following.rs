@@ -118,7 +118,7 @@ impl Election {
 
     fn follow(&mut self, beat: Beat, now: Timestamp) {
         self.epoch = Some(beat.epoch.clone());
-        self.round = self.round.max(beat.round);
+        self.learn_round(&beat.epoch.leader, beat.round);
         let leader = beat.epoch.leader.clone();
         let beat_interval = Duration::from_millis(beat.every_ms);
         self.state =
@@ -137,8 +137,8 @@ impl Election {
     }
 
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
+        self.learn_round(&beat.epoch.leader, beat.round);
         let State::Following(following) = &mut self.state else { return };
-        self.round = self.round.max(beat.round);
         following.beat_interval = Duration::from_millis(beat.every_ms);
         following.hear(now);
         following.forget_round_interval(now);
@@ -205,7 +205,7 @@ impl Election {
 
     pub(super) fn take_resign(&mut self, epoch: &Epoch, last_round: u64, now: Timestamp) {
         if self.epoch.as_ref() == Some(epoch) {
-            self.round = self.round.max(last_round);
+            self.learn_round(&epoch.leader, last_round);
         }
         let followed = matches!(&self.state, State::Following(following) if following.epoch == *epoch);
         self.close(epoch.clone());

@@ -184,6 +184,11 @@ pub enum Effect {
     Look,
     /// Ask broker, gateway and fuser, and hand in [`Input::PartsAnswered`] when they have answered.
     AskParts,
+    /// Count a message of this node that states a term or round beyond what a cell can have reached.
+    CountImplausible {
+        /// The sender.
+        from: NodeName,
+    },
     /// Write to the log.
     Log {
         /// The event.

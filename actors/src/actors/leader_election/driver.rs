@@ -8,7 +8,7 @@ use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::model::time::Timestamp;
-use ecod::wire::Encoding;
+use ecod::wire::{Encoding, RejectReason};
 use ractor::ActorRef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -143,6 +143,7 @@ impl ElectionDriver {
                 });
             }
             Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
+            Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),
             Effect::Log { notice } => log(notice),
         }
         None
