@@ -226,7 +226,7 @@ impl Cell {
                 return Some(Input::Looked { rounds_due, load_percent: 0, members });
             }
             Effect::AskParts => {
-                let links = [(broker(index).into(), LinkState::Up)].into();
+                let links = (0..nodes).map(|index| (broker(index).into(), LinkState::Up)).collect();
                 let sample = HealthSample { broker_serves: true, links: Some(links), fuser_runs: true };
                 return Some(Input::PartsAnswered { sample });
             }

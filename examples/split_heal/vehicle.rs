@@ -234,7 +234,9 @@ impl Vehicle {
                 return Some(Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members });
             }
             Effect::AskParts => {
-                let links = [(broker(self.index).into(), LinkState::Up)].into();
+                let brokers = self.members.values().filter_map(|member| member.broker.clone());
+                let brokers = brokers.chain([broker(self.index).into()]);
+                let links = brokers.map(|broker| (broker, LinkState::Up)).collect();
                 let sample = HealthSample { broker_serves: true, links: Some(links), fuser_runs: true };
                 return Some(Input::PartsAnswered { sample });
             }

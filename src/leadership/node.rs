@@ -27,7 +27,7 @@ use uuid::Uuid;
 pub use interface::{Effect, Input, Member, NodeSettings, Notice};
 
 use crate::leadership::address::BrokerAddress;
-use crate::leadership::election::{Election, ElectionEffect, ElectionInput, Health};
+use crate::leadership::election::{Body, Election, ElectionEffect, ElectionInput, Health};
 use crate::leadership::health::HealthMonitor;
 use crate::leadership::links::{Brokers, LinkState, Links};
 use crate::leadership::timers::{DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME};
@@ -150,6 +150,9 @@ impl LeadershipNode {
             Input::Wake => {}
             Input::Receive { from, message } if message.from != from => {
                 self.log(Notice::Misattributed { from, claimed: message.from });
+            }
+            Input::Receive { from, message } if message.body == Body::Ready && !self.is_served_by(&from) => {
+                self.log(Notice::NotServed { challenger: from });
             }
             Input::Receive { message, .. } => self.feed(ElectionInput::Receive { message }, now),
             Input::MemberAlive { member } => self.meet(member, now),
@@ -323,6 +326,13 @@ impl LeadershipNode {
         let health = self.monitor.health(plane, brokers, no_other, self.round_period);
         let is_reached = self.is_reached(no_other);
         self.set_health(Health { broker: health.broker && is_reached, ..health }, now);
+    }
+
+    /// Whether this node is logged in where a node would lead: a lead that is handed to a broker that nobody is admitted
+    /// to silences the cell. The challenger says again that it is ready.
+    fn is_served_by(&self, challenger: &NodeName) -> bool {
+        self.links.plane().external.is_some()
+            || self.members.broker_of(challenger).is_some_and(|broker| self.monitor.is_logged_in(&broker))
     }
 
     /// Whether the members reach the broker that this node would lead with; the first time that they do not is logged.

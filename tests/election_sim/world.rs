@@ -173,6 +173,9 @@ impl World {
             Arrival::Relay { from, map } => self.relay(to, from, &map),
             Arrival::Map { map } => self.accept(to, &map),
             Arrival::Share { share } => self.take_share(to, &share),
+            // A membership tells its news in order.
+            Arrival::Tell { about, about_life, is_there }
+                if self.nodes[to].known.get(&about) != is_there.then_some(&about_life) => {}
             Arrival::Tell { about, about_life, is_there: true } => {
                 self.nodes[to].members.insert(about, about_life);
                 self.handle(to, Input::MemberAlive { member: self.member(about, about_life) });

@@ -228,6 +228,11 @@ pub enum Notice {
         /// The leader that hands over.
         leader: NodeName,
     },
+    /// A node is ready to be handed the lead, and this node is not logged in at its broker.
+    NotServed {
+        /// The node.
+        challenger: NodeName,
+    },
     /// A message in another node's name was dropped.
     Misattributed {
         /// The sender.

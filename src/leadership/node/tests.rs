@@ -209,8 +209,8 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
     }
 }
 
-#[test]
-fn a_round_is_held_before_the_word_that_yields_the_next() {
+/// A leader to which a better candidate says that it is ready; the leader can log in at its broker or cannot.
+fn leading_beside_a_ready_challenger(logs_in: bool) -> Scene {
     let mut scene = Scene::new(Role::Auto, None);
     scene.take(Input::MemberAlive { member: member("edge", 2) });
     scene.members.push(member("edge", 2));
@@ -218,6 +218,9 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
     assert!(scene.machine.leadership.is_leading());
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
     for ms in 0..4500 {
+        if ms == 1000 && logs_in {
+            scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Up });
+        }
         if ms % 50 == 0 {
             scene.hear_in(epoch.clone(), Body::Status { over: None });
             scene.hear_in(epoch.clone(), Body::Ready);
@@ -227,12 +230,28 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
         }
         scene.run_for(1);
     }
-    let yields =
-        |effect: &Effect| matches!(effect, Effect::Send { message, .. } if matches!(message.body, Body::Yield { .. }));
-    let yielded = scene.position_of(yields).expect("a better candidate is handed the lead");
+    scene
+}
+
+fn is_yield(effect: &Effect) -> bool {
+    matches!(effect, Effect::Send { message, .. } if matches!(message.body, Body::Yield { .. }))
+}
+
+#[test]
+fn a_round_is_held_before_the_word_that_yields_the_next() {
+    let scene = leading_beside_a_ready_challenger(true);
+    let yielded = scene.position_of(is_yield).expect("a better candidate is handed the lead");
     assert_eq!(scene.effects[yielded - 1], Effect::HoldRound);
     let snapshot = scene.position_of(|effect| *effect == Effect::SendSnapshot { to: name("edge") });
     assert!(snapshot.is_some_and(|snapshot| snapshot < yielded));
+}
+
+#[test]
+fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
+    let scene = leading_beside_a_ready_challenger(false);
+    assert_eq!(scene.position_of(is_yield), None);
+    assert!(scene.machine.leadership.is_leading());
+    assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
 }
 
 #[test]

@@ -201,6 +201,9 @@ fn log(notice: Notice) {
         Notice::ProcessGone { peer, broker } => tracing::info!(%peer, %broker, "process is gone"),
         Notice::LeaderDisconnected { peer } => tracing::info!(%peer, "connection of the leader broke"),
         Notice::Preparing { leader } => tracing::info!(%leader, "preparing to take over"),
+        Notice::NotServed { challenger } => {
+            tracing::debug!(%challenger, "the lead is not handed over yet: no login at the challenger's broker");
+        }
         Notice::Misattributed { from, claimed } => {
             tracing::debug!(%from, %claimed, "election message in another's name dropped");
         }
