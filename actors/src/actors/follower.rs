@@ -9,9 +9,9 @@
 //! It owns the node's [`RoundFilter`], which decides by the leadership of the moment. So each map is judged where it
 //! arrives, without another hop and without a lock.
 
-use std::fs::File;
-use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
+mod map_log;
+
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use ecod::leadership::Leadership;
@@ -22,6 +22,8 @@ use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
+
+use map_log::MapLog;
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::follower::FollowerMessage;
@@ -63,7 +65,7 @@ pub struct Follower;
 pub struct FollowerState {
     newest: Newest,
     filter: RoundFilter,
-    log: Option<BufWriter<File>>,
+    log: Option<MapLog>,
     recording: LogSender,
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
@@ -82,8 +84,7 @@ impl Actor for Follower {
         _myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let log = arguments.log.as_deref().map(open).transpose()?;
-        Ok(FollowerState::new(arguments, log))
+        Ok(FollowerState::new(arguments))
     }
 
     async fn handle(
@@ -116,10 +117,10 @@ impl Actor for Follower {
 }
 
 impl FollowerState {
-    fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, recording, saved_term, leadership, election, fuser, counters, spans, .. } =
+    fn new(arguments: FollowerArguments) -> Self {
+        let FollowerArguments { newest, log, recording, saved_term, leadership, election, fuser, counters, spans } =
             arguments;
-        let filter = RoundFilter::new(saved_term);
+        let (filter, log) = (RoundFilter::new(saved_term), log.map(MapLog::new));
         Self { newest, filter, log, recording, leadership, election, fuser, counters, spans }
     }
 
@@ -132,7 +133,9 @@ impl FollowerState {
         }
         self.tell_election(accepted);
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
-        self.write(&received);
+        if let Some(log) = &mut self.log {
+            log.append(&received);
+        }
         self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
         Ok(())
@@ -162,18 +165,4 @@ impl FollowerState {
             self.election.send(LeaderElectionMessage::Note { input: Input::RoundAccepted { epoch, round } });
         }
     }
-
-    fn write(&mut self, received: &ReceivedMap) {
-        let Some(log) = &mut self.log else { return };
-        let written = serde_json::to_writer(&mut *log, received).map_err(std::io::Error::from);
-        if let Err(error) = written.and_then(|()| log.write_all(b"\n")).and_then(|()| log.flush()) {
-            tracing::warn!(%error, "map log abandoned");
-            self.log = None;
-        }
-    }
-}
-
-fn open(path: &Path) -> Result<BufWriter<File>, ActorProcessingErr> {
-    let file = File::options().create(true).append(true).open(path);
-    file.map(BufWriter::new).map_err(|error| format!("cannot open map log {}: {error}", path.display()).into())
 }
