@@ -28,6 +28,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::{LogItem, LogSender};
+use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
 
@@ -111,7 +112,7 @@ impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
         let FollowerArguments { newest, recording, saved_term, leadership, election, fuser, counters, spans, .. } =
             arguments;
-        let filter = RoundFilter::new(saved_term);
+        let filter = RoundFilter::new(saved_term, clock::now());
         Self { newest, filter, log, recording, leadership, election, fuser, counters, spans }
     }
 
