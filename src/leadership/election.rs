@@ -407,4 +407,42 @@ mod tests {
         assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), cell);
         assert_eq!(hear(4, cell + 1), cell + 1);
     }
+
+    #[test]
+    fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
+        let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
+        let mut now = Timestamp(1_000_000);
+        let mut election = Election::new(ElectionConfig::default(), euclid.clone(), 0, now);
+        let health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
+        election.handle(ElectionInput::Health { health }, now);
+        let mut seq = 0;
+        let mut hear = |from: &NodeName, epoch: Option<&Epoch>, body, election: &mut Election, now| {
+            seq += 1;
+            let message = ElectionMessage {
+                schema: SCHEMA_VERSION,
+                from: from.clone(),
+                run: 1,
+                seq,
+                candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+                term: epoch.map_or(0, |epoch| epoch.term),
+                epoch: epoch.cloned(),
+                hears_you: true,
+                body,
+            };
+            election.handle(ElectionInput::Receive { message }, now)
+        };
+        while !election.is_leading() {
+            hear(&hopper, None, Body::Status { over: None }, &mut election, now);
+            now = election.next_deadline();
+            election.tick(now);
+        }
+        let own = election.epoch().cloned();
+        let next = Epoch::new(2, gauss.clone());
+        let beat = Body::Beat { every_ms: 50, round: 1, followers: 1, after: own.clone(), successors: Vec::new() };
+        hear(&gauss, Some(&next), beat, &mut election, now);
+        assert_eq!(election.leader(), Some(&gauss));
+        let effects = hear(&hopper, own.as_ref(), Body::Status { over: None }, &mut election, now);
+        let is_answer = |effect: &ElectionEffect| matches!(effect, ElectionEffect::Send { to, message } if *to == hopper && message.epoch.as_ref() == Some(&next));
+        assert!(effects.iter().any(is_answer), "{effects:?}");
+    }
 }

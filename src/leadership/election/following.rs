@@ -193,7 +193,11 @@ impl Election {
         {
             self.renew_later(now);
         }
-        if self.peers.get(from).is_some_and(|peer| peer.told) {
+        let Some(peer) = self.peers.get(from) else { return };
+        // Of two that began to lead at the same time, one ends at once, and may have followers that hear it next in a while.
+        let follows_what_is_over =
+            peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.id && Some(epoch) != self.current_epoch());
+        if peer.told && !follows_what_is_over {
             return;
         }
         if self.is_leading() {
