@@ -224,7 +224,10 @@ impl Node {
         self.closed = (0, now);
         self.publishers = PublisherFilter::default();
         self.resync = LedgerResync::new(self.name.clone(), TICKS_PER_SNAPSHOT);
-        self.ledger = if self.has_disk { self.saved.clone() } else { ReputationLedger::default() };
+        if !self.has_disk {
+            self.saved = ReputationLedger::default();
+        }
+        self.ledger = self.saved.clone();
         (self.known, self.members, self.links) = Default::default();
         self.leadership = Leadership::default();
         self.filter = RoundFilter::new(self.persisted, Timestamp(now).shifted(self.clock));
