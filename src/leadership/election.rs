@@ -408,41 +408,61 @@ mod tests {
         assert_eq!(hear(4, cell + 1), cell + 1);
     }
 
+    /// A message of a node that follows or leads `epoch`, and hears this one.
+    fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> ElectionInput {
+        let message = ElectionMessage {
+            schema: SCHEMA_VERSION,
+            from: from.clone(),
+            run: 1,
+            seq,
+            candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+            term: epoch.map_or(0, |epoch| epoch.term),
+            epoch: epoch.cloned(),
+            hears_you: true,
+            body,
+        };
+        ElectionInput::Receive { message }
+    }
+
+    fn beat(after: Option<&Epoch>) -> Body {
+        Body::Beat { every_ms: 50, round: 1, followers: 1, after: after.cloned(), successors: Vec::new() }
+    }
+
     #[test]
     fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
         let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
         let mut now = Timestamp(1_000_000);
-        let mut election = Election::new(ElectionConfig::default(), euclid.clone(), 0, now);
+        let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
         let health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
         election.handle(ElectionInput::Health { health }, now);
-        let mut seq = 0;
-        let mut hear = |from: &NodeName, epoch: Option<&Epoch>, body, election: &mut Election, now| {
-            seq += 1;
-            let message = ElectionMessage {
-                schema: SCHEMA_VERSION,
-                from: from.clone(),
-                run: 1,
-                seq,
-                candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
-                term: epoch.map_or(0, |epoch| epoch.term),
-                epoch: epoch.cloned(),
-                hears_you: true,
-                body,
-            };
-            election.handle(ElectionInput::Receive { message }, now)
-        };
-        while !election.is_leading() {
-            hear(&hopper, None, Body::Status { over: None }, &mut election, now);
+        let status = || Body::Status { over: None };
+        for seq in 1.. {
+            election.handle(message(&hopper, seq, None, status()), now);
             now = election.next_deadline();
             election.tick(now);
+            if election.is_leading() {
+                break;
+            }
         }
-        let own = election.epoch().cloned();
-        let next = Epoch::new(2, gauss.clone());
-        let beat = Body::Beat { every_ms: 50, round: 1, followers: 1, after: own.clone(), successors: Vec::new() };
-        hear(&gauss, Some(&next), beat, &mut election, now);
+        let (own, next) = (election.epoch().cloned(), Epoch::new(2, gauss.clone()));
+        election.handle(message(&gauss, 1, Some(&next), beat(own.as_ref())), now);
         assert_eq!(election.leader(), Some(&gauss));
-        let effects = hear(&hopper, own.as_ref(), Body::Status { over: None }, &mut election, now);
+        let effects = election.handle(message(&hopper, 1000, own.as_ref(), status()), now);
         let is_answer = |effect: &ElectionEffect| matches!(effect, ElectionEffect::Send { to, message } if *to == hopper && message.epoch.as_ref() == Some(&next));
         assert!(effects.iter().any(is_answer), "{effects:?}");
+    }
+
+    #[test]
+    fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
+        let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
+        let (before, next) = (Epoch::new(1, edge.clone()), Epoch::new(2, gauss.clone()));
+        let now = Timestamp(1_000_000);
+        let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, now);
+        election.handle(message(&edge, 1, Some(&before), beat(None)), now);
+        election.handle(message(&edge, 2, Some(&next), Body::Status { over: None }), now);
+        assert_eq!(election.leader(), Some(&gauss));
+        election.handle(ElectionInput::Round { epoch: next, round: 2 }, now);
+        election.handle(message(&gauss, 1, Some(&before), Body::Status { over: None }), now);
+        assert_eq!(election.leader(), Some(&gauss));
     }
 }

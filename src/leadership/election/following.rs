@@ -141,6 +141,7 @@ impl Election {
         self.round = self.round.max(beat.round);
         following.beat_interval = Duration::from_millis(beat.every_ms);
         following.hear(now);
+        following.has_beaten = true;
         following.forget_round_interval(now);
         if beat.hears_us {
             following.bidirectional_at = now;
@@ -154,9 +155,7 @@ impl Election {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
                 let leads = message.epoch.as_ref() == Some(&following.epoch);
-                // Others' word of the leadership may overtake what the leader sent before.
-                let is_unheard = following.direct_at == Timestamp::default();
-                let is_earlier = is_unheard && message.term < following.epoch.term;
+                let is_earlier = !following.has_beaten && message.term < following.epoch.term;
                 if !leads && !is_earlier && !matches!(message.body, Body::Beat { .. }) {
                     let ended = following.epoch.clone();
                     let follows = message.epoch.clone().filter(|next| {
