@@ -124,7 +124,7 @@ impl Cell {
         let down = Node {
             machine: None,
             leadership: Leadership::default(),
-            filter: RoundFilter::new(0),
+            filter: RoundFilter::new(0, Timestamp(1_000_000_000)),
             clock: Timestamp(1_000_000_000),
             persisted: 0,
             publishing: None,
@@ -152,7 +152,7 @@ impl Cell {
         node.clock = node.clock + Duration::from_millis(1);
         node.leadership = Leadership::default();
         node.machine = Some(LeadershipNode::new(settings(index), node.persisted, &node.leadership, node.clock));
-        node.filter = RoundFilter::new(node.persisted);
+        node.filter = RoundFilter::new(node.persisted, node.clock);
         node.last = None;
         self.handle(index, Input::OwnBroker { address: Some(broker(index)) });
         self.handle(index, Input::LinkChanged { broker: broker(index).into(), state: LinkState::Up });

@@ -81,7 +81,7 @@ impl Vehicle {
         let mut vehicle = Self {
             machine: LeadershipNode::new(settings, 0, &Leadership::default(), now),
             leadership: Leadership::default(),
-            filter: RoundFilter::new(0),
+            filter: RoundFilter::new(0, now),
             resync: LedgerResync::new(name.clone(), SHARES_PER_SNAPSHOT),
             tick_at: now + SHARE_PERIOD,
             aggregator: Aggregator::new_standby(fusion, landmarks, now),

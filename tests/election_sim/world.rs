@@ -14,7 +14,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{Encoding, Role};
 
-use crate::evidence::PUBLISH_PERIOD;
+use crate::evidence::{PUBLISH_PERIOD, Votes};
 use crate::node::{Arrival, Event, Fault, Node, address_of, broker_of};
 use crate::random::Random;
 
@@ -39,8 +39,7 @@ pub(crate) struct World {
     pub(crate) lateness: u64,
     /// What to print when a check fails.
     pub(crate) history: Vec<String>,
-    /// Votes that were settled in each leadership.
-    pub(crate) recorded: BTreeMap<Epoch, u64>,
+    pub(crate) votes: Votes,
     cuts: BTreeSet<(usize, usize)>,
     pub(crate) loss_percent: u64,
     queue: BinaryHeap<Planned>,
@@ -86,7 +85,7 @@ impl World {
             packets: 0,
             lateness: 2 * MS,
             history: Vec::new(),
-            recorded: BTreeMap::new(),
+            votes: Votes::default(),
             cuts: BTreeSet::new(),
             loss_percent: 0,
             queue: BinaryHeap::new(),

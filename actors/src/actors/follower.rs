@@ -31,6 +31,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::{LogItem, LogSender};
+use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::telemetry::spans::Spans;
 
@@ -120,7 +121,7 @@ impl FollowerState {
     fn new(arguments: FollowerArguments) -> Self {
         let FollowerArguments { newest, log, recording, saved_term, leadership, election, fuser, counters, spans } =
             arguments;
-        let (filter, log) = (RoundFilter::new(saved_term), log.map(MapLog::new));
+        let (filter, log) = (RoundFilter::new(saved_term, clock::now()), log.map(MapLog::new));
         Self { newest, filter, log, recording, leadership, election, fuser, counters, spans }
     }
 

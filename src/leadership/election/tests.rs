@@ -11,20 +11,33 @@ fn euclid() -> Election {
     election
 }
 
-/// The `seq`-th message of edge, the leader of term 8.
-fn of_edge(seq: u64, term: u64, body: Body) -> ElectionInput {
-    let message = ElectionMessage {
+/// A message of a node that follows or leads `epoch`, and hears this one.
+fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> ElectionMessage {
+    ElectionMessage {
         schema: SCHEMA_VERSION,
-        from: NodeName::from_static("edge"),
+        from: from.clone(),
         run: 1,
         seq,
-        candidacy: Candidacy { role: Role::Edge, priority: 0, load: 0, fit: true },
-        term,
-        epoch: Some(epoch_of_edge()),
+        candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+        term: epoch.map_or(0, |epoch| epoch.term),
+        epoch: epoch.cloned(),
         hears_you: true,
         body,
-    };
-    ElectionInput::Receive { message }
+    }
+}
+
+fn received(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> ElectionInput {
+    ElectionInput::Receive { message: message(from, seq, epoch, body) }
+}
+
+fn beat_after(after: Option<&Epoch>) -> Body {
+    Body::Beat { every_ms: 50, round: 1, followers: 1, after: after.cloned(), successors: Vec::new() }
+}
+
+/// A message of edge, the leader of term 8, that knows `term`.
+fn of_edge(seq: u64, term: u64, body: Body) -> ElectionInput {
+    let message = message(&NodeName::from_static("edge"), seq, Some(&epoch_of_edge()), body);
+    ElectionInput::Receive { message: ElectionMessage { term, ..message } }
 }
 
 fn epoch_of_edge() -> Epoch {
@@ -75,4 +88,42 @@ fn a_forged_round_does_not_move_the_first_round_of_the_next_leader() {
     assert_eq!(succeeded_after(&[88, 88 + MAX_ROUND_STEP + 1]), (89, 1));
     assert_eq!(succeeded_after(&[3 * MAX_ROUND_STEP]), (3 * MAX_ROUND_STEP + 1, 0), "a node that joins an old cell");
     assert_eq!(succeeded_after(&[MAX_ROUND]), (1, 0), "rounds begin anew rather than beyond what receivers take");
+}
+
+#[test]
+fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
+    let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
+    let mut now = Timestamp(1_000_000);
+    let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
+    let health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
+    election.handle(ElectionInput::Health { health }, now);
+    let status = || Body::Status { over: None };
+    for seq in 1.. {
+        election.handle(received(&hopper, seq, None, status()), now);
+        now = election.next_deadline();
+        election.tick(now);
+        if election.is_leading() {
+            break;
+        }
+    }
+    let (own, next) = (election.epoch().cloned(), Epoch::new(2, gauss.clone()));
+    election.handle(received(&gauss, 1, Some(&next), beat_after(own.as_ref())), now);
+    assert_eq!(election.leader(), Some(&gauss));
+    let effects = election.handle(received(&hopper, 1000, own.as_ref(), status()), now);
+    let is_answer = |effect: &ElectionEffect| matches!(effect, ElectionEffect::Send { to, message } if *to == hopper && message.epoch.as_ref() == Some(&next));
+    assert!(effects.iter().any(is_answer), "{effects:?}");
+}
+
+#[test]
+fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
+    let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
+    let (before, next) = (Epoch::new(1, edge.clone()), Epoch::new(2, gauss.clone()));
+    let now = Timestamp(1_000_000);
+    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, now);
+    election.handle(received(&edge, 1, Some(&before), beat_after(None)), now);
+    election.handle(received(&edge, 2, Some(&next), Body::Status { over: None }), now);
+    assert_eq!(election.leader(), Some(&gauss));
+    election.handle(ElectionInput::Round { epoch: next, round: 2 }, now);
+    election.handle(received(&gauss, 1, Some(&before), Body::Status { over: None }), now);
+    assert_eq!(election.leader(), Some(&gauss));
 }
