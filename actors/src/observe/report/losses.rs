@@ -33,6 +33,7 @@ const EVENTS: [Event; 23] = [
     Event::ClientsFull,
     Event::ClientDenied,
     Event::ClientExpelled,
+    Event::Overreached,
 ];
 
 /// Sums of counters, which start at zero in every run of the node.
