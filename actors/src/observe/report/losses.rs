@@ -9,7 +9,7 @@ use crate::observe::recorder::CounterReading;
 use crate::telemetry::counters::Event;
 
 /// Events that count as losses.
-const EVENTS: [Event; 23] = [
+const EVENTS: [Event; 24] = [
     Event::PublishRefused,
     Event::PublishTooLarge,
     Event::InboxFull,

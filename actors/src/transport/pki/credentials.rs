@@ -313,4 +313,22 @@ mod tests {
         std::thread::sleep(RELOAD_INTERVAL);
         assert!(!Arc::ptr_eq(&credentials.current(), &before), "and against the next");
     }
+
+    #[test]
+    fn a_node_that_is_to_be_more_than_its_certificate_allows_is_told_both() {
+        let (directory, euclid) = (tempfile::tempdir().unwrap(), NodeName::from_static("euclid"));
+        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        authority.issue(&euclid, Role::Auto, Duration::from_secs(60), clock::now()).unwrap();
+        let (certificate, key) = authority.files_of(&euclid);
+        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+        let credentials = Credentials::load(&files, &euclid).unwrap();
+        assert!(credentials.check_rights(Role::Auto, 100).is_ok() && credentials.check_rights(Role::Cav, 255).is_ok());
+        for (role, priority) in [(Role::Edge, 100), (Role::Auto, 101)] {
+            let error = credentials.check_rights(role, priority).unwrap_err().to_string();
+            let named = [role_name(role), &priority.to_string(), "ecod:role=auto;priority=100", "pki issue euclid"];
+            assert!(named.iter().all(|part| error.contains(part)), "{error}");
+        }
+        let observer = Credentials::load(&files, &NodeName::from_static("euclid--top")).unwrap();
+        assert!(observer.check_rights(Role::Auto, 0).is_err(), "an observer never leads");
+    }
 }

@@ -133,4 +133,27 @@ mod tests {
             assert_eq!(parse_rights(text), None, "{text}");
         }
     }
+
+    /// The subject of a certificate for `edge` with these alternative names.
+    fn subject(names: Vec<rcgen::SanType>) -> Result<CertificateSubject, InvalidCertificate> {
+        let mut parameters = rcgen::CertificateParams::default();
+        parameters.distinguished_name.push(rcgen::DnType::CommonName, "edge");
+        parameters.subject_alt_names = names;
+        let certificate = parameters.self_signed(&rcgen::KeyPair::generate().unwrap()).unwrap();
+        CertificateSubject::of(certificate.der())
+    }
+
+    #[test]
+    fn a_certificate_of_a_version_that_wrote_no_rights_still_lets_a_broker_lead() {
+        let broker = || rcgen::SanType::DnsName(BROKER_NAME.try_into().unwrap());
+        let uri = |text: &str| rcgen::SanType::URI(text.try_into().unwrap());
+        assert_eq!(subject(vec![broker()]).unwrap().rights(), Rights::default());
+        assert_eq!(subject(vec![uri("https://example.org"), broker()]).unwrap().rights(), Rights::default());
+        assert_eq!(subject(Vec::new()).unwrap().rights(), Rights::NONE, "a vehicle's");
+        assert_eq!(subject(vec![uri("ecod:role=edge;priority=9")]).unwrap().rights(), Rights::NONE, "without a broker");
+        let both = subject(vec![broker(), uri("ecod:role=auto;priority=9")]).unwrap();
+        assert_eq!(both.rights(), Rights { role: Role::Auto, priority: 9 });
+        assert_eq!(both.rights_of(&NodeName::from_static("edge--top")), Rights::NONE, "an observer's");
+        assert_eq!(subject(vec![broker(), uri("ecod:role=chief")]), Err(InvalidCertificate::Rights));
+    }
 }
