@@ -8,13 +8,13 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ecod::leadership::Leadership;
 use ecod::leadership::election::{Election, ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
 use ecod::leadership::round_filter::RoundFilter;
 use ecod::leadership::timers::EPOCH_MEMORY;
+use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -283,7 +283,7 @@ impl Cell {
         match packet {
             Packet::Election(to, message) => {
                 let from = message.from.clone();
-                self.handle(to, Input::Receive { from, message });
+                self.handle(to, Input::Receive { from, rights: Rights::default(), message });
             }
             Packet::Map(to, map) => self.accept(to, map),
         }

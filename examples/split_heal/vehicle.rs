@@ -7,13 +7,13 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
-use ecod::leadership::Leadership;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
 use ecod::leadership::round_filter::RoundFilter;
+use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -141,7 +141,7 @@ impl Vehicle {
         match payload {
             Payload::Election(bytes) => {
                 let message = ElectionMessage::decode(bytes)?;
-                self.handle(Input::Receive { from: from.clone(), message }, now);
+                self.handle(Input::Receive { from: from.clone(), rights: Rights::default(), message }, now);
             }
             Payload::Report(kind, bytes) => self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?,
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),

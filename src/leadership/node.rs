@@ -27,9 +27,10 @@ use uuid::Uuid;
 pub use interface::{Effect, Input, Member, NodeSettings, Notice};
 
 use crate::leadership::address::BrokerAddress;
-use crate::leadership::election::{Body, Election, ElectionEffect, ElectionInput, Health};
+use crate::leadership::election::{Body, Election, ElectionEffect, ElectionInput, ElectionMessage, Health};
 use crate::leadership::health::HealthMonitor;
 use crate::leadership::links::{Brokers, LinkState, Links};
+use crate::leadership::rights::Rights;
 use crate::leadership::timers::{DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME};
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
@@ -148,13 +149,13 @@ impl LeadershipNode {
     fn take(&mut self, input: Input, now: Timestamp) {
         match input {
             Input::Wake => {}
-            Input::Receive { from, message } if message.from != from => {
+            Input::Receive { from, message, .. } if message.from != from => {
                 self.log(Notice::Misattributed { from, claimed: message.from });
             }
-            Input::Receive { from, message } if message.body == Body::Ready && !self.is_served_by(&from) => {
+            Input::Receive { from, message, .. } if message.body == Body::Ready && !self.is_served_by(&from) => {
                 self.log(Notice::NotServed { challenger: from });
             }
-            Input::Receive { message, .. } => self.feed(ElectionInput::Receive { message }, now),
+            Input::Receive { rights, message, .. } => self.receive(message, rights, now),
             Input::MemberAlive { member } => self.meet(member, now),
             Input::MemberChanged { member } => {
                 self.members.place(member);
@@ -234,6 +235,18 @@ impl LeadershipNode {
                 }
             };
             self.effects.push(effect);
+        }
+    }
+
+    /// Hands the election what a node may say. A message that declares more still tells what its sender may be.
+    fn receive(&mut self, message: ElectionMessage, rights: Rights, now: Timestamp) {
+        let (from, declared) = (message.from.clone(), message.candidacy);
+        let limited = rights.limit(message);
+        if limited.as_ref().is_none_or(|message| message.candidacy != declared) {
+            self.log(Notice::Overreached { from, role: declared.role, priority: declared.priority, rights });
+        }
+        if let Some(message) = limited {
+            self.feed(ElectionInput::Receive { message }, now);
         }
     }
 

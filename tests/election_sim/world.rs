@@ -5,10 +5,10 @@
 use std::cmp::{Ordering, Reverse};
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
-use ecod::leadership::Position;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::links::LinkState;
 use ecod::leadership::node::{Effect, Input, Member};
+use ecod::leadership::{Position, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -167,7 +167,7 @@ impl World {
             Arrival::Packet { from, bytes } => {
                 let message = ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
                 let from = self.nodes[from].name.clone();
-                self.handle(to, Input::Receive { from, message });
+                self.handle(to, Input::Receive { from, rights: Rights::default(), message });
             }
             Arrival::Relay { from, map } => self.relay(to, from, &map),
             Arrival::Map { map } => self.accept(to, &map),

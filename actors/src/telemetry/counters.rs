@@ -100,6 +100,8 @@ pub enum Event {
     ClientsFull,
     /// The embedded broker refused a login, message or filter: another's name or topic, or beyond a limit.
     ClientDenied,
+    /// Another node declared more in the election than its certificate allows.
+    Overreached,
     /// The embedded broker cut off a client whose certificate was revoked or expired.
     ClientExpelled,
 }

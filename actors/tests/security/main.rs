@@ -7,5 +7,6 @@ mod fixture;
 mod floods;
 mod frames;
 mod hung;
+mod identity;
 mod payloads;
 mod topics;

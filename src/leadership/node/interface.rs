@@ -8,6 +8,7 @@ use crate::leadership::address::BrokerAddress;
 use crate::leadership::election::{ElectionConfig, ElectionMessage, Health};
 use crate::leadership::health::HealthSample;
 use crate::leadership::links::{DataPlane, LinkState, WantedLinks};
+use crate::leadership::rights::Rights;
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -50,6 +51,8 @@ pub enum Input {
     Receive {
         /// The sender, as the transport proved.
         from: NodeName,
+        /// The sender's rights, as the transport proved.
+        rights: Rights,
         /// The message.
         message: ElectionMessage,
     },
@@ -232,6 +235,17 @@ pub enum Notice {
     NotServed {
         /// The node.
         challenger: NodeName,
+    },
+    /// A node declared more than its certificate allows, or claimed a lead that it may not have.
+    Overreached {
+        /// The node.
+        from: NodeName,
+        /// The role that it declared.
+        role: Role,
+        /// The priority that it declared.
+        priority: u8,
+        /// What its certificate allows.
+        rights: Rights,
     },
     /// A message in another node's name was dropped.
     Misattributed {

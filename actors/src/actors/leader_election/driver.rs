@@ -1,12 +1,13 @@
 //! From messages to the inputs of the node's leadership, and from its effects to the node's parts.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{Encoding, RejectReason};
 use ractor::ActorRef;
@@ -34,6 +35,8 @@ pub struct ElectionDriver {
     parts: Parts,
     leadership: watch::Sender<Leadership>,
     counters: Arc<Counters>,
+    /// Nodes that declared more than their certificate allows.
+    overreached: BTreeSet<NodeName>,
     /// The deadline for which the timer is set.
     alarm: Timestamp,
     timer: Option<AbortHandle>,
@@ -55,6 +58,7 @@ impl ElectionDriver {
             parts,
             leadership,
             counters,
+            overreached: BTreeSet::new(),
             alarm: Timestamp(u64::MAX),
             timer: None,
             myself,
@@ -67,8 +71,8 @@ impl ElectionDriver {
             MembershipEvent::Changed { member } => Input::MemberChanged { member: as_seen(&member) },
             MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
             MembershipEvent::Down { name } => Input::MemberDown { name },
-            MembershipEvent::Received { from, payload, .. } => match ElectionMessage::decode(&payload) {
-                Ok(message) => Input::Receive { from, message },
+            MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
+                Ok(message) => Input::Receive { from, rights, message },
                 Err(reason) => {
                     self.counters.reject(reason, from.as_str());
                     return tracing::debug!(%from, %reason, "election message dropped");
@@ -144,6 +148,16 @@ impl ElectionDriver {
             }
             Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
             Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),
+            Effect::Log { notice: Notice::Overreached { from, role, priority, rights } } => {
+                self.counters.count(Event::Overreached);
+                if self.overreached.insert(from.clone()) {
+                    tracing::warn!(
+                        %from, ?role, priority, ?rights,
+                        "a node declares more than its certificate allows and counts as what that says; issue it a \
+                         certificate by `ecod-node pki issue`, or lower its `role` or `election.priority`"
+                    );
+                }
+            }
             Effect::Log { notice } => log(notice),
         }
         None
@@ -204,6 +218,7 @@ fn log(notice: Notice) {
         Notice::NotServed { challenger } => {
             tracing::debug!(%challenger, "the lead is not handed over yet: no login at the challenger's broker");
         }
+        Notice::Overreached { .. } => {}
         Notice::Misattributed { from, claimed } => {
             tracing::debug!(%from, %claimed, "election message in another's name dropped");
         }
