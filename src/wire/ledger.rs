@@ -12,7 +12,7 @@ use crate::model::time::Timestamp;
 /// A part of the evidence for reputations; receivers keep the larger of every count.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerShare {
-    /// Major version of the payload, [`SCHEMA_VERSION`].
+    /// Major version of the payload, as of every payload.
     #[n(0)]
     pub schema: u32,
     /// The sender; equals the last level of the topic.
@@ -22,10 +22,10 @@ pub struct LedgerShare {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(2)]
     pub epoch: Option<u64>,
-    /// Counts, at most [`MAX_SHARE_ENTRIES`].
+    /// Counts, at most 512.
     #[n(3)]
     pub entries: Vec<LedgerEntry>,
-    /// Marks, at most [`MAX_SHARE_ENTRIES`]; without them earlier and later votes cannot be separated.
+    /// Marks, at most 512; without them earlier and later votes cannot be separated.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(4), default)]
     pub marks: Vec<LedgerMark>,
