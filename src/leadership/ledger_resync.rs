@@ -158,7 +158,8 @@ impl LedgerResync {
         let (mut taken, refused) =
             if is_over { (share.clone(), Vec::new()) } else { self.judge(share, ledger, leadership, now) };
         // What was signed together is taken together.
-        if is_over || (self.is_signed && !refused.is_empty()) {
+        let is_whole = taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
+        if is_over || (self.is_signed && !is_whole) {
             (taken.entries, taken.marks) = (Vec::new(), Vec::new());
         }
         let leader = share.epoch.filter(|term| leadership.knows_term(*term));
@@ -170,7 +171,7 @@ impl LedgerResync {
         }
         let present = self.leads.as_ref().or(leadership.epoch.as_ref());
         let taken = Arc::new(taken);
-        let is_statement = self.is_signed && !taken.is_empty();
+        let is_statement = self.is_signed && taken.lane().is_some_and(|lane| !self.has_counted(&lane, ledger));
         let is_news =
             if is_statement { ledger.merge_statement(&taken, present) } else { ledger.merge_share(&taken, present) };
         self.growth.note(&taken, ledger, now);
@@ -187,7 +188,8 @@ impl LedgerResync {
     ) -> (LedgerShare, Vec<RejectReason>) {
         let mut refused = BTreeSet::new();
         let mut is_usable = |lane: Epoch, is_plausible: bool, is_news: &dyn Fn() -> bool| {
-            if self.is_own(&lane, ledger) {
+            if self.leads.as_ref() == Some(&lane) {
+                // Nobody knows better what it counts now.
                 return false;
             }
             let reason = if !leadership.knows_term(lane.term) {
@@ -218,11 +220,9 @@ impl LedgerResync {
         (taken, refused.into_iter().collect())
     }
 
-    /// Whether this node counted a lane itself, or does so now: nobody else knows it better.
-    fn is_own(&self, lane: &Epoch, ledger: &ReputationLedger) -> bool {
-        let has_counted =
-            || self.is_signed && lane.leader == self.name && ledger.has_lane(lane) && !ledger.is_stated(lane);
-        self.leads.as_ref() == Some(lane) || has_counted()
+    /// Whether this node counted what is known of a lane, and signs it.
+    fn has_counted(&self, lane: &Epoch, ledger: &ReputationLedger) -> bool {
+        lane.leader == self.name && ledger.has_lane(lane) && !ledger.is_stated(lane)
     }
 
     /// Whether a candidate may tell of a lane.
@@ -317,8 +317,7 @@ impl LedgerResync {
     fn everything(&self, ledger: &ReputationLedger, except: Option<&Epoch>) -> Vec<LedgerShare> {
         let is_told = |term: u64, aggregator: &NodeName| {
             let lane = Epoch::new(term, aggregator.clone());
-            let is_counted_here = lane.leader == self.name && !ledger.is_stated(&lane);
-            except != Some(&lane) && (!self.is_signed || (self.leads.is_some() && is_counted_here))
+            except != Some(&lane) && (!self.is_signed || (self.leads.is_some() && self.has_counted(&lane, ledger)))
         };
         let entries: Vec<_> = ledger.entries().filter(|entry| is_told(entry.epoch, &entry.aggregator)).collect();
         let marks: Vec<_> = ledger.marks().filter(|mark| is_told(mark.epoch, &mark.aggregator)).collect();

@@ -250,6 +250,16 @@ fn evidence_without_a_signature_is_refused_where_all_sign() {
 }
 
 #[test]
+fn what_was_signed_together_is_taken_together() {
+    let mut euclid = signing("euclid", 7, "edge");
+    let slanders =
+        vec![slander(7, "edge", 1), LedgerEntry { label: "vase".into(), ..slander(7, "edge", u64::MAX >> 11) }];
+    let merged = euclid.merge(&sign(vec![share("edge", Some(7), slanders)])[0], 0).unwrap();
+    assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Implausible][..]));
+    assert_eq!((euclid.incorrect("gauss"), euclid.ledger.statements().count()), (0, 0));
+}
+
+#[test]
 fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
     let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("euclid", 7, "edge"));
     edge.lead(7);
@@ -297,6 +307,20 @@ fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificat
     assert!(!gauss.ledger.retain_statements(|_| true));
     assert!(gauss.ledger.retain_statements(|share| share.signed != said[0].signed));
     assert_eq!((gauss.ledger.totals().len(), gauss.ledger.lanes()), (0, 0));
+}
+
+#[test]
+fn a_node_that_lost_the_last_of_its_counts_learns_it_from_others_and_signs_it_again() {
+    let (mut edge, mut before) = (signing("edge", 8, "leader"), signing("edge", 7, "edge"));
+    before.lead(7);
+    before.record(7, "gauss");
+    edge.ledger = before.ledger.clone();
+    let lost = sign(before.record(7, "gauss"));
+    edge.hear(&[LedgerShare { node: name("other"), ..lost[0].clone() }]);
+    assert_eq!(edge.ledger.totals(), before.ledger.totals());
+    edge.lead(9);
+    let [share] = &edge.resync.snapshot(&edge.ledger)[..] else { panic!("one lane") };
+    assert_eq!((share.entries[0].correct, &share.signed), (2, &None), "to be signed");
 }
 
 #[test]
