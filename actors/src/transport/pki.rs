@@ -5,6 +5,7 @@
 //! Credentials         the certificates of one node; reloads changed files
 //! CertificateSubject  the node that a certificate names, and its rights
 //! BrokerTrust         verification of a broker's certificate for as long as a connection lasts
+//! EvidenceSigner      signatures under evidence that is passed on
 //! ```
 //!
 //! Each cell has its own CA, so that certificates of other cells are not valid in it. A certificate's common name is the
@@ -17,6 +18,7 @@ mod authority;
 mod broker_trust;
 mod config;
 mod credentials;
+mod evidence;
 mod subject;
 
 pub(crate) use attestation::{Distrust, MAX_CERTIFICATE_BYTES, is_signed_by};
@@ -24,6 +26,7 @@ pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
 pub use broker_trust::BrokerTrust;
 pub use config::TlsConfig;
 pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external_broker};
+pub use evidence::{EvidenceError, EvidenceSigner};
 pub use subject::{CertificateSubject, InvalidCertificate};
 
 /// DNS name in the certificate of every node that may lead, below a domain reserved for private use.

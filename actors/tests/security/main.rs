@@ -3,6 +3,7 @@
 mod brokers;
 mod certificates;
 mod claims;
+mod evidence;
 mod fixture;
 mod floods;
 mod frames;

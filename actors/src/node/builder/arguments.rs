@@ -191,6 +191,7 @@ impl NodeBuilder {
             config: self.config.reputations.clone(),
             reputations: self.reputations.clone(),
             file: self.state_file("reputations"),
+            credentials: self.security.credentials.clone(),
             newest: self.newest.reputations.subscribe(),
             members: self.members(),
             leadership: self.leadership(),
