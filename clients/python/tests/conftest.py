@@ -6,6 +6,7 @@ import contextlib
 import getpass
 import os
 import random
+import shutil
 import socket
 import subprocess
 import time
@@ -118,7 +119,10 @@ def mosquitto(start: Callable[..., Server], tmp_path: Path) -> Callable[..., Ser
 
         def command(port: int) -> list[str]:
             configuration.write_text("\n".join([f"listener {port} 127.0.0.1", f"user {getpass.getuser()}", *(lines or ["allow_anonymous true"]), ""]))
-            return ["mosquitto", "-c", str(configuration)]
+            # Debian has it where not every user's path leads.
+            found = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
+            assert found, "mosquitto is missing: install Debian's package of that name"
+            return [found, "-c", str(configuration)]
 
         return start(command)
 
