@@ -117,7 +117,7 @@ def test_the_planner_brakes_for_an_object_ahead_and_without_maps(edge: Callable[
 
             until(own.maps(timeout=20), seen_at(25.0))
             until(own.maps(timeout=20), seen_at(15.0))
-            wait_for(lambda: said[-1].startswith("BRAKE: an object is 1"))
+            wait_for(lambda: any(line.startswith("BRAKE: an object is 1") for line in said))
             # The object goes away, and then the edge.
             until(own.maps(timeout=20), seen_at(60.0))
             wait_for(lambda: own.report([], pose=(0.5, 0.0, 0.0)) and said[-1].startswith("GO"))
