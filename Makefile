@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -116,11 +116,11 @@ asyncapi-check: PACKAGES := ca-certificates $(if $(shell command -v npm),,npm)
 asyncapi-check: setup ## validate docs/asyncapi.yaml by the parser of its standard; installs npm where there is none
 	packaging/check-asyncapi
 
-python-check: PACKAGES += mosquitto-clients python3-venv
-python-check: setup ## feed a live cell by the Python example; installs paho-mqtt in a directory of its own
-	python3 -m venv $(BUILD)/python-venv
-	$(BUILD)/python-venv/bin/pip install --quiet 'paho-mqtt>=2,<3'
-	PAHO_PYTHON=$(abspath $(BUILD))/python-venv/bin/python3 cargo test --locked -p ecod-actors --test clients -- --include-ignored --nocapture
+# PYTHONS="python3.9 python3.13" tests it with these.
+python-client-check: PACKAGES += mosquitto python3-venv
+python-client-check: setup ## the Python client: built, installed in clean environments, its types and tests at real brokers and nodes
+	cargo build --locked --bin ecod-node
+	packaging/check-python-client $(PYTHONS)
 
 deb: setup ## Debian packages of a node, with camera and without, in target/debian
 	packaging/deb

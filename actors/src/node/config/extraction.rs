@@ -8,9 +8,10 @@ use super::{LoadError, NodeConfig};
 
 const ENVIRONMENT_PREFIX: &str = "ECOD_";
 
-/// `ECOD_…`, two underscores between the levels of a key.
+/// `ECOD_…`, two underscores between the levels of a key. `ECOD_BROKER` is the clients': the address of a node, not
+/// the table of the same name.
 pub(super) fn environment() -> Env {
-    Env::prefixed(ENVIRONMENT_PREFIX).split("__")
+    Env::prefixed(ENVIRONMENT_PREFIX).ignore(&["broker"]).split("__")
 }
 
 /// Reads the configuration. Values from the environment are guessed to be numbers, lists and so on by their looks;

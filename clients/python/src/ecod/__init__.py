@@ -1,0 +1,22 @@
+"""Reads the map of an ECOD cell, and reports detections to it.
+
+    import ecod
+
+    with ecod.Cell("localhost:1883", "lot-1") as cell:
+        for map in cell.maps():
+            print(map.round, map.objects)
+"""
+
+from . import geo
+from .cell import BROKER_NAME, Cell
+from .convert import from_arrays, from_supervision
+from .errors import EcodError, Invalid, Refused, Silent, Unreachable
+from .messages import FieldOfView, FusedObject, GlobalMap, LandmarkState, NodeStatus, ObjectReport, PerceivedObject, Pose
+from .messages import PoseCorrection, Reputation, Reputations, Verdict, Verdicts, time_of
+
+# fmt: off
+__all__ = [
+    "BROKER_NAME", "Cell", "EcodError", "FieldOfView", "FusedObject", "GlobalMap", "Invalid", "LandmarkState", "NodeStatus",
+    "ObjectReport", "PerceivedObject", "Pose", "PoseCorrection", "Refused", "Reputation", "Reputations", "Silent",
+    "Unreachable", "Verdict", "Verdicts", "from_arrays", "from_supervision", "geo", "time_of",
+]

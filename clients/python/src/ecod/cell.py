@@ -1,0 +1,244 @@
+"""A program's part in a cell."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import socket
+import threading
+import time
+import uuid
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
+from typing import Any, Optional, TypeVar, Union
+
+from .codec import Rejected, encode
+from .connection import Connection, host_and_port, log, tls_context
+from .errors import Invalid, Silent
+from .messages import SCHEMA_VERSION, FieldOfView, GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Pose
+from .messages import Reputations, Verdicts, is_name
+from .streams import Stream
+
+M = TypeVar("M")
+Objects = Iterable[Union[PerceivedObject, Mapping[str, Any]]]
+AnyPose = Union[Pose, tuple[float, float, float]]
+Time = Union[datetime, float]
+
+# Brokers of a cell are known by this name at every address; their certificates bear it.
+BROKER_NAME = "broker.ecod.internal"
+
+# Largest report by default: `mqtt.max_payload_bytes` of nodes.
+MAX_REPORT_BYTES = 256 * 1024
+
+# Silence in seconds after which the log says where to look.
+SILENCE_S = 10.0
+
+
+class Cell:
+    """A connection to a cell, which is made anew whenever it is lost.
+
+    `broker` is the HOST:PORT of a node or broker (`ECOD_BROKER`, default localhost:1883, with `ca` port 8883). `cell` is
+    the cell's name (`ECOD_CELL`, default `cell`). The program reports as `<node>--<part>`, or as `node` itself if `part`
+    is empty; `node` is `ECOD_NAME` or the machine's host name by default. `ca`, `cert` and `key` are PEM files for TLS;
+    `broker_name` is the name in the broker's certificate, None for the host. `user` and `password` are
+    `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD` by default.
+
+    Raises `Unreachable` or `Refused` unless the broker lets the program in within `timeout` seconds.
+    """
+
+    def __init__(
+        self,
+        broker: Optional[str] = None,
+        cell: Optional[str] = None,
+        *,
+        node: Optional[str] = None,
+        part: str = "python",
+        ca: Optional[str] = None,
+        cert: Optional[str] = None,
+        key: Optional[str] = None,
+        broker_name: Optional[str] = BROKER_NAME,
+        user: Optional[str] = None,
+        password: Optional[str] = None,
+        timeout: float = 10.0,
+    ) -> None:
+        env = os.environ.get
+        address = host_and_port(broker or env("ECOD_BROKER") or "localhost", 8883 if ca else 1883)
+        self.cell = _name("cell", cell or env("ECOD_CELL") or "cell")
+        node = node or env("ECOD_NAME") or re.sub("[^A-Za-z0-9_]", "-", socket.gethostname().split(".")[0])
+        self.name = _name("node", f"{node}--{part}" if part else node)
+        self.counts: Counter[str] = Counter()
+        """What was not taken, by the reasons in docs/protocol.md, and reports that were not sent: `unsent`."""
+
+        self._root = f"ecod/v1/{self.cell}/"
+        self._sending = threading.Lock()
+        self._seq: Counter[str] = Counter()
+        self._maps = Stream(GlobalMap, "global_detections")
+        self._verdicts = Stream(Verdicts, "global_verdicts")
+        self._reputations = Stream(Reputations, "reputations", is_retained=True)
+        self._statuses = Stream(NodeStatus, "nodes/+", is_retained=True)
+        if not ca and (cert or key):
+            raise Invalid("cert and key need `ca`, the file with the certificates that a broker must show")
+        tls = tls_context(ca, cert, key, broker_name or address[0]) if ca else None
+        login = (user or env("ECOD_MQTT__USER"), password or env("ECOD_MQTT__PASSWORD"))
+        # A cell's broker takes ids of this form only, by which nobody ends another's session.
+        client_id = f"{self.name}-{uuid.uuid4().hex}"
+        self._connection = Connection(address, client_id, tls, login, self._take, timeout)
+
+    def maps(self, timeout: Optional[float] = None) -> Iterator[GlobalMap]:
+        """The maps of the cell, from now on: always the newest, whatever a slow reader has missed.
+
+        Maps that are not later by epoch and round than the one before are dropped. Waits while none comes, at most
+        `timeout` seconds (`Silent`). Raises `Refused` when the broker refuses. Ends when the cell is closed.
+        """
+        return self._read(self._maps, timeout)
+
+    def verdicts(self, timeout: Optional[float] = None) -> Iterator[Verdicts]:
+        """The verdicts of the cell, by the rules of `maps`."""
+        return self._read(self._verdicts, timeout)
+
+    def reputations(self, timeout: Optional[float] = None) -> Iterator[Reputations]:
+        """The trust in each vehicle: the present state first, then by the rules of `maps`."""
+        return self._read(self._reputations, timeout)
+
+    def statuses(self, timeout: Optional[float] = None) -> Iterator[NodeStatus]:
+        """The statuses of the nodes: the present ones first, then every change; the newest of each node."""
+        return self._read(self._statuses, timeout)
+
+    def report(
+        self,
+        objects: Objects,
+        *,
+        captured_at: Optional[Time] = None,
+        pose: Optional[AnyPose] = None,
+        seen: Optional[Iterable[str]] = None,
+        view: Optional[FieldOfView] = None,
+    ) -> bool:
+        """Reports what one frame shows, for the map. A frame without objects is a report, too.
+
+        `captured_at` is a datetime with time zone, or Unix seconds; default now. `pose` is the camera's, east and north in
+        metres and heading in radians. `seen` names the known locations in view. Gives whether the report was sent:
+        without a connection it is dropped and counted. Raises `Invalid` for values that the protocol does not allow, and
+        `Refused` when the broker refused an earlier report.
+        """
+        return self._report("detections", list(objects), captured_at, pose, seen, view)
+
+    def vote(
+        self,
+        objects: Objects,
+        *,
+        captured_at: Optional[Time] = None,
+        pose: Optional[AnyPose] = None,
+        seen: Optional[Iterable[str]] = None,
+    ) -> bool:
+        """Votes on what is at known locations, for the verdicts: objects name their `landmark`. The rest is as in `report`."""
+        objects = list(objects)
+        for place, item in enumerate(objects):
+            if not (item.get("landmark") if isinstance(item, Mapping) else item.landmark):
+                raise Invalid(f"not sent: objects[{place}].landmark: is missing, a vote is on a known location")
+        return self._report("vote_detections", objects, captured_at, pose, seen, None)
+
+    def close(self) -> None:
+        """Ends the connection, and with it all loops over messages."""
+        self._connection.close()
+
+    def __enter__(self) -> Cell:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def _read(self, stream: Stream[M], timeout: Optional[float]) -> Iterator[M]:
+        self._connection.subscribe(self._root + stream.topic)
+        return self._iterate(stream, 0 if stream.is_retained else stream.number, timeout)
+
+    def _iterate(self, stream: Stream[M], number: int, timeout: Optional[float]) -> Iterator[M]:
+        while True:
+            with self._connection.changed:
+                entry = self._wait(stream, number, timeout)
+            if entry is None:
+                return
+            number, message = entry
+            yield message
+
+    def _wait(self, stream: Stream[M], number: int, timeout: Optional[float]) -> Optional[tuple[int, M]]:
+        """The next payload of a stream, or None when the cell is closed."""
+        began = time.monotonic()
+        is_told = False
+        while not self._connection.closing.is_set():
+            entry = stream.after(number)
+            if entry is not None:
+                return entry
+            self._connection.raise_if_refused(self._root + stream.topic)
+            waited = time.monotonic() - began
+            silence = f"nothing on {self._root}{stream.topic} from {self._connection.at} for {waited:.1f} s; "
+            silence += "does a node lead the cell (argument `cell` or ECOD_CELL)?" if self._connection.is_connected else "no connection"
+            if timeout is not None and waited >= timeout:
+                raise Silent(silence)
+            if waited >= SILENCE_S and not is_told:
+                is_told = True
+                log.warning("%s", silence)
+            self._connection.changed.wait(1.0 if timeout is None else min(1.0, timeout - waited))
+        return None
+
+    def _report(
+        self,
+        topic: str,
+        objects: list[Any],
+        captured_at: Optional[Time],
+        pose: Optional[AnyPose],
+        seen: Optional[Iterable[str]],
+        view: Optional[FieldOfView],
+    ) -> bool:
+        full_topic = f"{self._root}{topic}/{self.name}"
+        pose = Pose(*pose) if isinstance(pose, (tuple, list)) else pose
+        seen = None if seen is None else list(seen)
+        with self._sending:
+            seq = self._seq[topic] + 1
+            report = ObjectReport(SCHEMA_VERSION, self.name, seq, micros(captured_at), objects, pose, seen, view)
+            payload = encode(report)
+            if len(payload) > MAX_REPORT_BYTES:
+                raise Invalid(f"not sent: {len(payload)} bytes with {len(objects)} objects, at most {MAX_REPORT_BYTES}")
+            self._connection.raise_if_refused(full_topic)
+            self._seq[topic] = seq
+            is_sent = self._connection.publish(full_topic, payload)
+            if not is_sent:
+                self.counts["unsent"] += 1
+            return is_sent
+
+    def _take(self, topic: str, payload: bytes) -> None:
+        """Takes a message from the broker: the newest of its kind counts, an unusable one is counted and told of once."""
+        head, _, node = topic[len(self._root) :].partition("/")
+        for stream in (self._maps, self._verdicts, self._reputations, self._statuses):
+            if stream.topic.partition("/")[0] == head:
+                try:
+                    stream.take(node, payload, self._connection.changed)
+                except Rejected as rejected:
+                    reason, text = rejected.args
+                    self.counts[reason] += 1
+                    if reason not in stream.told:
+                        stream.told.add(reason)
+                        # An order that is not kept is usual after a reconnection.
+                        level = logging.INFO if reason in ("superseded", "repeated") else logging.WARNING
+                        log.log(level, "not taken from %s, %s: %s; others like it are only counted", topic, reason, text)
+
+
+def micros(moment: Optional[Time]) -> int:
+    """Unix microseconds of a datetime with time zone or of Unix seconds; default now."""
+    if moment is None:
+        return time.time_ns() // 1000
+    if isinstance(moment, datetime):
+        if moment.tzinfo is None:
+            raise Invalid(f"not sent: captured_at {moment} has no time zone; datetime.now(timezone.utc) has one")
+        moment = moment.timestamp()
+    try:
+        return round(moment * 1e6)
+    except (ValueError, OverflowError, TypeError):
+        raise Invalid(f"not sent: captured_at {moment!r} must be a datetime or Unix seconds") from None
+
+
+def _name(what: str, name: str) -> str:
+    if not is_name(name):
+        raise Invalid(f"{what} name {name!r} must be 1 to 64 of A-Z a-z 0-9 _ -")
+    return name

@@ -1,0 +1,258 @@
+"""Payloads of a cell, with the names of their JSON Schemas.
+
+Times are Unix microseconds, lengths metres, angles radians counter-clockwise from east. Positions are in the cell's
+east-north frame. Fields stand in the order of the compact encoding (docs/protocol.md), which has no names.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import uuid
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta, timezone
+from typing import Annotated, Any, Callable, Literal, NamedTuple, Optional
+
+SCHEMA_VERSION = 1
+
+
+class Rule(NamedTuple):
+    """A condition on a field's value, and its wording."""
+
+    holds: Callable[[Any], bool]
+    text: str
+
+
+# Marks a field that the compact encoding gives in whole millimetres.
+MILLIMETRES = "millimetres"
+
+
+def _between(low: float, high: float) -> Rule:
+    return Rule(lambda value: low <= value <= high, f"must be from {low:g} to {high:g}")
+
+
+def _at_most(number: int) -> Rule:
+    return Rule(lambda items: len(items) <= number, f"must have at most {number} entries")
+
+
+def _is_label(text: str) -> bool:
+    has_controls = any(ord(character) < 32 or 127 <= ord(character) < 160 for character in text)
+    return 1 <= len(text.encode("utf-8", "replace")) <= 64 and not has_controls
+
+
+def _is_uuid(text: str) -> bool:
+    try:
+        return bool(uuid.UUID(text))
+    except ValueError:
+        return False
+
+
+def _is_covariance(covariance: tuple[float, float, float]) -> bool:
+    xx, xy, yy = covariance
+    return math.isfinite(xx * yy) and xx >= 0 and yy >= 0 and xy * xy <= xx * yy * (1 + 1e-9)
+
+
+def is_name(text: str) -> bool:
+    """Whether nodes and cells may have this name."""
+    return re.fullmatch("[A-Za-z0-9_-]{1,64}", text) is not None
+
+
+Schema = Annotated[int, Rule(lambda value: value == SCHEMA_VERSION, "is unknown: this package reads version 1")]
+Count = Annotated[int, Rule(lambda value: 0 <= value < 2**53, "must be from 0 to 2⁵³ − 1")]
+Name = Annotated[str, Rule(is_name, "must be 1 to 64 of A-Z a-z 0-9 _ -")]
+Label = Annotated[str, Rule(_is_label, "must have 1 to 64 bytes and no control characters")]
+Uuid = Annotated[str, Rule(_is_uuid, "must be a UUID")]
+Fraction = Annotated[float, _between(0, 1)]
+Metres = Annotated[float, _between(-1e8, 1e8), MILLIMETRES]
+Size = Annotated[float, _between(0, 1e5)]
+Speed = Annotated[float, _between(-1e4, 1e4)]
+Angle = Annotated[float, _between(-1e6, 1e6)]
+Score = Annotated[float, _between(-1e9, 1e9)]
+Amount = Annotated[float, _between(0, 2**53 - 1)]
+Covariance = Annotated[tuple[float, float, float], Rule(_is_covariance, "must be a covariance [xx, xy, yy]")]
+
+
+def time_of(micros: int) -> datetime:
+    """The time of a field whose name ends in `_us`, in UTC."""
+    return datetime(1970, 1, 1, tzinfo=timezone.utc) + timedelta(microseconds=micros)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of a camera (`WirePose` in the schema)."""
+
+    x_m: Metres
+    y_m: Metres
+    heading_rad: Angle
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """Range and opening angle of a sensor, centred on the heading of the pose."""
+
+    range_m: Size
+    angle_rad: Annotated[float, _between(0, 1e6)]
+
+
+@dataclass(frozen=True)
+class PerceivedObject:
+    """A detection with its position in the cell's frame."""
+
+    label: Label
+    confidence: Fraction
+    x_m: Metres
+    y_m: Metres
+    covariance_m2: Optional[Covariance] = None
+    landmark: Optional[Label] = None
+    velocity_mps: Optional[tuple[Speed, Speed]] = None
+    heading_rad: Optional[Angle] = None
+    size_m: Optional[tuple[Size, Size]] = None
+    scores: Annotated[dict[Label, Fraction], _at_most(256)] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ObjectReport:
+    """The detections of one vehicle in one frame."""
+
+    schema: Schema
+    node: Name
+    seq: Count
+    captured_at_us: Count
+    objects: Annotated[list[PerceivedObject], _at_most(1024)]
+    pose: Optional[Pose] = None
+    seen: Optional[Annotated[list[Label], _at_most(1024)]] = None
+    view: Optional[FieldOfView] = None
+
+
+@dataclass(frozen=True)
+class LandmarkState:
+    """The agreed state of one known location."""
+
+    id: Label
+    label: Optional[Label]
+    confidence: Fraction
+    x_m: Metres
+    y_m: Metres
+    contributors: list[Name]
+    observers: list[Name] = field(default_factory=list)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the location is known to be empty; without a label it is otherwise unknown."""
+        return self.label is None and bool(self.observers)
+
+
+@dataclass(frozen=True)
+class FusedObject:
+    """An object at no known location, at the time of fusion."""
+
+    id: Uuid
+    label: Label
+    confidence: Fraction
+    x_m: Metres
+    y_m: Metres
+    covariance_m2: Covariance
+    contributors: list[Name]
+    existence: Optional[Fraction] = None
+    velocity_mps: Optional[tuple[Speed, Speed]] = None
+    heading_rad: Optional[Angle] = None
+    size_m: Optional[tuple[Size, Size]] = None
+    age_s: Optional[Amount] = None
+    first_seen_us: Optional[Count] = None
+    vehicle: Optional[Name] = None
+    scores: dict[Label, Fraction] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PoseCorrection:
+    """The estimated error of a vehicle's positions."""
+
+    about_m: tuple[Metres, Metres]
+    dx_m: Metres
+    dy_m: Metres
+    dheading_rad: Angle
+    pairs: Amount
+
+
+@dataclass(frozen=True)
+class GlobalMap:
+    """The fused map of one round (PACE)."""
+
+    schema: Schema
+    aggregator: Name
+    epoch: Count
+    round: Count
+    fused_at_us: Count
+    oldest_capture_us: Optional[Count]
+    landmarks: list[LandmarkState]
+    objects: list[FusedObject]
+    pose_corrections: dict[Name, PoseCorrection] = field(default_factory=dict)
+
+    @property
+    def fused_at(self) -> datetime:
+        """Time when the round closed, by the aggregator's clock, in UTC."""
+        return time_of(self.fused_at_us)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The agreed label of one known location."""
+
+    landmark: Label
+    label: Optional[Label]
+    score: Score
+    margin: Score
+    votes: dict[Label, Score]
+    contributors: list[Name]
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """The verdicts of one round (VOTE)."""
+
+    schema: Schema
+    aggregator: Name
+    epoch: Count
+    round: Count
+    fused_at_us: Count
+    verdicts: list[Verdict]
+
+    @property
+    def fused_at(self) -> datetime:
+        """Time when the round closed, by the aggregator's clock, in UTC."""
+        return time_of(self.fused_at_us)
+
+
+@dataclass(frozen=True)
+class Reputation:
+    """The trust in one vehicle and its evidence."""
+
+    score: Fraction
+    correct: Count
+    incorrect: Count
+
+
+@dataclass(frozen=True)
+class Reputations:
+    """The trust in each vehicle."""
+
+    schema: Schema
+    aggregator: Optional[Name]
+    epoch: Count
+    round: Count
+    reputations: dict[Name, Reputation]
+
+
+@dataclass(frozen=True)
+class NodeStatus:
+    """A node's status, published by itself, or `offline` by its broker."""
+
+    schema: Schema
+    node: Name
+    id: Uuid
+    role: Literal["auto", "cav", "edge"]
+    state: Literal["following", "aggregating", "offline"]
+    epoch: Count
+    aggregator: Optional[Name]
+    fit: Optional[bool]
+    version: Label

@@ -1,0 +1,117 @@
+"""A program's part in a cell of real nodes."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import Server, program, until, wait_for
+
+import ecod
+
+CAR = ecod.PerceivedObject("car", 0.9, 0.1, 0.2, landmark="slot-0", covariance_m2=(0.01, 0.0, 0.01))
+
+
+def agreed(cell: ecod.Cell) -> ecod.GlobalMap:
+    """The first map with the car, and the empty place beside it, that this program reports and votes for."""
+
+    def is_agreed(map: ecod.GlobalMap) -> bool:
+        cell.report([CAR], pose=(1.0, 6.0, -1.57), seen=["slot-0", "slot-1"])
+        cell.vote([CAR])
+        return map.landmarks[0].label == "car" and map.landmarks[1].is_empty
+
+    return until(cell.maps(timeout=20), is_agreed)
+
+
+@pytest.mark.parametrize("encoding", ["json", "cbor", "compact"])
+def test_a_node_takes_reports_and_its_messages_are_read(edge: Callable[..., Server], cell_name: str, encoding: str) -> None:
+    node = edge(ECOD_MQTT__ENCODING=encoding)
+    with ecod.Cell(node.address, cell_name, node="euclid") as cell:
+        map = agreed(cell)
+        first, second = map.landmarks
+        assert (first.id, first.contributors, first.observers) == ("slot-0", ["euclid--python"], ["euclid--python"])
+        assert (first.x_m, first.y_m) == pytest.approx((0.1, 0.2), abs=0.01) and first.confidence > 0.5
+        assert (second.label, second.x_m, second.y_m) == (None, 2.5, 0.0)
+        assert abs(map.fused_at.timestamp() - time.time()) < 20
+        assert (map.aggregator, map.schema) == ("edge", 1)
+        verdict = next(cell.verdicts(timeout=20)).verdicts[0]
+        assert (verdict.landmark, verdict.label, list(verdict.votes)) == ("slot-0", "car", ["car"])
+        assert next(cell.reputations(timeout=20)).aggregator == "edge"
+        status = next(cell.statuses(timeout=20))
+        assert (status.node, status.role, status.state) == ("edge", "edge", "aggregating") and len(status.id) == 36
+        assert not cell.counts, cell.counts
+
+
+@pytest.mark.parametrize("encoding", ["json", "cbor", "compact"])
+def test_tracks_of_a_node_are_read(edge: Callable[..., Server], cell_name: str, encoding: str) -> None:
+    node = edge(ECOD_MQTT__ENCODING=encoding, ECOD_FUSION__TRACKS__MODE="on")
+    with ecod.Cell(node.address, cell_name, node="euclid") as cell:
+        began = time.time()
+
+        def tracks(map: ecod.GlobalMap) -> list[ecod.FusedObject]:
+            x_m = 20 + 5 * (time.time() - began)
+            position = (x_m, 3.0, (0.01, 0.0, 0.01))
+            car = ecod.PerceivedObject("car", 0.9, *position, velocity_mps=(5.0, 0.0), size_m=(5.0, 2.0), scores={"car": 0.9})
+            cell.report([car], pose=(0.0, 0.0, 0.0), view=ecod.FieldOfView(100.0, 6.28))
+            return [thing for thing in map.objects if (thing.velocity_mps or (0.0, 0.0))[0] > 3.0]
+
+        map = until(cell.maps(timeout=20), tracks)
+        (track,) = tracks(map)
+        assert {thing.vehicle for thing in map.objects} == {None, "euclid--python"}, "who reports is there, too"
+        assert track.label == "car" and track.contributors == ["euclid--python"] and len(track.id) == 36
+        assert track.velocity_mps == pytest.approx((5.0, 0.0), abs=2.0) and track.y_m == pytest.approx(3.0, abs=0.5)
+        assert track.first_seen_us is not None and abs(track.first_seen_us / 1e6 - began) < 20
+        assert not cell.counts, cell.counts
+
+
+def test_maps_go_on_after_the_node_is_killed_and_started_again(edge: Callable[..., Server], cell_name: str) -> None:
+    node = edge()
+    with ecod.Cell(node.address, cell_name, node="euclid") as cell:
+        agreed(cell)
+        node.kill()
+        wait_for(lambda: not cell.report([CAR]))
+        node.start()
+        # Its terms begin anew, as it has no `state_dir`.
+        assert agreed(cell).landmarks[0].contributors == ["euclid--python"]
+
+
+@pytest.fixture
+def pki(tmp_path: Path, cell_name: str) -> Callable[..., dict[str, str]]:
+    """Issues certificates of the cell; gives the files as arguments of `Cell`."""
+    directory = tmp_path / "pki"
+
+    def run(*arguments: str) -> None:
+        subprocess.run([program(), "pki", *arguments, "--dir", str(directory)], check=True, capture_output=True)
+
+    def issue(name: str, role: str) -> dict[str, str]:
+        if not directory.exists():
+            run("init", "--cell", cell_name)
+        run("issue", name, "--role", role)
+        return {
+            "ca": str(directory / "ca.pem"),
+            "cert": str(directory / "nodes" / f"{name}.pem"),
+            "key": str(directory / "nodes" / f"{name}.key"),
+        }
+
+    return issue
+
+
+def test_a_cell_with_certificates_takes_a_program_by_its_own(
+    edge: Callable[..., Server], cell_name: str, pki: Callable[..., dict[str, Any]]
+) -> None:
+    own, other = pki("edge", "edge"), pki("euclid", "cav")
+    node = edge(ECOD_TLS__CA=own["ca"], ECOD_TLS__CERTIFICATE=own["cert"], ECOD_TLS__KEY=own["key"])
+    with ecod.Cell(node.address, cell_name, node="euclid", part="", **other) as cell:
+        assert agreed(cell).landmarks[0].contributors == ["euclid"]
+    with pytest.raises(ecod.Refused, match=f"{node.address} refuses the login: Not authorized"):
+        ecod.Cell(node.address, cell_name, node="gauss", part="", **other)
+    with pytest.raises(ecod.Unreachable, match=f"no TLS with {node.address} .*broker.example.*check .*`broker_name`"):
+        ecod.Cell(node.address, cell_name, node="euclid", broker_name="broker.example", **other)
+    with pytest.raises(ecod.Unreachable, match=f"{node.address} .*certificate"):
+        ecod.Cell(node.address, cell_name, node="euclid", ca=other["ca"], timeout=3.0)
+    with pytest.raises(ecod.Unreachable, match=f"{node.address} .*without TLS"):
+        ecod.Cell(node.address, cell_name, node="euclid", timeout=3.0)
