@@ -100,6 +100,8 @@ pub enum Event {
     ClientsFull,
     /// The embedded broker refused a login, message or filter: another's name or topic, or beyond a limit.
     ClientDenied,
+    /// The embedded broker cut off a client that did not read for 15 s, or for whose bytes there was no room.
+    ClientStalled,
     /// The embedded broker cut off a client whose certificate was revoked or expired.
     ClientExpelled,
 }

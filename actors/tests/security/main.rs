@@ -7,5 +7,7 @@ mod fixture;
 mod floods;
 mod frames;
 mod hung;
+mod packets;
 mod payloads;
+mod resources;
 mod topics;

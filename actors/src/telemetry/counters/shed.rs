@@ -12,6 +12,8 @@ pub enum ShedReason {
     /// A node, an address or a local client published more often than `broker.max_messages_hz`. The embedded broker
     /// dropped the message.
     BrokerThrottled,
+    /// A client of the embedded broker read too slowly. The oldest message for it was dropped, or the rest when it was cut.
+    ReaderSlow,
     /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
     ReportThrottled,
     /// A candidate shared evidence more often than `mqtt.max_report_hz`; the share was not decoded.
@@ -111,8 +113,13 @@ mod tests {
         let others = snapshot.iter().find(|shed| shed.source == OTHERS).unwrap();
         assert_eq!(others.times, 2 * MAX_TRACKED_SOURCES as u64);
         let sums = shedding.sums();
-        let expected =
-            [("broker_throttled", 0), ("ledger_throttled", 0), ("report_replaced", 0), ("status_throttled", 0)];
+        let expected = [
+            ("broker_throttled", 0),
+            ("ledger_throttled", 0),
+            ("reader_slow", 0),
+            ("report_replaced", 0),
+            ("status_throttled", 0),
+        ];
         assert_eq!(
             sums,
             BTreeMap::from_iter(expected.into_iter().chain([("report_throttled", 4 * MAX_TRACKED_SOURCES as u64)]))
