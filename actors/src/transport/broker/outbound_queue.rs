@@ -24,6 +24,9 @@ struct QueuedPacket {
 /// Messages of one client beyond this many bytes give way, but for the newest.
 const MAX_BYTES: usize = 4 * 1024 * 1024;
 
+/// Packets that must not be dropped and may wait beside the messages.
+const MAX_ANSWERS: usize = 64;
+
 /// Memory that an empty queue keeps.
 const KEPT_BYTES: usize = 16 * 1024;
 
@@ -36,7 +39,7 @@ const RETAIN: u8 = 0x01;
 pub(super) struct QueueFull;
 
 impl OutboundQueue {
-    /// An empty queue of at most so many packets.
+    /// An empty queue of at most so many messages.
     pub(super) fn new(max_packets: usize) -> Self {
         Self { bytes: VecDeque::new(), packets: VecDeque::new(), scanner: PacketScanner::default(), max_packets }
     }
@@ -63,7 +66,7 @@ impl OutboundQueue {
             while self.packets.len() > self.max_packets || self.bytes.len() > MAX_BYTES {
                 if self.drop_oldest() {
                     dropped += 1;
-                } else if self.packets.len() > self.max_packets {
+                } else if self.packets.len() > self.max_packets + MAX_ANSWERS {
                     return Err(QueueFull);
                 } else {
                     break;
@@ -187,7 +190,16 @@ mod tests {
     #[test]
     fn answers_that_nobody_reads_fill_the_queue() {
         let mut queue = OutboundQueue::new(10);
-        let pushed = (0..20).take_while(|_| queue.push(&[0xd0, 0]).is_ok()).count();
-        assert_eq!(pushed, 10);
+        let pushed = (0..100).take_while(|_| queue.push(&[0xd0, 0]).is_ok()).count();
+        assert_eq!(pushed, 10 + MAX_ANSWERS);
+    }
+
+    #[test]
+    fn a_queue_of_one_message_holds_the_newest_beside_what_is_begun() {
+        let mut queue = OutboundQueue::new(1);
+        queue.push(&message(1, 100)).unwrap();
+        queue.advance(1);
+        assert_eq!((2..5).map(|mark| queue.push(&message(mark, 100)).unwrap()).sum::<usize>(), 2);
+        assert_eq!(all(&mut queue), [&message(1, 100)[1..], &message(4, 100)].concat());
     }
 }
