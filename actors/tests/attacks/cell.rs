@@ -31,8 +31,9 @@ const KEY: &str = "5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5
 /// The nodes: the edge, a candidate, and the vehicle whose map log is read.
 const NODES: [(&str, Role); 3] = [("edge", Role::Edge), ("v01", Role::Auto), ("v02", Role::Cav)];
 
-/// The vehicle whose certificate the attacker holds.
-pub(crate) const ATTACKER: &str = "gauss";
+/// The vehicle, and the node that may lead, whose certificates the attackers hold.
+pub(crate) const VEHICLE: &str = "gauss";
+pub(crate) const CANDIDATE: &str = "turing";
 
 /// Time for all processes to start and agree, and for how long they must have agreed.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
@@ -52,7 +53,8 @@ const ROUND: Duration = Duration::from_millis(100);
 /// Running nodes with their files; all end with it.
 pub(crate) struct Cell {
     nodes: Vec<Node>,
-    certificates: TlsConfig,
+    vehicle: TlsConfig,
+    candidate: TlsConfig,
     directory: TempDir,
 }
 
@@ -72,8 +74,10 @@ pub(crate) struct Target {
     pub(crate) gossip: Vec<SocketAddr>,
     /// The cell's key.
     pub(crate) key: &'static str,
-    /// TLS with the certificate of a vehicle, [`ATTACKER`].
+    /// TLS with the certificate of a vehicle, [`VEHICLE`].
     pub(crate) vehicle: Arc<ClientConfig>,
+    /// TLS with the certificate of a node that may lead, [`CANDIDATE`].
+    pub(crate) candidate: Arc<ClientConfig>,
 }
 
 impl Cell {
@@ -85,7 +89,8 @@ impl Cell {
         fs::write(home.join("frames/0.ppm"), grey_frame())?;
         fs::write(home.join("detections.jsonl"), DETECTIONS)?;
         let mut authority = Authority::init(&home.join("pki"), &NodeName::new(CELL)?, clock::now())?;
-        let certificates = issue(&mut authority, ATTACKER, Role::Cav)?;
+        let vehicle = issue(&mut authority, VEHICLE, Role::Cav)?;
+        let candidate = issue(&mut authority, CANDIDATE, Role::Auto)?;
         let mut ports = Ports::new();
         let mut addresses = Vec::new();
         for _ in NODES {
@@ -109,7 +114,7 @@ impl Cell {
             command.stderr(File::create(directory.join("node.log"))?).current_dir(&directory);
             nodes.push(Node { name, broker, gossip, process: Process::start(&mut command)? });
         }
-        Ok(Self { nodes, certificates, directory })
+        Ok(Self { nodes, vehicle, candidate, directory })
     }
 
     /// Waits until maps hold the reports of all honest vehicles, and have done so for a while.
@@ -133,15 +138,17 @@ impl Cell {
     }
 
     /// What an attacker needs.
-    pub(crate) fn target(&self) -> Target {
-        let name = NodeName::from_static(ATTACKER);
-        let credentials = Credentials::load(&self.certificates, &name).expect("issued above");
-        Target {
+    pub(crate) fn target(&self) -> anyhow::Result<Target> {
+        let client = |files: &TlsConfig, name| -> anyhow::Result<_> {
+            Ok(Arc::clone(&Credentials::load(files, &NodeName::from_static(name))?.current().client))
+        };
+        Ok(Target {
             broker: self.nodes[0].broker,
             gossip: self.nodes.iter().map(|node| node.gossip).collect(),
             key: KEY,
-            vehicle: Arc::clone(&credentials.current().client),
-        }
+            vehicle: client(&self.vehicle, VEHICLE)?,
+            candidate: client(&self.candidate, CANDIDATE)?,
+        })
     }
 
     /// The beginning of a measurement.

@@ -2,6 +2,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod_actors::transport::pki::BROKER_NAME;
@@ -9,6 +10,7 @@ use rustls::ClientConfig;
 use rustls::pki_types::ServerName;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
+use tokio::time::sleep;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 use uuid::Uuid;
@@ -56,6 +58,23 @@ pub(crate) async fn log_in_as(
         bail!("the login was refused: {answer:?}");
     }
     Ok(stream)
+}
+
+/// Sends the opening once and the packet for ever, over a new connection whenever one ends.
+pub(crate) async fn send_for_ever(
+    broker: SocketAddr,
+    (tls, name): (&Arc<ClientConfig>, &str),
+    opening: &[u8],
+    packet: &[u8],
+) {
+    loop {
+        if let Ok(mut stream) = log_in(broker, tls, name).await
+            && stream.write_all(opening).await.is_ok()
+        {
+            while stream.write_all(packet).await.is_ok() {}
+        }
+        sleep(Duration::from_millis(100)).await;
+    }
 }
 
 /// A SUBSCRIBE of one filter, QoS 0.

@@ -9,6 +9,7 @@
 //! Each kind of attacker has a file with its rows. `ROWS=a,b` runs those whose names contain `a` or `b`;
 //! `ATTACK=quick` runs only those for every change, `PROGRAM=file` attacks another build. A row that missed its bar while the machine stood still is repeated.
 
+mod candidate;
 mod cell;
 mod client;
 mod key_holder;
@@ -37,11 +38,11 @@ use crate::machine::Machine;
 use crate::row::{Outcome, Row, table};
 
 /// Kinds of attackers.
-const ATTACKERS: [&[Row]; 3] = [stranger::ROWS, key_holder::ROWS, vehicle::ROWS];
+const ATTACKERS: [&[Row]; 4] = [stranger::ROWS, key_holder::ROWS, vehicle::ROWS, candidate::ROWS];
 
 /// Duration of an attack, and of a quick one.
 const ATTACK_TIME: Duration = Duration::from_secs(20);
-const QUICK_TIME: Duration = Duration::from_secs(4);
+const QUICK_TIME: Duration = Duration::from_secs(3);
 
 /// Time after the attack in which maps still count.
 const AFTERMATH: Duration = Duration::from_secs(1);
@@ -99,7 +100,7 @@ async fn attempt(row: &Row, time: Duration) -> anyhow::Result<Outcome> {
 async fn run(row: &Row, time: Duration, machine: &mut Machine) -> anyhow::Result<Outcome> {
     let mut cell = Cell::start()?;
     cell.settle().await?;
-    let attacker = Attacker::start(row, cell.target())?;
+    let attacker = Attacker::start(row, cell.target()?)?;
     let from = cell.mark()?;
     machine.sleep(time).await?;
     let fault = attacker.stop();

@@ -30,6 +30,8 @@ pub(crate) enum Means {
     CellKey,
     /// Holds the certificate of a vehicle that never leads.
     Vehicle,
+    /// Holds the certificate of a node that may lead, and does not.
+    Candidate,
 }
 
 impl Means {
@@ -38,6 +40,7 @@ impl Means {
             Self::Stranger => "stranger",
             Self::CellKey => "cell key",
             Self::Vehicle => "cav certificate",
+            Self::Candidate => "candidate's",
         }
     }
 }

@@ -8,8 +8,8 @@ use rustls::ClientConfig;
 use tokio::io::AsyncWriteExt;
 use tokio::time::sleep;
 
-use crate::cell::{ATTACKER, CELL, Target};
-use crate::client::{log_in, log_in_as, publish, subscribe};
+use crate::cell::{CELL, Target, VEHICLE};
+use crate::client::{log_in, log_in_as, publish, send_for_ever, subscribe};
 use crate::packets::{packet, text};
 use crate::row::{Means, Row, UNHARMED};
 
@@ -73,42 +73,26 @@ fn detections(node: &str) -> String {
 }
 
 fn report() -> Vec<u8> {
-    publish(&detections(ATTACKER), &vec![b'x'; 255_000])
+    publish(&detections(VEHICLE), &vec![b'x'; 255_000])
 }
 
 /// Every connection sends as much as it can; some of them also subscribe to everything and read nothing.
 async fn flood(target: Target, readers: usize) -> anyhow::Result<()> {
-    let packet = report();
-    let send = |connection: usize| {
-        let (target, packet) = (&target, &packet);
-        async move {
-            loop {
-                if send_all(target, packet, connection < readers).await.is_err() {
-                    sleep(Duration::from_millis(100)).await;
-                }
-            }
-        }
+    let reading = [subscribe("#"), report()];
+    let connection = |index| {
+        let opening = if index < readers { &reading[0][..] } else { &[] };
+        send_for_ever(target.broker, (&target.vehicle, VEHICLE), opening, &reading[1])
     };
-    join_all((0..CONNECTIONS).map(send)).await;
+    join_all((0..CONNECTIONS).map(connection)).await;
     Ok(())
-}
-
-async fn send_all(target: &Target, packet: &[u8], reads: bool) -> anyhow::Result<()> {
-    let mut stream = log_in(target.broker, &target.vehicle, ATTACKER).await?;
-    if reads {
-        stream.write_all(&subscribe("#")).await?;
-    }
-    loop {
-        stream.write_all(packet).await?;
-    }
 }
 
 /// Every connection sends all but the last byte of the largest packet that it may begin.
 async fn unfinished_packets(target: Target) -> anyhow::Result<()> {
-    let packet = publish(&detections(ATTACKER), &vec![b'x'; 8 * 1024 * 1024]);
+    let packet = publish(&detections(VEHICLE), &vec![b'x'; 8 * 1024 * 1024]);
     let send = |_| async {
         loop {
-            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, ATTACKER).await
+            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await
                 && stream.write_all(&packet[..packet.len() - 1]).await.is_ok()
                 && stream.flush().await.is_ok()
             {
@@ -123,16 +107,16 @@ async fn unfinished_packets(target: Target) -> anyhow::Result<()> {
 
 /// Fills the places for retained statuses, and subscribes to all of them as often as one packet can.
 async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
-    let mut stream = log_in(target.broker, &target.vehicle, ATTACKER).await?;
+    let mut stream = log_in(target.broker, &target.vehicle, VEHICLE).await?;
     for observer in 0..64 {
-        let topic = format!("ecod/v1/{CELL}/nodes/{ATTACKER}--{observer}");
+        let topic = format!("ecod/v1/{CELL}/nodes/{VEHICLE}--{observer}");
         stream.write_all(&packet(0x31, &[&text(&topic), &vec![b'x'; 16 * 1024]])).await?;
     }
     let filter = [&text("ecod/v1/+/nodes/#")[..], &[0]].concat();
     let packet = packet(0x82, &[&[0, 1], &filter.repeat(10_000)]);
     let ask = |_| async {
         loop {
-            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, ATTACKER).await {
+            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
                 while stream.write_all(&packet).await.is_ok() {}
             }
             sleep(Duration::from_millis(100)).await;
@@ -156,7 +140,7 @@ async fn abandoned_sessions(target: Target) -> anyhow::Result<()> {
 
 async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<()> {
     let mut stream = crate::client::secure(target.broker, tls).await?;
-    let id = format!("{ATTACKER}-{}", uuid::Uuid::now_v7().simple());
+    let id = format!("{VEHICLE}-{}", uuid::Uuid::now_v7().simple());
     // Not a clean session.
     stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x00\0\0", &text(&id)])).await?;
     stream.write_all(&packet(0x82, &[&[0, 1], &text("#"), &[1]])).await?;
@@ -167,7 +151,7 @@ async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Resu
 async fn deep_filters(target: Target) -> anyhow::Result<()> {
     let filter = vec!["a"; 15_000].join("/");
     loop {
-        if let Ok(mut stream) = log_in(target.broker, &target.vehicle, ATTACKER).await {
+        if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
             stream.write_all(&subscribe(&filter)).await?;
             stream.write_all(&publish(&filter, b"payload")).await?;
         }
@@ -182,7 +166,7 @@ async fn claims(target: Target) -> anyhow::Result<()> {
         let ids = ["edge", "v01", "v02"].map(|name| format!("{name}-{run}"));
         let refused = try_join_all(ids.iter().map(|id| log_in_as(target.broker, &target.vehicle, id))).await;
         anyhow::ensure!(refused.is_err(), "logged in as another");
-        let mut stream = log_in(target.broker, &target.vehicle, ATTACKER).await?;
+        let mut stream = log_in(target.broker, &target.vehicle, VEHICLE).await?;
         for topic in ["detections/v01", "nodes/v01", "global_detections", "reputations", "ledger/v01"] {
             stream.write_all(&publish(&format!("ecod/v1/{CELL}/{topic}"), b"{}")).await?;
         }

@@ -175,6 +175,18 @@ mod tests {
     }
 
     #[test]
+    fn who_ends_packets_is_not_the_oldest_however_much_it_sends() {
+        let backlog = Backlog::default();
+        let [(sender, mut sender_cut), (reader, mut reader_cut)] = [0, 1].map(|_| backlog.open(Some("gauss".into())));
+        sender.set_unfinished(MIB, Timestamp(1));
+        reader.set_unread(MIB, Timestamp(2));
+        sender.set_unfinished(0, Timestamp(3));
+        sender.set_unfinished(MIB, Timestamp(3));
+        reader.set_unread(MAX_BYTES_EACH, Timestamp(4));
+        assert!(is_cut(&mut reader_cut) && !is_cut(&mut sender_cut));
+    }
+
+    #[test]
     fn a_connection_that_counts_alone_is_bounded_too() {
         let backlog = Backlog::default();
         let (slot, mut cut) = backlog.open(None);

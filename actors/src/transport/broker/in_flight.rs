@@ -120,7 +120,8 @@ mod tests {
         drop(held);
         assert!(!in_flight.is_full(&gauss, false) && in_flight.charges().total > 0);
         drop(part);
-        assert_eq!((in_flight.charges().total, in_flight.charges().by_principal.len()), (0, 0));
+        let charges = in_flight.charges();
+        assert_eq!((charges.total, charges.by_principal.len()), (0, 0));
     }
 
     #[test]

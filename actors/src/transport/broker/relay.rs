@@ -101,6 +101,10 @@ impl RelayLimits {
             if scanner.is_between_packets() {
                 unfinished = 0;
             }
+            if packets > 0 {
+                // The packet before has ended.
+                slot.set_unfinished(0, clock::now());
+            }
             slot.set_unfinished(unfinished, clock::now());
             let has_large_share = principal.has_large_share(&self.elected);
             let source = principal.source();
