@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -70,6 +70,10 @@ trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENAR
 soak: PACKAGES += iproute2 nftables
 soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
 	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact soak::soak --nocapture
+
+attack: PACKAGES += iproute2
+attack: setup ## attackers of all kinds against real cells, and a table; ROWS=text runs those named so, ATTACK=quick a part
+	cargo test --release --locked -p ecod-actors --test attacks -- --ignored --exact attacks --nocapture
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check

@@ -102,6 +102,8 @@ pub enum Event {
     ClientDenied,
     /// Another node declared more in the election than its certificate allows.
     Overreached,
+    /// The embedded broker cut off a client that did not read for 15 s, or for whose bytes there was no room.
+    ClientStalled,
     /// The embedded broker cut off a client whose certificate was revoked or expired.
     ClientExpelled,
 }

@@ -2,15 +2,22 @@
 
 #![deny(clippy::indexing_slicing)]
 
+mod backlog;
+mod byte_throttle;
 mod connect_packet;
 mod connection_throttle;
 mod embedded;
 mod frontend;
 mod heartbeat;
+mod in_flight;
+mod outbound_queue;
+mod packet_scanner;
 mod permissions;
 mod principal;
 mod publish_throttle;
+mod relay;
 mod retained;
+mod subscriptions;
 use std::net::SocketAddr;
 
 #[cfg(fuzzing)]

@@ -9,5 +9,7 @@ mod floods;
 mod frames;
 mod hung;
 mod identity;
+mod packets;
 mod payloads;
+mod resources;
 mod topics;

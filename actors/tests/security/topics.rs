@@ -9,31 +9,13 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 use crate::fixture::{Cell, SOON, knock, secure};
+use crate::packets::{packet, text};
 
 const CONNACK: [u8; 4] = [0x20, 2, 0, 0];
 const CONNACK_NOT_AUTHORIZED: [u8; 4] = [0x20, 2, 0, 5];
 const SUBACK_FAILURE: [u8; 5] = [0x90, 3, 0, 1, 0x80];
 const UNSUBACK: [u8; 4] = [0xb0, 2, 0, 2];
 const PUBACK: [u8; 4] = [0x40, 2, 0, 3];
-
-fn packet(first: u8, body: &[&[u8]]) -> Vec<u8> {
-    let body = body.concat();
-    let mut packet = vec![first];
-    let mut left = body.len();
-    loop {
-        let more = if left > 0x7f { 0x80 } else { 0 };
-        packet.push((left & 0x7f) as u8 | more);
-        left >>= 7;
-        if left == 0 {
-            break;
-        }
-    }
-    [packet, body].concat()
-}
-
-fn text(text: &str) -> Vec<u8> {
-    [&(text.len() as u16).to_be_bytes(), text.as_bytes()].concat()
-}
 
 fn login(will: Option<&str>) -> Vec<u8> {
     let will_topic = will.map(text).unwrap_or_default();

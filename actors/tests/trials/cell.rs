@@ -15,8 +15,9 @@ use tempfile::TempDir;
 use crate::analysis::{Accepted, NodeRun};
 use crate::logs;
 use crate::network::{self, Bridged};
+use crate::ports::Ports;
 use crate::process::{Process, command};
-use crate::settings::{Addresses, DETECTIONS, Ports, configuration, frame};
+use crate::settings::{Addresses, DETECTIONS, addresses, configuration, frame};
 
 /// The program under test.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_ecod-node");
@@ -100,12 +101,13 @@ impl Cell {
         fs::create_dir(&frames)?;
         fs::write(frames.join("0.ppm"), frame())?;
         fs::write(cell.directory.path().join("detections.jsonl"), DETECTIONS)?;
-        let addresses = (0..plan.nodes).map(|node| ports.of(node, plan.bridged)).collect::<anyhow::Result<Vec<_>>>()?;
-        for (index, address) in addresses.iter().enumerate() {
+        let all = (0..plan.nodes).map(|node| addresses(&mut ports, node, plan.bridged));
+        let all = all.collect::<anyhow::Result<Vec<_>>>()?;
+        for (index, address) in all.iter().enumerate() {
             let name = if index == EDGE { "edge".to_owned() } else { format!("v{index:02}") };
             let home = cell.directory.path().join(&name);
             fs::create_dir(&home)?;
-            let text = configuration(plan, index, &name, *address, &addresses, broker, cell.directory.path());
+            let text = configuration(plan, index, &name, *address, &all, broker, cell.directory.path());
             fs::write(home.join("node.toml"), text)?;
             cell.nodes.push(Node {
                 name: NodeName::new(name)?,

@@ -12,6 +12,7 @@ mod cell;
 mod logs;
 mod machine;
 mod network;
+mod ports;
 mod process;
 mod report;
 mod scenario;

@@ -1,14 +1,12 @@
 //! Addresses, configurations and input of a cell's nodes.
 
 use std::fmt::Write as _;
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
-
-use anyhow::bail;
-use ecod_actors::platform::clock;
 
 use crate::cell::{EDGE, Plan};
 use crate::network;
+use crate::ports::Ports;
 
 /// Where a node's broker listens and where it gossips.
 #[derive(Debug, Clone, Copy)]
@@ -17,40 +15,14 @@ pub(crate) struct Addresses {
     pub(crate) gossip: SocketAddr,
 }
 
-/// Hands out ports that are free now, from below those that the system gives to outgoing connections.
-pub(crate) struct Ports {
-    next: u16,
-}
-
-impl Ports {
-    const FIRST: u16 = 18_000;
-    const LAST: u16 = 32_000;
-
-    /// Starts somewhere else in every process.
-    pub(crate) fn new() -> Self {
-        let span = u32::from(Self::LAST - Self::FIRST);
-        Self { next: Self::FIRST + (clock::now().micros() as u32 % span) as u16 }
-    }
-
-    pub(crate) fn free(&mut self) -> anyhow::Result<u16> {
-        for _ in Self::FIRST..Self::LAST {
-            self.next = if self.next >= Self::LAST { Self::FIRST } else { self.next + 1 };
-            let address = (Ipv4Addr::LOCALHOST, self.next);
-            if TcpListener::bind(address).is_ok() && UdpSocket::bind(address).is_ok() {
-                return Ok(self.next);
-            }
-        }
-        bail!("no free port on loopback")
-    }
-
-    pub(crate) fn of(&mut self, node: usize, bridged: bool) -> anyhow::Result<Addresses> {
-        let (ip, broker, gossip) = if bridged {
-            (network::address(node), 1883, 17_884)
-        } else {
-            (Ipv4Addr::LOCALHOST, self.free()?, self.free()?)
-        };
-        Ok(Addresses { broker: (ip, broker).into(), gossip: (ip, gossip).into() })
-    }
+/// Addresses of a node: free ports on loopback, or fixed ones in a namespace.
+pub(crate) fn addresses(ports: &mut Ports, node: usize, bridged: bool) -> anyhow::Result<Addresses> {
+    let (ip, broker, gossip) = if bridged {
+        (network::address(node), 1883, 17_884)
+    } else {
+        (Ipv4Addr::LOCALHOST, ports.free()?, ports.free()?)
+    };
+    Ok(Addresses { broker: (ip, broker).into(), gossip: (ip, gossip).into() })
 }
 
 /// The cell's name.

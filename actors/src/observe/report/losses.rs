@@ -9,7 +9,7 @@ use crate::observe::recorder::CounterReading;
 use crate::telemetry::counters::Event;
 
 /// Events that count as losses.
-const EVENTS: [Event; 24] = [
+const EVENTS: [Event; 25] = [
     Event::PublishRefused,
     Event::PublishTooLarge,
     Event::InboxFull,
@@ -32,6 +32,7 @@ const EVENTS: [Event; 24] = [
     Event::ClientMalformed,
     Event::ClientsFull,
     Event::ClientDenied,
+    Event::ClientStalled,
     Event::ClientExpelled,
     Event::Overreached,
 ];

@@ -12,6 +12,8 @@ pub enum ShedReason {
     /// A node, an address or a local client published more often than `broker.max_messages_hz`. The embedded broker
     /// dropped the message.
     BrokerThrottled,
+    /// A client of the embedded broker read too slowly. The oldest message for it was dropped, or the rest when it was cut.
+    ReaderSlow,
     /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
     ReportThrottled,
     /// A candidate shared evidence more often than `mqtt.max_report_hz`; the share was not decoded.

@@ -3,7 +3,7 @@
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -19,9 +19,11 @@ use tokio::sync::oneshot;
 use super::BrokerHealth;
 use super::frontend::BrokerFrontend;
 use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
+use super::in_flight::InFlightMeter;
 use super::permissions::{AccessPolicy, MAX_TOPIC_LEVELS, Permissions};
 use super::publish_throttle::PublishThrottle;
 use super::retained::RetainedMessages;
+use super::subscriptions::{MAX_SUBSCRIPTIONS, SubscriptionQuota};
 use crate::platform::clock;
 
 /// An MQTT broker that lives inside the process.
@@ -89,8 +91,8 @@ pub struct BrokerConfig {
     /// Maximum clients at a time of one certificate, or of one remote address without certificates; default 32. A node
     /// has one or two, and one for each observer. A cell behind address translation needs as many for each node.
     pub max_clients_each: usize,
-    /// Maximum messages waiting for one slow client; default 256. More carries a client over longer pauses, but what it
-    /// then gets is old. Each of them may be as large as the largest packet.
+    /// Maximum messages waiting for one slow client; default 256. Beyond them, and beyond 4 MiB, the oldest gives way. More
+    /// carries a client over longer pauses, but what it then gets is old.
     pub max_waiting: usize,
     /// Maximum topics with a retained message; default 8192: one for each node's status and one for the reputations.
     pub max_retained: usize,
@@ -174,8 +176,9 @@ struct RunningBroker {
 /// Largest packet in bytes without a configured limit: the default maps and their topics.
 const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
 
-/// Maximum subscriptions of one client.
-const MAX_SUBSCRIPTIONS: usize = 256;
+/// Time for which a session outlives its connection; zero would mean no limit. A new connection starts empty: queues of
+/// absent clients would hold memory.
+const MAX_SESSION_EXPIRY: Duration = Duration::from_millis(1);
 
 /// Time for connections to end when the broker stops. Afterwards their tasks are abandoned.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
@@ -321,6 +324,8 @@ async fn prepare(
         .max_connections(config.max_clients)
         .max_mqueue_len(config.max_waiting)
         .max_subscriptions(MAX_SUBSCRIPTIONS)
+        .session_expiry_interval(MAX_SESSION_EXPIRY)
+        .max_session_expiry_interval(MAX_SESSION_EXPIRY)
         .handshake_timeout(Duration::from_secs(5));
     let listener = match &policy {
         // Without anonymous clients, rmqtt asks the hooks about each login.
@@ -337,7 +342,10 @@ async fn prepare(
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
             let frontend = BrokerFrontend::new(public, own, policy, config);
-            Permissions { principals: frontend.principals(), policy: policy.clone() }.install(&context).await;
+            let principals = frontend.principals();
+            SubscriptionQuota::new(principals.clone(), Arc::clone(&policy.counters)).install(&context).await;
+            InFlightMeter { in_flight: frontend.in_flight(), principals: principals.clone() }.install(&context).await;
+            Permissions { principals, policy: policy.clone() }.install(&context).await;
             (Some(frontend), bound)
         }
         None => (None, own),

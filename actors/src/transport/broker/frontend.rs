@@ -1,8 +1,8 @@
 //! Public side of the embedded broker: TLS, connection limits, and the principal of each client.
 //!
 //! ```text
-//! client ── TCP ──> admission ── TLS ──> CONNECT within time and size ──> loopback ──> rmqtt
-//!                    by source     certificate of the cell                registered with its principal
+//! client ── TCP ──> admission ── TLS ──> CONNECT within time and size ── relay ── loopback ──> rmqtt
+//!                    by source     certificate of the cell                within its principal's limits
 //! ```
 //!
 //! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore listens on a free
@@ -18,13 +18,17 @@ use rustls::pki_types::{CertificateDer, UnixTime};
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::{Semaphore, watch};
-use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout, timeout_at};
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout_at};
 use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
+use super::backlog::Backlog;
+use super::byte_throttle::ByteThrottle;
 use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
+use super::in_flight::InFlight;
 use super::permissions::AccessPolicy;
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
+use super::relay::RelayLimits;
 use super::{BrokerConfig, connect_packet};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
@@ -45,6 +49,7 @@ struct FrontendState {
     backend: SocketAddr,
     places: Arc<Semaphore>,
     quota: ConnectionQuota,
+    limits: RelayLimits,
     handshake_timeout: Duration,
     counters: Arc<Counters>,
 }
@@ -60,9 +65,6 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
 /// Time after which a client that reads nothing is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(15);
-
-/// Time to deliver the rest to a client that has ended its side.
-const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl BrokerFrontend {
     /// A frontend on a listener, for a broker that listens at `behind`.
@@ -80,6 +82,14 @@ impl BrokerFrontend {
             backend,
             places: Arc::new(Semaphore::new(config.max_clients)),
             quota: ConnectionQuota::new(config.max_clients_each),
+            limits: RelayLimits {
+                backlog: Backlog::default(),
+                throttle: ByteThrottle::default(),
+                in_flight: InFlight::default(),
+                elected: Arc::clone(&policy.elected),
+                max_waiting: config.max_waiting,
+                counters: Arc::clone(&policy.counters),
+            },
             handshake_timeout: Duration::from_millis(config.handshake_timeout_ms),
             counters: Arc::clone(&policy.counters),
         };
@@ -94,6 +104,11 @@ impl BrokerFrontend {
     /// Principals of the forwarded connections.
     pub(super) fn principals(&self) -> PrincipalRegistry {
         self.shared.principals.clone()
+    }
+
+    /// Messages on their way through rmqtt.
+    pub(super) fn in_flight(&self) -> InFlight {
+        self.shared.limits.in_flight.clone()
     }
 
     /// Accepts clients; never ends.
@@ -160,6 +175,8 @@ pub(super) enum ClientRejection {
     Full,
     #[error("as many clients as allowed are connected of this certificate or address")]
     Crowded,
+    #[error("does not read what it gets, or does not end what it begins")]
+    Stalled,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),
     #[error("certificate no longer valid: {0}")]
@@ -175,6 +192,7 @@ impl ClientRejection {
             Self::Untrusted(_) => Some(Event::ClientUntrusted),
             Self::Malformed | Self::Lost(_) => Some(Event::ClientMalformed),
             Self::Full | Self::Crowded => Some(Event::ClientsFull),
+            Self::Stalled => Some(Event::ClientStalled),
             Self::CertificateInvalidated(_) => Some(Event::ClientExpelled),
         }
     }
@@ -226,13 +244,13 @@ impl FrontendState {
         let socket = TcpSocket::new_v4()?;
         socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
         // Registered before rmqtt can ask for it, and until the port may be reused.
-        let _pass = self.principals.register(socket.local_addr()?, principal);
+        let _pass = self.principals.register(socket.local_addr()?, principal.clone());
         let mut backend = socket.connect(self.backend).await?;
         backend.set_nodelay(true)?;
         backend.write_all(&connect.packet).await?;
         let _visit = slot.log_in();
         tokio::select! {
-            () = relay(stream, backend) => Ok(()),
+            ended = self.limits.relay(stream, backend, &principal) => ended,
             error = certificate_invalidated(current, &certificates) => Err(ClientRejection::CertificateInvalidated(error)),
         }
     }
@@ -248,28 +266,6 @@ async fn secure(
     let certificates = stream.get_ref().1.peer_certificates().map(|chain| chain.to_vec());
     let certificates = certificates.ok_or_else(|| ClientRejection::Untrusted("no certificate".into()))?;
     Ok((Box::pin(stream), certificates))
-}
-
-/// Forwards bytes until either side ends. The rest for a client that has left is sent for a moment longer.
-async fn relay(client: Stream, broker: TcpStream) {
-    let (mut from_client, mut to_client) = tokio::io::split(client);
-    let (mut from_broker, mut to_broker) = broker.into_split();
-    let up = async {
-        let copied = tokio::io::copy(&mut from_client, &mut to_broker).await;
-        (copied.is_ok(), to_broker.shutdown().await.is_ok())
-    };
-    let down = async {
-        let copied = tokio::io::copy(&mut from_broker, &mut to_client).await;
-        (copied.is_ok(), to_client.shutdown().await.is_ok())
-    };
-    tokio::pin!(up, down);
-    tokio::select! {
-        ended = &mut down => tracing::trace!(?ended, "the broker ended the connection"),
-        ended = &mut up => {
-            let rest = timeout(FAREWELL_TIMEOUT, down).await;
-            tracing::trace!(?ended, ?rest, "the client ended the connection");
-        }
-    }
 }
 
 /// Waits until the client's certificate is no longer valid; the result is the reason.

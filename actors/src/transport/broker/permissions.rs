@@ -20,7 +20,9 @@ use ecod::wire::{Limits, Topic, Topics};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
-use rmqtt::types::{AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, SubscribeAclResult, TopicFilter};
+use rmqtt::types::{
+    AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, QoS, SubscribeAclResult, TopicFilter,
+};
 
 use super::principal::{Principal, PrincipalRegistry};
 use crate::telemetry::counters::{Counters, Event};
@@ -107,6 +109,9 @@ impl Permissions {
 /// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
 pub(super) const MAX_TOPIC_LEVELS: usize = 32;
 
+/// Maximum payload of a status in bytes. One has some hundred; they are retained, and sent to each new subscriber.
+const MAX_STATUS_BYTES: usize = 16 * 1024;
+
 /// Maximum length of a topic or filter in bytes.
 const MAX_TOPIC_BYTES: usize = 512;
 
@@ -139,6 +144,10 @@ impl Handler for Permissions {
                 self.policy.counters.count(Event::ClientDenied);
                 HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
             }
+            // Messages are passed on without acknowledgement: one that does not come would hold them in memory.
+            Parameter::ClientSubscribeCheckAcl(..) => {
+                HookResult::SubscribeAclResult(SubscribeAclResult::new_success(QoS::AtMostOnce, None))
+            }
             // An UNSUBACK cannot refuse. Such a filter is never subscribed, so that there is nothing to end.
             Parameter::ClientUnsubscribe(_, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
                 self.policy.counters.count(Event::ClientDenied);
@@ -153,7 +162,8 @@ impl Handler for Permissions {
 /// Largest payload that receivers of the topic accept, in bytes.
 fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     match topic {
-        Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) | Topic::Nodes(_) => limits.payload_bytes,
+        Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) => limits.payload_bytes,
+        Topic::Nodes(_) => limits.payload_bytes.min(MAX_STATUS_BYTES),
         Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
     }
 }

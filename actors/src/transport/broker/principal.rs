@@ -2,11 +2,12 @@
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use rmqtt::types::ClientId;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::permissions::LeaderCheck;
 use crate::platform::throttle::host_network;
 use crate::transport::pki::CertificateSubject;
 
@@ -18,20 +19,44 @@ pub(super) struct Principal {
     /// Key under which its connections and messages count together. Absent for local clients without certificates: a
     /// whole cell may run on this machine.
     quota_key: Option<Arc<str>>,
+    /// Name under which its bytes count together, also for local clients.
+    source: Arc<str>,
     /// Whether the broker draws the client id.
     pub(super) has_generated_id: bool,
 }
 
 impl Principal {
     pub(super) fn new(identity: Option<CertificateSubject>, from: IpAddr, has_generated_id: bool) -> Self {
-        let quota_key = match &identity {
+        let quota_key: Option<Arc<str>> = match &identity {
             Some(identity) => Some(identity.name().as_str().into()),
             None if from.to_canonical().is_loopback() => None,
             None => Some(host_network(from).to_string().into()),
         };
-        Self { identity: identity.map(Arc::new), quota_key, has_generated_id }
+        let source = quota_key.clone().unwrap_or_else(|| THIS_MACHINE.into());
+        Self { identity: identity.map(Arc::new), quota_key, source, has_generated_id }
+    }
+
+    /// Name under which its bytes count together.
+    pub(super) fn source(&self) -> &Arc<str> {
+        &self.source
+    }
+
+    /// Name under which held bytes count together; none where each connection counts alone.
+    pub(super) fn quota_key(&self) -> Option<Arc<str>> {
+        self.quota_key.clone()
+    }
+
+    /// Whether it sends maps, or may be a whole cell.
+    pub(super) fn has_large_share(&self, elected: &LeaderCheck) -> bool {
+        match &self.identity {
+            Some(identity) => identity.may_serve() && elected(identity.name()),
+            None => self.quota_key.is_none(),
+        }
     }
 }
+
+/// Source of local clients without certificates.
+const THIS_MACHINE: &str = "this machine";
 
 /// Key under which messages are counted.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -53,7 +78,13 @@ impl QuotaKey {
 
 /// Principals of the connections that the frontend forwards, by the frontend's local address.
 #[derive(Debug, Clone, Default)]
-pub(super) struct PrincipalRegistry(Arc<RwLock<HashMap<SocketAddr, Principal>>>);
+pub(super) struct PrincipalRegistry(Arc<RwLock<HashMap<SocketAddr, Registered>>>);
+
+#[derive(Debug)]
+struct Registered {
+    principal: Principal,
+    subscriptions: usize,
+}
 
 /// Entry of one connection in the registry; removed when dropped.
 pub(super) struct Registration {
@@ -63,25 +94,68 @@ pub(super) struct Registration {
 
 impl PrincipalRegistry {
     pub(super) fn register(&self, address: SocketAddr, principal: Principal) -> Registration {
-        self.0.write().unwrap_or_else(PoisonError::into_inner).insert(address, principal);
+        self.connections_mut().insert(address, Registered { principal, subscriptions: 0 });
         Registration { principals: self.clone(), address }
     }
 
     pub(super) fn principal(&self, address: Option<SocketAddr>) -> Option<Principal> {
-        self.0.read().unwrap_or_else(PoisonError::into_inner).get(&address?).cloned()
+        Some(self.connections().get(&address?)?.principal.clone())
+    }
+
+    /// Number of connections.
+    pub(super) fn len(&self) -> usize {
+        self.connections().len()
+    }
+
+    /// Name under which the bytes of a connection count.
+    pub(super) fn source(&self, address: Option<SocketAddr>) -> Option<Arc<str>> {
+        Some(Arc::clone(&self.connections().get(&address?)?.principal.source))
+    }
+
+    /// Counts a subscription of a connection.
+    pub(super) fn add_subscription(&self, address: Option<SocketAddr>) {
+        let mut connections = self.connections_mut();
+        if let Some(connection) = address.and_then(|address| connections.get_mut(&address)) {
+            connection.subscriptions += 1;
+        }
+    }
+
+    /// Counts the end of a subscription.
+    pub(super) fn remove_subscription(&self, address: Option<SocketAddr>) {
+        let mut connections = self.connections_mut();
+        if let Some(connection) = address.and_then(|address| connections.get_mut(&address)) {
+            connection.subscriptions = connection.subscriptions.saturating_sub(1);
+        }
+    }
+
+    /// Subscriptions of all connections of the same principal; 0 where each counts alone.
+    pub(super) fn subscriptions(&self, address: Option<SocketAddr>) -> usize {
+        let connections = self.connections();
+        let key_of = |registered: &Registered| registered.principal.quota_key.clone();
+        let Some(key) = address.and_then(|address| connections.get(&address).and_then(key_of)) else { return 0 };
+        let own = connections.values().filter(|other| other.principal.quota_key.as_ref() == Some(&key));
+        own.map(|connection| connection.subscriptions).sum()
+    }
+
+    fn connections(&self) -> RwLockReadGuard<'_, HashMap<SocketAddr, Registered>> {
+        self.0.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn connections_mut(&self) -> RwLockWriteGuard<'_, HashMap<SocketAddr, Registered>> {
+        self.0.write().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Key under which the messages of a client count.
     pub(super) fn quota_key(&self, address: Option<SocketAddr>, client: &ClientId) -> QuotaKey {
-        let principals = self.0.read().unwrap_or_else(PoisonError::into_inner);
-        let quota_key = address.and_then(|address| principals.get(&address)?.quota_key.clone());
+        let connections = self.connections();
+        let quota_key = address.and_then(|address| connections.get(&address)?.principal.quota_key.clone());
         quota_key.map_or_else(|| QuotaKey::Client(client.clone()), QuotaKey::Principal)
     }
 }
 
 impl Drop for Registration {
     fn drop(&mut self) {
-        self.principals.0.write().unwrap_or_else(PoisonError::into_inner).remove(&self.address);
+        self.principals.connections_mut().remove(&self.address);
     }
 }
 

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
+use bytes::Bytes;
 use rmqtt::retain::{DefaultRetainStorage, RetainStorage};
 use rmqtt::types::{Retain, TopicFilter, TopicName};
 use tokio::sync::Mutex;
@@ -43,7 +44,14 @@ impl RetainStorage for RetainedMessages {
 
     // `_listener_expiry` is for queued messages. A retained status is valid until it is replaced, or until the expiry
     // that its publisher set (MQTT 5).
-    async fn set(&self, topic: &TopicName, message: Retain, _listener_expiry: Option<Duration>) -> rmqtt::Result<()> {
+    async fn set(
+        &self,
+        topic: &TopicName,
+        mut message: Retain,
+        _listener_expiry: Option<Duration>,
+    ) -> rmqtt::Result<()> {
+        // Its own bytes: those that came are part of a larger buffer, and count as in flight.
+        message.publish.payload = Bytes::copy_from_slice(&message.publish.payload);
         let properties = message.publish.properties.as_ref();
         let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));
         let (now, bytes) = (Instant::now(), message.publish.payload.len());

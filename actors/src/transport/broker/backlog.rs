@@ -1,0 +1,198 @@
+//! Bytes that the broker holds for its clients, bounded for each principal and in total.
+//!
+//! Two kinds of bytes are held for a client: those that it does not read, and packets that it has begun and not ended.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use ecod::model::time::Timestamp;
+use tokio::sync::oneshot;
+
+/// Bytes held by connection. Beyond a bound, the connection that has held some for the longest time gives way: it is cut.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Backlog(Arc<Mutex<BacklogTable>>);
+
+#[derive(Debug, Default)]
+struct BacklogTable {
+    connections: BTreeMap<u64, Holding>,
+    /// Bytes of all connections.
+    bytes: usize,
+    next_number: u64,
+}
+
+#[derive(Debug)]
+struct Holding {
+    /// Absent for connections that count alone.
+    principal: Option<Arc<str>>,
+    unread: usize,
+    unfinished: usize,
+    /// Since when there are any.
+    since: Option<Timestamp>,
+    /// Dropped to cut the connection.
+    cut: Option<oneshot::Sender<()>>,
+}
+
+/// Maximum bytes held for one principal, and in total.
+const MAX_BYTES_EACH: usize = 16 * 1024 * 1024;
+const MAX_BYTES: usize = 48 * 1024 * 1024;
+
+/// A connection's part of the backlog; ends when dropped.
+#[derive(Debug)]
+pub(super) struct BacklogSlot {
+    backlog: Backlog,
+    number: u64,
+}
+
+impl Backlog {
+    /// A part for one more connection, and a receiver that ends when the connection has to.
+    pub(super) fn open(&self, principal: Option<Arc<str>>) -> (BacklogSlot, oneshot::Receiver<()>) {
+        let mut table = self.table();
+        let number = table.next_number;
+        table.next_number += 1;
+        let (cut, is_cut) = oneshot::channel();
+        let holding = Holding { principal, unread: 0, unfinished: 0, since: None, cut: Some(cut) };
+        table.connections.insert(number, holding);
+        (BacklogSlot { backlog: self.clone(), number }, is_cut)
+    }
+
+    fn table(&self) -> MutexGuard<'_, BacklogTable> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl BacklogSlot {
+    /// Records the bytes that the client has not read.
+    pub(super) fn set_unread(&self, bytes: usize, now: Timestamp) {
+        self.set(|holding| holding.unread = bytes, now);
+    }
+
+    /// Records the bytes of a packet that the client has not ended.
+    pub(super) fn set_unfinished(&self, bytes: usize, now: Timestamp) {
+        self.set(|holding| holding.unfinished = bytes, now);
+    }
+
+    fn set(&self, change: impl FnOnce(&mut Holding), now: Timestamp) {
+        let mut table = self.backlog.table();
+        let Some(holding) = table.connections.get_mut(&self.number) else { return };
+        let before = holding.bytes();
+        change(holding);
+        let (bytes, principal) = (holding.bytes(), holding.principal.clone());
+        holding.since = holding.since.or(Some(now)).filter(|_| bytes > 0);
+        table.bytes = (table.bytes + bytes).saturating_sub(before);
+        if bytes <= before || table.bytes <= MAX_BYTES_EACH {
+            return;
+        }
+        match principal {
+            Some(principal) => {
+                table.cut_oldest(|holding| holding.principal.as_ref() == Some(&principal), MAX_BYTES_EACH);
+            }
+            None if bytes > MAX_BYTES_EACH => table.cut(self.number),
+            None => {}
+        }
+        table.cut_oldest(|_| true, MAX_BYTES);
+    }
+}
+
+impl Drop for BacklogSlot {
+    fn drop(&mut self) {
+        let mut table = self.backlog.table();
+        table.cut(self.number);
+        table.connections.remove(&self.number);
+    }
+}
+
+impl BacklogTable {
+    /// Cuts connections, the oldest holding first, until the rest of a group hold no more than a bound.
+    fn cut_oldest(&mut self, is_member: impl Fn(&Holding) -> bool, bound: usize) {
+        loop {
+            let members = || self.connections.iter().filter(|(_, holding)| holding.bytes() > 0 && is_member(holding));
+            let oldest = members().min_by_key(|(_, holding)| holding.since).map(|(number, _)| *number);
+            match oldest {
+                Some(oldest) if members().map(|(_, holding)| holding.bytes()).sum::<usize>() > bound => {
+                    self.cut(oldest);
+                }
+                _ => break,
+            }
+        }
+    }
+
+    fn cut(&mut self, number: u64) {
+        if let Some(holding) = self.connections.get_mut(&number) {
+            self.bytes -= holding.bytes();
+            holding.cut = None;
+        }
+    }
+}
+
+impl Holding {
+    /// Held bytes; those of a connection that is being cut do not count.
+    fn bytes(&self) -> usize {
+        if self.cut.is_some() { self.unread + self.unfinished } else { 0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MIB: usize = 1024 * 1024;
+
+    fn is_cut(receiver: &mut oneshot::Receiver<()>) -> bool {
+        receiver.try_recv() == Err(oneshot::error::TryRecvError::Closed)
+    }
+
+    #[test]
+    fn the_oldest_of_a_principal_gives_way_and_others_do_not() {
+        let backlog = Backlog::default();
+        let (honest, mut honest_cut) = backlog.open(Some("euclid".into()));
+        honest.set_unread(MIB, Timestamp(1));
+        let mut flood: Vec<_> = (0..10).map(|_| backlog.open(Some("gauss".into()))).collect();
+        for (n, (slot, _)) in flood.iter().enumerate() {
+            slot.set_unread(MIB, Timestamp(10 + n as u64));
+            slot.set_unfinished(MIB, Timestamp(50));
+        }
+        let cut: Vec<_> = flood.iter_mut().map(|(_, receiver)| is_cut(receiver)).collect();
+        assert_eq!(cut, [vec![true; 2], vec![false; 8]].concat());
+        assert!(!is_cut(&mut honest_cut));
+        flood.clear();
+        assert_eq!(backlog.table().connections.len(), 1);
+    }
+
+    #[test]
+    fn the_oldest_of_all_gives_way_beyond_the_ceiling() {
+        let backlog = Backlog::default();
+        let mut slots: Vec<_> = (0..20).map(|n| backlog.open(Some(format!("v{n}").into()))).collect();
+        let (empty, mut empty_cut) = backlog.open(None);
+        empty.set_unread(1, Timestamp(0));
+        empty.set_unread(0, Timestamp(0));
+        for (n, (slot, _)) in slots.iter().enumerate() {
+            slot.set_unread(4 * MIB, Timestamp(100 - n as u64));
+        }
+        let cut = slots.iter_mut().filter_map(|(_, receiver)| is_cut(receiver).then_some(())).count();
+        assert_eq!(cut, 8);
+        assert!(!is_cut(&mut slots[0].1), "it came last");
+        assert!(!is_cut(&mut empty_cut), "it holds nothing");
+    }
+
+    #[test]
+    fn who_ends_packets_is_not_the_oldest_however_much_it_sends() {
+        let backlog = Backlog::default();
+        let [(sender, mut sender_cut), (reader, mut reader_cut)] = [0, 1].map(|_| backlog.open(Some("gauss".into())));
+        sender.set_unfinished(MIB, Timestamp(1));
+        reader.set_unread(MIB, Timestamp(2));
+        sender.set_unfinished(0, Timestamp(3));
+        sender.set_unfinished(MIB, Timestamp(3));
+        reader.set_unread(MAX_BYTES_EACH, Timestamp(4));
+        assert!(is_cut(&mut reader_cut) && !is_cut(&mut sender_cut));
+    }
+
+    #[test]
+    fn a_connection_that_counts_alone_is_bounded_too() {
+        let backlog = Backlog::default();
+        let (slot, mut cut) = backlog.open(None);
+        slot.set_unread(MAX_BYTES_EACH, Timestamp(0));
+        assert!(!is_cut(&mut cut));
+        slot.set_unread(MAX_BYTES_EACH + 1, Timestamp(0));
+        assert!(is_cut(&mut cut));
+    }
+}

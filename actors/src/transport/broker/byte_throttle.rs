@@ -1,0 +1,77 @@
+//! Bytes per second that each principal may send.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use ecod::model::time::Timestamp;
+
+/// Paces what principals send: all connections of one together. Nothing is lost, the sender waits.
+#[derive(Debug, Default)]
+pub(super) struct ByteThrottle(Mutex<HashMap<Arc<str>, Timestamp>>);
+
+/// Bytes per second of one principal. A vehicle sends some tens of kilobytes.
+const BYTES_PER_S: u64 = 4 * 1024 * 1024;
+
+/// Bytes that count for each packet beside its own, as small packets cost time as well.
+const PACKET_BYTES: usize = 1024;
+
+/// Factor on the rate of the leader, which sends maps, and of this machine without certificates, where a cell may run.
+const LARGE_SHARE: u64 = 8;
+
+/// Time of silence after which as much may be sent at once: two of the largest packets.
+const BURST: Duration = Duration::from_secs(4);
+
+/// Principals after which those are forgotten that have sent nothing lately.
+const MAX_PRINCIPALS: usize = 4096;
+
+impl ByteThrottle {
+    /// Counts received bytes; the result is the time until the principal may send more.
+    pub(super) fn charge(
+        &self,
+        principal: &Arc<str>,
+        has_large_share: bool,
+        (bytes, packets): (usize, usize),
+        now: Timestamp,
+    ) -> Duration {
+        let mut paid_until = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if paid_until.len() >= MAX_PRINCIPALS {
+            paid_until.retain(|_, until| *until > now);
+        }
+        let rate = BYTES_PER_S * if has_large_share { LARGE_SHARE } else { 1 };
+        let cost = (bytes + packets * PACKET_BYTES) as u64 * 1_000_000 / rate;
+        let until = paid_until.entry(Arc::clone(principal)).or_insert(now);
+        *until = (*until).max(now) + Duration::from_micros(cost);
+        until.since(now + BURST)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Bytes sent in a time by two connections that wait as they are told.
+    fn sent(large: bool, packet: usize, seconds: u64) -> usize {
+        let (throttle, principal) = (ByteThrottle::default(), "gauss".into());
+        let (mut waits, mut sent) = ([Timestamp(0); 2], 0);
+        loop {
+            waits.sort();
+            let [now, _] = waits;
+            if now > Timestamp(seconds * 1_000_000) {
+                return sent;
+            }
+            sent += packet;
+            waits[0] = now + throttle.charge(&principal, large, (packet, 1), now) + Duration::from_micros(1);
+        }
+    }
+
+    #[test]
+    fn connections_of_one_principal_share_a_rate() {
+        let mib = |bytes: usize| bytes as f64 / f64::from(1 << 20);
+        let (long, short) = (mib(sent(false, 64 * 1024, 20)), mib(sent(false, 64 * 1024, 10)));
+        assert!((38.0..42.0).contains(&(long - short)), "4 MiB a second: {long} {short}");
+        assert!((54.0..58.0).contains(&short), "and a burst: {short}");
+        assert!((420.0..460.0).contains(&mib(sent(true, 64 * 1024, 10))));
+        assert!(sent(false, 2, 10) < 2 * 60_000, "empty packets are few");
+    }
+}

@@ -1,0 +1,169 @@
+//! The bytes of one client, both ways, within its principal's limits.
+
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::sync::oneshot;
+use tokio::time::{sleep, timeout};
+
+use super::backlog::{Backlog, BacklogSlot};
+use super::byte_throttle::ByteThrottle;
+use super::frontend::ClientRejection;
+use super::in_flight::InFlight;
+use super::outbound_queue::OutboundQueue;
+use super::packet_scanner::{PacketScanner, Piece};
+use super::permissions::LeaderCheck;
+use super::principal::Principal;
+use crate::platform::clock;
+use crate::telemetry::counters::{Counters, ShedReason};
+
+/// Limits of what passes between clients and rmqtt.
+pub(super) struct RelayLimits {
+    pub(super) backlog: Backlog,
+    pub(super) throttle: ByteThrottle,
+    pub(super) in_flight: InFlight,
+    pub(super) elected: LeaderCheck,
+    /// Maximum messages that wait for one client.
+    pub(super) max_waiting: usize,
+    pub(super) counters: Arc<Counters>,
+}
+
+/// Time to deliver the rest to a client that has ended its side.
+const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Time between two looks whether rmqtt has passed on enough to take more.
+const IN_FLIGHT_PAUSE: Duration = Duration::from_millis(2);
+
+const BUFFER_BYTES: usize = 8 * 1024;
+
+impl RelayLimits {
+    /// Forwards bytes until either side ends or the client exceeds its limits.
+    ///
+    /// # Errors
+    /// [`ClientRejection::Stalled`]; a connection that is lost otherwise has just ended.
+    pub(super) async fn relay(
+        &self,
+        client: impl AsyncRead + AsyncWrite,
+        broker: TcpStream,
+        principal: &Principal,
+    ) -> Result<(), ClientRejection> {
+        let (slot, cut) = self.backlog.open(principal.quota_key());
+        let (from_client, to_client) = tokio::io::split(client);
+        let (from_broker, mut to_broker) = broker.into_split();
+        let up = async {
+            let forwarded = self.forward_up(from_client, &mut to_broker, principal, &slot).await;
+            (forwarded.is_ok(), to_broker.shutdown().await.is_ok())
+        };
+        let down = self.forward_down(from_broker, to_client, principal, &slot, cut);
+        tokio::pin!(up, down);
+        tokio::select! {
+            ended = &mut down => match ended {
+                Err(error) if error.kind() == io::ErrorKind::TimedOut => {
+                    // The rest of its queue.
+                    self.counters.shed(ShedReason::ReaderSlow, principal.source());
+                    Err(ClientRejection::Stalled)
+                }
+                _ => Ok(()),
+            },
+            ended = &mut up => {
+                let rest = timeout(FAREWELL_TIMEOUT, down).await;
+                tracing::trace!(?ended, ?rest, "the client ended the connection");
+                Ok(())
+            }
+        }
+    }
+
+    /// Passes bytes to rmqtt at the principal's rate, and only while rmqtt keeps up.
+    async fn forward_up(
+        &self,
+        mut client: impl AsyncRead + Unpin,
+        broker: &mut (impl AsyncWrite + Unpin),
+        principal: &Principal,
+        slot: &BacklogSlot,
+    ) -> io::Result<()> {
+        let (mut buffer, mut scanner, mut unfinished) = (vec![0; BUFFER_BYTES], PacketScanner::default(), 0);
+        loop {
+            let read = client.read(&mut buffer).await?;
+            let received = buffer.get(..read).unwrap_or_default();
+            if received.is_empty() {
+                return Ok(());
+            }
+            let (mut pieces, mut packets) = (received, 0);
+            while let Some(piece) = scanner.next(&mut pieces) {
+                match piece {
+                    Piece::Head(..) => (packets, unfinished) = (packets + 1, 0),
+                    Piece::Body(body) => unfinished += body.len(),
+                }
+            }
+            if scanner.is_between_packets() {
+                unfinished = 0;
+            }
+            if packets > 0 {
+                // The packet before has ended.
+                slot.set_unfinished(0, clock::now());
+            }
+            slot.set_unfinished(unfinished, clock::now());
+            let has_large_share = principal.has_large_share(&self.elected);
+            let source = principal.source();
+            let wait = self.throttle.charge(source, has_large_share, (read, packets), clock::now());
+            if !wait.is_zero() {
+                sleep(wait).await;
+            }
+            while self.in_flight.is_full(source, has_large_share) {
+                sleep(IN_FLIGHT_PAUSE).await;
+            }
+            broker.write_all(received).await?;
+        }
+    }
+
+    /// Takes all that rmqtt sends, so that nothing waits there, and passes it on as the client reads it.
+    async fn forward_down(
+        &self,
+        mut broker: impl AsyncRead + Unpin,
+        mut client: impl AsyncWrite + Unpin,
+        principal: &Principal,
+        slot: &BacklogSlot,
+        cut: oneshot::Receiver<()>,
+    ) -> io::Result<()> {
+        let (mut buffer, mut queue) = (vec![0; BUFFER_BYTES], OutboundQueue::new(self.max_waiting));
+        let (mut is_flushed, mut has_ended) = (true, false);
+        tokio::pin!(cut);
+        loop {
+            if has_ended && queue.is_empty() && is_flushed {
+                return client.shutdown().await;
+            }
+            tokio::select! {
+                biased;
+                _ = &mut cut => return Err(stalled()),
+                sent = send(&mut client, queue.next()), if !queue.is_empty() || !is_flushed => {
+                    is_flushed = queue.is_empty();
+                    queue.advance(sent?);
+                    slot.set_unread(queue.len(), clock::now());
+                }
+                read = broker.read(&mut buffer), if !has_ended => {
+                    let read = read?;
+                    has_ended = read == 0;
+                    let pushed = queue.push(buffer.get(..read).unwrap_or_default());
+                    let Ok(dropped) = pushed else { return Err(stalled()) };
+                    for _ in 0..dropped {
+                        self.counters.shed(ShedReason::ReaderSlow, principal.source());
+                    }
+                    slot.set_unread(queue.len(), clock::now());
+                }
+            }
+        }
+    }
+}
+
+/// Sends some bytes, or, if there are none, those that TLS still holds.
+async fn send(client: &mut (impl AsyncWrite + Unpin), bytes: &[u8]) -> io::Result<usize> {
+    if bytes.is_empty() { client.flush().await.map(|()| 0) } else { client.write(bytes).await }
+}
+
+/// The end of a client that does not take what it gets, or does not end what it begins.
+fn stalled() -> io::Error {
+    io::ErrorKind::TimedOut.into()
+}

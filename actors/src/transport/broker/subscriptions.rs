@@ -1,0 +1,72 @@
+//! Subscriptions of each principal: how many, and how often. Each new one is answered with all retained messages.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use rmqtt::codec::v5::SubscribeAckReason;
+use rmqtt::context::ServerContext;
+use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
+use rmqtt::types::SubscribeAclResult;
+
+use super::principal::{PrincipalRegistry, QuotaKey};
+use crate::platform::clock;
+use crate::platform::throttle::KeyedThrottle;
+use crate::telemetry::counters::{Counters, Event};
+
+/// Maximum subscriptions of one client, and of all clients of one certificate or address.
+pub(super) const MAX_SUBSCRIPTIONS: usize = 256;
+
+/// Time after which one more subscription is allowed once a burst is used up.
+const INTERVAL: Duration = Duration::from_millis(50);
+
+/// Hook of rmqtt that refuses subscriptions of a principal that has too many, or makes too many.
+pub(super) struct SubscriptionQuota {
+    rate: Mutex<KeyedThrottle<QuotaKey>>,
+    principals: PrincipalRegistry,
+    counters: Arc<Counters>,
+}
+
+impl SubscriptionQuota {
+    pub(super) fn new(principals: PrincipalRegistry, counters: Arc<Counters>) -> Self {
+        let rate = KeyedThrottle::new(2 * MAX_SUBSCRIPTIONS as u32, INTERVAL);
+        Self { rate: Mutex::new(rate), principals, counters }
+    }
+
+    /// Registers the hooks, before the permissions.
+    pub(super) async fn install(self, context: &ServerContext) {
+        let register = context.extends.hook_mgr().register();
+        let hook = Arc::new(self);
+        for event in [Type::ClientSubscribeCheckAcl, Type::SessionSubscribed, Type::SessionUnsubscribed] {
+            register.add_priority(event, 1, Box::new(SharedQuota(Arc::clone(&hook)))).await;
+        }
+        register.start().await;
+    }
+}
+
+struct SharedQuota(Arc<SubscriptionQuota>);
+
+#[async_trait]
+impl Handler for SharedQuota {
+    async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
+        let SubscriptionQuota { rate, principals, counters } = &*self.0;
+        match parameter {
+            Parameter::SessionSubscribed(session, _) => principals.add_subscription(session.id.remote_addr),
+            Parameter::SessionUnsubscribed(session, _) => principals.remove_subscription(session.id.remote_addr),
+            Parameter::ClientSubscribeCheckAcl(session, _) => {
+                let address = session.id.remote_addr;
+                let source = principals.quota_key(address, &session.id.client_id);
+                let is_allowed = principals.subscriptions(address) < MAX_SUBSCRIPTIONS
+                    && rate.lock().unwrap_or_else(PoisonError::into_inner).allow(&source, clock::now());
+                if !is_allowed {
+                    counters.count(Event::ClientDenied);
+                    tracing::debug!(source = source.as_str(), "subscription refused");
+                    let refused = SubscribeAclResult::new_failure(SubscribeAckReason::QuotaExceeded);
+                    return (false, Some(HookResult::SubscribeAclResult(refused)));
+                }
+            }
+            _ => {}
+        }
+        (true, before)
+    }
+}

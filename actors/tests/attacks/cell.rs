@@ -1,0 +1,285 @@
+//! A cell of real processes with certificates: an edge, a candidate and a vehicle, the latter two with cameras.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::wire::Role;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
+use rustls::ClientConfig;
+use serde::Deserialize;
+use tempfile::TempDir;
+
+use crate::ports::Ports;
+use crate::process::{Process, command};
+use crate::row::Outcome;
+
+/// The program under test, unless the environment names another.
+const PROGRAM: &str = env!("CARGO_BIN_EXE_ecod-node");
+
+/// The cell's name and key.
+pub(crate) const CELL: &str = "lot";
+const KEY: &str = "5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e";
+
+/// The nodes: the edge, a candidate, and the vehicle whose map log is read.
+const NODES: [(&str, Role); 3] = [("edge", Role::Edge), ("v01", Role::Auto), ("v02", Role::Cav)];
+
+/// The vehicle, and the node that may lead, whose certificates the attackers hold.
+pub(crate) const VEHICLE: &str = "gauss";
+pub(crate) const CANDIDATE: &str = "turing";
+
+/// Time for all processes to start and agree, and for how long they must have agreed.
+const START_TIMEOUT: Duration = Duration::from_secs(60);
+const SETTLED: Duration = Duration::from_millis(1500);
+
+/// One object ahead of each vehicle in every frame, and the size of the frames.
+const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":75,"y_min":50,"x_max":85,"y_max":60}}]
+"#;
+const FRAME_SIZE: (usize, usize) = (160, 120);
+
+/// Where the object is.
+const LANDMARK: &str = "\n[[landmarks]]\nid = \"ahead\"\nx_m = 6.6\ny_m = 0.0\n";
+
+/// Time between two maps.
+const ROUND: Duration = Duration::from_millis(100);
+
+/// Running nodes with their files; all end with it.
+pub(crate) struct Cell {
+    nodes: Vec<Node>,
+    vehicle: TlsConfig,
+    candidate: TlsConfig,
+    directory: TempDir,
+}
+
+struct Node {
+    name: &'static str,
+    broker: SocketAddr,
+    gossip: SocketAddr,
+    process: Process,
+}
+
+/// What an attacker knows and holds. A row uses what its means allow.
+#[derive(Clone)]
+pub(crate) struct Target {
+    /// The edge's broker.
+    pub(crate) broker: SocketAddr,
+    /// Where the nodes gossip.
+    pub(crate) gossip: Vec<SocketAddr>,
+    /// The cell's key.
+    pub(crate) key: &'static str,
+    /// TLS with the certificate of a vehicle, [`VEHICLE`].
+    pub(crate) vehicle: Arc<ClientConfig>,
+    /// TLS with the certificate of a node that may lead, [`CANDIDATE`].
+    pub(crate) candidate: Arc<ClientConfig>,
+}
+
+impl Cell {
+    /// Issues certificates, writes configurations, and starts all processes.
+    pub(crate) fn start() -> anyhow::Result<Self> {
+        let directory = tempfile::Builder::new().prefix("ecod-attack-").tempdir()?;
+        let home = directory.path();
+        fs::create_dir(home.join("frames"))?;
+        fs::write(home.join("frames/0.ppm"), grey_frame())?;
+        fs::write(home.join("detections.jsonl"), DETECTIONS)?;
+        let mut authority = Authority::init(&home.join("pki"), &NodeName::new(CELL)?, clock::now())?;
+        let vehicle = issue(&mut authority, VEHICLE, Role::Cav)?;
+        let candidate = issue(&mut authority, CANDIDATE, Role::Auto)?;
+        let mut ports = Ports::new();
+        let mut addresses = Vec::new();
+        for _ in NODES {
+            let [broker, gossip] = [ports.free()?, ports.free()?];
+            addresses.push((SocketAddr::from((Ipv4Addr::LOCALHOST, broker)), (Ipv4Addr::LOCALHOST, gossip).into()));
+        }
+        let seeds: Vec<SocketAddr> = addresses.iter().map(|(_, gossip)| *gossip).collect();
+        let mut nodes = Vec::new();
+        for ((name, role), (broker, gossip)) in NODES.into_iter().zip(addresses) {
+            let tls = issue(&mut authority, name, role)?;
+            let directory = home.join(name);
+            fs::create_dir(&directory)?;
+            let text = configuration(name, role, broker, gossip, &seeds, &tls, home);
+            fs::write(directory.join("node.toml"), text)?;
+            let program = std::env::var("PROGRAM").unwrap_or_else(|_| PROGRAM.to_owned());
+            let mut command = command(Path::new(&program), None);
+            command
+                .env_clear()
+                .envs(std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")));
+            command.args(["--log-format", "text", "--config", "node.toml", "--map-log", "maps.jsonl"]);
+            command.stderr(File::create(directory.join("node.log"))?).current_dir(&directory);
+            nodes.push(Node { name, broker, gossip, process: Process::start(&mut command)? });
+        }
+        Ok(Self { nodes, vehicle, candidate, directory })
+    }
+
+    /// Waits until maps hold the reports of all honest vehicles, and have done so for a while.
+    pub(crate) async fn settle(&mut self) -> anyhow::Result<()> {
+        let started = Instant::now();
+        loop {
+            tokio::time::sleep(Duration::from_millis(250)).await;
+            let ended = self.ended()?;
+            ensure!(ended.is_empty(), "ended at once: {}, files in {:?}", ended.join(", "), self.keep());
+            let since = Timestamp(clock::now().micros() - SETTLED.as_micros() as u64);
+            let maps = self.maps(since)?;
+            let is_whole = |map: &Map| map.reporters().is_superset(&honest());
+            if maps.len() >= 12 && maps.iter().all(is_whole) {
+                return Ok(());
+            }
+            if started.elapsed() > START_TIMEOUT {
+                let directory = self.keep();
+                anyhow::bail!("the cell does not settle, files in {directory:?}");
+            }
+        }
+    }
+
+    /// What an attacker needs.
+    pub(crate) fn target(&self) -> anyhow::Result<Target> {
+        let client = |files: &TlsConfig, name| -> anyhow::Result<_> {
+            Ok(Arc::clone(&Credentials::load(files, &NodeName::from_static(name))?.current().client))
+        };
+        Ok(Target {
+            broker: self.nodes[0].broker,
+            gossip: self.nodes.iter().map(|node| node.gossip).collect(),
+            key: KEY,
+            vehicle: client(&self.vehicle, VEHICLE)?,
+            candidate: client(&self.candidate, CANDIDATE)?,
+        })
+    }
+
+    /// The beginning of a measurement.
+    pub(crate) fn mark(&self) -> anyhow::Result<Timestamp> {
+        // Writing 5 sets the peak of memory back to what is used now.
+        let edge = self.nodes[0].process.id();
+        fs::write(format!("/proc/{edge}/clear_refs"), "5").context("peak memory of the edge")?;
+        Ok(clock::now())
+    }
+
+    /// Measurements since a mark.
+    pub(crate) fn outcome(&mut self, from: Timestamp) -> anyhow::Result<Outcome> {
+        let time = clock::now().since(from);
+        let ended = self.ended()?;
+        let maps = self.maps(from)?;
+        Ok(Outcome {
+            maps: maps.len(),
+            expected: (time.as_millis() / ROUND.as_millis()) as usize,
+            honest: maps.iter().filter(|map| map.reporters().is_superset(&honest())).count(),
+            rss_mb: if ended.is_empty() { self.peak_memory_mb()? } else { 0 },
+            false_verdicts: None,
+            ended,
+        })
+    }
+
+    /// Maps that the vehicle has accepted since a time.
+    fn maps(&self, since: Timestamp) -> anyhow::Result<Vec<Map>> {
+        let file = self.directory.path().join("v02/maps.jsonl");
+        let text = fs::read_to_string(&file).unwrap_or_default();
+        let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
+        let lines = whole.lines().map(serde_json::from_str::<Line>);
+        let lines = lines.collect::<Result<Vec<_>, _>>().with_context(|| file.display().to_string())?;
+        Ok(lines.into_iter().filter(|line| line.received_at_us >= since).map(|line| line.map).collect())
+    }
+
+    fn ended(&mut self) -> anyhow::Result<Vec<String>> {
+        let mut ended = Vec::new();
+        for node in &mut self.nodes {
+            if let Some(status) = node.process.ended()? {
+                ended.push(format!("{} ({status})", node.name));
+            }
+        }
+        Ok(ended)
+    }
+
+    fn peak_memory_mb(&self) -> anyhow::Result<u64> {
+        let text = fs::read_to_string(format!("/proc/{}/status", self.nodes[0].process.id()))?;
+        let peak = text.lines().find_map(|line| line.strip_prefix("VmHWM:")).context("no peak of memory")?;
+        Ok(peak.trim().trim_end_matches(" kB").parse::<u64>()? * 1024 / 1_000_000)
+    }
+
+    /// Leaves the files where they are.
+    fn keep(&mut self) -> PathBuf {
+        self.directory.disable_cleanup(true);
+        self.directory.path().to_owned()
+    }
+}
+
+/// What is needed of a line of a map log.
+#[derive(Deserialize)]
+struct Line {
+    received_at_us: Timestamp,
+    map: Map,
+}
+
+#[derive(Deserialize)]
+struct Map {
+    landmarks: Vec<Landmark>,
+}
+
+#[derive(Deserialize)]
+struct Landmark {
+    contributors: BTreeSet<String>,
+}
+
+impl Map {
+    fn reporters(&self) -> BTreeSet<&str> {
+        self.landmarks.iter().flat_map(|landmark| &landmark.contributors).map(String::as_str).collect()
+    }
+}
+
+/// The honest vehicles.
+fn honest() -> BTreeSet<&'static str> {
+    NODES.into_iter().filter(|(_, role)| *role != Role::Edge).map(|(name, _)| name).collect()
+}
+
+/// A picture: the vehicles see by recorded detections, but all else is as with a camera.
+fn grey_frame() -> Vec<u8> {
+    let (width, height) = FRAME_SIZE;
+    let header = format!("P6 {width} {height} 255\n");
+    [header.as_bytes(), &vec![128; width * height * 3]].concat()
+}
+
+fn issue(authority: &mut Authority, name: &str, role: Role) -> anyhow::Result<TlsConfig> {
+    let name = NodeName::new(name)?;
+    authority.issue(&name, role, Duration::from_secs(86_400), clock::now())?;
+    let (certificate, key) = authority.files_of(&name);
+    Ok(TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) })
+}
+
+fn configuration(
+    name: &str,
+    role: Role,
+    broker: SocketAddr,
+    gossip: SocketAddr,
+    seeds: &[SocketAddr],
+    tls: &TlsConfig,
+    shared: &Path,
+) -> String {
+    let seeds: Vec<_> = seeds.iter().map(|seed| format!("\"{seed}\"")).collect();
+    let seeds = seeds.join(", ");
+    let role = match role {
+        Role::Auto => "auto",
+        Role::Cav => "cav",
+        Role::Edge => "edge",
+    };
+    let TlsConfig { ca, certificate, key, revocation_list } = tls;
+    let list = revocation_list.as_ref().map(|list| format!("revocation_list = {list:?}\n")).unwrap_or_default();
+    let mut text = format!(
+        "name = \"{name}\"\ncell = \"{CELL}\"\nrole = \"{role}\"\nlisten = \"{broker}\"\nstate_dir = \"state\"\n\n\
+         [membership]\nkey = \"{KEY}\"\nbind = \"{gossip}\"\nseeds = [{seeds}]\n\n\
+         [membership.multicast]\nenabled = false\n\n[dashboard]\nenabled = false\n\n\
+         [tls]\nca = {ca:?}\ncertificate = {certificate:?}\nkey = {key:?}\n{list}"
+    );
+    if role != "edge" {
+        let (frames, detections) = (shared.join("frames"), shared.join("detections.jsonl"));
+        text += &format!(
+            "\n[camera.source]\nkind = \"images\"\npath = {frames:?}\nlooping = true\n\n\
+             [camera.detector]\nkind = \"recorded\"\npath = {detections:?}\nlooping = true\n\n\
+             [camera.projection.sizes.default]\nwidth_m = 0.5\nheight_m = 0.5\n"
+        );
+    }
+    text + LANDMARK
+}

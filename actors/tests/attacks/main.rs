@@ -1,0 +1,136 @@
+//! Attacks on a cell of real processes, from outside and from within: `make attack`.
+//!
+//! ```text
+//! harness ── starts ──> edge, v01, v02   real nodes with certificates, which report and fuse throughout
+//!    └────── runs ───>  a row            one attack, by the means of one kind of attacker
+//!    └────── reads ──>  map logs, memory of the edge ──> the row's line in the table
+//! ```
+//!
+//! Each kind of attacker has a file with its rows. `ROWS=a,b` runs those whose names contain `a` or `b`;
+//! `ATTACK=quick` runs only those for every change, `PROGRAM=file` attacks another build. A row that missed its bar while the machine stood still is repeated.
+
+mod candidate;
+mod cell;
+mod client;
+mod key_holder;
+mod row;
+mod stranger;
+mod vehicle;
+
+#[allow(dead_code, reason = "shared with the trials")]
+#[path = "../trials/machine.rs"]
+mod machine;
+#[path = "../security/packets.rs"]
+mod packets;
+#[path = "../trials/ports.rs"]
+mod ports;
+#[allow(dead_code, reason = "shared with the trials")]
+#[path = "../trials/process.rs"]
+mod process;
+
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use tokio::runtime::{Builder, Runtime};
+
+use crate::cell::{Cell, Target};
+use crate::machine::Machine;
+use crate::row::{Outcome, Row, table};
+
+/// Kinds of attackers.
+const ATTACKERS: [&[Row]; 4] = [stranger::ROWS, key_holder::ROWS, vehicle::ROWS, candidate::ROWS];
+
+/// Duration of an attack, and of a quick one.
+const ATTACK_TIME: Duration = Duration::from_secs(20);
+const QUICK_TIME: Duration = Duration::from_secs(3);
+
+/// Time after the attack in which maps still count.
+const AFTERMATH: Duration = Duration::from_secs(1);
+
+/// Attempts at a row on a machine that stands still.
+const MAX_ATTEMPTS: usize = 3;
+
+#[test]
+#[ignore = "takes minutes: make attack"]
+fn attacks() {
+    // Processes end with the thread that started them: all are started by this one.
+    let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+    if let Err(error) = runtime.block_on(run_all()) {
+        panic!("{error:#}");
+    }
+}
+
+async fn run_all() -> anyhow::Result<()> {
+    let is_quick = std::env::var("ATTACK").is_ok_and(|mode| mode == "quick");
+    let wanted = std::env::var("ROWS").unwrap_or_default();
+    let is_wanted = |row: &&Row| {
+        let is_named = wanted.split(',').any(|part| row.attack.contains(part.trim()));
+        is_named && (row.quick || !is_quick)
+    };
+    let time = if is_quick { QUICK_TIME } else { ATTACK_TIME };
+    let mut lines = Vec::new();
+    for row in ATTACKERS.into_iter().flatten().filter(is_wanted) {
+        lines.push((row, attempt(row, time).await.with_context(|| row.attack)?));
+    }
+    println!("\n{}", table(&lines));
+    let misses: Vec<_> = lines.iter().filter(|(row, outcome)| !row.bar.is_met(outcome)).collect();
+    if lines.is_empty() {
+        bail!("no row's name contains any of ROWS={wanted}");
+    }
+    if !misses.is_empty() {
+        bail!("bars missed: {}", misses.iter().map(|(row, _)| row.attack).collect::<Vec<_>>().join(", "));
+    }
+    Ok(())
+}
+
+/// Runs a row until it meets its bar, or misses it on a machine that runs.
+async fn attempt(row: &Row, time: Duration) -> anyhow::Result<Outcome> {
+    for left in (0..MAX_ATTEMPTS).rev() {
+        let mut machine = Machine::default();
+        let outcome = run(row, time, &mut machine).await?;
+        println!("{}: {outcome}", row.attack);
+        if row.bar.is_met(&outcome) || left == 0 || !machine.is_starved() {
+            return Ok(outcome);
+        }
+        println!("    repeated, the machine stood still: {}", machine.account());
+    }
+    bail!("no attempt")
+}
+
+async fn run(row: &Row, time: Duration, machine: &mut Machine) -> anyhow::Result<Outcome> {
+    let mut cell = Cell::start()?;
+    cell.settle().await?;
+    let attacker = Attacker::start(row, cell.target()?)?;
+    let from = cell.mark()?;
+    machine.sleep(time).await?;
+    let fault = attacker.stop();
+    machine.sleep(AFTERMATH).await?;
+    if let Some(error) = fault {
+        println!("    the attacker gave up: {error:#}");
+    }
+    cell.outcome(from)
+}
+
+/// An attack under way, on threads of its own.
+struct Attacker {
+    runtime: Runtime,
+    task: tokio::task::JoinHandle<anyhow::Result<()>>,
+}
+
+impl Attacker {
+    fn start(row: &Row, target: Target) -> anyhow::Result<Self> {
+        let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+        let task = runtime.spawn((row.run)(target));
+        Ok(Self { runtime, task })
+    }
+
+    /// Ends the attack; the result is the reason for which it ended before, if it failed.
+    fn stop(self) -> Option<anyhow::Error> {
+        let fault = match self.task.is_finished() {
+            true => futures_util::FutureExt::now_or_never(self.task).and_then(Result::ok).and_then(Result::err),
+            false => None,
+        };
+        self.runtime.shutdown_background();
+        fault
+    }
+}

@@ -1,0 +1,131 @@
+//! An attack, its bar, and the table of outcomes.
+
+use std::fmt;
+use std::fmt::Write as _;
+use std::pin::Pin;
+
+use crate::cell::Target;
+
+/// One attack by one kind of attacker.
+pub(crate) struct Row {
+    /// Name, as in the table.
+    pub(crate) attack: &'static str,
+    pub(crate) means: Means,
+    pub(crate) bar: Bar,
+    /// Whether it runs on every change.
+    pub(crate) quick: bool,
+    /// The attack; it is stopped from outside unless it ends by itself.
+    pub(crate) run: fn(Target) -> Attack,
+}
+
+/// A running attack.
+pub(crate) type Attack = Pin<Box<dyn Future<Output = anyhow::Result<()>> + Send>>;
+
+/// Means of an attacker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Means {
+    /// Reaches the cell's ports and holds no secret.
+    Stranger,
+    /// Holds the cell's key, and no certificate.
+    CellKey,
+    /// Holds the certificate of a vehicle that never leads.
+    Vehicle,
+    /// Holds the certificate of a node that may lead, and does not.
+    Candidate,
+}
+
+impl Means {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Stranger => "stranger",
+            Self::CellKey => "cell key",
+            Self::Vehicle => "cav certificate",
+            Self::Candidate => "candidate's",
+        }
+    }
+}
+
+/// Least and most that a row's outcome may be.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Bar {
+    /// Least part of the expected maps that arrive, 0 to 1.
+    pub(crate) maps: f64,
+    /// Least part of the maps with the reports of all honest vehicles, 0 to 1.
+    pub(crate) honest: f64,
+    /// Most memory of the edge at any time, in MB.
+    pub(crate) rss_mb: u64,
+}
+
+/// The bar of attacks that may cost a cell nothing.
+pub(crate) const UNHARMED: Bar = Bar { maps: 0.95, honest: 0.95, rss_mb: 200 };
+
+/// Measurements of a row.
+#[derive(Debug, Clone)]
+pub(crate) struct Outcome {
+    /// Maps that an honest vehicle accepted, and the number that it expects at least: rounds end early when all have
+    /// reported.
+    pub(crate) maps: usize,
+    pub(crate) expected: usize,
+    /// Maps with the reports of all honest vehicles.
+    pub(crate) honest: usize,
+    /// Largest memory of the edge in MB.
+    pub(crate) rss_mb: u64,
+    /// Wrong verdicts, where the cell votes.
+    pub(crate) false_verdicts: Option<usize>,
+    /// Nodes that ended.
+    pub(crate) ended: Vec<String>,
+}
+
+impl Bar {
+    /// Whether an outcome is good enough.
+    pub(crate) fn is_met(&self, outcome: &Outcome) -> bool {
+        let part = |count: usize, of: usize| count as f64 / of.max(1) as f64;
+        part(outcome.maps, outcome.expected) >= self.maps
+            && part(outcome.honest, outcome.expected.max(outcome.maps)) >= self.honest
+            && outcome.rss_mb <= self.rss_mb
+            && outcome.false_verdicts.unwrap_or_default() == 0
+            && outcome.ended.is_empty()
+    }
+}
+
+impl fmt::Display for Bar {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:.0} %, {:.0} %, {} MB", 100.0 * self.maps, 100.0 * self.honest, self.rss_mb)
+    }
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { maps, expected, honest, rss_mb, .. } = self;
+        write!(f, "{maps} of {expected} maps, {honest} with all honest reports, {rss_mb} MB")?;
+        if !self.ended.is_empty() {
+            write!(f, ", ended: {}", self.ended.join(", "))?;
+        }
+        Ok(())
+    }
+}
+
+/// All outcomes, for people.
+pub(crate) fn table(lines: &[(&Row, Outcome)]) -> String {
+    let width = lines.iter().map(|(row, _)| row.attack.chars().count()).max().unwrap_or_default();
+    let mut text = format!(
+        "{:width$}  {:16}  {:>11}  {:>6}  {:>6}  {:>5}  {:18}  verdict\n",
+        "attack", "means", "maps", "honest", "RSS MB", "false", "bar"
+    );
+    for (row, outcome) in lines {
+        let maps = format!("{}/{}", outcome.maps, outcome.expected);
+        let wrong = outcome.false_verdicts.map_or_else(|| "-".to_owned(), |count| count.to_string());
+        let verdict = match (row.bar.is_met(outcome), outcome.ended.is_empty()) {
+            (true, _) => "held".to_owned(),
+            (false, true) => "BROKEN".to_owned(),
+            (false, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),
+        };
+        let (attack, means, honest, rss) = (row.attack, row.means.name(), outcome.honest, outcome.rss_mb);
+        let _ = writeln!(
+            text,
+            "{attack:width$}  {means:16}  {maps:>11}  {honest:>6}  {rss:>6}  {wrong:>5}  {:18}  {verdict}",
+            row.bar.to_string()
+        );
+    }
+    text
+}

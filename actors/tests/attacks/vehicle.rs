@@ -1,0 +1,175 @@
+//! The owner of a vehicle's certificate, which may report, read everything, and never lead.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::future::{join_all, try_join_all};
+use rustls::ClientConfig;
+use tokio::io::AsyncWriteExt;
+use tokio::time::sleep;
+
+use crate::cell::{CELL, Target, VEHICLE};
+use crate::client::{log_in, log_in_as, publish, send_for_ever, subscribe};
+use crate::packets::{packet, text};
+use crate::row::{Means, Row, UNHARMED};
+
+pub(crate) const ROWS: &[Row] = &[
+    Row {
+        attack: "30 connections flood with 255 kB",
+        means: Means::Vehicle,
+        bar: UNHARMED,
+        quick: true,
+        run: |target| Box::pin(flood(target, 0)),
+    },
+    Row {
+        attack: "30 readers of everything read nothing, beside a flood",
+        means: Means::Vehicle,
+        bar: UNHARMED,
+        quick: true,
+        run: |target| Box::pin(flood(target, 30)),
+    },
+    Row {
+        attack: "packets that never end",
+        means: Means::Vehicle,
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(unfinished_packets(target)),
+    },
+    Row {
+        attack: "retained messages asked for again and again",
+        means: Means::Vehicle,
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(repeated_subscriptions(target)),
+    },
+    Row {
+        attack: "sessions left behind with full queues",
+        means: Means::Vehicle,
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(abandoned_sessions(target)),
+    },
+    Row {
+        attack: "filters of 15,000 levels",
+        means: Means::Vehicle,
+        bar: UNHARMED,
+        quick: true,
+        run: |target| Box::pin(deep_filters(target)),
+    },
+    Row {
+        attack: "client ids and topics of others",
+        means: Means::Vehicle,
+        bar: UNHARMED,
+        quick: true,
+        run: |target| Box::pin(claims(target)),
+    },
+];
+
+/// Clients of one certificate, fewer than the broker takes.
+const CONNECTIONS: usize = 30;
+
+fn detections(node: &str) -> String {
+    format!("ecod/v1/{CELL}/detections/{node}")
+}
+
+fn report() -> Vec<u8> {
+    publish(&detections(VEHICLE), &vec![b'x'; 255_000])
+}
+
+/// Every connection sends as much as it can; some of them also subscribe to everything and read nothing.
+async fn flood(target: Target, readers: usize) -> anyhow::Result<()> {
+    let reading = [subscribe("#"), report()];
+    let connection = |index| {
+        let opening = if index < readers { &reading[0][..] } else { &[] };
+        send_for_ever(target.broker, (&target.vehicle, VEHICLE), opening, &reading[1])
+    };
+    join_all((0..CONNECTIONS).map(connection)).await;
+    Ok(())
+}
+
+/// Every connection sends all but the last byte of the largest packet that it may begin.
+async fn unfinished_packets(target: Target) -> anyhow::Result<()> {
+    let packet = publish(&detections(VEHICLE), &vec![b'x'; 8 * 1024 * 1024]);
+    let send = |_| async {
+        loop {
+            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await
+                && stream.write_all(&packet[..packet.len() - 1]).await.is_ok()
+                && stream.flush().await.is_ok()
+            {
+                sleep(Duration::from_secs(60)).await;
+            }
+            sleep(Duration::from_millis(100)).await;
+        }
+    };
+    join_all((0..CONNECTIONS).map(send)).await;
+    Ok(())
+}
+
+/// Fills the places for retained statuses, and subscribes to all of them as often as one packet can.
+async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
+    let mut stream = log_in(target.broker, &target.vehicle, VEHICLE).await?;
+    for observer in 0..64 {
+        let topic = format!("ecod/v1/{CELL}/nodes/{VEHICLE}--{observer}");
+        stream.write_all(&packet(0x31, &[&text(&topic), &vec![b'x'; 16 * 1024]])).await?;
+    }
+    let filter = [&text("ecod/v1/+/nodes/#")[..], &[0]].concat();
+    let packet = packet(0x82, &[&[0, 1], &filter.repeat(10_000)]);
+    let ask = |_| async {
+        loop {
+            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+                while stream.write_all(&packet).await.is_ok() {}
+            }
+            sleep(Duration::from_millis(100)).await;
+        }
+    };
+    join_all((0..CONNECTIONS).map(ask)).await;
+    Ok(())
+}
+
+/// Leaves sessions behind that are to be kept, one after the other, while reports come.
+async fn abandoned_sessions(target: Target) -> anyhow::Result<()> {
+    let leave = async {
+        loop {
+            if leave_session(&target, &target.vehicle).await.is_err() {
+                sleep(Duration::from_millis(100)).await;
+            }
+        }
+    };
+    tokio::join!(flood(target.clone(), 0), leave).0
+}
+
+async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<()> {
+    let mut stream = crate::client::secure(target.broker, tls).await?;
+    let id = format!("{VEHICLE}-{}", uuid::Uuid::now_v7().simple());
+    // Not a clean session.
+    stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x00\0\0", &text(&id)])).await?;
+    stream.write_all(&packet(0x82, &[&[0, 1], &text("#"), &[1]])).await?;
+    sleep(Duration::from_millis(50)).await;
+    Ok(stream.shutdown().await?)
+}
+
+async fn deep_filters(target: Target) -> anyhow::Result<()> {
+    let filter = vec!["a"; 15_000].join("/");
+    loop {
+        if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+            stream.write_all(&subscribe(&filter)).await?;
+            stream.write_all(&publish(&filter, b"payload")).await?;
+        }
+        sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// Takes the names of honest nodes, and publishes in them.
+async fn claims(target: Target) -> anyhow::Result<()> {
+    loop {
+        let run = uuid::Uuid::now_v7().simple().to_string();
+        let ids = ["edge", "v01", "v02"].map(|name| format!("{name}-{run}"));
+        let refused = try_join_all(ids.iter().map(|id| log_in_as(target.broker, &target.vehicle, id))).await;
+        anyhow::ensure!(refused.is_err(), "logged in as another");
+        let mut stream = log_in(target.broker, &target.vehicle, VEHICLE).await?;
+        for topic in ["detections/v01", "nodes/v01", "global_detections", "reputations", "ledger/v01"] {
+            stream.write_all(&publish(&format!("ecod/v1/{CELL}/{topic}"), b"{}")).await?;
+        }
+        sleep(Duration::from_millis(50)).await;
+    }
+}
