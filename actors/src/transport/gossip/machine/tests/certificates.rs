@@ -1,5 +1,7 @@
 //! Cells whose nodes prove certificates.
 
+use rustls::pki_types::UnixTime;
+
 use super::*;
 use crate::transport::gossip::trial_authority::TrialAuthority;
 
@@ -125,6 +127,21 @@ fn a_certificate_renewed_while_its_node_runs_is_shown_to_all_without_a_gap() {
     certified.set_identity(1, renewed);
     certified.cell.run(3000);
     assert_eq!(certified.cell.events(), 0);
+}
+
+/// A machine that starts in 1970 takes no certificate for valid, and takes part once its clock is set.
+#[test]
+fn a_node_whose_clock_is_wrong_waits_and_is_met_once_it_is_right() {
+    let mut certified = CertifiedCell::of(2);
+    let right = certified.authority.identity("node-3", Role::Auto);
+    let wrong = Identity { wall: UnixTime::since_unix_epoch(Duration::from_secs(8)), ..right.clone() };
+    let run = certified.cell.now.micros();
+    certified.cell.start_as(3, "node-3", (KEY, Some(wrong)), run);
+    certified.cell.run(3000);
+    assert!(certified.cell.sees(3).is_empty());
+    certified.set_identity(3, right);
+    certified.cell.run(2000);
+    certified.cell.assert_complete();
 }
 
 #[test]
