@@ -23,7 +23,7 @@ use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameKind, Introduction, NameClaim};
 use super::handshake::Identity;
 use super::key::{CellKey, SessionNonce};
-use super::node_id::NodeId;
+use super::node_id::{MAX_CLAIMED_LIFE, NodeId};
 use super::sessions::{Arrival, FrameContent, Sessions};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
@@ -245,7 +245,8 @@ impl GossipMachine {
         let Introduction { id, seen_at, claim } = introduction;
         match claim {
             NameClaim::Free => (),
-            NameClaim::After(life) => self.gossip.start_life_after(life, at),
+            NameClaim::After(life) if life <= MAX_CLAIMED_LIFE => self.gossip.start_life_after(life, at),
+            NameClaim::After(_) => (),
             NameClaim::Taken => self.report_taken(self.gossip.own().name.clone(), at),
         }
         let own = self.gossip.own().gossip.ip();

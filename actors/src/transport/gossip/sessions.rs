@@ -27,7 +27,7 @@ use super::handshake::{Identity, Prover};
 use super::key::{BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of};
 use super::node_id::NodeId;
 use super::refusals::Refusals;
-use super::reply_throttle::{ReplyThrottle, VerificationThrottle};
+use super::reply_throttle::ReplyThrottle;
 use crate::platform::throttle::TokenBucket;
 use peers::PeerTable;
 
@@ -45,7 +45,7 @@ pub(crate) struct Sessions {
     /// Throttles of answers to greetings, of answers to challenges, of verifications, and of own greetings.
     challenges: ReplyThrottle,
     proofs: ReplyThrottle,
-    verifications: VerificationThrottle,
+    verifications: ReplyThrottle,
     greetings: TokenBucket,
     other_key_seen: bool,
     certified: Refusals,
@@ -114,7 +114,7 @@ impl Sessions {
             prover: identity.map(|identity| Prover::new(identity, nonce)),
             challenges: ReplyThrottle::new(now),
             proofs: ReplyThrottle::new(now),
-            verifications: VerificationThrottle::new(now),
+            verifications: ReplyThrottle::new(now),
             greetings: TokenBucket::new(HELLO_BURST, HELLO_INTERVAL, now),
             other_key_seen: false,
             certified: Refusals::default(),
