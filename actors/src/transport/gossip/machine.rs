@@ -196,11 +196,11 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
-    /// Gossips that a node is alive, true or not.
+    /// Gossips about a node, true or not.
     #[cfg(test)]
-    pub(crate) fn spread(&mut self, id: NodeId, now: Timestamp) {
+    pub(crate) fn spread(&mut self, about: foca::Member<NodeId>, now: Timestamp) {
         let at = self.advance(now);
-        self.gossip.spread(id, at);
+        self.gossip.spread(about, at);
         self.flush_swim(at);
     }
 
@@ -228,7 +228,10 @@ impl GossipMachine {
                 self.outputs.extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
                 self.meet(introduction, speaks, greeter, at);
             }
-            FrameContent::Gossip { from, body } => self.gossip.receive(&from, &body, at)?,
+            FrameContent::Gossip { from, body } => {
+                let is_heard = |name: &NodeName| self.sessions.is_heard(name, at);
+                self.gossip.receive(&from, &body, &is_heard, at)?;
+            }
             FrameContent::Payload { from, rights, body } => {
                 let event = MembershipEvent::Received { from, rights, payload: Bytes::from(body), received_at: now };
                 self.outputs.push_back(GossipOutput::Tell(event));

@@ -171,6 +171,11 @@ impl Sessions {
         Some((&peer.id, peer.proven.as_ref()?.rights))
     }
 
+    /// Whether a node was heard a moment ago.
+    pub(crate) fn is_heard(&self, name: &NodeName, now: Timestamp) -> bool {
+        self.peers.speaker(name).is_some_and(|peer| now.since(peer.heard) < HEARD_TIME)
+    }
+
     /// Address of the node of a name, if it was heard lately.
     pub(crate) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
         let peer = self.peers.speaker(name)?;
@@ -329,6 +334,10 @@ const HELLO_INTERVAL: Duration = Duration::from_millis(10);
 
 /// Idle time after which a session may be replaced. It is then sent to only if the gossip holds the node alive.
 const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Time for which a node that was heard is not doubted on the word of others. It is about as long as the gossip takes to
+/// find that a node is down.
+const HEARD_TIME: Duration = Duration::from_millis(400);
 
 /// Time for which frames of a node's earlier run may still arrive.
 const MAX_TRANSIT: Duration = Duration::from_millis(500);
