@@ -113,6 +113,10 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 /// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
 pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let security = config.security().map_err(|error| NodeError::Failed(error.to_string()))?;
+    if let Some(credentials) = &security.credentials {
+        let checked = credentials.check_rights(config.role, config.election.priority);
+        checked.map_err(|error| NodeError::Failed(error.to_string()))?;
+    }
     let (failed, failure) = watch::channel(None);
     let builder = NodeBuilder::new(config, security, failed);
     let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());

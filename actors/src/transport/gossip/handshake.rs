@@ -72,6 +72,8 @@ pub(crate) struct SignedMessage<'a> {
 /// The owner of a verified certificate.
 #[derive(Debug, Clone)]
 pub(crate) struct Proven {
+    /// The node that the certificate names; the session may be an observer's.
+    pub(crate) holder: NodeName,
     pub(crate) certificate: Vec<u8>,
     pub(crate) expires: Timestamp,
     pub(crate) rights: Rights,
@@ -262,7 +264,12 @@ pub(crate) fn agree(
 }
 
 fn proven(subject: &CertificateSubject, name: &NodeName, certificate: &[u8]) -> Proven {
-    Proven { certificate: certificate.to_vec(), expires: subject.expires(), rights: subject.rights_of(name) }
+    Proven {
+        holder: subject.name().clone(),
+        certificate: certificate.to_vec(),
+        expires: subject.expires(),
+        rights: subject.rights_of(name),
+    }
 }
 
 /// Time for which an accept is waited for.

@@ -23,7 +23,7 @@ use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameKind, Introduction, NameClaim};
 use super::handshake::Identity;
 use super::key::{CellKey, SessionNonce};
-use super::node_id::NodeId;
+use super::node_id::{MAX_CLAIMED_LIFE, NodeId};
 use super::sessions::{Arrival, FrameContent, Sessions};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
@@ -196,11 +196,11 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
-    /// Gossips that a node is alive, true or not.
+    /// Gossips about a node, true or not.
     #[cfg(test)]
-    pub(crate) fn spread(&mut self, id: NodeId, now: Timestamp) {
+    pub(crate) fn spread(&mut self, about: foca::Member<NodeId>, now: Timestamp) {
         let at = self.advance(now);
-        self.gossip.spread(id, at);
+        self.gossip.spread(about, at);
         self.flush_swim(at);
     }
 
@@ -228,7 +228,10 @@ impl GossipMachine {
                 self.outputs.extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
                 self.meet(introduction, speaks, greeter, at);
             }
-            FrameContent::Gossip { from, body } => self.gossip.receive(&from, &body, at)?,
+            FrameContent::Gossip { from, body } => {
+                let is_heard = |name: &NodeName| self.sessions.is_heard(name, at);
+                self.gossip.receive(&from, &body, &is_heard, at)?;
+            }
             FrameContent::Payload { from, rights, body } => {
                 let event = MembershipEvent::Received { from, rights, payload: Bytes::from(body), received_at: now };
                 self.outputs.push_back(GossipOutput::Tell(event));
@@ -245,7 +248,8 @@ impl GossipMachine {
         let Introduction { id, seen_at, claim } = introduction;
         match claim {
             NameClaim::Free => (),
-            NameClaim::After(life) => self.gossip.start_life_after(life, at),
+            NameClaim::After(life) if life <= MAX_CLAIMED_LIFE => self.gossip.start_life_after(life, at),
+            NameClaim::After(_) => (),
             NameClaim::Taken => self.report_taken(self.gossip.own().name.clone(), at),
         }
         let own = self.gossip.own().gossip.ip();

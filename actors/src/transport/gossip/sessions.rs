@@ -27,7 +27,7 @@ use super::handshake::{Identity, Prover};
 use super::key::{BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of};
 use super::node_id::NodeId;
 use super::refusals::Refusals;
-use super::reply_throttle::{ReplyThrottle, VerificationThrottle};
+use super::reply_throttle::ReplyThrottle;
 use crate::platform::throttle::TokenBucket;
 use peers::PeerTable;
 
@@ -45,7 +45,7 @@ pub(crate) struct Sessions {
     /// Throttles of answers to greetings, of answers to challenges, of verifications, and of own greetings.
     challenges: ReplyThrottle,
     proofs: ReplyThrottle,
-    verifications: VerificationThrottle,
+    verifications: ReplyThrottle,
     greetings: TokenBucket,
     other_key_seen: bool,
     certified: Refusals,
@@ -114,7 +114,7 @@ impl Sessions {
             prover: identity.map(|identity| Prover::new(identity, nonce)),
             challenges: ReplyThrottle::new(now),
             proofs: ReplyThrottle::new(now),
-            verifications: VerificationThrottle::new(now),
+            verifications: ReplyThrottle::new(now),
             greetings: TokenBucket::new(HELLO_BURST, HELLO_INTERVAL, now),
             other_key_seen: false,
             certified: Refusals::default(),
@@ -169,6 +169,11 @@ impl Sessions {
     pub(crate) fn proven(&self, name: &NodeName) -> Option<(&NodeId, Rights)> {
         let peer = self.peers.speaker(name)?;
         Some((&peer.id, peer.proven.as_ref()?.rights))
+    }
+
+    /// Whether a node was heard a moment ago.
+    pub(crate) fn is_heard(&self, name: &NodeName, now: Timestamp) -> bool {
+        self.peers.speaker(name).is_some_and(|peer| now.since(peer.heard) < HEARD_TIME)
     }
 
     /// Address of the node of a name, if it was heard lately.
@@ -329,6 +334,10 @@ const HELLO_INTERVAL: Duration = Duration::from_millis(10);
 
 /// Idle time after which a session may be replaced. It is then sent to only if the gossip holds the node alive.
 const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Time for which a node that was heard is not doubted on the word of others. It is about as long as the gossip takes to
+/// find that a node is down.
+const HEARD_TIME: Duration = Duration::from_millis(400);
 
 /// Time for which frames of a node's earlier run may still arrive.
 const MAX_TRANSIT: Duration = Duration::from_millis(500);

@@ -101,7 +101,15 @@ impl Swim {
     }
 
     /// Processes a message that `from` has authenticated.
-    pub(crate) fn receive(&mut self, from: &NodeName, body: &[u8], now: Timestamp) -> Result<(), FrameEvent> {
+    ///
+    /// In a cell with certificates the word of a node that this one hears itself (`is_heard`) outweighs that of others.
+    pub(crate) fn receive(
+        &mut self,
+        from: &NodeName,
+        body: &[u8],
+        is_heard: &dyn Fn(&NodeName) -> bool,
+        now: Timestamp,
+    ) -> Result<(), FrameEvent> {
         let mut updates = body;
         let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, &mut updates);
         let header = header.map_err(|_| FrameEvent::Malformed)?;
@@ -112,7 +120,8 @@ impl Swim {
             return Err(FrameEvent::Malformed);
         }
         let result = if self.lives.is_some() {
-            let body = self.without_hearsay(&header.src, body, updates).map_err(|_| FrameEvent::Malformed)?;
+            let body =
+                self.without_hearsay(&header.src, (body, updates), is_heard).map_err(|_| FrameEvent::Malformed)?;
             self.foca.handle_data(&body, &mut self.runtime)
         } else {
             self.foca.handle_data(body, &mut self.runtime)
@@ -121,8 +130,14 @@ impl Swim {
         result.map_err(|_| FrameEvent::Malformed)
     }
 
-    /// A message without what it says of nodes that this one has not met, and of lives that a node has not claimed itself.
-    fn without_hearsay(&mut self, from: &NodeId, body: &[u8], updates: &[u8]) -> Result<Vec<u8>, postcard::Error> {
+    /// A message without what it says of nodes that this one has not met, of lives that a node has not claimed itself, and
+    /// without doubts about nodes that this one hears.
+    fn without_hearsay(
+        &mut self,
+        from: &NodeId,
+        (body, updates): (&[u8], &[u8]),
+        is_heard: &dyn Fn(&NodeName) -> bool,
+    ) -> Result<Vec<u8>, postcard::Error> {
         let Some((count, mut rest)) = updates.split_first_chunk::<2>() else { return Ok(body.to_vec()) };
         self.note_met(from);
         let mut kept = body.get(..body.len() - updates.len()).unwrap_or_default().to_vec();
@@ -133,7 +148,12 @@ impl Swim {
             let id = update.id();
             match lives.get(&id.name) {
                 _ if id.name == self.foca.identity().name => updates.push(update),
-                Some(life) if id.life <= **life => updates.push(update),
+                Some(life) if id.life <= **life => {
+                    let is_doubt = update.state() != State::Alive && id.name != from.name;
+                    if !is_doubt || !is_heard(&id.name) {
+                        updates.push(update);
+                    }
+                }
                 Some(_) => {}
                 None if update.state() != State::Down => self.outputs.push_back(SwimOutput::Unproven(id.clone())),
                 None => {}
@@ -188,8 +208,8 @@ impl Swim {
     }
 
     #[cfg(test)]
-    pub(crate) fn spread(&mut self, id: NodeId, now: Timestamp) {
-        let spread = self.foca.apply_many(std::iter::once(foca::Member::alive(id)), true, &mut self.runtime);
+    pub(crate) fn spread(&mut self, about: foca::Member<NodeId>, now: Timestamp) {
+        let spread = self.foca.apply_many(std::iter::once(about), true, &mut self.runtime);
         self.finish("lie", spread, now);
     }
 

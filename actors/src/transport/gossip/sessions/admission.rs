@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
 use super::peers::PeerSession;
@@ -10,7 +11,7 @@ use crate::transport::gossip::counters::FrameEvent;
 use crate::transport::gossip::frame::{FrameHeader, FrameKind, Handshake, Hello, Introduction, NameClaim};
 use crate::transport::gossip::handshake::{Attestation, Proven, Side, SignedMessage, Transcript, agree};
 use crate::transport::gossip::key::{Cookie, SessionId};
-use crate::transport::gossip::node_id::{MAX_CLAIMED_LIFE, NodeId};
+use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::replay_window::ReplayWindow;
 use crate::transport::gossip::session_keys::{KeyRing, KeySet};
 
@@ -37,7 +38,7 @@ impl Sessions {
         if !wants_session && is_accepted && is_there && is_alive() {
             return Ok(FrameContent::Nothing);
         }
-        if !self.challenges.allow(&head.sender, arrival.now) && !self.throttled() {
+        if !self.challenges.allow(&head.sender, arrival.from, arrival.now) && !self.throttled() {
             return Ok(FrameContent::Nothing);
         }
         let cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
@@ -56,7 +57,7 @@ impl Sessions {
         let signed = body.get(..body.len() - attestation.len()).unwrap_or_default();
         match message {
             Handshake::Challenge { cookie, name } => {
-                if !self.proofs.allow(&head.sender, arrival.now) && !self.throttled() {
+                if !self.proofs.allow(&head.sender, arrival.from, arrival.now) && !self.throttled() {
                     return Ok(FrameContent::Nothing);
                 }
                 let claim = (arrival.known)(&name).filter(|known| !known.alive);
@@ -115,9 +116,7 @@ impl Sessions {
         if !issued(slot) && !issued(slot.wrapping_sub(1)) {
             return Err(FrameEvent::Replayed);
         }
-        let claimed = if let NameClaim::After(life) = introduction.claim { life } else { 0 };
-        let is_plausible = introduction.id.has_plausible_life() && claimed <= MAX_CLAIMED_LIFE;
-        if is_plausible { Ok(()) } else { Err(FrameEvent::Malformed) }
+        if introduction.id.has_plausible_life() { Ok(()) } else { Err(FrameEvent::Malformed) }
     }
 
     /// A proof of this node's certificate to a challenger; `None` while the one before may still be answered.
@@ -126,7 +125,7 @@ impl Sessions {
         to: &SessionId,
         proof: &Handshake,
         (cookie, address): (Cookie, SocketAddr),
-        accepter: &ecod::model::names::NodeName,
+        accepter: &NodeName,
         now: Timestamp,
     ) -> Option<Vec<u8>> {
         let pending = (*to, address, cookie);
@@ -159,7 +158,7 @@ impl Sessions {
         if self.peers.get(&head.sender).is_some_and(|peer| head.counter <= peer.proof_counter) {
             return Err(FrameEvent::Replayed);
         }
-        if !self.verifications.allow(arrival.from.ip(), arrival.now) && !self.throttled() {
+        if !self.verifications.allow_host(arrival.from, arrival.now) && !self.throttled() {
             return Ok(FrameContent::Nothing);
         }
         let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };

@@ -38,6 +38,9 @@ pub(super) struct PeerSession {
     pub(super) superseded: Option<Timestamp>,
 }
 
+/// Maximum sessions by one certificate: a node, its former run, and observers that share its certificate.
+const MAX_SESSIONS_EACH: usize = 16;
+
 impl PeerSession {
     pub(super) fn note_heard(&mut self, now: Timestamp) {
         self.heard = now;
@@ -92,6 +95,12 @@ impl PeerTable {
 
     /// Adds a session, if there is room: the longest idle one gives way when it is idle for long enough.
     pub(super) fn insert(&mut self, session: SessionId, peer: PeerSession) -> Result<(), FrameEvent> {
+        let holder = |peer: &PeerSession| peer.proven.as_ref().map(|proven| proven.holder.clone());
+        if let Some(own) = holder(&peer)
+            && self.peers.values().filter(|peer| holder(peer).as_ref() == Some(&own)).count() >= MAX_SESSIONS_EACH
+        {
+            return Err(FrameEvent::TooManyPeers);
+        }
         if self.peers.len() >= self.max_peers {
             let longest_idle = self.peers.iter().min_by_key(|(_, peer)| peer.heard);
             let may_go = longest_idle.filter(|(_, idle)| peer.heard.since(idle.heard) >= SESSION_IDLE_TIMEOUT);

@@ -1,5 +1,7 @@
 //! Cells whose nodes prove certificates.
 
+use rustls::pki_types::UnixTime;
+
 use super::*;
 use crate::transport::gossip::trial_authority::TrialAuthority;
 
@@ -127,6 +129,21 @@ fn a_certificate_renewed_while_its_node_runs_is_shown_to_all_without_a_gap() {
     assert_eq!(certified.cell.events(), 0);
 }
 
+/// A machine that starts in 1970 takes no certificate for valid, and takes part once its clock is set.
+#[test]
+fn a_node_whose_clock_is_wrong_waits_and_is_met_once_it_is_right() {
+    let mut certified = CertifiedCell::of(2);
+    let right = certified.authority.identity("node-3", Role::Auto);
+    let wrong = Identity { wall: UnixTime::since_unix_epoch(Duration::from_secs(8)), ..right.clone() };
+    let run = certified.cell.now.micros();
+    certified.cell.start_as(3, "node-3", (KEY, Some(wrong)), run);
+    certified.cell.run(3000);
+    assert!(certified.cell.sees(3).is_empty());
+    certified.set_identity(3, right);
+    certified.cell.run(2000);
+    certified.cell.assert_complete();
+}
+
 #[test]
 fn nodes_of_which_one_lost_its_sessions_talk_again_within_a_second() {
     let mut certified = CertifiedCell::of(2);
@@ -160,11 +177,32 @@ fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
         let (gossip, broker) = (address(9), Some(address(9)));
         let lie = NodeId { name: node_name(3), run: 7, life, role: Role::Edge, gossip, broker };
         let now = certified.cell.now;
-        certified.machine(2).spread(lie, now);
+        certified.machine(2).spread(foca::Member::alive(lie), now);
         certified.cell.run(2000);
     }
     assert_eq!(certified.machine(1).members(), before);
     let is_news =
         |event: &MembershipEvent| matches!(event, MembershipEvent::Alive { .. } | MembershipEvent::Down { .. });
     assert!(!certified.events(1).iter().any(is_news), "{:?}", certified.events(1));
+}
+
+/// A member says again and again that another is down, which speaks all the while.
+#[test]
+fn a_node_that_is_heard_is_not_down_on_the_word_of_others() {
+    let mut certified = CertifiedCell::of(3);
+    certified.cell.forget_events();
+    for round in 0..60 {
+        let own = certified.machine(3).gossip.own().clone();
+        let now = certified.cell.now;
+        if round % 4 == 0 {
+            certified.machine(2).spread(foca::Member::down(own), now);
+        }
+        certified.machine(3).send(&node_name(1), b"beat", now);
+        certified.cell.run(50);
+    }
+    let is_down = |event: &MembershipEvent| matches!(event, MembershipEvent::Down { .. });
+    assert!(!certified.events(1).iter().any(is_down), "{:?}", certified.events(1));
+    certified.cell.nodes.remove(&3);
+    certified.cell.run(2000);
+    assert!(!certified.cell.sees(1).contains("node-3"), "one that is silent is");
 }

@@ -212,6 +212,25 @@ fn swapped_ephemerals_and_certificates_are_noticed() {
     assert_both_heard(&mut a, &mut b);
 }
 
+/// The holder of one certificate makes up observers without end.
+#[test]
+fn one_certificate_does_not_fill_the_table() {
+    let mut authority = TrialAuthority::new();
+    let mut b = node(&mut authority, "b", 200);
+    b.sessions.peers = PeerTable::new(256);
+    let files = authority.issue("gauss", Role::Cav, Duration::from_secs(60));
+    let mut refused = 0;
+    for n in 0..40 {
+        let name: &'static str = format!("gauss--{n}").leak();
+        let mut observer = End::with(name, n, Some(TrialAuthority::read(&files, name)));
+        let proof = proof(&mut observer, &mut b);
+        let opened = b.open(&proof, observer.address, NOW + SLOW);
+        refused += usize::from(opened == Err(FrameEvent::TooManyPeers));
+    }
+    assert_eq!((b.sessions.peers.len(), refused), (16, 24));
+    introduce(&mut node(&mut authority, "a", 100), &mut b);
+}
+
 /// Everything that a node sent comes back to it.
 #[test]
 fn reflected_frames_are_refused() {
