@@ -32,9 +32,9 @@ struct Holding {
     cut: Option<oneshot::Sender<()>>,
 }
 
-/// Maximum bytes held for one principal, and in total.
-const MAX_BYTES_EACH: usize = 16 * 1024 * 1024;
-const MAX_BYTES: usize = 48 * 1024 * 1024;
+/// Maximum bytes held for one principal, which is more than the largest map, and in total.
+const MAX_BYTES_EACH: usize = 10 * 1024 * 1024;
+const MAX_BYTES: usize = 32 * 1024 * 1024;
 
 /// A connection's part of the backlog; ends when dropped.
 #[derive(Debug)]
@@ -152,7 +152,7 @@ mod tests {
             slot.set_unfinished(MIB, Timestamp(50));
         }
         let cut: Vec<_> = flood.iter_mut().map(|(_, receiver)| is_cut(receiver)).collect();
-        assert_eq!(cut, [vec![true; 2], vec![false; 8]].concat());
+        assert_eq!(cut, [vec![true; 5], vec![false; 5]].concat());
         assert!(!is_cut(&mut honest_cut));
         flood.clear();
         assert_eq!(backlog.table().connections.len(), 1);
@@ -169,7 +169,7 @@ mod tests {
             slot.set_unread(4 * MIB, Timestamp(100 - n as u64));
         }
         let cut = slots.iter_mut().filter_map(|(_, receiver)| is_cut(receiver).then_some(())).count();
-        assert_eq!(cut, 8);
+        assert_eq!(cut, 12);
         assert!(!is_cut(&mut slots[0].1), "it came last");
         assert!(!is_cut(&mut empty_cut), "it holds nothing");
     }
