@@ -135,6 +135,11 @@ impl Default for BrokerConfig {
 }
 
 impl BrokerConfig {
+    /// Largest packet in bytes.
+    pub(super) fn packet_bytes(&self) -> u32 {
+        self.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES)
+    }
+
     /// Checks every value.
     ///
     /// # Errors
@@ -320,7 +325,7 @@ async fn prepare(
         // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
         .reuseaddr(Some(true))
         .nodelay(true)
-        .max_packet_size(config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
+        .max_packet_size(config.packet_bytes())
         .max_connections(config.max_clients)
         .max_mqueue_len(config.max_waiting)
         .max_subscriptions(MAX_SUBSCRIPTIONS)
