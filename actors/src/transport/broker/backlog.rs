@@ -9,8 +9,13 @@ use ecod::model::time::Timestamp;
 use tokio::sync::oneshot;
 
 /// Bytes held by connection. Beyond a bound, the connection that has held some for the longest time gives way: it is cut.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Backlog(Arc<Mutex<BacklogTable>>);
+#[derive(Debug, Clone)]
+pub(super) struct Backlog {
+    table: Arc<Mutex<BacklogTable>>,
+    /// Maximum bytes held for one principal, and in total.
+    max_bytes_each: usize,
+    max_bytes: usize,
+}
 
 #[derive(Debug, Default)]
 struct BacklogTable {
@@ -32,9 +37,13 @@ struct Holding {
     cut: Option<oneshot::Sender<()>>,
 }
 
-/// Maximum bytes held for one principal, and in total.
-const MAX_BYTES_EACH: usize = 16 * 1024 * 1024;
-const MAX_BYTES: usize = 48 * 1024 * 1024;
+/// Maximum bytes held for one principal, and in total, where packets are not larger than maps by default.
+const MAX_BYTES_EACH: usize = 10 * 1024 * 1024;
+const MAX_BYTES: usize = 32 * 1024 * 1024;
+
+/// Room beside the largest packet of a principal, and largest packets in total, where they are larger.
+const SPARE_BYTES: usize = 2 * 1024 * 1024;
+const MAX_PACKETS: usize = 4;
 
 /// A connection's part of the backlog; ends when dropped.
 #[derive(Debug)]
@@ -44,6 +53,15 @@ pub(super) struct BacklogSlot {
 }
 
 impl Backlog {
+    /// Room for packets of this size.
+    pub(super) fn new(max_packet_bytes: usize) -> Self {
+        Self {
+            table: Arc::default(),
+            max_bytes_each: MAX_BYTES_EACH.max(max_packet_bytes + SPARE_BYTES),
+            max_bytes: MAX_BYTES.max(MAX_PACKETS * max_packet_bytes),
+        }
+    }
+
     /// A part for one more connection, and a receiver that ends when the connection has to.
     pub(super) fn open(&self, principal: Option<Arc<str>>) -> (BacklogSlot, oneshot::Receiver<()>) {
         let mut table = self.table();
@@ -56,7 +74,7 @@ impl Backlog {
     }
 
     fn table(&self) -> MutexGuard<'_, BacklogTable> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -79,17 +97,18 @@ impl BacklogSlot {
         let (bytes, principal) = (holding.bytes(), holding.principal.clone());
         holding.since = holding.since.or(Some(now)).filter(|_| bytes > 0);
         table.bytes = (table.bytes + bytes).saturating_sub(before);
-        if bytes <= before || table.bytes <= MAX_BYTES_EACH {
+        let Backlog { max_bytes_each, max_bytes, .. } = self.backlog;
+        if bytes <= before || table.bytes <= max_bytes_each {
             return;
         }
         match principal {
             Some(principal) => {
-                table.cut_oldest(|holding| holding.principal.as_ref() == Some(&principal), MAX_BYTES_EACH);
+                table.cut_oldest(|holding| holding.principal.as_ref() == Some(&principal), max_bytes_each);
             }
-            None if bytes > MAX_BYTES_EACH => table.cut(self.number),
+            None if bytes > max_bytes_each => table.cut(self.number),
             None => {}
         }
-        table.cut_oldest(|_| true, MAX_BYTES);
+        table.cut_oldest(|_| true, max_bytes);
     }
 }
 
@@ -143,7 +162,7 @@ mod tests {
 
     #[test]
     fn the_oldest_of_a_principal_gives_way_and_others_do_not() {
-        let backlog = Backlog::default();
+        let backlog = Backlog::new(0);
         let (honest, mut honest_cut) = backlog.open(Some("euclid".into()));
         honest.set_unread(MIB, Timestamp(1));
         let mut flood: Vec<_> = (0..10).map(|_| backlog.open(Some("gauss".into()))).collect();
@@ -152,7 +171,7 @@ mod tests {
             slot.set_unfinished(MIB, Timestamp(50));
         }
         let cut: Vec<_> = flood.iter_mut().map(|(_, receiver)| is_cut(receiver)).collect();
-        assert_eq!(cut, [vec![true; 2], vec![false; 8]].concat());
+        assert_eq!(cut, [vec![true; 5], vec![false; 5]].concat());
         assert!(!is_cut(&mut honest_cut));
         flood.clear();
         assert_eq!(backlog.table().connections.len(), 1);
@@ -160,7 +179,7 @@ mod tests {
 
     #[test]
     fn the_oldest_of_all_gives_way_beyond_the_ceiling() {
-        let backlog = Backlog::default();
+        let backlog = Backlog::new(0);
         let mut slots: Vec<_> = (0..20).map(|n| backlog.open(Some(format!("v{n}").into()))).collect();
         let (empty, mut empty_cut) = backlog.open(None);
         empty.set_unread(1, Timestamp(0));
@@ -169,14 +188,24 @@ mod tests {
             slot.set_unread(4 * MIB, Timestamp(100 - n as u64));
         }
         let cut = slots.iter_mut().filter_map(|(_, receiver)| is_cut(receiver).then_some(())).count();
-        assert_eq!(cut, 8);
+        assert_eq!(cut, 12);
         assert!(!is_cut(&mut slots[0].1), "it came last");
         assert!(!is_cut(&mut empty_cut), "it holds nothing");
     }
 
     #[test]
+    fn the_largest_packet_always_has_room() {
+        let backlog = Backlog::new(64 * MIB);
+        let (leader, mut cut) = backlog.open(Some("edge".into()));
+        leader.set_unfinished(64 * MIB, Timestamp(0));
+        assert!(!is_cut(&mut cut));
+        leader.set_unread(3 * MIB, Timestamp(0));
+        assert!(is_cut(&mut cut));
+    }
+
+    #[test]
     fn who_ends_packets_is_not_the_oldest_however_much_it_sends() {
-        let backlog = Backlog::default();
+        let backlog = Backlog::new(0);
         let [(sender, mut sender_cut), (reader, mut reader_cut)] = [0, 1].map(|_| backlog.open(Some("gauss".into())));
         sender.set_unfinished(MIB, Timestamp(1));
         reader.set_unread(MIB, Timestamp(2));
@@ -188,7 +217,7 @@ mod tests {
 
     #[test]
     fn a_connection_that_counts_alone_is_bounded_too() {
-        let backlog = Backlog::default();
+        let backlog = Backlog::new(0);
         let (slot, mut cut) = backlog.open(None);
         slot.set_unread(MAX_BYTES_EACH, Timestamp(0));
         assert!(!is_cut(&mut cut));

@@ -91,7 +91,7 @@ pub struct BrokerConfig {
     /// Maximum clients at a time of one certificate, or of one remote address without certificates; default 32. A node
     /// has one or two, and one for each observer. A cell behind address translation needs as many for each node.
     pub max_clients_each: usize,
-    /// Maximum messages waiting for one slow client; default 256. Beyond them, and beyond 4 MiB, the oldest gives way. More
+    /// Maximum messages waiting for one slow client; default 256. Beyond them, and beyond 2 MiB, the oldest gives way. More
     /// carries a client over longer pauses, but what it then gets is old.
     pub max_waiting: usize,
     /// Maximum topics with a retained message; default 8192: one for each node's status and one for the reputations.
@@ -135,6 +135,11 @@ impl Default for BrokerConfig {
 }
 
 impl BrokerConfig {
+    /// Largest packet in bytes.
+    pub(super) fn packet_bytes(&self) -> u32 {
+        self.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES)
+    }
+
     /// Checks every value.
     ///
     /// # Errors
@@ -320,7 +325,7 @@ async fn prepare(
         // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
         .reuseaddr(Some(true))
         .nodelay(true)
-        .max_packet_size(config.max_packet_bytes.unwrap_or(DEFAULT_PACKET_BYTES))
+        .max_packet_size(config.packet_bytes())
         .max_connections(config.max_clients)
         .max_mqueue_len(config.max_waiting)
         .max_subscriptions(MAX_SUBSCRIPTIONS)

@@ -83,7 +83,7 @@ impl BrokerFrontend {
             places: Arc::new(Semaphore::new(config.max_clients)),
             quota: ConnectionQuota::new(config.max_clients_each),
             limits: RelayLimits {
-                backlog: Backlog::default(),
+                backlog: Backlog::new(config.packet_bytes() as usize),
                 throttle: ByteThrottle::default(),
                 in_flight: InFlight::default(),
                 elected: Arc::clone(&policy.elected),

@@ -22,7 +22,7 @@ struct QueuedPacket {
 }
 
 /// Messages of one client beyond this many bytes give way, but for the newest.
-const MAX_BYTES: usize = 4 * 1024 * 1024;
+const MAX_BYTES: usize = 2 * 1024 * 1024;
 
 /// Packets that must not be dropped and may wait beside the messages.
 const MAX_ANSWERS: usize = 64;

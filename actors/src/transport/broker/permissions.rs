@@ -293,6 +293,17 @@ mod tests {
     }
 
     #[test]
+    fn a_status_is_not_as_large_as_a_report() {
+        let mut permissions = permissions();
+        permissions.policy.limits = Limits::default();
+        let allows = |topic: &str, bytes| {
+            permissions.allows(&anyone(), &format!("ecod/v1/lot/{topic}"), true, bytes + ENVELOPE_BYTES)
+        };
+        assert!(allows("nodes/edge", MAX_STATUS_BYTES) && !allows("nodes/edge", MAX_STATUS_BYTES + 1));
+        assert!(allows("reputations", MAX_STATUS_BYTES + 1));
+    }
+
+    #[test]
     fn nobody_takes_the_client_id_of_another() {
         let euclid = identity("euclid", Role::Auto);
         let run = "0123456789abcdef0123456789abcdef";
