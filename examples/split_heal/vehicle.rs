@@ -235,7 +235,8 @@ impl Vehicle {
             }
             Effect::AskParts => {
                 let links = [(broker(self.index).into(), LinkState::Up)].into();
-                let sample = HealthSample { broker_serves: true, links: Some(links), fuser_runs: true };
+                let sample =
+                    HealthSample { broker_serves: true, links: Some(links), fuser_runs: true, rejects_reports: false };
                 return Some(Input::PartsAnswered { sample });
             }
             // Nobody restarts here, and everybody sends to all.

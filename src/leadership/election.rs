@@ -46,6 +46,7 @@
 #![deny(clippy::indexing_slicing)]
 
 mod awake_clock;
+mod clock_stamps;
 mod following;
 mod handover;
 mod interface;
@@ -57,6 +58,7 @@ mod seeking;
 
 pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
+pub use clock_stamps::{AnsweredStamps, ClockStamps};
 pub use interface::{ElectionEffect, ElectionInput, Health};
 pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP};
 
@@ -348,6 +350,7 @@ impl Election {
             epoch: self.current_epoch().cloned(),
             hears_you,
             body,
+            clock: None,
         };
         self.effects.push(ElectionEffect::Send { to: to.clone(), message });
     }
@@ -393,6 +396,7 @@ mod tests {
                 epoch: None,
                 hears_you: true,
                 body: Body::Status { over: None },
+                clock: None,
             };
             election.handle(ElectionInput::Receive { message }, now);
             election.handle(

@@ -37,6 +37,8 @@
 //! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a membership that restarts costs no leader |
 //! | [`DISK_TIMEOUT`] | 1 s | below `handover` | a hung disk delays a handover and does not end it |
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
+//! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
+//! | [`MIN_CLOCK_JUMP`] | 1 s | [`MAX_ROUND_AGE`] | a report's age tells by which time, before or after a jump, it is stamped |
 
 use std::time::Duration;
 
@@ -121,6 +123,15 @@ pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Least time between two transfers of all evidence to new leaders: leaders may seem to come and go fast.
 pub const FULL_RESYNC_PAUSE: Duration = Duration::from_secs(5);
+
+/// Time for which the stamps of a node are compared to later ones.
+pub const CLOCK_MEMORY: Duration = Duration::from_secs(15);
+
+/// Error of the cell's time from which it jumps; a smaller one is slewed away.
+pub const MIN_CLOCK_JUMP: Duration = MAX_ROUND_AGE;
+
+/// Rate at which the leader slews the cell's time, in parts per million.
+pub const MAX_CLOCK_SLEW: i64 = 5_000;
 
 /// Number of round intervals after the last round when rounds no longer count as regular.
 pub(crate) const REGULAR_GAPS: u32 = 8;

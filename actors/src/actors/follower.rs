@@ -28,6 +28,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::{LogItem, LogSender};
+use crate::platform::cell_clock::CellClock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
 
@@ -48,6 +49,8 @@ pub struct FollowerArguments {
     pub election: ActorSlot<LeaderElectionMessage>,
     /// Goes on from the maps taken, when the node leads.
     pub fuser: ActorSlot<FuserMessage>,
+    /// The cell's time.
+    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// The node's spans.
@@ -67,6 +70,7 @@ pub struct FollowerState {
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
     fuser: ActorSlot<FuserMessage>,
+    clock: CellClock,
     counters: Arc<Counters>,
     spans: Spans,
 }
@@ -109,10 +113,20 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
-        let FollowerArguments { newest, recording, saved_term, leadership, election, fuser, counters, spans, .. } =
-            arguments;
+        let FollowerArguments {
+            newest,
+            recording,
+            saved_term,
+            leadership,
+            election,
+            fuser,
+            clock,
+            counters,
+            spans,
+            ..
+        } = arguments;
         let filter = RoundFilter::new(saved_term);
-        Self { newest, filter, log, recording, leadership, election, fuser, counters, spans }
+        Self { newest, filter, log, recording, leadership, election, fuser, clock, counters, spans }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
@@ -123,8 +137,8 @@ impl FollowerState {
             self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
         }
         self.tell_election(accepted);
+        self.write(&ReceivedMap { received_at: self.clock.date(received_at), map: Arc::clone(map) });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
-        self.write(&received);
         self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
         Ok(())

@@ -15,6 +15,7 @@ use super::{BROKER_NAME, OBSERVER_MARK};
 pub struct CertificateSubject {
     name: NodeName,
     may_serve: bool,
+    begins: Timestamp,
     expires: Timestamp,
 }
 
@@ -43,8 +44,10 @@ impl CertificateSubject {
         let may_serve = alternatives.is_some_and(|names| {
             names.value.general_names.iter().any(|name| matches!(name, GeneralName::DNSName(BROKER_NAME)))
         });
-        let expires = u64::try_from(parsed.validity().not_after.timestamp()).unwrap_or(0);
-        Ok(Self { name, may_serve, expires: Timestamp(0) + Duration::from_secs(expires) })
+        let time = |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
+        let validity = parsed.validity();
+        let (begins, expires) = (time(validity.not_before.timestamp()), time(validity.not_after.timestamp()));
+        Ok(Self { name, may_serve, begins, expires })
     }
 
     /// The node's name.
@@ -55,6 +58,11 @@ impl CertificateSubject {
     /// Whether the node may serve a broker, and so lead.
     pub fn may_serve(&self) -> bool {
         self.may_serve
+    }
+
+    /// Beginning of the certificate's validity.
+    pub fn begins(&self) -> Timestamp {
+        self.begins
     }
 
     /// End of the certificate's validity.
