@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials clocks soak lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check asyncapi-check python-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials clocks soak lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -112,6 +112,9 @@ tracing-check: setup ## follow a detection through two nodes, with the feature o
 
 fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each; TARGETS=payload,... runs those only
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
+
+verify-handshake: ## the membership's handshake against an attacker that has the network, the cell's key and a certificate; needs Verifpal
+	packaging/verify-handshake
 
 asyncapi-check: PACKAGES := ca-certificates $(if $(shell command -v npm),,npm)
 asyncapi-check: setup ## validate docs/asyncapi.yaml by the parser of its standard; installs npm where there is none

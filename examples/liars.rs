@@ -1,4 +1,4 @@
-//! What liars achieve: ⌊(n−1)/2⌋ of n vehicles lie, in four ways, and by rejoining under new names.
+//! What liars achieve: ⌊(n−1)/2⌋ of n vehicles lie, in four ways, by rejoining under new names, and by forged evidence.
 //!
 //! `cargo run --release --example liars -- [--svg FILE] [--table FILE] [--write-table FILE] [--seeds N]`
 //!
@@ -11,10 +11,14 @@ use std::collections::BTreeMap;
 use std::error::Error;
 use std::time::Duration;
 
+use ecod::leadership::ledger_resync::LedgerResync;
+use ecod::leadership::{Leadership, Position};
+use ecod::model::epoch::Epoch;
 use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
+use ecod::reputation::{Evidence, ReputationLedger};
 use ecod::vote::{Vote, VoteConfig};
-use ecod::wire::{ObjectReport, PerceivedObject};
+use ecod::wire::{LedgerEntry, LedgerShare, LedgerSignature, ObjectReport, PerceivedObject, SCHEMA_VERSION};
 use plotters::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -30,7 +34,9 @@ const SERIES: [(&str, RGBColor); 4] = [
 const LANDMARKS: usize = 6;
 const ROUNDS: u64 = 600;
 const SETTLED: u64 = 300;
-const LIES: [Lie; 5] = [Lie::Random, Lie::Constant, Lie::Copying, Lie::Turning, Lie::Rejoining];
+const LIES: [Lie; 6] = [Lie::Random, Lie::Constant, Lie::Copying, Lie::Turning, Lie::Rejoining, Lie::Forging];
+/// Round before which the aggregator restarts, where evidence is forged.
+const RESTART: u64 = 150;
 const HONEST_ACCURACY: f64 = 0.8;
 const PERIOD: Duration = Duration::from_millis(500);
 
@@ -46,6 +52,60 @@ enum Lie {
     Turning,
     /// Copying, under a new name every ten rounds.
     Rejoining,
+    /// Copying; the first is a candidate that tells the aggregator every round that liars are right and others wrong.
+    Forging,
+}
+
+/// The ledger of an aggregator in a cell with certificates.
+struct Ledger {
+    resync: LedgerResync,
+    ledger: ReputationLedger,
+    leadership: Leadership,
+}
+
+impl Ledger {
+    fn new() -> Result<Self, Box<dyn Error>> {
+        let epoch = Epoch::new(2, NodeName::new("edge")?);
+        let mut resync = LedgerResync::signed(epoch.leader.clone(), 10);
+        resync.lead(epoch.clone());
+        let leadership = Leadership { position: Position::Leading, epoch: Some(epoch), standby: None, term: 2 };
+        Ok(Self { resync, ledger: ReputationLedger::default(), leadership })
+    }
+
+    fn record(&mut self, evidence: &[Evidence]) {
+        if let Some(epoch) = &self.leadership.epoch {
+            self.resync.record(epoch, evidence, &mut self.ledger);
+        }
+    }
+
+    /// Takes what the first liar can sign: evidence of leaderships of its own. True if anything changes.
+    fn take_forged(&mut self, vehicles: usize, liars: usize, now: Timestamp) -> Result<bool, Box<dyn Error>> {
+        let forger = NodeName::new("liar-0")?;
+        let mut is_news = false;
+        for epoch in 1..=2 {
+            let entry = |vehicle: usize, label: &str| {
+                let is_liar = vehicle < liars;
+                let node = NodeName::new(format!("{}-{vehicle}", if is_liar { "liar" } else { "honest" }))?;
+                let (correct, incorrect) = if is_liar { (1_000_000, 0) } else { (0, 1_000_000) };
+                let (aggregator, label) = (forger.clone(), label.into());
+                Ok(LedgerEntry { epoch, aggregator, node, label, correct, incorrect })
+            };
+            let pairs = (0..vehicles).flat_map(|vehicle| LABELS.map(|label| (vehicle, label)));
+            let entries = pairs.map(|(vehicle, label)| entry(vehicle, label)).collect::<Result<_, Box<dyn Error>>>()?;
+            let share = LedgerShare {
+                schema: SCHEMA_VERSION,
+                node: forger.clone(),
+                epoch: None,
+                entries,
+                marks: Vec::new(),
+                signed: Some(LedgerSignature { certificate: "liar-0".into(), signature: "valid".into() }),
+                reset_at_us: None,
+            };
+            let candidates = std::slice::from_ref(&forger);
+            is_news |= self.resync.merge(&share, &mut self.ledger, candidates, &self.leadership, now)?.is_news;
+        }
+        Ok(is_news)
+    }
 }
 
 struct Course {
@@ -76,7 +136,10 @@ impl Trial {
     }
 
     fn lie_name(&self) -> String {
-        format!("{:?}", self.lie).to_lowercase()
+        match self.lie {
+            Lie::Forging => "forges evidence".into(),
+            lie => format!("{lie:?}").to_lowercase(),
+        }
     }
 
     /// What stands above its panel.
@@ -120,8 +183,17 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     let (mut right, mut right_most, mut settled, mut majority, mut honest) = (0, 0.0, 0, 0.0, 0.0);
     let mut now = Timestamp(1_700_000_000_000_000);
     let mut truths = [0; LANDMARKS];
+    let mut ledger = Ledger::new()?;
     for round in 0..ROUNDS {
         now = now + PERIOD;
+        if lie == Lie::Forging {
+            if round == RESTART {
+                vote = Vote::new(VoteConfig::default(), Vec::new());
+            }
+            if ledger.take_forged(vehicles, liars, now)? || round == RESTART {
+                vote.adopt(&ledger.ledger);
+            }
+        }
         // The objects are exchanged when the votes of the last ones are no longer fresh.
         if round % 6 == 0 {
             now = now + Duration::from_secs(3);
@@ -148,7 +220,7 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
                     }
                     Lie::Random => other(&mut rng, truth),
                     Lie::Constant => 0,
-                    Lie::Copying | Lie::Turning | Lie::Rejoining => common[place],
+                    Lie::Copying | Lie::Turning | Lie::Rejoining | Lie::Forging => common[place],
                 };
                 said[place][label] += 1;
                 said_honestly[place][label] += usize::from(vehicle >= liars);
@@ -161,8 +233,9 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
             let report = ObjectReport { objects, ..ObjectReport::new(node, round, now) };
             vote.observe(&report, now)?;
         }
-        let verdicts: BTreeMap<_, Option<Label>> =
-            vote.close(now).verdicts.into_iter().map(|v| (v.landmark, v.label)).collect();
+        let closed = vote.close(now);
+        ledger.record(&closed.evidence);
+        let verdicts: BTreeMap<_, Option<Label>> = closed.verdicts.into_iter().map(|v| (v.landmark, v.label)).collect();
         for (place, &truth) in truths.iter().enumerate() {
             let label = verdicts.get(format!("place-{place}").as_str()).cloned().flatten();
             let good = usize::from(label.as_deref() == Some(LABELS[truth]));

@@ -23,9 +23,11 @@ pub mod ledger_resync;
 pub mod links;
 pub mod node;
 pub mod readiness;
+pub mod rights;
 pub mod round_filter;
 pub mod timers;
 pub mod view;
 
 pub use address::{BrokerAddress, InvalidAddress};
+pub use rights::Rights;
 pub use view::{Leadership, Position};

@@ -10,6 +10,7 @@
 mod ledger;
 mod marks;
 mod replication;
+mod statements;
 
 use std::collections::BTreeMap;
 

@@ -18,6 +18,7 @@
 
 mod codec;
 mod compact;
+mod ledger;
 mod object;
 mod reject;
 mod topic;
@@ -31,6 +32,7 @@ use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
 pub use codec::{Encoding, decode, decode_report, decode_share, encode};
+pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
@@ -278,74 +280,6 @@ pub struct Reputation {
     pub correct: u64,
     /// Number of votes that did not.
     #[n(2)]
-    pub incorrect: u64,
-}
-
-/// A part of the evidence for reputations; receivers keep the larger of every count.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
-pub struct LedgerShare {
-    /// Major version of the payload, [`SCHEMA_VERSION`].
-    #[n(0)]
-    pub schema: u32,
-    /// The sender; equals the last level of the topic.
-    #[n(1)]
-    pub node: NodeName,
-    /// Term of the sender's leadership; absent when it does not lead.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[n(2)]
-    pub epoch: Option<u64>,
-    /// Counts, at most [`MAX_SHARE_ENTRIES`].
-    #[n(3)]
-    pub entries: Vec<LedgerEntry>,
-    /// Marks, at most [`MAX_SHARE_ENTRIES`]; without them earlier and later votes cannot be separated.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[cbor(n(4), default)]
-    pub marks: Vec<LedgerMark>,
-}
-
-/// The numbers of right and wrong votes of one vehicle for one label under one leadership.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
-pub struct LedgerEntry {
-    /// Term of the leadership that counted.
-    #[n(0)]
-    pub epoch: u64,
-    /// Its aggregator.
-    #[n(1)]
-    pub aggregator: NodeName,
-    /// The vehicle.
-    #[n(2)]
-    pub node: NodeName,
-    /// The label that it stated.
-    #[cbor(n(3), with = "Text")]
-    pub label: Label,
-    /// Number of votes that agreed with the verdict, since the leadership began.
-    #[n(4)]
-    pub correct: u64,
-    /// Number of votes that did not.
-    #[n(5)]
-    pub incorrect: u64,
-}
-
-/// The numbers of right and wrong votes of one vehicle under one leadership at an earlier number of votes; written once.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
-pub struct LedgerMark {
-    /// Term of the leadership that counted.
-    #[n(0)]
-    pub epoch: u64,
-    /// Its aggregator.
-    #[n(1)]
-    pub aggregator: NodeName,
-    /// The vehicle.
-    #[n(2)]
-    pub node: NodeName,
-    /// Its number of votes then, divided by 32.
-    #[n(3)]
-    pub number: u64,
-    /// Number of those that agreed with the verdict.
-    #[n(4)]
-    pub correct: u64,
-    /// Number of those that did not.
-    #[n(5)]
     pub incorrect: u64,
 }
 

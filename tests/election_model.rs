@@ -8,13 +8,13 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ecod::leadership::Leadership;
 use ecod::leadership::election::{Election, ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
 use ecod::leadership::round_filter::RoundFilter;
 use ecod::leadership::timers::EPOCH_MEMORY;
+use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -124,7 +124,7 @@ impl Cell {
         let down = Node {
             machine: None,
             leadership: Leadership::default(),
-            filter: RoundFilter::new(0),
+            filter: RoundFilter::new(0, Timestamp(1_000_000_000)),
             clock: Timestamp(1_000_000_000),
             persisted: 0,
             publishing: None,
@@ -152,7 +152,7 @@ impl Cell {
         node.clock = node.clock + Duration::from_millis(1);
         node.leadership = Leadership::default();
         node.machine = Some(LeadershipNode::new(settings(index), node.persisted, &node.leadership, node.clock));
-        node.filter = RoundFilter::new(node.persisted);
+        node.filter = RoundFilter::new(node.persisted, node.clock);
         node.last = None;
         self.handle(index, Input::OwnBroker { address: Some(broker(index)) });
         self.handle(index, Input::LinkChanged { broker: broker(index).into(), state: LinkState::Up });
@@ -226,7 +226,7 @@ impl Cell {
                 return Some(Input::Looked { rounds_due, load_percent: 0, members });
             }
             Effect::AskParts => {
-                let links = [(broker(index).into(), LinkState::Up)].into();
+                let links = (0..nodes).map(|index| (broker(index).into(), LinkState::Up)).collect();
                 let sample =
                     HealthSample { broker_serves: true, links: Some(links), fuser_runs: true, rejects_reports: false };
                 return Some(Input::PartsAnswered { sample });
@@ -235,6 +235,7 @@ impl Cell {
             | Effect::SetLinks { .. }
             | Effect::PublishStatus { .. }
             | Effect::SendSnapshot { .. }
+            | Effect::CountImplausible { .. }
             | Effect::Log { .. } => {}
         }
         None
@@ -283,7 +284,7 @@ impl Cell {
         match packet {
             Packet::Election(to, message) => {
                 let from = message.from.clone();
-                self.handle(to, Input::Receive { from, message });
+                self.handle(to, Input::Receive { from, rights: Rights::default(), message });
             }
             Packet::Map(to, map) => self.accept(to, map),
         }

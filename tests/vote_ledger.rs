@@ -92,3 +92,18 @@ fn a_standby_that_counted_the_latest_votes_itself_takes_over_those_before() {
     assert!(after[&name("a")].score < before[&name("a")].score - 0.2, "{before:?} {after:?}");
     assert!(after[&name("b")].score >= before[&name("b")].score, "{before:?} {after:?}");
 }
+
+#[test]
+fn evidence_that_is_withdrawn_no_longer_counts() {
+    let mut forged = ReputationLedger::default();
+    record(&mut forged, "liar", 1000, true);
+    record(&mut forged, "a", 1000, false);
+    record(&mut forged, "b", 1000, false);
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    vote.adopt(&forged);
+    assert!(vote.reputations()[&name("liar")].score > 0.9);
+    vote.adopt(&ReputationLedger::default());
+    let scores: Vec<f64> = vote.reputations().into_values().map(|vehicle| vehicle.score).collect();
+    assert!(scores.iter().all(|score| (score - scores[0]).abs() < 1e-9), "all are strangers again: {scores:?}");
+    assert_eq!(verdict(&mut vote, &[("liar", "mouse"), ("a", "cup"), ("b", "cup")]).as_deref(), Some("cup"));
+}

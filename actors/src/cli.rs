@@ -10,6 +10,7 @@ mod pki;
 mod record;
 mod replay;
 mod report;
+mod reset;
 mod run;
 mod schema;
 mod shell;
@@ -76,6 +77,8 @@ enum Command {
     /// Make the certificates of a cell: its CA, one per node, and the revocation list
     #[command(subcommand)]
     Pki(pki::PkiCommand),
+    /// Forget the evidence behind the reputations, or the highest term, of a node that is stopped
+    Reset(reset::ResetArguments),
     /// Print the JSON Schemas of every payload
     Schema,
     /// Print a completion script for a shell
@@ -145,6 +148,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         Some(Command::Replay(arguments)) => replay::run(&arguments),
         Some(Command::Report(arguments)) => report::run(&arguments),
         Some(Command::Pki(command)) => pki::run(&command),
+        Some(Command::Reset(arguments)) => reset::run(&arguments),
         Some(Command::Schema) => schema::run(),
         Some(Command::Completions(arguments)) => shell::completions(&arguments, Cli::command()),
         Some(Command::Man(arguments)) => shell::man(&arguments, Cli::command()),

@@ -3,6 +3,9 @@
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Output, Stdio};
 
+use ecod::model::names::NodeName;
+use ecod_actors::platform::state_file::StateFile;
+
 fn ecod_node() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
     for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
@@ -241,4 +244,36 @@ fn certificates_are_made_used_and_revoked_by_command() {
     assert!(foreign.starts_with("FAIL") && foreign.contains("is for edge, this node is gauss"), "{foreign}");
     let revoked = pki(&["revoke", "edge"]);
     assert!(String::from_utf8_lossy(&revoked.stdout).contains("revoked 1 of edge"), "{}", stderr(&revoked));
+}
+
+/// A node whose evidence and term an earlier version let others poison.
+#[test]
+fn evidence_and_term_are_reset_while_the_node_is_stopped() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name);
+    std::fs::write(path("edge.toml"), "name = \"edge\"\nrole = \"edge\"\ncell = \"lot\"\nstate_dir = \".\"\n").unwrap();
+    std::fs::write(path("lot.edge.reputations.json"), "{\"poisoned\":1}").unwrap();
+    std::fs::write(path("lot.edge.term.json"), "9007199254740991").unwrap();
+    let reset = |arguments: &[&str]| {
+        let mut command = ecod_node();
+        command.current_dir(directory.path()).args(["reset", "--config", "edge.toml"]).args(arguments).output().unwrap()
+    };
+    assert_eq!(reset(&[]).status.code(), Some(2), "says what to reset");
+    let cell = |name: &str| NodeName::new(name).unwrap();
+    let running = StateFile::lock(directory.path(), &cell("lot"), &cell("edge")).unwrap();
+    let refused = reset(&["--reputations"]);
+    assert!(!refused.status.success() && stderr(&refused).contains("stop it"), "{}", stderr(&refused));
+    drop(running);
+    let done = reset(&["--reputations", "--term"]);
+    assert!(done.status.success(), "{}", stderr(&done));
+    let text = std::fs::read_to_string(path("lot.edge.reputations.json")).unwrap();
+    assert!(text.contains("reset_at_us") && !text.contains("poisoned"), "{text}");
+    assert!(!path("lot.edge.term.json").exists());
+    let vehicle = ecod_node()
+        .current_dir(directory.path())
+        .env("ECOD_ROLE", "cav")
+        .args(["reset", "--config", "edge.toml", "--reputations"])
+        .output()
+        .unwrap();
+    assert!(stderr(&vehicle).contains("never leads"), "{}", stderr(&vehicle));
 }

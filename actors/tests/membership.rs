@@ -61,6 +61,7 @@ impl Node {
             run: clock::now().micros(),
             role: Role::Auto,
             broker: Some(BROKER),
+            credentials: None,
             config,
             events: Arc::new(move |event| sink.lock().unwrap().push(event)),
             members: sender,

@@ -7,13 +7,13 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::{Aggregator, Fused, FusionConfig};
-use ecod::leadership::Leadership;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
 use ecod::leadership::round_filter::RoundFilter;
+use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -81,7 +81,7 @@ impl Vehicle {
         let mut vehicle = Self {
             machine: LeadershipNode::new(settings, 0, &Leadership::default(), now),
             leadership: Leadership::default(),
-            filter: RoundFilter::new(0),
+            filter: RoundFilter::new(0, now),
             resync: LedgerResync::new(name.clone(), SHARES_PER_SNAPSHOT),
             tick_at: now + SHARE_PERIOD,
             aggregator: Aggregator::new_standby(fusion, landmarks, now),
@@ -141,7 +141,7 @@ impl Vehicle {
         match payload {
             Payload::Election(bytes) => {
                 let message = ElectionMessage::decode(bytes)?;
-                self.handle(Input::Receive { from: from.clone(), message }, now);
+                self.handle(Input::Receive { from: from.clone(), rights: Rights::default(), message }, now);
             }
             Payload::Report(kind, bytes) => self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?,
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),
@@ -234,7 +234,9 @@ impl Vehicle {
                 return Some(Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members });
             }
             Effect::AskParts => {
-                let links = [(broker(self.index).into(), LinkState::Up)].into();
+                let brokers = self.members.values().filter_map(|member| member.broker.clone());
+                let brokers = brokers.chain([broker(self.index).into()]);
+                let links = brokers.map(|broker| (broker, LinkState::Up)).collect();
                 let sample =
                     HealthSample { broker_serves: true, links: Some(links), fuser_runs: true, rejects_reports: false };
                 return Some(Input::PartsAnswered { sample });
@@ -243,6 +245,7 @@ impl Vehicle {
             Effect::PersistTerm { .. }
             | Effect::SetLinks { .. }
             | Effect::PublishStatus { .. }
+            | Effect::CountImplausible { .. }
             | Effect::Log { .. } => {}
         }
         None

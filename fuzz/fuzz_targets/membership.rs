@@ -16,8 +16,9 @@ enum Step {
     Wait { ms: u16 },
 }
 
-fuzz_target!(|steps: Vec<Step>| {
-    let mut listener = Listener::meet();
+fuzz_target!(|input: (bool, Vec<Step>)| {
+    let (proves, steps) = input;
+    let mut listener = Listener::meet(proves);
     for step in steps {
         match step {
             Step::Datagram(frame) => listener.hear(&frame),
@@ -25,4 +26,5 @@ fuzz_target!(|steps: Vec<Step>| {
             Step::Wait { ms } => listener.wait(ms.into()),
         }
     }
+    listener.assert_nobody_else();
 });

@@ -41,6 +41,7 @@ async fn main() {
             run: clock::now().micros(),
             role: Role::Auto,
             broker: None,
+            credentials: None,
             config: MembershipConfig {
                 key: Some(Secret::new("5e".repeat(32))),
                 bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),

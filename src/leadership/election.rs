@@ -60,7 +60,10 @@ pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
 pub use clock_stamps::{AnsweredStamps, ClockStamps};
 pub use interface::{ElectionEffect, ElectionInput, Health};
-pub use message::{Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP};
+use message::MAX_ROUND_STEP;
+pub use message::{
+    Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP,
+};
 
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -240,7 +243,13 @@ impl Election {
     }
 
     fn receive(&mut self, message: ElectionMessage, now: Timestamp) {
-        if message.from == self.id || !self.is_plausible(message.term) || !self.peers.note(&message, now) {
+        if message.from == self.id {
+            return;
+        }
+        if !self.is_plausible(message.term) {
+            return self.effects.push(ElectionEffect::CountImplausible { from: message.from });
+        }
+        if !self.peers.note(&message, now) {
             return;
         }
         self.learn_term(message.term);
@@ -272,6 +281,21 @@ impl Election {
         if self.is_plausible(term) {
             self.terms.seen = self.terms.seen.max(term);
         }
+    }
+
+    /// Notes the last round of a leadership as a node states it.
+    fn learn_round(&mut self, from: &NodeName, round: u64) {
+        let limit = if self.round == 0 { MAX_ROUND } else { self.round.saturating_add(MAX_ROUND_STEP) };
+        if round <= limit.min(MAX_ROUND) {
+            self.round = self.round.max(round);
+        } else {
+            self.effects.push(ElectionEffect::CountImplausible { from: from.clone() });
+        }
+    }
+
+    /// Number of the first round of a leadership.
+    fn next_round(&self) -> u64 {
+        if self.round < MAX_ROUND { self.round + 1 } else { 1 }
     }
 
     fn peer_alive(&mut self, peer: &NodeName, now: Timestamp) {
@@ -377,38 +401,4 @@ struct Beat {
 const LOAD_QUARTER: u8 = 25;
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::wire::Role;
-
-    #[test]
-    fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
-        let now = Timestamp(1_000_000);
-        let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 7, now);
-        let mut hear = |seq, term| {
-            let message = ElectionMessage {
-                schema: SCHEMA_VERSION,
-                from: NodeName::from_static("gauss"),
-                run: 1,
-                seq,
-                candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
-                term,
-                epoch: None,
-                hears_you: true,
-                body: Body::Status { over: None },
-                clock: None,
-            };
-            election.handle(ElectionInput::Receive { message }, now);
-            election.handle(
-                ElectionInput::Round { epoch: Epoch::new(term, NodeName::from_static("gauss")), round: 1 },
-                now,
-            );
-            election.term()
-        };
-        let cell = 5000;
-        assert_eq!(hear(1, cell), cell, "a node that joins learns the cell's term");
-        assert_eq!(hear(2, MAX_TERM), cell);
-        assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), cell);
-        assert_eq!(hear(4, cell + 1), cell + 1);
-    }
-}
+mod tests;

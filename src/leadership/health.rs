@@ -141,6 +141,11 @@ impl HealthMonitor {
         !private || self.is_up(plane.external.as_ref(), no_other)
     }
 
+    /// Whether this node is logged in at a broker.
+    pub fn is_logged_in(&self, broker: &BrokerAddress) -> bool {
+        matches!(self.links.get(broker), Some(LinkState::Up | LinkState::Stalled))
+    }
+
     fn is_up(&self, broker: Option<&BrokerAddress>, no_other: bool) -> bool {
         match broker.and_then(|broker| self.links.get(broker)) {
             Some(LinkState::Up) => true,

@@ -5,19 +5,33 @@
 //! - A node that has led sends a leader all it knows when it first hears it. Every other candidate listens for longer than
 //!   leaders take to share all they know, and then sends what nobody has shared, each at a time of its own. So evidence of
 //!   leaders that are gone is kept, too, when a split heals.
-//! - Evidence is accepted of candidates, and of terms that the election knows.
+//! - Evidence is accepted of candidates, of terms that the election knows, and by plausible steps. The leader's present
+//!   lane is accepted of the leader alone.
 //!
-//! Nothing is sent here: methods return the shares to publish. Time is counted in ticks of the publication period.
+//! # Signed evidence
+//!
+//! In a cell with certificates every share is of one lane and signed by the lane's aggregator. Whoever passes it on
+//! passes on the same bytes. A signature proves who counted, not that it led. So a lane must come from the leader that
+//! this node follows, or followed a moment ago, or from another candidate than the lane's aggregator. Candidates
+//! accept nothing else themselves, so a lane that a candidate has invented for itself gets no further.
+//!
+//! Nothing is sent here: methods return the shares to publish, to be signed where they are of the node's own lanes and
+//! are not yet. Time is counted in ticks of the publication period.
 
-use std::collections::BTreeSet;
+mod growth;
 
-use crate::leadership::timers::FULL_RESYNC_PAUSE;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use crate::leadership::timers::{FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD};
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
-use crate::reputation::{EntryKey, Evidence, ReputationLedger};
+use crate::reputation::{EntryKey, Evidence, MAX_ENTRIES, ReputationLedger};
 use crate::wire::{LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION};
+use growth::GrowthLimit;
+pub use growth::MAX_FIRST_VOTES;
 
 /// Number of times that a leader is sent what it was not told, in case it was lost.
 const REPEATS: u32 = 3;
@@ -26,6 +40,8 @@ const REPEATS: u32 = 3;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LedgerResync {
     name: NodeName,
+    /// Whether evidence is signed.
+    is_signed: bool,
     ticks_per_snapshot: u32,
     /// The node's own leadership, while it leads.
     leads: Option<Epoch>,
@@ -43,6 +59,9 @@ pub struct LedgerResync {
     wait: u32,
     /// Number of times that this will still happen.
     repeats: u32,
+    /// When each of the latest leaders was last followed.
+    followed: BTreeMap<NodeName, Timestamp>,
+    growth: GrowthLimit,
 }
 
 /// Outcome of a share that was merged.
@@ -50,17 +69,23 @@ pub struct LedgerResync {
 pub struct Merged {
     /// Whether the ledger changed.
     pub is_news: bool,
-    /// Whether entries of terms that the election does not know were left out.
-    pub has_unknown_terms: bool,
+    /// Reasons why entries were left out.
+    pub refused: Vec<RejectReason>,
     /// Shares to publish.
     pub shares: Vec<LedgerShare>,
 }
 
 impl LedgerResync {
+    /// The same in a cell with certificates. [`Self::merge`] is then given shares whose signature was verified.
+    pub fn signed(name: NodeName, ticks_per_snapshot: u32) -> Self {
+        Self { is_signed: true, ..Self::new(name, ticks_per_snapshot) }
+    }
+
     /// The part of the node of this name; everything is shared each `ticks_per_snapshot` calls of [`Self::tick`].
     pub fn new(name: NodeName, ticks_per_snapshot: u32) -> Self {
         Self {
             name,
+            is_signed: false,
             ticks_per_snapshot,
             leads: None,
             has_led: false,
@@ -71,6 +96,8 @@ impl LedgerResync {
             shared: ReputationLedger::default(),
             wait: 0,
             repeats: 0,
+            followed: BTreeMap::new(),
+            growth: GrowthLimit::default(),
         }
     }
 
@@ -103,13 +130,14 @@ impl LedgerResync {
         let changed = ledger.entries_of(&keys);
         let reached = ledger.marks_reached(epoch.term, &epoch.leader, evidence);
         self.leads = Some(epoch.clone());
-        self.shares(&changed, &reached)
+        self.shares(ledger, &changed, &reached)
     }
 
     /// Takes in another candidate's share. `candidates` are the other nodes that may lead.
     ///
     /// # Errors
-    /// [`RejectReason::NotCandidate`] for the share of a node that may not lead; nothing is changed.
+    /// [`RejectReason::NotCandidate`] for the share of a node that may not lead, [`RejectReason::BadSignature`] for one
+    /// without a signature where there must be one. Nothing is changed then.
     pub fn merge(
         &mut self,
         share: &LedgerShare,
@@ -121,28 +149,114 @@ impl LedgerResync {
         if !candidates.contains(&share.node) {
             return Err(RejectReason::NotCandidate);
         }
-        let terms = share.entries.iter().map(|entry| entry.epoch).chain(share.marks.iter().map(|mark| mark.epoch));
-        let has_unknown_terms = terms.max().is_some_and(|term| !leadership.knows_term(term));
-        let is_own = |term: u64, leader: &NodeName| {
-            self.leads.as_ref().is_some_and(|own| own.term == term && own.leader == *leader)
-        };
-        let is_usable = |term: u64, leader: &NodeName| leadership.knows_term(term) && !is_own(term, leader);
-        let entries = share.entries.iter().filter(|entry| is_usable(entry.epoch, &entry.aggregator));
-        let marks = share.marks.iter().filter(|mark| is_usable(mark.epoch, &mark.aggregator));
-        let (entries, marks): (Vec<_>, Vec<_>) = (entries.cloned().collect(), marks.cloned().collect());
+        if self.is_signed && !share.is_empty() && (share.signed.is_none() || share.lane().is_none()) {
+            return Err(RejectReason::BadSignature);
+        }
+        self.note_leader(leadership, now);
+        let is_reset = self.take_reset(share, ledger, now);
+        let is_over = !self.is_signed && share.reset_at_us.unwrap_or_default() < ledger.reset_at();
+        let (mut taken, refused) =
+            if is_over { (share.clone(), Vec::new()) } else { self.judge(share, ledger, leadership, now) };
+        // What was signed together is taken together.
+        let is_whole = taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
+        if is_over || (self.is_signed && !is_whole) {
+            (taken.entries, taken.marks) = (Vec::new(), Vec::new());
+        }
         let leader = share.epoch.filter(|term| leadership.knows_term(*term));
         self.hear(leader.map(|term| Epoch::new(term, share.node.clone())), ledger, candidates);
+        // The sender has not heard of the reset.
+        self.owes_everything |= is_over;
         if self.repeats > 0 {
-            self.shared.merge_entries(entries.iter().cloned(), self.leader.as_ref());
-            self.shared.merge_marks(marks.iter().cloned(), self.leader.as_ref());
+            self.shared.merge_share(&taken, self.leader.as_ref());
         }
         let present = self.leads.as_ref().or(leadership.epoch.as_ref());
-        let is_news = ledger.merge_entries(entries, present) | ledger.merge_marks(marks, present);
-        Ok(Merged { is_news, has_unknown_terms, shares: self.take_everything(ledger, now) })
+        let taken = Arc::new(taken);
+        let is_statement = self.is_signed && taken.lane().is_some_and(|lane| !self.has_counted(&lane, ledger));
+        let is_news =
+            if is_statement { ledger.merge_statement(&taken, present) } else { ledger.merge_share(&taken, present) };
+        self.growth.note(&taken, ledger, now);
+        Ok(Merged { is_news: is_news | is_reset, refused, shares: self.take_everything(ledger, now) })
+    }
+
+    /// The part of a share that is evidence for this node, and the reasons to leave out the rest.
+    fn judge(
+        &self,
+        share: &LedgerShare,
+        ledger: &ReputationLedger,
+        leadership: &Leadership,
+        now: Timestamp,
+    ) -> (LedgerShare, Vec<RejectReason>) {
+        let mut refused = BTreeSet::new();
+        let mut is_usable = |lane: Epoch, is_plausible: bool, is_news: &dyn Fn() -> bool| {
+            if self.leads.as_ref() == Some(&lane) {
+                // Nobody knows better what it counts now.
+                return false;
+            }
+            let reason = if !leadership.knows_term(lane.term) {
+                RejectReason::UnknownTerm
+            } else if !self.may_tell(&share.node, &lane, leadership) {
+                RejectReason::Unattested
+            } else if !is_plausible {
+                RejectReason::Implausible
+            } else {
+                return true;
+            };
+            // Candidates may repeat what all know.
+            if is_news() {
+                refused.insert(reason);
+            }
+            false
+        };
+        let lane = |term: u64, aggregator: &NodeName| Epoch::new(term, aggregator.clone());
+        let mut taken = share.clone();
+        taken.entries.retain(|entry| {
+            let is_plausible = self.growth.admits(entry, now);
+            is_usable(lane(entry.epoch, &entry.aggregator), is_plausible, &|| ledger.lacks_entry(entry))
+        });
+        taken.marks.retain(|mark| {
+            let is_plausible = self.growth.admits_mark(mark, now);
+            is_usable(lane(mark.epoch, &mark.aggregator), is_plausible, &|| ledger.lacks_mark(mark))
+        });
+        (taken, refused.into_iter().collect())
+    }
+
+    /// Whether this node counted what is known of a lane, and signs it.
+    fn has_counted(&self, lane: &Epoch, ledger: &ReputationLedger) -> bool {
+        lane.leader == self.name && ledger.has_lane(lane) && !ledger.is_stated(lane)
+    }
+
+    /// Whether a candidate may tell of a lane.
+    fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
+        if leadership.present_epoch() == Some(lane) {
+            return *sender == lane.leader;
+        }
+        !self.is_signed || *sender != lane.leader || self.followed.contains_key(sender)
+    }
+
+    /// Notes who leads. The last word of a leader may come when another leads already.
+    fn note_leader(&mut self, leadership: &Leadership, now: Timestamp) {
+        self.followed.retain(|_, at| now.since(*at) < LAST_WORD_TIME);
+        if let Some(leader) = leadership.leader() {
+            self.followed.insert(leader.clone(), now);
+        }
+    }
+
+    /// Forgets all evidence if the share knows of a later reset than this node; true if it does.
+    fn take_reset(&mut self, share: &LedgerShare, ledger: &mut ReputationLedger, now: Timestamp) -> bool {
+        let later = share.reset_at_us.filter(|at| *at > ledger.reset_at() && at.since(now) < MAX_RESET_AHEAD);
+        let Some(reset_at) = later.filter(|_| !self.is_signed) else { return false };
+        *ledger = ReputationLedger::reset(reset_at);
+        self.shared = ReputationLedger::default();
+        self.growth = GrowthLimit::default();
+        true
     }
 
     /// Lets a publication period pass.
     pub fn tick(&mut self, ledger: &ReputationLedger, leadership: &Leadership, now: Timestamp) -> Vec<LedgerShare> {
+        self.note_leader(leadership, now);
+        if self.growth.len() > 2 * MAX_ENTRIES {
+            self.growth.retain(|lane| ledger.has_lane(lane));
+        }
         let mut shares = self.take_everything(ledger, now);
         shares.extend(self.take_unshared(ledger, leadership));
         self.ticks += 1;
@@ -158,12 +272,10 @@ impl LedgerResync {
     /// All evidence, or one share that says that there is none: a node that takes over waits for it, and a node that has
     /// some answers it.
     pub fn snapshot(&self, ledger: &ReputationLedger) -> Vec<LedgerShare> {
-        let (entries, marks): (Vec<_>, Vec<_>) = (ledger.entries().collect(), ledger.marks().collect());
-        let mut shares = Vec::new();
-        if entries.is_empty() {
-            shares.push(self.share_of(&[], &[]));
+        let mut shares = self.everything(ledger, None);
+        if shares.iter().all(|share| share.entries.is_empty()) {
+            shares.insert(0, self.share_of(ledger, &[], &[]));
         }
-        shares.extend(self.shares(&entries, &marks));
         shares
     }
 
@@ -192,8 +304,27 @@ impl LedgerResync {
             return Vec::new();
         }
         (self.owes_everything, self.everything_sent_at) = (false, Some(now));
-        let (entries, marks): (Vec<_>, Vec<_>) = (ledger.entries().collect(), ledger.marks().collect());
-        self.shares(&entries, &marks)
+        let mut shares = self.everything(ledger, self.leader.as_ref());
+        if shares.is_empty() && ledger.reset_at() > Timestamp::default() {
+            // The news is the reset.
+            shares.push(self.share_of(ledger, &[], &[]));
+        }
+        shares
+    }
+
+    /// All evidence but that of one lane. Where evidence is signed, what a node counted itself counts for nobody while
+    /// it does not lead.
+    fn everything(&self, ledger: &ReputationLedger, except: Option<&Epoch>) -> Vec<LedgerShare> {
+        let is_told = |term: u64, aggregator: &NodeName| {
+            let lane = Epoch::new(term, aggregator.clone());
+            except != Some(&lane) && (!self.is_signed || (self.leads.is_some() && self.has_counted(&lane, ledger)))
+        };
+        let entries: Vec<_> = ledger.entries().filter(|entry| is_told(entry.epoch, &entry.aggregator)).collect();
+        let marks: Vec<_> = ledger.marks().filter(|mark| is_told(mark.epoch, &mark.aggregator)).collect();
+        let mut shares = self.shares(ledger, &entries, &marks);
+        let statements = ledger.statements().filter(|share| share.lane().as_ref() != except);
+        shares.extend(statements.map(|share| self.passed_on(share)));
+        shares
     }
 
     /// Evidence that nobody has shared with the leader, if it is time to send it.
@@ -210,25 +341,55 @@ impl LedgerResync {
             return Vec::new();
         }
         (self.wait, self.repeats) = (self.ticks_per_snapshot.max(1), self.repeats - 1);
+        let is_told = |term: u64, aggregator: &NodeName| {
+            let is_leaders = self.leader.as_ref().is_some_and(|lane| lane.term == term && lane.leader == *aggregator);
+            leadership.knows_term(term) && !is_leaders
+        };
         let (mut entries, mut marks) = ledger.beyond(&self.shared);
-        entries.retain(|entry| leadership.knows_term(entry.epoch));
-        marks.retain(|mark| leadership.knows_term(mark.epoch));
-        self.shares(&entries, &marks)
+        entries.retain(|entry| is_told(entry.epoch, &entry.aggregator));
+        marks.retain(|mark| is_told(mark.epoch, &mark.aggregator));
+        if !self.is_signed {
+            return self.shares(ledger, &entries, &marks);
+        }
+        let untold = ledger.statements().filter(|share| {
+            share.entries.iter().any(|entry| entries.contains(entry))
+                || share.marks.iter().any(|mark| marks.contains(mark))
+        });
+        untold.map(|share| self.passed_on(share)).collect()
     }
 
-    fn shares(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) -> Vec<LedgerShare> {
-        let entries = entries.chunks(MAX_SHARE_ENTRIES).map(|entries| self.share_of(entries, &[]));
-        entries.chain(marks.chunks(MAX_SHARE_ENTRIES).map(|marks| self.share_of(&[], marks))).collect()
+    fn shares(&self, ledger: &ReputationLedger, entries: &[LedgerEntry], marks: &[LedgerMark]) -> Vec<LedgerShare> {
+        let share = |entries: &[LedgerEntry], marks: &[LedgerMark]| self.share_of(ledger, entries, marks);
+        if !entries.is_empty() && entries.len() + marks.len() <= MAX_SHARE_ENTRIES {
+            let together = share(entries, marks);
+            if !self.is_signed || together.lane().is_some() {
+                return vec![together];
+            }
+        }
+        // Only what is of one lane can be signed.
+        let is_together = |one: (u64, &NodeName), next: (u64, &NodeName)| !self.is_signed || one == next;
+        let entries = entries.chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
+        let marks = marks.chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
+        let entries = entries.flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES)).map(|entries| share(entries, &[]));
+        entries.chain(marks.flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES)).map(|marks| share(&[], marks))).collect()
     }
 
-    fn share_of(&self, entries: &[LedgerEntry], marks: &[LedgerMark]) -> LedgerShare {
+    fn share_of(&self, ledger: &ReputationLedger, entries: &[LedgerEntry], marks: &[LedgerMark]) -> LedgerShare {
         LedgerShare {
             schema: SCHEMA_VERSION,
             node: self.name.clone(),
             epoch: self.leads.as_ref().map(|epoch| epoch.term),
             entries: entries.to_vec(),
             marks: marks.to_vec(),
+            signed: None,
+            reset_at_us: Some(ledger.reset_at()).filter(|at| *at > Timestamp::default()),
         }
+    }
+
+    /// A share of another aggregator as this node sends it.
+    fn passed_on(&self, share: &LedgerShare) -> LedgerShare {
+        let epoch = self.leads.as_ref().map(|epoch| epoch.term);
+        LedgerShare { node: self.name.clone(), epoch, ..share.clone() }
     }
 }
 

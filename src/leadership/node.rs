@@ -27,9 +27,10 @@ use uuid::Uuid;
 pub use interface::{Effect, Input, Member, NodeSettings, Notice};
 
 use crate::leadership::address::BrokerAddress;
-use crate::leadership::election::{Election, ElectionEffect, ElectionInput, Health};
+use crate::leadership::election::{Body, Election, ElectionEffect, ElectionInput, ElectionMessage, Health};
 use crate::leadership::health::HealthMonitor;
 use crate::leadership::links::{Brokers, LinkState, Links};
+use crate::leadership::rights::Rights;
 use crate::leadership::timers::{DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME};
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
@@ -148,10 +149,13 @@ impl LeadershipNode {
     fn take(&mut self, input: Input, now: Timestamp) {
         match input {
             Input::Wake => {}
-            Input::Receive { from, message } if message.from != from => {
+            Input::Receive { from, message, .. } if message.from != from => {
                 self.log(Notice::Misattributed { from, claimed: message.from });
             }
-            Input::Receive { message, .. } => self.feed(ElectionInput::Receive { message }, now),
+            Input::Receive { from, message, .. } if message.body == Body::Ready && !self.is_served_by(&from) => {
+                self.log(Notice::NotServed { challenger: from });
+            }
+            Input::Receive { rights, message, .. } => self.receive(message, rights, now),
             Input::MemberAlive { member } => self.meet(member, now),
             Input::MemberChanged { member } => {
                 self.members.place(member);
@@ -214,6 +218,7 @@ impl LeadershipNode {
                 ElectionEffect::HoldRound => Effect::HoldRound,
                 ElectionEffect::StopPublishing { epoch } => Effect::StopPublishing { epoch },
                 ElectionEffect::SendSnapshot { to } => Effect::SendSnapshot { to },
+                ElectionEffect::CountImplausible { from } => Effect::CountImplausible { from },
                 ElectionEffect::Lead { epoch, first_round, first } => {
                     self.preparation = None;
                     self.tell_leadership();
@@ -230,6 +235,18 @@ impl LeadershipNode {
                 }
             };
             self.effects.push(effect);
+        }
+    }
+
+    /// Hands the election what a node may say. A message that declares more still tells what its sender may be.
+    fn receive(&mut self, message: ElectionMessage, rights: Rights, now: Timestamp) {
+        let (from, declared) = (message.from.clone(), message.candidacy);
+        let limited = rights.limit(message);
+        if limited.as_ref().is_none_or(|message| message.candidacy != declared) {
+            self.log(Notice::Overreached { from, role: declared.role, priority: declared.priority, rights });
+        }
+        if let Some(message) = limited {
+            self.feed(ElectionInput::Receive { message }, now);
         }
     }
 
@@ -322,6 +339,13 @@ impl LeadershipNode {
         let health = self.monitor.health(plane, brokers, no_other, self.round_period);
         let is_reached = self.is_reached(no_other);
         self.set_health(Health { broker: health.broker && is_reached, ..health }, now);
+    }
+
+    /// Whether this node is logged in where a node would lead: a lead that is handed to a broker that nobody is admitted
+    /// to silences the cell. The challenger says again that it is ready.
+    fn is_served_by(&self, challenger: &NodeName) -> bool {
+        self.links.plane().external.is_some()
+            || self.members.broker_of(challenger).is_some_and(|broker| self.monitor.is_logged_in(&broker))
     }
 
     /// Whether the members reach the broker that this node would lead with; the first time that they do not is logged.

@@ -66,6 +66,8 @@ pub enum Refusal {
     Superseded,
     /// The election names another leader.
     NotElected,
+    /// Its number is further ahead than rounds can have been published.
+    Implausible,
     /// It was under way for too long.
     Stale,
 }
@@ -77,6 +79,7 @@ impl Refusal {
             Self::Repeated => None,
             Self::Superseded => Some(RejectReason::Superseded),
             Self::NotElected => Some(RejectReason::NotElected),
+            Self::Implausible => Some(RejectReason::OutOfRange),
             Self::Stale => Some(RejectReason::Stale),
         }
     }
@@ -85,14 +88,14 @@ impl Refusal {
 impl RoundFilter {
     /// A filter of a node that starts. `saved_term` is the last term that an earlier run wrote to disk, 0 without any:
     /// terms below those that it knew are refused at first.
-    pub fn new(saved_term: u64) -> Self {
+    pub fn new(saved_term: u64, now: Timestamp) -> Self {
         let floor = floor(saved_term);
         Self {
             maps: SuccessionFilter::new(floor),
-            map_age: StalenessFilter::default(),
+            map_age: StalenessFilter::new(now),
             map_accepted_at: None,
             verdicts: SuccessionFilter::new(floor),
-            verdict_age: StalenessFilter::default(),
+            verdict_age: StalenessFilter::new(now),
             // Brokers retain them: a node that starts gets them before it can have heard of any term.
             reputations: SuccessionFilter::of_any_term(floor),
         }
@@ -209,7 +212,7 @@ mod tests {
 
     #[test]
     fn a_huge_epoch_silences_the_others_for_a_moment_only() {
-        let (mut filter, seeking) = (RoundFilter::new(0), seeking());
+        let (mut filter, seeking) = (RoundFilter::new(0, ms(0)), seeking());
         let mut take = |epoch, round, at| take(&mut filter, &map(epoch, round, ms(at)), ms(at), &seeking);
         assert_eq!(take(u64::MAX, 1, 0), Err(Refusal::NotElected));
         assert_eq!(take(u64::MAX, 2, 500), Ok(()), "it goes on and on");
@@ -221,7 +224,7 @@ mod tests {
 
     #[test]
     fn rounds_that_waited_while_the_node_was_stopped_are_not_taken() {
-        let (mut filter, seeking) = (RoundFilter::new(0), seeking());
+        let (mut filter, seeking) = (RoundFilter::new(0, ms(0)), seeking());
         let at = |round: u64| ms(100 * round);
         for round in 0..10 {
             assert_eq!(take(&mut filter, &map(7, round, at(round)), at(round), &seeking), Ok(()));
@@ -236,7 +239,7 @@ mod tests {
 
     #[test]
     fn a_refused_map_does_not_make_old_ones_look_fresh() {
-        let (mut filter, leadership) = (RoundFilter::new(0), following(8, "edge"));
+        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
         let at = |round: u64| ms(100 * round);
         for round in 0..10 {
             assert_eq!(take(&mut filter, &map(8, round, at(round)), at(round), &leadership), Ok(()));
@@ -248,7 +251,7 @@ mod tests {
 
     #[test]
     fn each_topic_goes_by_its_own_order_and_reputations_may_come_without_a_name() {
-        let (mut filter, seeking, now) = (RoundFilter::new(0), seeking(), Timestamp(1));
+        let (mut filter, seeking, now) = (RoundFilter::new(0, Timestamp(1)), seeking(), Timestamp(1));
         let reputations = |epoch, round, aggregator: Option<&'static str>| Reputations {
             schema: SCHEMA_VERSION,
             aggregator: aggregator.map(NodeName::from_static),
@@ -265,14 +268,14 @@ mod tests {
 
     #[test]
     fn a_deposed_leader_is_refused_even_when_nobody_else_is_heard() {
-        let (mut filter, leadership) = (RoundFilter::new(0), following(8, "euclid"));
+        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "euclid"));
         assert_eq!(take(&mut filter, &map(8, 1, ms(0)), ms(0), &leadership), Ok(()));
         assert_eq!(take(&mut filter, &map(7, 99, ms(9000)), ms(9000), &leadership), Err(Refusal::Superseded));
     }
 
     #[test]
     fn verdicts_are_signs_of_life_only_where_no_maps_come() {
-        let (mut filter, leadership) = (RoundFilter::new(0), following(8, "edge"));
+        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
         let verdicts = |round: u64| Verdicts {
             schema: SCHEMA_VERSION,
             aggregator: NodeName::from_static("edge"),
@@ -292,7 +295,7 @@ mod tests {
 
     #[test]
     fn a_term_that_no_election_knows_is_accepted_and_not_gone_on_from() {
-        let mut filter = RoundFilter::new(0);
+        let mut filter = RoundFilter::new(0, ms(0));
         let next = filter.accept_map(&map(8, 1, ms(0)), ms(0), &seeking()).unwrap();
         assert!(!next.is_known_term);
         let known = filter.accept_map(&map(8, 2, ms(100)), ms(100), &following(8, "edge")).unwrap();

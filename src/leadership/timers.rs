@@ -132,6 +132,11 @@ pub const MIN_CLOCK_JUMP: Duration = MAX_ROUND_AGE;
 
 /// Rate at which the leader slews the cell's time, in parts per million.
 pub const MAX_CLOCK_SLEW: i64 = 5_000;
+/// Time after the end of a leadership in which evidence that its leader sends is still accepted of it.
+pub const LAST_WORD_TIME: Duration = Duration::from_secs(5);
+
+/// Maximum time by which the clock of the node that forgot all evidence may be ahead of this node's.
+pub const MAX_RESET_AHEAD: Duration = Duration::from_secs(24 * 3600);
 
 /// Number of round intervals after the last round when rounds no longer count as regular.
 pub(crate) const REGULAR_GAPS: u32 = 8;
@@ -260,6 +265,7 @@ mod tests {
             (REDISCOVERY_TIME, DEPARTED_TIME, "a broker's end is understood"),
             (config.response_timeout(), REDISCOVERY_TIME, "a restarted membership costs no leader"),
             (DISK_TIMEOUT, config.handover(), "a hung disk ends no handover"),
+            (config.handover(), LAST_WORD_TIME, "the last evidence counts after a handover"),
             (FULL_RESYNC_PAUSE, Duration::from_secs(10), "a new leader is told before the next snapshot"),
         ] {
             assert!(smaller < larger, "{why}: {smaller:?} is not below {larger:?}");

@@ -101,7 +101,13 @@ pub type LandmarkId = SmolStr;
 
 /// Whether a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
 pub fn is_label(text: &str) -> bool {
-    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
+    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(|c| c.is_control() || is_layout_control(c))
+}
+
+/// Whether a character breaks lines or turns the direction of the text around it: a label with one would show another's
+/// text on pages and terminals (Unicode Technical Report 36, section 2.7).
+fn is_layout_control(c: char) -> bool {
+    matches!(c, '\u{61C}' | '\u{200E}' | '\u{200F}' | '\u{2028}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
 }
 
 #[cfg(test)]
@@ -115,6 +121,16 @@ mod tests {
         }
         for bad in ["", "a/b", "a+", "#", "a b", "é", &"x".repeat(65)] {
             assert!(NodeName::new(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn labels_are_of_any_script_and_never_change_how_others_are_shown() {
+        for good in ["car", "ABCD 123", "véhicule", "می\u{200C}خواهم", "車"] {
+            assert!(is_label(good), "{good}");
+        }
+        for bad in ["", "car\n", "car\u{202E}rac", "\u{2066}car", "car\u{2028}van", &"x".repeat(65)] {
+            assert!(!is_label(bad), "{}", bad.escape_unicode());
         }
     }
 }

@@ -5,9 +5,11 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::marks::Marks;
+use super::statements::Statements;
 use super::{Counts, Evidence, RememberedVotes, ReputationConfig};
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
+use crate::model::time::Timestamp;
 use crate::wire::{LedgerMark, Reputation};
 
 /// The votes of one vehicle in one lane.
@@ -27,6 +29,10 @@ pub struct ReputationLedger {
     pub(super) lanes: BTreeMap<Epoch, BTreeMap<NodeName, Record>>,
     /// Number of counts and marks in all lanes.
     pub(super) entries: usize,
+    /// What aggregators signed, by lane. It is not serialised with the counts.
+    pub(super) statements: BTreeMap<Epoch, Statements>,
+    /// Time of the last reset, in cells without certificates; 0 if there was none.
+    pub(super) reset_at: Timestamp,
 }
 
 /// Counts by vehicle and label.
@@ -73,6 +79,16 @@ impl From<ReputationLedger> for Snapshot {
 }
 
 impl ReputationLedger {
+    /// A ledger without evidence from before a reset.
+    pub fn reset(reset_at: Timestamp) -> Self {
+        Self { reset_at, ..Self::default() }
+    }
+
+    /// Time of the last reset; 0 if there was none.
+    pub fn reset_at(&self) -> Timestamp {
+        self.reset_at
+    }
+
     /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Other lanes give
     /// way to it, see [`Self::merge_entries`]. The vote is not counted where its lane alone takes all the room.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {

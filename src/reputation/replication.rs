@@ -44,18 +44,30 @@ impl ReputationLedger {
 
     /// The counts and marks that are missing in `other` or larger than there.
     pub fn beyond(&self, other: &Self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
-        let known = |epoch: u64, aggregator: &NodeName, node: &NodeName| {
-            other.lanes.get(&Epoch::new(epoch, aggregator.clone()))?.get(node)
-        };
-        let is_news = |entry: &LedgerEntry| {
-            let counts = known(entry.epoch, &entry.aggregator, &entry.node).and_then(|r| r.labels.get(&entry.label));
-            counts.is_none_or(|counts| counts.correct < entry.correct || counts.incorrect < entry.incorrect)
-        };
-        let is_new_mark = |mark: &LedgerMark| {
-            let marks = known(mark.epoch, &mark.aggregator, &mark.node).map(|record| &record.marks);
-            marks.is_none_or(|marks| marks.would_keep(mark.number) && !marks.has(mark.number))
-        };
-        (self.entries().filter(is_news).collect(), self.marks().filter(is_new_mark).collect())
+        let entries = self.entries().filter(|entry| other.lacks_entry(entry)).collect();
+        (entries, self.marks().filter(|mark| other.lacks_mark(mark)).collect())
+    }
+
+    /// Whether a count is missing here or larger than here.
+    pub fn lacks_entry(&self, entry: &LedgerEntry) -> bool {
+        let record = self.record_of(entry.epoch, &entry.aggregator, &entry.node);
+        let counts = record.and_then(|record| record.labels.get(&entry.label));
+        counts.is_none_or(|counts| counts.correct < entry.correct || counts.incorrect < entry.incorrect)
+    }
+
+    /// Whether a mark is missing here and would be kept.
+    pub fn lacks_mark(&self, mark: &LedgerMark) -> bool {
+        let record = self.record_of(mark.epoch, &mark.aggregator, &mark.node);
+        record.is_none_or(|record| record.marks.would_keep(mark.number) && !record.marks.has(mark.number))
+    }
+
+    fn record_of(&self, term: u64, aggregator: &NodeName, node: &NodeName) -> Option<&Record> {
+        self.lanes.get(&Epoch::new(term, aggregator.clone()))?.get(node)
+    }
+
+    /// Whether there is a lane.
+    pub fn has_lane(&self, lane: &Epoch) -> bool {
+        self.lanes.contains_key(lane)
     }
 
     /// Takes the larger of every count; true when that changed anything.
@@ -116,11 +128,22 @@ impl ReputationLedger {
     fn forget_oldest(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
         let oldest = self.lanes.keys().find(|other| *other != lane && Some(*other) != present).cloned();
         let gives_way = |oldest: &Epoch| oldest < lane || present == Some(lane);
-        let Some(forgotten) = oldest.filter(gives_way).and_then(|oldest| self.lanes.remove(&oldest)) else {
-            return false;
-        };
-        self.entries -= forgotten.values().map(|record| record.labels.len() + record.marks.len()).sum::<usize>();
+        let Some(oldest) = oldest.filter(gives_way) else { return false };
+        self.forget(&oldest);
         true
+    }
+
+    /// Forgets a lane.
+    pub(super) fn forget(&mut self, lane: &Epoch) {
+        self.entries -= self.size_of(lane);
+        self.lanes.remove(lane);
+        self.statements.remove(lane);
+    }
+
+    /// Number of counts and marks in a lane.
+    pub(super) fn size_of(&self, lane: &Epoch) -> usize {
+        let records = self.lanes.get(lane).into_iter().flat_map(|vehicles| vehicles.values());
+        records.map(|record| record.labels.len() + record.marks.len()).sum()
     }
 }
 

@@ -1,5 +1,7 @@
 //! Owner of the sensor models: what is learnt of each vehicle, and the only module that creates a [`SensorId`].
 
+use std::collections::BTreeMap;
+
 use hashbrown::HashMap;
 use nalgebra::Matrix2;
 
@@ -89,20 +91,22 @@ impl Sensors {
         self.models.iter().flatten().map(Box::as_ref)
     }
 
-    /// Takes the counts of all vehicles from a ledger.
+    /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
+    /// it have none.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
-        let mut silent = Vec::new();
-        for (node, (correct, incorrect)) in ledger.totals() {
-            let counts = TrustCounts::new(correct, incorrect, self.fleet.reputation());
-            match self.ids.get(&node).and_then(|id| self.models[id.number()].as_deref_mut()) {
-                Some(sensor) => {
-                    sensor.counts = counts;
-                    self.fleet.set_counts(sensor.id, &counts);
-                }
-                None => silent.push((node, counts)),
-            }
+        let config = self.fleet.reputation();
+        let votes = ledger.remembered(config.memory_votes, |_| 0).into_iter().map(|(node, labels)| {
+            let (correct, incorrect) =
+                labels.values().fold((0.0, 0.0), |sum, votes| (sum.0 + votes.0, sum.1 + votes.1));
+            (node, TrustCounts::new(correct, incorrect, config))
+        });
+        let mut votes: BTreeMap<_, _> = votes.collect();
+        for sensor in self.models.iter_mut().flatten() {
+            sensor.counts = votes.remove(&sensor.node).unwrap_or_default();
+            self.fleet.set_counts(sensor.id, &sensor.counts);
         }
-        self.dormant.keep(silent);
+        self.dormant = DormantCounts::default();
+        self.dormant.keep(votes);
     }
 
     /// Counts evidence about vehicles that are heard.

@@ -98,8 +98,8 @@ pub(super) struct TrustCounts {
 
 impl TrustCounts {
     /// Counts from a ledger.
-    pub(super) fn new(correct: u64, incorrect: u64, config: &ReputationConfig) -> Self {
-        let mut counts = Self { correct: correct as f64, incorrect: incorrect as f64 };
+    pub(super) fn new(correct: f64, incorrect: f64, config: &ReputationConfig) -> Self {
+        let mut counts = Self { correct, incorrect };
         counts.fade(config);
         counts
     }

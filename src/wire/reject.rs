@@ -60,12 +60,16 @@ reject_reasons! {
     NotElected = "not_elected",
     /// A report for an algorithm that the cell does not run.
     NotFused = "not_fused",
-    /// A payload without a signature of the cell, where every payload must have one.
+    /// A payload without a signature of the cell, or evidence without its aggregator's, where there must be one.
     BadSignature = "bad_signature",
     /// Evidence of a node that is not known as a candidate.
     NotCandidate = "not_candidate",
     /// Evidence of a term that the election does not know yet.
     UnknownTerm = "unknown_term",
+    /// Evidence of a leadership that its sender cannot vouch for.
+    Unattested = "unattested",
+    /// Evidence of more votes than there can have been.
+    Implausible = "implausible",
 }
 
 impl fmt::Display for RejectReason {

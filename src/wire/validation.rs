@@ -38,6 +38,9 @@ pub const MAX_INTEGER: u64 = (1 << 53) - 1;
 /// this only rejects rounds that would look fresh for hours.
 pub const MAX_FUSED_AHEAD_S: u64 = 3600;
 
+/// Maximum length of a certificate or signature in base64, in bytes.
+const MAX_TEXT: usize = 4096;
+
 /// Maximum number of counts, and of marks, in one share: it stays below the default of [`Limits::payload_bytes`].
 pub const MAX_SHARE_ENTRIES: usize = 512;
 
@@ -178,7 +181,10 @@ fn check_share(share: &LedgerShare, _: &Limits) -> Result<(), RejectReason> {
     if share.entries.len() > MAX_SHARE_ENTRIES || share.marks.len() > MAX_SHARE_ENTRIES {
         return Err(RejectReason::TooManyObjects);
     }
-    check_integers(share.epoch)?;
+    if share.signed.as_ref().is_some_and(|signed| signed.certificate.len().max(signed.signature.len()) > MAX_TEXT) {
+        return Err(RejectReason::TooLarge);
+    }
+    check_integers(share.epoch.into_iter().chain(share.reset_at_us.map(Timestamp::micros)))?;
     let mut marks = share.marks.iter();
     marks.try_for_each(|mark| check_integers([mark.epoch, mark.number, mark.correct, mark.incorrect]))?;
     share.entries.iter().try_for_each(|entry| {

@@ -8,7 +8,7 @@ use std::collections::btree_map::Entry;
 use ecod::aggregator::round::FirstRound;
 use ecod::leadership::links::{LinkState, WantedLinks};
 use ecod::leadership::node::Input;
-use ecod::leadership::timers::{EPOCH_MEMORY, MAX_ROUND_AGE};
+use ecod::leadership::timers::{ELECTED_SILENCE, EPOCH_MEMORY, MAX_ROUND_AGE};
 use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, LedgerShare, SCHEMA_VERSION};
@@ -127,7 +127,9 @@ impl World {
 
     /// Sends shares to all candidates that have a link to one of the brokers that the node publishes to; some are lost.
     pub(crate) fn share(&mut self, index: usize, shares: Vec<LedgerShare>) {
+        let leads = self.nodes[index].publishing.as_ref().map(|(epoch, _)| epoch.term);
         for share in shares {
+            assert_eq!(share.epoch, leads, "{} shares what another leadership recorded as its own", share.node);
             for broker in self.brokers_of(index) {
                 for to in self.clients_of(broker).into_iter().filter(|to| *to != index) {
                     if self.random.chance(LOST_SHARES_PERCENT) {
@@ -175,8 +177,11 @@ impl World {
             let last = of_this_run().next();
             let leadership = &node.leadership;
             panic!(
-                "{} accepts #{} of {}, {age} µs old: {what}; {leadership:?}, before {last:?}",
-                node.name, map.round, map.epoch
+                "{} accepts #{} of {}, {age} µs old: {what}; {leadership:?}, before {last:?}\n{}",
+                node.name,
+                map.round,
+                map.epoch,
+                self.history.join("\n")
             )
         };
         if u128::from(age) > MAX_ROUND_AGE.as_micros() {
@@ -184,6 +189,20 @@ impl World {
         }
         if of_this_run().any(|accepted| accepted.epoch == map.epoch && accepted.round >= map.round) {
             fail("it or a later one of its leadership was accepted before");
+        }
+        let of_earlier_runs = || node.accepted.iter().filter(|accepted| accepted.at < node.started_at);
+        let is_starting = u128::from(self.now - node.started_at) < EPOCH_MEMORY.as_micros();
+        if is_starting && of_earlier_runs().any(|accepted| accepted.epoch.term > map.epoch.term) {
+            fail("a later leadership's was accepted before the start");
+        }
+        if let Some(elected) = node.leadership.present_epoch() {
+            let is_heard = |accepted: &Accepted| {
+                accepted.epoch == *elected && u128::from(self.now - accepted.at) < ELECTED_SILENCE.as_micros()
+            };
+            let may_lead = [Some(&elected.leader), node.leadership.standby.as_ref()].contains(&Some(&map.epoch.leader));
+            if map.epoch > *elected && !may_lead && of_this_run().next().is_some_and(is_heard) {
+                fail("the elected leader's are there, and it is no successor of it");
+            }
         }
         let Some(later) = of_this_run().find(|accepted| accepted.epoch > map.epoch) else { return };
         let is_elected = node.leadership.present_epoch() == Some(&map.epoch);

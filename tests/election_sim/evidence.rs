@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 
 use ecod::leadership::node::Input;
 use ecod::model::epoch::Epoch;
-use ecod::model::names::NodeName;
+use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
-use ecod::reputation::{Evidence, ReputationLedger};
-use ecod::wire::{LedgerEntry, LedgerShare, Role};
+use ecod::reputation::{Counts, EntryKey, Evidence, ReputationLedger};
+use ecod::wire::{LedgerEntry, LedgerMark, LedgerShare, Role};
 
 use crate::node::Arrival;
 use crate::world::{MS, World};
@@ -15,18 +15,61 @@ use crate::world::{MS, World};
 /// Time between two publications of reputations, in µs.
 pub(crate) const PUBLISH_PERIOD: u64 = 1000 * MS;
 
+/// Vehicles about which there is evidence: so few that they reach marks.
+const VEHICLES: usize = 2;
+
+/// Labels that every vehicle states in turn.
+const LABELS: [&str; 2] = ["car", "van"];
+
+/// Every vote that was settled, as leaders recorded it.
+#[derive(Default)]
+pub(crate) struct Votes {
+    counts: BTreeMap<EntryKey, Counts>,
+    /// The counts of each vehicle in each lane after every vote.
+    courses: BTreeMap<(Epoch, NodeName), Vec<Counts>>,
+}
+
+impl Votes {
+    /// Settles one more vote of a vehicle; returns it as evidence.
+    fn settle(&mut self, lane: &Epoch, node: NodeName, correct: bool) -> Evidence {
+        let add = |counts: &mut Counts| if correct { counts.correct += 1 } else { counts.incorrect += 1 };
+        let course = self.courses.entry((lane.clone(), node.clone())).or_default();
+        let label = Label::from(LABELS[course.len() % LABELS.len()]);
+        let mut sum = course.last().copied().unwrap_or_default();
+        add(&mut sum);
+        course.push(sum);
+        add(self.counts.entry(EntryKey { lane: lane.clone(), node: node.clone(), label: label.clone() }).or_default());
+        Evidence { node, label, correct }
+    }
+
+    /// Whether an entry counts no more votes than were settled.
+    fn hold(&self, entry: &LedgerEntry) -> bool {
+        let LedgerEntry { epoch, aggregator, node, label, correct, incorrect } = entry.clone();
+        let settled = self.counts.get(&EntryKey { lane: Epoch::new(epoch, aggregator), node, label });
+        settled.is_some_and(|settled| correct <= settled.correct && incorrect <= settled.incorrect)
+    }
+
+    /// Whether a mark holds the counts that a vehicle once had.
+    fn passed(&self, mark: &LedgerMark) -> bool {
+        let LedgerMark { epoch, aggregator, node, correct, incorrect, .. } = mark.clone();
+        let course = self.courses.get(&(Epoch::new(epoch, aggregator), node));
+        let votes = (correct + incorrect) as usize;
+        let counts = course.and_then(|course| course.get(votes.checked_sub(1)?));
+        counts == Some(&Counts { correct, incorrect })
+    }
+}
+
 impl World {
     /// Records what a round of a node's own leadership says about vehicles.
     pub(crate) fn judge_vehicles(&mut self, index: usize, epoch: &Epoch) {
         if self.random.chance(80) {
             return;
         }
-        let vehicle = self.random.index(self.nodes.len());
+        let vehicle = self.random.index(VEHICLES);
         let (node, correct) = (self.nodes[vehicle].name.clone(), self.random.chance(90));
-        let evidence = [Evidence { node, label: "car".into(), correct }];
+        let evidence = self.votes.settle(epoch, node, correct);
         let node = &mut self.nodes[index];
-        let shares = node.resync.record(epoch, &evidence, &mut node.ledger);
-        *self.recorded.entry(epoch.clone()).or_default() += 1;
+        let shares = node.resync.record(epoch, &[evidence], &mut node.ledger);
         self.share(index, shares);
     }
 
@@ -45,14 +88,28 @@ impl World {
         let now = Timestamp(self.now).shifted(self.nodes[to].steady_clock);
         let node = &mut self.nodes[to];
         if let Ok(merged) = node.resync.merge(share, &mut node.ledger, &candidates, &node.leadership, now) {
+            self.judge_merge(to, share);
             self.share(to, merged.shares);
         }
+    }
+
+    /// Whether a node knows what it was told of terms that its election knows.
+    fn judge_merge(&self, to: usize, share: &LedgerShare) {
+        let node = &self.nodes[to];
+        let mut told = ReputationLedger::default();
+        let is_known = |term: u64| node.leadership.knows_term(term);
+        told.merge_entries(share.entries.iter().filter(|entry| is_known(entry.epoch)).cloned(), None);
+        told.merge_marks(share.marks.iter().filter(|mark| is_known(mark.epoch)).cloned(), None);
+        let lacks = told.beyond(&node.ledger);
+        assert!(lacks.0.is_empty() && lacks.1.is_empty(), "{} was told {lacks:?} and does not know it", node.name);
     }
 
     /// A publication period has passed.
     pub(crate) fn keep(&mut self, index: usize) {
         let now = Timestamp(self.now).shifted(self.nodes[index].steady_clock);
         let node = &mut self.nodes[index];
+        let lost = node.saved.beyond(&node.ledger);
+        assert!(lost.0.is_empty() && lost.1.is_empty(), "{} forgot {lost:?}", node.name);
         node.saved.clone_from(&node.ledger);
         let shares = node.resync.tick(&node.ledger, &node.leadership, now);
         self.share(index, shares);
@@ -74,18 +131,34 @@ impl World {
         all
     }
 
-    /// Whether no lane counts more than its leader recorded.
+    /// Whether every living candidate knows all of `known`.
+    pub(crate) fn everyone_knows(&self, known: &ReputationLedger) -> Result<(), String> {
+        for (_, node) in self.alive().filter(|(_, node)| node.config.role != Role::Cav) {
+            let (entries, marks) = known.beyond(&node.ledger);
+            if !entries.is_empty() || !marks.is_empty() {
+                return Err(format!("{} lacks {entries:?} {marks:?}", node.name));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether every count, mark and total of a living node is made of votes that a leader settled, each once.
     pub(crate) fn nothing_is_counted_twice(&self) -> Result<(), String> {
         for (_, node) in self.alive() {
-            let mut counted: BTreeMap<Epoch, u64> = BTreeMap::new();
-            for LedgerEntry { epoch, aggregator, correct, incorrect, .. } in node.ledger.entries() {
-                *counted.entry(Epoch::new(epoch, aggregator)).or_default() += correct + incorrect;
+            if let Some(entry) = node.ledger.entries().find(|entry| !self.votes.hold(entry)) {
+                return Err(format!("{} counts votes that nobody settled: {entry:?}", node.name));
             }
-            for (lane, counted) in counted {
-                let recorded = self.recorded.get(&lane).copied().unwrap_or_default();
-                if counted > recorded {
-                    return Err(format!("{} counts {counted} of {recorded} votes of {lane}", node.name));
-                }
+            if let Some(mark) = node.ledger.marks().find(|mark| !self.votes.passed(mark)) {
+                return Err(format!("{} has a mark that nobody reached: {mark:?}", node.name));
+            }
+            let mut sums: BTreeMap<NodeName, (u64, u64)> = BTreeMap::new();
+            for LedgerEntry { node, correct, incorrect, .. } in node.ledger.entries() {
+                let sum = sums.entry(node).or_default();
+                *sum = (sum.0 + correct, sum.1 + incorrect);
+            }
+            let totals = node.ledger.totals();
+            if totals != sums {
+                return Err(format!("{} has totals {totals:?} of counts {sums:?}", node.name));
             }
         }
         Ok(())

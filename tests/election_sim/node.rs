@@ -182,7 +182,7 @@ impl Node {
             name,
             config,
             machine: None,
-            filter: RoundFilter::new(0),
+            filter: RoundFilter::new(0, Timestamp(0)),
             publishers: PublisherFilter::default(),
             ledger: ReputationLedger::default(),
             saved: ReputationLedger::default(),
@@ -224,10 +224,13 @@ impl Node {
         self.closed = (0, now);
         self.publishers = PublisherFilter::default();
         self.resync = LedgerResync::new(self.name.clone(), TICKS_PER_SNAPSHOT);
-        self.ledger = if self.has_disk { self.saved.clone() } else { ReputationLedger::default() };
+        if !self.has_disk {
+            self.saved = ReputationLedger::default();
+        }
+        self.ledger = self.saved.clone();
         (self.known, self.members, self.links) = Default::default();
         self.leadership = Leadership::default();
-        self.filter = RoundFilter::new(self.persisted);
+        self.filter = RoundFilter::new(self.persisted, Timestamp(now).shifted(self.clock));
         let status = NodeStatus::starting(self.name.clone(), Uuid::from_u128(self.life.into()), self.config.role, "");
         let settings = NodeSettings {
             election: self.config.clone(),

@@ -5,16 +5,16 @@
 use std::cmp::{Ordering, Reverse};
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
-use ecod::leadership::Position;
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::links::LinkState;
 use ecod::leadership::node::{Effect, Input, Member};
+use ecod::leadership::{Position, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{Encoding, Role};
 
-use crate::evidence::PUBLISH_PERIOD;
+use crate::evidence::{PUBLISH_PERIOD, Votes};
 use crate::node::{Arrival, Event, Fault, Node, address_of, broker_of};
 use crate::random::Random;
 
@@ -39,8 +39,7 @@ pub(crate) struct World {
     pub(crate) lateness: u64,
     /// What to print when a check fails.
     pub(crate) history: Vec<String>,
-    /// Votes that were settled in each leadership.
-    pub(crate) recorded: BTreeMap<Epoch, u64>,
+    pub(crate) votes: Votes,
     cuts: BTreeSet<(usize, usize)>,
     pub(crate) loss_percent: u64,
     queue: BinaryHeap<Planned>,
@@ -86,7 +85,7 @@ impl World {
             packets: 0,
             lateness: 2 * MS,
             history: Vec::new(),
-            recorded: BTreeMap::new(),
+            votes: Votes::default(),
             cuts: BTreeSet::new(),
             loss_percent: 0,
             queue: BinaryHeap::new(),
@@ -168,11 +167,14 @@ impl World {
             Arrival::Packet { from, bytes } => {
                 let message = ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
                 let from = self.nodes[from].name.clone();
-                self.handle(to, Input::Receive { from, message });
+                self.handle(to, Input::Receive { from, rights: Rights::default(), message });
             }
             Arrival::Relay { from, map } => self.relay(to, from, &map),
             Arrival::Map { map } => self.accept(to, &map),
             Arrival::Share { share } => self.take_share(to, &share),
+            // A membership tells its news in order.
+            Arrival::Tell { about, about_life, is_there }
+                if self.nodes[to].known.get(&about) != is_there.then_some(&about_life) => {}
             Arrival::Tell { about, about_life, is_there: true } => {
                 self.nodes[to].members.insert(about, about_life);
                 self.handle(to, Input::MemberAlive { member: self.member(about, about_life) });
@@ -356,7 +358,7 @@ impl World {
                 let after = if answers { self.random.between(MS, 20 * MS) } else { 1000 * MS };
                 self.push_to(index, after, Arrival::Answered);
             }
-            Effect::PublishStatus { .. } | Effect::Log { .. } => {}
+            Effect::PublishStatus { .. } | Effect::CountImplausible { .. } | Effect::Log { .. } => {}
         }
         None
     }

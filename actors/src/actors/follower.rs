@@ -9,18 +9,21 @@
 //! It owns the node's [`RoundFilter`], which decides by the leadership of the moment. So each map is judged where it
 //! arrives, without another hop and without a lock.
 
-use std::fs::File;
-use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
+mod map_log;
+
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::{AcceptedRound, Refusal, RoundFilter};
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
+
+use map_log::MapLog;
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::follower::FollowerMessage;
@@ -29,7 +32,8 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::{LogItem, LogSender};
 use crate::platform::cell_clock::CellClock;
-use crate::telemetry::counters::{Counters, Event};
+use crate::platform::clock;
+use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::telemetry::spans::Spans;
 
 /// What a follower needs at its start.
@@ -65,7 +69,7 @@ pub struct Follower;
 pub struct FollowerState {
     newest: Newest,
     filter: RoundFilter,
-    log: Option<BufWriter<File>>,
+    log: Option<MapLog>,
     recording: LogSender,
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
@@ -85,8 +89,7 @@ impl Actor for Follower {
         _myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let log = arguments.log.as_deref().map(open).transpose()?;
-        Ok(FollowerState::new(arguments, log))
+        Ok(FollowerState::new(arguments))
     }
 
     async fn handle(
@@ -95,16 +98,23 @@ impl Actor for Follower {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let taken = match message {
-            FollowerMessage::TakeMap { delivery } => state.take_map(&delivery.message, delivery.received_at),
-            FollowerMessage::TakeVerdicts { delivery } => state.take_verdicts(&delivery.message, delivery.received_at),
+        let (taken, sender) = match message {
+            FollowerMessage::TakeMap { delivery } => {
+                let map = &delivery.message;
+                (state.take_map(map, delivery.received_at), Some(map.aggregator.clone()))
+            }
+            FollowerMessage::TakeVerdicts { delivery } => {
+                let verdicts = &delivery.message;
+                (state.take_verdicts(verdicts, delivery.received_at), Some(verdicts.aggregator.clone()))
+            }
             FollowerMessage::TakeReputations { delivery } => {
-                state.take_reputations(&delivery.message, delivery.received_at)
+                let reputations = &delivery.message;
+                (state.take_reputations(reputations, delivery.received_at), reputations.aggregator.clone())
             }
         };
         match taken.map_err(Refusal::reject_reason) {
             Ok(()) => {}
-            Err(Some(reason)) => state.counters.reject(reason),
+            Err(Some(reason)) => state.counters.reject(reason, sender.as_ref().map_or(OTHERS, NodeName::as_str)),
             Err(None) => state.counters.count(Event::Repeated),
         }
         Ok(())
@@ -112,9 +122,10 @@ impl Actor for Follower {
 }
 
 impl FollowerState {
-    fn new(arguments: FollowerArguments, log: Option<BufWriter<File>>) -> Self {
+    fn new(arguments: FollowerArguments) -> Self {
         let FollowerArguments {
             newest,
+            log,
             recording,
             saved_term,
             leadership,
@@ -123,9 +134,8 @@ impl FollowerState {
             clock,
             counters,
             spans,
-            ..
         } = arguments;
-        let filter = RoundFilter::new(saved_term);
+        let (filter, log) = (RoundFilter::new(saved_term, clock::now()), log.map(MapLog::new));
         Self { newest, filter, log, recording, leadership, election, fuser, clock, counters, spans }
     }
 
@@ -137,8 +147,10 @@ impl FollowerState {
             self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
         }
         self.tell_election(accepted);
-        self.write(&ReceivedMap { received_at: self.clock.date(received_at), map: Arc::clone(map) });
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
+        if let Some(log) = &mut self.log {
+            log.append(&ReceivedMap { received_at: self.clock.date(received_at), map: Arc::clone(map) });
+        }
         self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
         Ok(())
@@ -168,18 +180,4 @@ impl FollowerState {
             self.election.send(LeaderElectionMessage::Note { input: Input::RoundAccepted { epoch, round } });
         }
     }
-
-    fn write(&mut self, received: &ReceivedMap) {
-        let Some(log) = &mut self.log else { return };
-        let written = serde_json::to_writer(&mut *log, received).map_err(std::io::Error::from);
-        if let Err(error) = written.and_then(|()| log.write_all(b"\n")).and_then(|()| log.flush()) {
-            tracing::warn!(%error, "map log abandoned");
-            self.log = None;
-        }
-    }
-}
-
-fn open(path: &Path) -> Result<BufWriter<File>, ActorProcessingErr> {
-    let file = File::options().create(true).append(true).open(path);
-    file.map(BufWriter::new).map_err(|error| format!("cannot open map log {}: {error}", path.display()).into())
 }

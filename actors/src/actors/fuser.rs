@@ -191,7 +191,7 @@ impl FuserState {
             }
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
-                self.counters.reject(reason);
+                self.counters.reject(reason, report.node.as_str());
             }
         }
     }

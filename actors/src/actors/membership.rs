@@ -16,18 +16,21 @@ use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use ring::rand::{SecureRandom, SystemRandom};
+use rustls::pki_types::UnixTime;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 
 use crate::messages::membership::MembershipMessage;
 use crate::platform::clock;
-use crate::transport::gossip::key::{CellKey, SessionId};
+use crate::transport::gossip::handshake::Identity;
+use crate::transport::gossip::key::{CellKey, SessionNonce};
 use crate::transport::gossip::machine::{GossipMachine, GossipOutput, GossipSetup};
 use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::socket::GossipSocket;
 use crate::transport::gossip::{
     EventSink, FrameCounters, FrameEvent, MAX_PAYLOAD_BYTES, Member, MembershipConfig, MembershipEvent, MulticastConfig,
 };
+use crate::transport::pki::{Credentials, Distrust};
 
 /// Arguments of a [`Membership`].
 pub struct MembershipArguments {
@@ -41,6 +44,8 @@ pub struct MembershipArguments {
     pub role: Role,
     /// Address of the node's broker, if it has one. Others replace 0.0.0.0 by the address at which they see the node.
     pub broker: Option<SocketAddr>,
+    /// The node's certificates. With them, all nodes of the cell prove theirs.
+    pub credentials: Option<Arc<Credentials>>,
     /// Timings, seeds and limits.
     pub config: MembershipConfig,
     /// Callback for every event.
@@ -65,6 +70,7 @@ pub struct MembershipState {
     events: EventSink,
     members: watch::Sender<Vec<Member>>,
     counters: Arc<FrameCounters>,
+    certificates: Option<CertificateWatch>,
     /// Tasks that end with the actor.
     _tasks: JoinSet<()>,
 }
@@ -79,21 +85,27 @@ impl Actor for Membership {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let MembershipArguments { name, cell, run, role, broker, config, events, members, counters } = arguments;
+        let MembershipArguments { name, cell, run, role, broker, credentials, config, events, members, counters } =
+            arguments;
         let key = CellKey::load(&config, &cell)?;
         let socket = Arc::new(GossipSocket::bind(&config)?);
         let address = socket.address();
-        log_who_can_take_part(&config, address);
+        log_who_can_take_part(&config, credentials.is_some(), address);
+        let mut certificates = credentials.map(CertificateWatch::new);
+        let identity = certificates.as_mut().map(CertificateWatch::identity);
         let now = clock::now();
         let gossip = config.advertise.unwrap_or(address);
         let own = NodeId { name, run, life: run.max(now.micros()), role, gossip, broker };
         let (session, secret, seed) = draw_secrets()?;
-        let setup = GossipSetup { own, key, session, secret, seed, counters: Arc::clone(&counters) };
+        let setup = GossipSetup { own, key, session, identity, secret, seed, counters: Arc::clone(&counters) };
         let machine = GossipMachine::new(setup, &config, now);
         let (deadline, deadlines) = watch::channel(machine.next_deadline());
         let handled = Arc::new(Notify::new());
         let mut tasks = JoinSet::new();
         tasks.spawn(watch_socket(Arc::clone(&socket), deadlines, Arc::clone(&handled), myself.clone()));
+        if certificates.is_some() {
+            tasks.spawn(check_certificates(myself.clone()));
+        }
         if !join_group(&socket, &config.multicast) {
             tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
         }
@@ -103,7 +115,17 @@ impl Actor for Membership {
             }));
         }
         members.send_replace(Vec::new());
-        Ok(MembershipState { machine, socket, deadline, handled, events, members, counters, _tasks: tasks })
+        Ok(MembershipState {
+            machine,
+            socket,
+            deadline,
+            handled,
+            events,
+            members,
+            counters,
+            certificates,
+            _tasks: tasks,
+        })
     }
 
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
@@ -123,6 +145,11 @@ impl Actor for Membership {
             MembershipMessage::Send { to, payload } => state.machine.send(&to, &payload, now),
             MembershipMessage::SetSeeds { addresses } => state.machine.set_seeds(addresses),
             MembershipMessage::Address { reply } => drop(reply.send(state.socket.address())),
+            MembershipMessage::CheckCertificates => {
+                if let Some(identity) = state.certificates.as_mut().map(CertificateWatch::identity) {
+                    state.machine.set_identity(identity, now);
+                }
+            }
             MembershipMessage::Wake => state.wake(),
         }
         state.carry_out();
@@ -168,6 +195,48 @@ impl MembershipState {
             self.members.send_replace(self.machine.members());
         }
         self.deadline.send_replace(self.machine.next_deadline());
+    }
+}
+
+/// The node's certificates, and whether its own was valid when last looked at.
+struct CertificateWatch {
+    credentials: Arc<Credentials>,
+    own: Option<Distrust>,
+}
+
+impl CertificateWatch {
+    fn new(credentials: Arc<Credentials>) -> Self {
+        Self { credentials, own: None }
+    }
+
+    /// The present certificates and time. Logs when the own certificate begins or ceases to be valid, such as when the
+    /// clock is set.
+    fn identity(&mut self) -> Identity {
+        let (credentials, wall) = (self.credentials.current(), UnixTime::now());
+        let own = credentials.verify_node(credentials.certificate(), wall).err();
+        match (&self.own, &own) {
+            (None, Some(cause)) => tracing::warn!(
+                %cause,
+                "this node's certificate is not valid, so that no node admits it: waiting. Set this machine's clock, or \
+                 issue a certificate by `ecod-node pki issue`"
+            ),
+            (Some(_), None) => tracing::info!("this node's certificate is valid now"),
+            _ => {}
+        }
+        self.own = own;
+        Identity { credentials, wall }
+    }
+}
+
+/// Time between two checks of the certificates.
+const CERTIFICATE_PERIOD: Duration = Duration::from_millis(500);
+
+async fn check_certificates(membership: ActorRef<MembershipMessage>) {
+    loop {
+        tokio::time::sleep(CERTIFICATE_PERIOD).await;
+        if membership.cast(MembershipMessage::CheckCertificates).is_err() {
+            return;
+        }
     }
 }
 
@@ -228,17 +297,19 @@ async fn join_later(socket: Arc<GossipSocket>, config: MulticastConfig) {
 
 const MAX_SLEEP: Duration = Duration::from_secs(60);
 
-fn draw_secrets() -> Result<(SessionId, [u8; 32], u64), ActorProcessingErr> {
+fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
     let random = SystemRandom::new();
-    let (mut session, mut secret, mut seed) = (SessionId::default(), [0; 32], [0; 8]);
+    let (mut session, mut secret, mut seed) = (SessionNonce::default(), [0; 32], [0; 8]);
     let drawn = random.fill(&mut session).and_then(|()| random.fill(&mut secret)).and_then(|()| random.fill(&mut seed));
     drawn.map_err(|_| "the system gives no random numbers")?;
     Ok((session, secret, u64::from_le_bytes(seed)))
 }
 
-fn log_who_can_take_part(config: &MembershipConfig, address: SocketAddr) {
+fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: SocketAddr) {
     match (config.has_key(), address.ip().is_loopback()) {
-        (true, _) => tracing::info!(%address, "gossiping with whoever has the cell's key"),
+        (true, _) if proves => tracing::info!(%address, "gossiping with whoever has the cell's key and a certificate"),
+        (true, _) => tracing::info!(%address, "gossiping with whoever has the cell's key: certificates are not proven"),
+        (false, false) if proves => tracing::warn!(%address, "gossiping with certificates, no cell key is set"),
         (false, true) => tracing::info!(%address, "gossiping on this machine only: no cell key is set"),
         (false, false) => tracing::warn!(%address, "gossiping with anyone: no cell key is set"),
     }

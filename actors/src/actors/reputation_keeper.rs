@@ -6,6 +6,9 @@
 //! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
 //! ```
 //!
+//! With certificates, what this node counts is signed here, and what others counted is verified here. When a certificate
+//! is revoked, the counts that it signed go within a second, from what is published and from the fuser.
+//!
 //! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. What is
 //! published was saved before. What an actor knew outlives it in its [`ReputationStore`]; what a node knew outlives it in its state
 //! directory.
@@ -15,6 +18,7 @@ mod store;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::ledger_resync::LedgerResync;
@@ -30,7 +34,7 @@ use tokio::task::JoinHandle;
 pub use config::ReputationKeeperConfig;
 #[cfg(fuzzing)]
 pub use store::read_saved;
-pub use store::{ReputationStore, SharedReputations};
+pub use store::{ReputationStore, SharedReputations, reset_saved};
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
@@ -42,7 +46,11 @@ use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::Delivery;
+use crate::transport::pki::{Credentials, EvidenceSigner};
 use store::Saved;
+
+/// Time between two looks at the revocation list.
+const REVOCATION_CHECK_PERIOD: Duration = Duration::from_secs(1);
 
 /// What a keeper needs at its start.
 pub struct ReputationKeeperArguments {
@@ -58,6 +66,8 @@ pub struct ReputationKeeperArguments {
     pub reputations: SharedReputations,
     /// Where it is saved, if anywhere.
     pub file: Option<StateFile>,
+    /// The node's certificates; without them evidence is not signed.
+    pub credentials: Option<Arc<Credentials>>,
     /// The newest reputations of the cell.
     pub newest: watch::Receiver<Option<Received<Reputations>>>,
     /// The other nodes.
@@ -80,12 +90,14 @@ pub struct ReputationKeeper;
 pub struct ReputationKeeperState {
     arguments: ReputationKeeperArguments,
     resync: LedgerResync,
+    signer: Option<EvidenceSigner>,
     last_round: u64,
     published: Option<(Epoch, u64)>,
     unsaved: bool,
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
     disk_failed: bool,
+    cannot_sign: bool,
 }
 
 impl Actor for ReputationKeeper {
@@ -98,9 +110,15 @@ impl Actor for ReputationKeeper {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        store::restore(&arguments);
-        myself.send_interval(arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
-        Ok(ReputationKeeperState::new(arguments))
+        let mut state = ReputationKeeperState::new(arguments);
+        store::restore(&state.arguments, state.signer.as_mut());
+        myself.send_interval(state.arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
+        if state.signer.is_some() {
+            // Those that were revoked while the actor did not run.
+            state.drop_revoked();
+            myself.send_interval(REVOCATION_CHECK_PERIOD, || ReputationKeeperMessage::CheckCertificates);
+        }
+        Ok(state)
     }
 
     async fn handle(
@@ -126,6 +144,12 @@ impl Actor for ReputationKeeper {
                 state.send_snapshot();
             }
             ReputationKeeperMessage::Tick => state.tick().await,
+            ReputationKeeperMessage::CheckCertificates => {
+                if state.signer.as_mut().is_some_and(EvidenceSigner::reload) && state.drop_revoked() {
+                    state.published = None;
+                    state.settle().await;
+                }
+            }
         }
         Ok(())
     }
@@ -138,8 +162,12 @@ impl Actor for ReputationKeeper {
 
 impl ReputationKeeperState {
     fn new(arguments: ReputationKeeperArguments) -> Self {
+        let (name, ticks_per_snapshot) = (arguments.name.clone(), arguments.config.ticks_per_snapshot());
+        let credentials = arguments.credentials.clone();
+        let resync = if credentials.is_some() { LedgerResync::signed } else { LedgerResync::new };
         Self {
-            resync: LedgerResync::new(arguments.name.clone(), arguments.config.ticks_per_snapshot()),
+            resync: resync(name, ticks_per_snapshot),
+            signer: credentials.map(|credentials| EvidenceSigner::new(arguments.cell.clone(), credentials)),
             arguments,
             last_round: 0,
             published: None,
@@ -148,6 +176,7 @@ impl ReputationKeeperState {
             unadopted: false,
             writing: None,
             disk_failed: false,
+            cannot_sign: false,
         }
     }
 
@@ -183,6 +212,12 @@ impl ReputationKeeperState {
     fn merge(&mut self, delivery: &Delivery<Arc<LedgerShare>>) {
         let share = &delivery.message;
         let candidates = self.candidates();
+        if let Some(signer) = self.signer.as_mut().filter(|_| !share.is_empty())
+            && let Err(error) = signer.verify(share)
+        {
+            tracing::debug!(node = %share.node, %error, "evidence not used");
+            return self.arguments.counters.reject(RejectReason::BadSignature, share.node.as_str());
+        }
         let leadership = self.arguments.leadership.borrow().clone();
         let mut store = self.arguments.reputations.open();
         let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, delivery.received_at);
@@ -191,12 +226,12 @@ impl ReputationKeeperState {
             Ok(merged) => merged,
             Err(reason) => {
                 tracing::debug!(node = %share.node, %reason, "evidence not used");
-                return self.arguments.counters.reject(reason);
+                return self.arguments.counters.reject(reason, share.node.as_str());
             }
         };
-        if merged.has_unknown_terms {
-            tracing::debug!(node = %share.node, term = leadership.term, "evidence of a later term");
-            self.arguments.counters.reject(RejectReason::UnknownTerm);
+        for reason in merged.refused {
+            tracing::debug!(node = %share.node, %reason, term = leadership.term, "part of the evidence not used");
+            self.arguments.counters.reject(reason, share.node.as_str());
         }
         if merged.is_news {
             self.arguments.counters.count(Event::LedgerMerged);
@@ -213,11 +248,16 @@ impl ReputationKeeperState {
     }
 
     async fn tick(&mut self) {
-        self.save().await;
-        self.publish();
+        self.settle().await;
         let leadership = self.arguments.leadership.borrow().clone();
         let shares = self.resync.tick(&self.arguments.reputations.open().ledger, &leadership, clock::now());
         self.publish_shares(shares);
+    }
+
+    /// Saves, publishes and uses what has changed.
+    async fn settle(&mut self) {
+        self.save().await;
+        self.publish();
         if std::mem::take(&mut self.unadopted) {
             let ledger = Arc::new(self.arguments.reputations.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });
@@ -242,15 +282,37 @@ impl ReputationKeeperState {
         self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
     }
 
-    fn send_snapshot(&self) {
+    fn send_snapshot(&mut self) {
         let shares = self.resync.snapshot(&self.arguments.reputations.open().ledger);
         self.publish_shares(shares);
     }
 
-    fn publish_shares(&self, shares: Vec<LedgerShare>) {
+    /// Publishes shares; those of the node's own counts are signed first.
+    fn publish_shares(&mut self, shares: Vec<LedgerShare>) {
         for share in shares {
-            self.arguments.gateway.send(GatewayMessage::PublishShare { share });
+            let signer = self.signer.as_ref().filter(|_| share.signed.is_none() && !share.is_empty());
+            let share = match signer {
+                Some(signer) => signer.sign(share),
+                None => Some(share),
+            };
+            if let Some(share) = share {
+                self.arguments.gateway.send(GatewayMessage::PublishShare { share });
+            } else if !std::mem::replace(&mut self.cannot_sign, true) {
+                tracing::warn!("evidence not shared: `tls.key` is not an ECDSA P-256 key, as `ecod-node pki` makes it");
+            }
         }
+    }
+
+    /// Drops the evidence of aggregators whose certificate was revoked; true if there was any.
+    fn drop_revoked(&mut self) -> bool {
+        let Some(signer) = &mut self.signer else { return false };
+        let mut store = self.arguments.reputations.open();
+        let has_dropped = store.ledger.retain_statements(|share| signer.is_trusted(share));
+        if has_dropped {
+            tracing::info!(lanes = store.ledger.lanes(), "evidence of revoked nodes dropped");
+            (self.unsaved, self.unadopted) = (true, true);
+        }
+        has_dropped
     }
 
     /// Saves what has changed; a disk that fails or hangs is counted, and the node goes on.

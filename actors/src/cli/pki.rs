@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use clap::{Args, Subcommand};
+use ecod::leadership::Rights;
+use ecod::leadership::election::ElectionConfig;
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
 
@@ -29,9 +31,12 @@ pub(super) enum PkiCommand {
         ca: AuthorityDir,
         /// Name of the node
         node: NodeName,
-        /// Role of the node; a certificate for `cav` allows no broker, so the node can never lead
+        /// Highest role of the node, its key `role`; with `cav` it can never lead, with `auto` not as an edge
         #[arg(long, default_value = "auto", value_parser = ["auto", "cav", "edge"])]
         role: String,
+        /// Highest priority of the node in the election, its key `election.priority`
+        #[arg(long, default_value_t = ElectionConfig::default().priority)]
+        priority: u8,
         /// Validity of the certificate in days
         #[arg(long, default_value_t = DEFAULT_DAYS, value_parser = clap::value_parser!(u32).range(1..=3650))]
         days: u32,
@@ -60,7 +65,7 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
             let authority = Authority::init(&ca.dir, cell, now).map_err(failure)?;
             format!("made a CA for {cell}; copy its certificate to every node: {}\n", shown(&authority.ca()))
         }
-        PkiCommand::Issue { ca, node, role, days } => {
+        PkiCommand::Issue { ca, node, role, priority, days } => {
             let mut authority = Authority::open(&ca.dir).map_err(failure)?;
             let role = match role.as_str() {
                 "cav" => Role::Cav,
@@ -68,7 +73,7 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
                 _ => Role::Auto,
             };
             let valid = Duration::from_secs(u64::from(*days) * 86_400);
-            authority.issue(node, role, valid, now).map_err(failure)?;
+            authority.issue(node, Rights { role, priority: *priority }, valid, now).map_err(failure)?;
             configuration(&authority, node)
         }
         PkiCommand::Revoke { ca, node } => {

@@ -27,8 +27,8 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
             Finding::fine(check, "none, and none are needed on one machine")
         });
     };
-    let current = match Credentials::load(files, name) {
-        Ok(credentials) => credentials.current(),
+    let credentials = match Credentials::load(files, name) {
+        Ok(credentials) => credentials,
         Err(error) => {
             let fix = match &error {
                 CredentialsError::File { key: "tls.revocation_list", .. } => {
@@ -39,14 +39,15 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
             return Some(Finding::broken(check, error.to_string(), fix));
         }
     };
+    let current = credentials.current();
     let identity: &CertificateSubject = &current.identity;
     let left = identity.expires().since(clock::now());
     let shown = format!("for {}, {} days left", identity.name(), left.as_secs() / 86_400);
     let is_public = std::fs::metadata(&files.key).is_ok_and(|metadata| metadata.permissions().mode() & 0o077 != 0);
     Some(if left.is_zero() {
         Finding::broken(check, "expired", format!("`ecod-node pki issue {name}` creates a new one"))
-    } else if config.may_lead() && !identity.may_serve() {
-        Finding::broken(check, "for role cav, which never leads", "issue one with `--role auto` or `--role edge`")
+    } else if let Some(error) = credentials.check_rights(config.role, config.election.priority).err() {
+        Finding::broken(check, error.to_string(), "issue one, or lower `role` or `election.priority`")
     } else if is_public {
         Finding::doubtful(
             check,

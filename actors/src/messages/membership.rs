@@ -26,6 +26,8 @@ pub enum MembershipMessage {
         /// The seeds, resolved.
         addresses: Vec<SocketAddr>,
     },
+    /// Read changed certificates, and end sessions whose certificate is no longer valid; sent by the membership to itself.
+    CheckCertificates,
     /// Process waiting datagrams and due timers; sent by the membership to itself.
     Wake,
 }

@@ -45,4 +45,6 @@ pub enum ReputationKeeperMessage {
     },
     /// Save, publish and pass on what has changed.
     Tick,
+    /// Drop the evidence of nodes whose certificate was revoked.
+    CheckCertificates,
 }

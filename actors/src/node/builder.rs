@@ -2,6 +2,7 @@
 
 mod arguments;
 
+use std::fs::File;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -43,6 +44,7 @@ use crate::observe::recorder::ImageRecorder;
 use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
+use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
 use crate::telemetry::spans::Spans;
 use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
@@ -61,6 +63,8 @@ pub(super) struct NodeBuilder {
     counters: Arc<Counters>,
     newest: Newest,
     reputations: SharedReputations,
+    /// Keeps `ecod-node reset` away while the node runs.
+    _state_lock: Option<File>,
     recording: LogSender,
     report_queue: LatestReportQueue,
     broker_address: watch::Sender<Option<SocketAddr>>,
@@ -84,8 +88,12 @@ impl NodeBuilder {
     pub(super) fn new(config: NodeConfig, security: Security, failed: watch::Sender<Option<String>>) -> Self {
         let by_evidence = config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote();
         let counters = Arc::<Counters>::default();
+        let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
+        let directory = config.state_dir.as_deref();
         Self {
-            name: config.name.clone().unwrap_or(NodeName::from_static("node")),
+            // A directory that cannot be written is reported when something is saved.
+            _state_lock: directory.and_then(|directory| StateFile::lock(directory, &config.cell, &name).ok()),
+            name,
             config,
             security,
             run: Uuid::now_v7(),

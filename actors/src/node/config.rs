@@ -270,7 +270,12 @@ impl NodeConfig {
     /// # Errors
     /// [`SecurityError`] naming the file.
     pub fn security(&self) -> Result<Security, SecurityError> {
-        Security::load(self.tls.as_ref().zip(self.name.as_ref()), &self.mqtt, (&self.membership, &self.cell))
+        let tls = self.tls.as_ref().zip(self.name.as_ref());
+        let security = Security::load(tls, &self.mqtt, (&self.membership, &self.cell))?;
+        if let Some(credentials) = &security.credentials {
+            credentials.check_rights(self.role, self.election.priority)?;
+        }
+        Ok(security)
     }
 
     /// Whether the node may lead its cell.

@@ -1,4 +1,12 @@
 //! State files that survive crashes: they hold the last complete state or the one before, never a mixture.
+//!
+//! ```text
+//! ecod-state 1 <SHA-256 of the rest, 64 hexadecimal digits>
+//! <the state as JSON>
+//! ```
+//!
+//! A file that was damaged, or edited by hand, does not have its checksum. It is set aside, and the node starts without
+//! it. Files of early versions are JSON alone; they are read as they are, and get a checksum when they are next written.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
@@ -6,6 +14,7 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use ecod::model::names::NodeName;
+use ring::digest::{SHA256, digest};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -18,10 +27,28 @@ pub struct StateFile {
 /// Maximum length of a state file in bytes.
 const MAX_BYTES: u64 = 64 * 1024 * 1024;
 
+/// Beginning of a file with a checksum: kind and version.
+const HEADER: &str = "ecod-state 1 ";
+
 impl StateFile {
     /// The file `<cell>.<node>.<what>.json` in `directory`, so that the nodes of a machine can share a directory.
     pub fn new(directory: &Path, cell: &NodeName, node: &NodeName, what: &str) -> Self {
         Self { path: directory.join(format!("{cell}.{node}.{what}.json")) }
+    }
+
+    /// Lock on the state of a node, which its process holds as long as it runs.
+    ///
+    /// # Errors
+    /// When another process holds it, or the directory cannot be written.
+    pub fn lock(directory: &Path, cell: &NodeName, node: &NodeName) -> io::Result<File> {
+        fs::create_dir_all(directory)?;
+        let file = OpenOptions::new()
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(directory.join(format!("{cell}.{node}.lock")))?;
+        file.try_lock()?;
+        Ok(file)
     }
 
     /// The file.
@@ -29,7 +56,7 @@ impl StateFile {
         &self.path
     }
 
-    /// The state written last, if it is complete and `is_ours`. Any other content is set aside with a warning.
+    /// The state written last, if it is undamaged and `is_ours`. Any other content is set aside with a warning.
     pub fn load<T: DeserializeOwned>(&self, is_ours: impl FnOnce(&T) -> bool) -> Option<T> {
         let mut bytes = Vec::new();
         let read = File::open(&self.path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
@@ -41,15 +68,36 @@ impl StateFile {
                 return None;
             }
         }
-        let why = match serde_json::from_slice(&bytes) {
+        let why = match parse(&bytes) {
             Ok(state) if is_ours(&state) => return Some(state),
             Ok(_) => "it belongs to another node or version".into(),
-            Err(error) => error.to_string(),
+            Err(why) => why,
         };
+        self.set_aside(&why);
+        None
+    }
+
+    /// Renames the file to `….set-aside`, with a warning that says why.
+    pub fn set_aside(&self, why: &str) {
         let aside = self.path.with_extension("set-aside");
         let moved = fs::rename(&self.path, &aside).err();
-        tracing::warn!(path = %self.path.display(), aside = %aside.display(), why, ?moved, "state set aside");
-        None
+        let (path, aside) = (self.path.display(), aside.display());
+        tracing::warn!(
+            %path, %aside, why, ?moved,
+            "state set aside, the node goes on without it; to use a copy of yours, put it there while the node is stopped"
+        );
+    }
+
+    /// Deletes the file; true if there was one.
+    ///
+    /// # Errors
+    /// When the directory refuses it.
+    pub fn delete(&self) -> io::Result<bool> {
+        match fs::remove_file(&self.path) {
+            Ok(()) => Ok(true),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+            Err(error) => Err(error),
+        }
     }
 
     /// Replaces the state. After `Ok` it survives a loss of power.
@@ -58,8 +106,28 @@ impl StateFile {
     /// When the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
         fs::create_dir_all(self.path.parent().unwrap_or(Path::new(".")))?;
-        replace_file(&self.path, &serde_json::to_vec(state)?, 0o666)
+        let state = serde_json::to_vec(state)?;
+        let mut bytes = format!("{HEADER}{}\n", checksum(&state)).into_bytes();
+        bytes.extend(state);
+        replace_file(&self.path, &bytes, 0o666)
     }
+}
+
+/// The state in the bytes of a file.
+fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, String> {
+    serde_json::from_slice(content(bytes)?).map_err(|error| error.to_string())
+}
+
+/// The bytes of the state in a file whose checksum is right. Without a header, all of it.
+fn content(bytes: &[u8]) -> Result<&[u8], String> {
+    let Some(rest) = bytes.strip_prefix(HEADER.as_bytes()) else { return Ok(bytes) };
+    let (found, rest) = rest.split_at(rest.len().min(2 * SHA256.output_len()));
+    let state = rest.strip_prefix(b"\n").filter(|state| found == checksum(state).as_bytes());
+    state.ok_or_else(|| "it is damaged: its checksum differs".into())
+}
+
+fn checksum(state: &[u8]) -> String {
+    hex::encode(digest(&SHA256, state))
 }
 
 /// Replaces a file atomically, with permissions `mode` less the process's umask. After `Ok` it survives a loss of power.
@@ -107,6 +175,38 @@ mod tests {
         file.save(&[7]).unwrap();
         assert_eq!(file.load::<Vec<u32>>(|_| false), None, "not ours");
         assert!(!file.path().exists());
+    }
+
+    #[test]
+    fn a_file_of_an_early_version_is_read_and_then_has_a_checksum() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = file(directory.path());
+        fs::write(file.path(), b"[1,2,3]").unwrap();
+        let read: Vec<u32> = file.load(|_| true).unwrap();
+        file.save(&read).unwrap();
+        assert!(fs::read_to_string(file.path()).unwrap().starts_with(HEADER));
+        assert_eq!(file.load(|_| true), Some(vec![1, 2, 3]));
+    }
+
+    #[test]
+    fn no_byte_changes_unnoticed() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = file(directory.path());
+        for state in [1_795_239_882_u64, 0, 7] {
+            file.save(&state).unwrap();
+            let bytes = fs::read(file.path()).unwrap();
+            for place in 0..bytes.len() {
+                for change in 1..=u8::MAX {
+                    let mut damaged = bytes.clone();
+                    damaged[place] ^= change;
+                    assert_eq!(parse::<u64>(&damaged).ok(), None, "byte {place} ^ {change:#x}");
+                }
+            }
+            (0..bytes.len()).for_each(|end| assert_eq!(parse::<u64>(&bytes[..end]).ok(), None, "{end} bytes"));
+            fs::write(file.path(), &bytes[..bytes.len() - 1]).unwrap();
+            assert_eq!(file.load::<u64>(|_| true), None);
+            assert!(!file.path().exists(), "set aside");
+        }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Counters of events, rejected payloads and shed messages; cheap enough for every packet.
 
-mod shed;
+mod by_source;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use ecod::wire::RejectReason;
 use strum::{IntoStaticStr, VariantArray};
 
-pub use shed::{OTHERS, Shed, ShedReason};
+pub use by_source::{OTHERS, Shed, ShedReason, SourceCount};
 
-use shed::Shedding;
+use by_source::CountsBySource;
 
 /// An event that is too frequent for the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, IntoStaticStr, VariantArray)]
@@ -100,6 +100,8 @@ pub enum Event {
     ClientsFull,
     /// The embedded broker refused a login, message or filter: another's name or topic, or beyond a limit.
     ClientDenied,
+    /// Another node declared more in the election than its certificate allows.
+    Overreached,
     /// The embedded broker cut off a client whose certificate was revoked or expired.
     ClientExpelled,
 }
@@ -119,7 +121,8 @@ impl Event {
 pub struct Counters {
     events: [AtomicU64; Event::ALL.len()],
     rejects: [AtomicU64; RejectReason::ALL.len()],
-    shedding: Shedding,
+    rejects_by_source: CountsBySource<RejectReason>,
+    shed: CountsBySource<ShedReason>,
 }
 
 impl Default for Counters {
@@ -127,7 +130,8 @@ impl Default for Counters {
         Self {
             events: [const { AtomicU64::new(0) }; Event::ALL.len()],
             rejects: [const { AtomicU64::new(0) }; RejectReason::ALL.len()],
-            shedding: Shedding::default(),
+            rejects_by_source: CountsBySource::default(),
+            shed: CountsBySource::default(),
         }
     }
 }
@@ -143,19 +147,40 @@ impl Counters {
         self.events[event as usize].fetch_add(times, Ordering::Relaxed);
     }
 
-    /// Counts a rejected payload.
-    pub fn reject(&self, reason: RejectReason) {
+    /// Counts a rejected payload of a node, or of a broker where the sender is not known. The first of each source is
+    /// also a line in the log: a warning, unless elections and re-ordering explain it.
+    pub fn reject(&self, reason: RejectReason, source: &str) {
         self.rejects[reason as usize].fetch_add(1, Ordering::Relaxed);
+        if !self.rejects_by_source.count(reason, source) {
+            return;
+        }
+        let reason_name = reason.as_str();
+        if is_everyday(reason) {
+            tracing::debug!(source, reason = reason_name, "payload rejected");
+        } else {
+            tracing::warn!(
+                source,
+                reason = reason_name,
+                "payloads of this sender are rejected; see docs/protocol.md#rejections"
+            );
+        }
+    }
+
+    /// Payloads rejected so far, by reason and source.
+    pub fn rejects_by_source(&self) -> Vec<SourceCount<RejectReason>> {
+        self.rejects_by_source.snapshot()
     }
 
     /// Counts a message that was shed under overload; the first of each source is also a warning.
     pub fn shed(&self, reason: ShedReason, source: &str) {
-        self.shedding.count(reason, source);
+        if self.shed.count(reason, source) {
+            tracing::warn!(source, reason = reason.as_str(), "more comes in than is taken, the rest is left out");
+        }
     }
 
     /// Shed messages so far, by reason and source.
     pub fn all_shed(&self) -> Vec<Shed> {
-        self.shedding.snapshot()
+        self.shed.snapshot()
     }
 
     /// Occurrences of an event.
@@ -170,12 +195,22 @@ impl Counters {
 
     /// All counts by label, zeros included: a metric exists before its first event.
     pub fn snapshot(&self) -> CounterSnapshot {
+        let mut shed: BTreeMap<_, _> = ShedReason::ALL.iter().map(|reason| (reason.as_str(), 0)).collect();
+        for Shed { reason, times, .. } in self.all_shed() {
+            *shed.entry(reason.as_str()).or_default() += times;
+        }
         CounterSnapshot {
             events: Event::ALL.iter().map(|event| (event.as_str(), self.events(*event))).collect(),
             rejects: RejectReason::ALL.map(|reason| (reason.as_str(), self.rejects(reason))).into(),
-            shed: self.shedding.sums(),
+            shed,
         }
     }
+}
+
+/// Whether a reason occurs without anybody's fault: around a change of leader, or on a network that re-orders.
+fn is_everyday(reason: RejectReason) -> bool {
+    use RejectReason::{NotCandidate, NotElected, NotFused, OutOfOrder, Stale, Superseded, UnknownTerm};
+    matches!(reason, NotCandidate | NotElected | NotFused | OutOfOrder | Stale | Superseded | UnknownTerm)
 }
 
 /// All counters of a node at one moment.
@@ -197,7 +232,7 @@ mod tests {
     fn every_reason_and_event_has_its_own_counter() {
         let counters = Counters::default();
         for (times, reason) in RejectReason::ALL.into_iter().enumerate() {
-            (0..times).for_each(|_| counters.reject(reason));
+            (0..times).for_each(|_| counters.reject(reason, "euclid"));
         }
         for (times, event) in Event::ALL.iter().enumerate() {
             (0..times).for_each(|_| counters.count(*event));
@@ -208,6 +243,9 @@ mod tests {
         for (times, event) in Event::ALL.iter().enumerate() {
             assert_eq!(counters.events(*event), times as u64, "{event:?}");
         }
+        let named = counters.rejects_by_source();
+        assert!(named.iter().all(|count| count.source == "euclid" && count.times == counters.rejects(count.reason)));
+        assert_eq!(named.len(), RejectReason::ALL.len() - 1);
         let snapshot = counters.snapshot();
         assert_eq!((snapshot.events.len(), snapshot.rejects.len()), (Event::ALL.len(), RejectReason::ALL.len()));
     }

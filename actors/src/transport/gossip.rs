@@ -7,19 +7,25 @@ pub(crate) mod counters;
 pub(crate) mod frame;
 #[cfg(fuzzing)]
 pub mod fuzzing;
+pub(crate) mod handshake;
 pub(crate) mod key;
 pub(crate) mod machine;
 pub(crate) mod node_id;
+pub(crate) mod refusals;
 pub(crate) mod replay_window;
 pub(crate) mod reply_throttle;
 pub(crate) mod seeds;
+pub(crate) mod session_keys;
 pub(crate) mod sessions;
 pub(crate) mod socket;
 pub(crate) mod swim;
+#[cfg(any(test, fuzzing))]
+pub(crate) mod trial_authority;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
@@ -46,7 +52,7 @@ pub struct Member {
     pub gossip: SocketAddr,
     /// Address of its broker, if it has one.
     pub broker: Option<SocketAddr>,
-    /// The role it was started with.
+    /// The role it was started with; in a cell with certificates at most that of its own.
     pub role: Role,
 }
 
@@ -77,6 +83,8 @@ pub enum MembershipEvent {
     Received {
         /// The authenticated sender.
         from: NodeName,
+        /// Its rights by its certificate; all in a cell without certificates.
+        rights: Rights,
         /// The payload.
         payload: Bytes,
         /// Time of arrival by this node's clock.

@@ -5,26 +5,35 @@
 //! Credentials         the certificates of one node; reloads changed files
 //! CertificateSubject  the node that a certificate names, and its rights
 //! BrokerTrust         verification of a broker's certificate for as long as a connection lasts
+//! EvidenceSigner      signatures under evidence that is passed on
 //! ```
 //!
 //! Each cell has its own CA, so that certificates of other cells are not valid in it. A certificate's common name is the
-//! node's name. Only the certificate of a node that may lead also has [`BROKER_NAME`], which clients verify: a vehicle
-//! that never leads cannot pose as a broker, and addresses may change.
+//! node's name. An alternative name of kind URI holds its highest role and priority. Only the certificate of a node that
+//! may lead also has [`BROKER_NAME`], which clients verify: a vehicle that never leads cannot pose as a broker, and
+//! addresses may change.
 
+mod attestation;
 mod authority;
 mod broker_trust;
 mod config;
 mod credentials;
+mod evidence;
 mod subject;
 
+pub(crate) use attestation::{Distrust, MAX_CERTIFICATE_BYTES, is_signed_by};
 pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
 pub use broker_trust::BrokerTrust;
 pub use config::TlsConfig;
 pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external_broker};
+pub use evidence::{EvidenceError, EvidenceSigner};
 pub use subject::{CertificateSubject, InvalidCertificate};
 
 /// DNS name in the certificate of every node that may lead, below a domain reserved for private use.
 pub const BROKER_NAME: &str = "broker.ecod.internal";
+
+/// Scheme of the URI in a node's certificate that holds its rights, such as `ecod:role=auto;priority=100`.
+const RIGHTS_SCHEME: &str = "ecod:";
 
 /// Separator between a node's name and the rest in the names of observers that use its certificate.
 pub const OBSERVER_MARK: &str = "--";

@@ -114,18 +114,20 @@ fn a_vehicle_that_never_leads_says_that_it_records_no_reports_of_others() {
     }
 }
 
-/// A map log on a full disk ends, and maps go on.
+/// A map log on a full disk, or on one that cannot be written, costs no map and no start.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_map_log_on_a_full_disk_holds_up_no_map() {
-    let directory = tempfile::tempdir().unwrap();
-    let address = free_address();
-    let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
-    (config.map_log, config.record) = (Some("/dev/full".into()), None);
-    let node = node::start(config).await.unwrap();
-    let mut maps = node.newest_map();
-    let reached = maps.wait_for(|newest| newest.as_ref().is_some_and(|newest| newest.map.round > 5));
-    tokio::time::timeout(Duration::from_secs(30), reached).await.expect("maps go on").unwrap();
-    node.stop().await;
+async fn a_map_log_that_cannot_be_written_holds_up_no_map() {
+    for path in ["/dev/full", "/proc/maps.jsonl"] {
+        let directory = tempfile::tempdir().unwrap();
+        let address = free_address();
+        let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
+        (config.map_log, config.record) = (Some(path.into()), None);
+        let node = node::start(config).await.unwrap();
+        let mut maps = node.newest_map();
+        let reached = maps.wait_for(|newest| newest.as_ref().is_some_and(|newest| newest.map.round > 5));
+        tokio::time::timeout(Duration::from_secs(30), reached).await.expect("maps go on").unwrap();
+        node.stop().await;
+    }
 }
 
 /// A directory that cannot be made is counted and tried again.

@@ -42,6 +42,7 @@ async fn start(name: &str, seed: Option<SocketAddr>) -> Node {
         run: clock::now().micros(),
         role: Role::Auto,
         broker: None,
+        credentials: None,
         config,
         events: Arc::new(move |event| {
             if let MembershipEvent::Received { payload, .. } = event {

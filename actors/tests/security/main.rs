@@ -3,9 +3,11 @@
 mod brokers;
 mod certificates;
 mod claims;
+mod evidence;
 mod fixture;
 mod floods;
 mod frames;
 mod hung;
+mod identity;
 mod payloads;
 mod topics;

@@ -118,7 +118,7 @@ impl Election {
 
     fn follow(&mut self, beat: Beat, now: Timestamp) {
         self.epoch = Some(beat.epoch.clone());
-        self.round = self.round.max(beat.round);
+        self.learn_round(&beat.epoch.leader, beat.round);
         let leader = beat.epoch.leader.clone();
         let beat_interval = Duration::from_millis(beat.every_ms);
         self.state =
@@ -137,10 +137,11 @@ impl Election {
     }
 
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
+        self.learn_round(&beat.epoch.leader, beat.round);
         let State::Following(following) = &mut self.state else { return };
-        self.round = self.round.max(beat.round);
         following.beat_interval = Duration::from_millis(beat.every_ms);
         following.hear(now);
+        following.has_beaten = true;
         following.forget_round_interval(now);
         if beat.hears_us {
             following.bidirectional_at = now;
@@ -154,9 +155,7 @@ impl Election {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
                 let leads = message.epoch.as_ref() == Some(&following.epoch);
-                // Others' word of the leadership may overtake what the leader sent before.
-                let is_unheard = following.direct_at == Timestamp::default();
-                let is_earlier = is_unheard && message.term < following.epoch.term;
+                let is_earlier = !following.has_beaten && message.term < following.epoch.term;
                 if !leads && !is_earlier && !matches!(message.body, Body::Beat { .. }) {
                     let ended = following.epoch.clone();
                     let follows = message.epoch.clone().filter(|next| {
@@ -193,7 +192,11 @@ impl Election {
         {
             self.renew_later(now);
         }
-        if self.peers.get(from).is_some_and(|peer| peer.told) {
+        let Some(peer) = self.peers.get(from) else { return };
+        // Of two that began to lead at the same time, one ends at once, and may have followers that hear it next in a while.
+        let follows_what_is_over =
+            peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.id && Some(epoch) != self.current_epoch());
+        if peer.told && !follows_what_is_over {
             return;
         }
         if self.is_leading() {
@@ -205,7 +208,7 @@ impl Election {
 
     pub(super) fn take_resign(&mut self, epoch: &Epoch, last_round: u64, now: Timestamp) {
         if self.epoch.as_ref() == Some(epoch) {
-            self.round = self.round.max(last_round);
+            self.learn_round(&epoch.leader, last_round);
         }
         let followed = matches!(&self.state, State::Following(following) if following.epoch == *epoch);
         self.close(epoch.clone());

@@ -72,7 +72,7 @@ impl Election {
 
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
         self.learn_term(epoch.term);
-        self.round = self.round.max(round);
+        self.learn_round(&epoch.leader, round);
         let least = self.config.beat();
         match &mut self.state {
             State::Following(following) if following.epoch == *epoch => following.take_round(least, now),
@@ -118,7 +118,7 @@ impl Election {
         let ours = following.epoch.leader == *from && epoch == Some(&following.epoch) && following.prepared;
         if ours && self.candidacy().may_lead() {
             let after = following.epoch.clone();
-            self.round = self.round.max(last_round);
+            self.learn_round(from, last_round);
             self.lead(Some(after), now);
         }
     }

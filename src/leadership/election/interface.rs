@@ -109,6 +109,12 @@ pub enum ElectionEffect {
         /// The leader that hands over.
         leader: NodeName,
     },
+    /// Count a message of this node that states a term or round beyond what a cell can have reached. The number has
+    /// changed nothing.
+    CountImplausible {
+        /// The sender.
+        from: NodeName,
+    },
     /// Share all evidence about vehicles with a node: the next leader, or the one that remains when two sides heal.
     SendSnapshot {
         /// The addressee.

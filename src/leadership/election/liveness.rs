@@ -39,6 +39,8 @@ pub(super) struct Following {
     round_interval: Option<Duration>,
     /// Time at which this node heard the leader.
     pub(super) direct_at: Timestamp,
+    /// Whether a beat of it was heard. Others' word of the leadership, and its rounds, may overtake what it sent before.
+    pub(super) has_beaten: bool,
     /// Time at which the leader said that it hears this node.
     pub(super) bidirectional_at: Timestamp,
     /// Time at which others heard the leader, at least.
@@ -70,6 +72,7 @@ impl Following {
             early_gaps: 0,
             round_interval: None,
             direct_at,
+            has_beaten: direct_at != Timestamp::default(),
             bidirectional_at: direct_at,
             indirect_heard_at,
             given_up: false,

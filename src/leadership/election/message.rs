@@ -19,6 +19,13 @@ pub const MAX_TERM: u64 = (1 << 53) - 1;
 /// never gets so far ahead of a node. A forged term near [`MAX_TERM`] would end elections for good.
 pub const MAX_TERM_STEP: u64 = 1 << 20;
 
+/// Largest step by which one message raises the known number of the last round: more rounds than a cell publishes in
+/// years. A node that has just started believes any number up to [`MAX_ROUND`].
+pub(super) const MAX_ROUND_STEP: u64 = 1 << 32;
+
+/// Largest round number taken from the wire. A leader that would go on from it begins anew: epochs order rounds first.
+pub const MAX_ROUND: u64 = 1 << 52;
+
 /// Largest encoded message in bytes; it fits one Ethernet frame with room for the membership's seal.
 pub const MAX_MESSAGE_BYTES: usize = 1200;
 
@@ -208,12 +215,19 @@ impl ElectionMessage {
         let known = |epoch: &Option<Epoch>| epoch.as_ref().is_none_or(|epoch| epoch.term <= self.term);
         let body = match &self.body {
             Body::Status { over } => known(over),
-            Body::Beat { every_ms, after, successors, .. } => {
+            Body::Beat { every_ms, after, successors, round, .. } => {
                 let leads = self.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.from);
-                leads && known(after) && successors.len() <= MAX_SUCCESSORS && (1..=60_000).contains(every_ms)
+                leads
+                    && known(after)
+                    && successors.len() <= MAX_SUCCESSORS
+                    && (1..=60_000).contains(every_ms)
+                    && *round <= MAX_ROUND
             }
-            Body::Resign { epoch, .. } => epoch.term <= self.term && epoch.leader == self.from,
-            Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready | Body::Yield { .. } => true,
+            Body::Resign { epoch, last_round } => {
+                epoch.term <= self.term && epoch.leader == self.from && *last_round <= MAX_ROUND
+            }
+            Body::Yield { last_round } => *last_round <= MAX_ROUND,
+            Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready => true,
         };
         let clock = self.clock.as_ref().is_none_or(|clock| clock.is_plausible());
         body && clock && self.term <= MAX_TERM && known(&self.epoch)
@@ -301,6 +315,9 @@ mod tests {
         assert_eq!(refused(beat(3, "edge")), RejectReason::Malformed, "an epoch beyond the sender's term");
         assert_eq!(refused(beat(4, "euclid")), RejectReason::Malformed, "a beat in another's name");
         assert_eq!(refused(beat(MAX_TERM + 1, "edge")), RejectReason::Malformed, "a term beyond all bounds");
+        let endless = Body::Yield { last_round: MAX_ROUND + 1 };
+        let reason = refused(ElectionMessage { body: endless, ..beat(4, "edge") });
+        assert_eq!(reason, RejectReason::Malformed, "a round beyond all bounds");
         assert_eq!(refused(ElectionMessage { schema: 2, ..beat(4, "edge") }), RejectReason::UnknownSchema);
     }
 }

@@ -159,7 +159,7 @@ impl Election {
             State::Following(_) => FirstRound::OnTime,
             State::Leading(_) => FirstRound::InStep,
         };
-        self.effects.push(ElectionEffect::Lead { epoch: epoch.clone(), first_round: self.round + 1, first });
+        self.effects.push(ElectionEffect::Lead { epoch: epoch.clone(), first_round: self.next_round(), first });
         self.state = State::Leading(Leading::new(epoch, after, successors, now));
         self.beat_all(now);
     }

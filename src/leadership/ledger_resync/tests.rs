@@ -3,6 +3,7 @@
 use super::*;
 use crate::leadership::view::Position;
 use crate::reputation::MAX_LANES;
+use crate::wire::LedgerSignature;
 
 fn name(name: &str) -> NodeName {
     NodeName::new(name).unwrap()
@@ -58,18 +59,31 @@ impl Candidate {
     }
 }
 
+/// A leadership that is followed.
+fn following(term: u64, leader: &str) -> Leadership {
+    let epoch = Some(Epoch::new(term, name(leader)));
+    Leadership { position: Position::Following, epoch, standby: None, term }
+}
+
 /// The candidate `euclid`, which follows `edge` in term 7 and has led before.
 fn euclid() -> Candidate {
     let mut euclid = Candidate::new("euclid");
-    let epoch = Some(Epoch::new(7, name("edge")));
-    euclid.leadership = Leadership { position: Position::Following, epoch, standby: None, term: 7 };
+    euclid.leadership = following(7, "edge");
     let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
     euclid.ledger.record(3, &name("euclid"), &own);
     euclid
 }
 
 fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> LedgerShare {
-    LedgerShare { schema: SCHEMA_VERSION, node: name(from), epoch: leads, entries, marks: Vec::new() }
+    LedgerShare {
+        schema: SCHEMA_VERSION,
+        node: name(from),
+        epoch: leads,
+        entries,
+        marks: Vec::new(),
+        signed: None,
+        reset_at_us: None,
+    }
 }
 
 fn slander(epoch: u64, aggregator: &str, incorrect: u64) -> LedgerEntry {
@@ -88,8 +102,35 @@ fn evidence_of_vehicles_strangers_and_later_terms_is_refused() {
 
     let merged = euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 1), slander(8, "edge", 1000)]), 0);
     let merged = merged.unwrap();
-    assert!(merged.is_news && merged.has_unknown_terms);
+    assert!(merged.is_news && merged.refused == [RejectReason::UnknownTerm]);
     assert_eq!(euclid.incorrect("gauss"), 1);
+}
+
+#[test]
+fn only_the_leader_tells_what_it_counts_while_it_leads() {
+    let mut euclid = euclid();
+    euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0).unwrap();
+    let merged = euclid.merge(&share("other", None, vec![slander(7, "edge", 1_000_000_000)]), 0).unwrap();
+    assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Unattested][..]));
+    euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 4)]), 100).unwrap();
+    assert_eq!(euclid.incorrect("gauss"), 4);
+}
+
+#[test]
+fn the_counts_of_a_leadership_that_is_known_do_not_leap() {
+    let mut euclid = euclid();
+    euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0).unwrap();
+    euclid.leadership = following(8, "leader");
+    for (forged, at_ms) in [(1_000_000_000, 1000), (1_000_000, 2000)] {
+        let merged = euclid.merge(&share("other", None, vec![slander(7, "edge", forged)]), at_ms).unwrap();
+        assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Implausible][..]));
+    }
+    let first = slander(8, "leader", MAX_FIRST_VOTES + 1);
+    assert!(!euclid.merge(&share("leader", Some(8), vec![first]), 2000).unwrap().is_news);
+    assert_eq!(euclid.incorrect("gauss"), 3);
+    // What was lost meanwhile.
+    euclid.merge(&share("other", None, vec![slander(7, "edge", 900)]), 3000).unwrap();
+    assert_eq!(euclid.incorrect("gauss"), 900);
 }
 
 #[test]
@@ -176,4 +217,154 @@ fn what_a_round_says_is_shared_at_once_and_that_there_is_nothing_too() {
     assert_eq!((empty.epoch, empty.entries.len()), (Some(1), 0));
     let [share] = &leader.record(1, "euclid")[..] else { panic!("one share") };
     assert_eq!((share.entries.len(), share.entries[0].correct), (1, 1));
+}
+
+/// A candidate of a cell with certificates that follows.
+fn signing(node: &str, term: u64, leader: &str) -> Candidate {
+    let leadership = following(term, leader);
+    Candidate { resync: LedgerResync::signed(name(node), PERIOD), leadership, ..Candidate::new(node) }
+}
+
+/// Shares as others get them: signed by those whose lane they are.
+fn sign(shares: Vec<LedgerShare>) -> Vec<LedgerShare> {
+    let sign = |share: LedgerShare| {
+        let aggregator = share.lane().map(|lane| lane.leader.to_string());
+        let signature = |certificate| LedgerSignature { certificate, signature: "signature".into() };
+        LedgerShare { signed: share.signed.clone().or(aggregator.map(signature)), ..share }
+    };
+    shares.into_iter().map(sign).collect()
+}
+
+#[test]
+fn evidence_without_a_signature_is_refused_where_all_sign() {
+    let mut euclid = signing("euclid", 7, "edge");
+    let honest = share("edge", Some(7), vec![slander(7, "edge", 1)]);
+    assert_eq!(euclid.merge(&honest, 0), Err(RejectReason::BadSignature));
+    let mixed = share("edge", Some(7), vec![slander(7, "edge", 1), slander(6, "gauss", 1)]);
+    let signed = LedgerSignature { certificate: "edge".into(), signature: "signature".into() };
+    assert_eq!(euclid.merge(&LedgerShare { signed: Some(signed), ..mixed }, 0), Err(RejectReason::BadSignature));
+    let empty = euclid.merge(&share("edge", Some(7), Vec::new()), 0).unwrap();
+    assert_eq!((empty.is_news, empty.refused), (false, Vec::new()), "there is nothing to sign");
+    euclid.hear(&sign(vec![honest]));
+    assert_eq!(euclid.incorrect("gauss"), 1);
+}
+
+#[test]
+fn what_was_signed_together_is_taken_together() {
+    let mut euclid = signing("euclid", 7, "edge");
+    let slanders =
+        vec![slander(7, "edge", 1), LedgerEntry { label: "vase".into(), ..slander(7, "edge", u64::MAX >> 11) }];
+    let merged = euclid.merge(&sign(vec![share("edge", Some(7), slanders)])[0], 0).unwrap();
+    assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Implausible][..]));
+    assert_eq!((euclid.incorrect("gauss"), euclid.ledger.statements().count()), (0, 0));
+}
+
+#[test]
+fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
+    let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("euclid", 7, "edge"));
+    edge.lead(7);
+    edge.leadership.position = Position::Leading;
+    let forged = sign(vec![share("gauss", None, vec![slander(6, "gauss", 1000)])]);
+    for node in [&mut edge, &mut euclid] {
+        let merged = node.merge(&forged[0], 0).unwrap();
+        assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Unattested][..]));
+        let sent = [node.wait(3), node.resync.snapshot(&node.ledger)].concat();
+        assert!(sent.iter().all(LedgerShare::is_empty), "nor is it passed on");
+    }
+    euclid.leadership = following(8, "gauss");
+    euclid.hear(&sign(vec![share("gauss", Some(8), vec![slander(8, "gauss", 3)])]));
+    assert_eq!(euclid.incorrect("gauss"), 3, "a leader is believed while it leads");
+    euclid.leadership = following(9, "edge");
+    let late = sign(vec![share("gauss", None, vec![slander(8, "gauss", 4)])]);
+    euclid.merge(&late[0], 1000).unwrap();
+    assert_eq!(euclid.incorrect("gauss"), 4, "and in its last word");
+    let later = sign(vec![share("gauss", None, vec![slander(8, "gauss", 5)])]);
+    let merged = euclid.merge(&later[0], 1000 + LAST_WORD_TIME.as_millis() as u64).unwrap();
+    assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Unattested][..]));
+}
+
+#[test]
+fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificate() {
+    let (mut euclid, mut gauss) = (signing("other", 7, "edge"), signing("gauss", 8, "leader"));
+    let mut edge = signing("edge", 7, "edge");
+    edge.lead(7);
+    let mut said = Vec::new();
+    for vehicle in ["euclid", "gauss", "euclid"] {
+        said.extend(sign(edge.record(7, vehicle)));
+    }
+    assert_eq!(said.len(), 3, "one signature for each round");
+    euclid.hear(&said);
+    let news = share("leader", Some(8), Vec::new());
+    (euclid.leadership, edge.leadership) = (following(8, "leader"), following(8, "leader"));
+    euclid.hear(std::slice::from_ref(&news));
+    let passed_on = euclid.wait(4);
+    assert!(passed_on.iter().all(|share| share.signed == said[0].signed && share.node == name("other")));
+    gauss.hear(&passed_on);
+    assert_eq!(gauss.ledger.totals(), edge.ledger.totals());
+    let statements = gauss.ledger.statements().count();
+    assert!((2..=3 * REPEATS as usize).contains(&statements), "{statements}");
+
+    assert!(!gauss.ledger.retain_statements(|_| true));
+    assert!(gauss.ledger.retain_statements(|share| share.signed != said[0].signed));
+    assert_eq!((gauss.ledger.totals().len(), gauss.ledger.lanes()), (0, 0));
+}
+
+#[test]
+fn a_node_that_lost_the_last_of_its_counts_learns_it_from_others_and_signs_it_again() {
+    let (mut edge, mut before) = (signing("edge", 8, "leader"), signing("edge", 7, "edge"));
+    before.lead(7);
+    before.record(7, "gauss");
+    edge.ledger = before.ledger.clone();
+    let lost = sign(before.record(7, "gauss"));
+    edge.hear(&[LedgerShare { node: name("other"), ..lost[0].clone() }]);
+    assert_eq!(edge.ledger.totals(), before.ledger.totals());
+    edge.lead(9);
+    let [share] = &edge.resync.snapshot(&edge.ledger)[..] else { panic!("one lane") };
+    assert_eq!((share.entries[0].correct, &share.signed), (2, &None), "to be signed");
+}
+
+#[test]
+fn statements_that_later_ones_replace_are_dropped() {
+    let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("euclid", 7, "edge"));
+    edge.lead(7);
+    for round in 0..2000 {
+        let said = sign(edge.record(7, ["euclid", "gauss", "other"][round % 3]));
+        said.iter().for_each(|share| drop(euclid.merge(share, round as u64 * 100).unwrap()));
+    }
+    assert_eq!(euclid.ledger.totals(), edge.ledger.totals());
+    assert!(euclid.ledger.statements().count() < 128, "{}", euclid.ledger.statements().count());
+    let mut copy = ReputationLedger::default();
+    for share in euclid.ledger.statements() {
+        copy.merge_statement(share, None);
+    }
+    assert_eq!(
+        (copy.totals(), copy.marks().collect::<Vec<_>>()),
+        (edge.ledger.totals(), edge.ledger.marks().collect())
+    );
+}
+
+#[test]
+fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back() {
+    let (mut leader, mut euclid) = (Candidate::new("leader"), Candidate::new("other"));
+    leader.lead(7);
+    leader.leadership = Leadership { position: Position::Leading, ..following(7, "leader") };
+    (0..900).for_each(|_| drop(leader.record(7, "liar")));
+    euclid.leadership = following(7, "leader");
+    euclid.ledger = ReputationLedger::reset(Timestamp(5_000_000));
+    let poisoned = leader.resync.snapshot(&leader.ledger);
+    let mut answers = Vec::new();
+    for (share, at_ms) in poisoned.iter().zip(6000..) {
+        answers.extend(euclid.merge(share, at_ms).unwrap().shares);
+    }
+    assert_eq!((answers.len(), euclid.vehicles().len()), (1, 0), "a node that follows tells its leader");
+    assert!(leader.merge(&answers[0], 6010).unwrap().is_news);
+    assert_eq!(leader.vehicles(), [""; 0]);
+    leader.hear(&poisoned);
+    assert_eq!(leader.vehicles(), [""; 0]);
+    euclid.hear(&leader.record(7, "gauss"));
+    assert_eq!(euclid.vehicles(), ["gauss"]);
+    let far = Timestamp(0) + 2 * MAX_RESET_AHEAD;
+    let forged = LedgerShare { reset_at_us: Some(far), ..share("other", None, Vec::new()) };
+    assert!(!leader.merge(&forged, 7000).unwrap().is_news, "a reset from a far future would be the last");
+    assert_eq!(leader.vehicles(), ["gauss"]);
 }

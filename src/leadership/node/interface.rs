@@ -8,6 +8,7 @@ use crate::leadership::address::BrokerAddress;
 use crate::leadership::election::{ElectionConfig, ElectionMessage, Health};
 use crate::leadership::health::HealthSample;
 use crate::leadership::links::{DataPlane, LinkState, WantedLinks};
+use crate::leadership::rights::Rights;
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -50,6 +51,8 @@ pub enum Input {
     Receive {
         /// The sender, as the transport proved.
         from: NodeName,
+        /// The sender's rights, as the transport proved.
+        rights: Rights,
         /// The message.
         message: ElectionMessage,
     },
@@ -184,6 +187,11 @@ pub enum Effect {
     Look,
     /// Ask broker, gateway and fuser, and hand in [`Input::PartsAnswered`] when they have answered.
     AskParts,
+    /// Count a message of this node that states a term or round beyond what a cell can have reached.
+    CountImplausible {
+        /// The sender.
+        from: NodeName,
+    },
     /// Write to the log.
     Log {
         /// The event.
@@ -222,6 +230,22 @@ pub enum Notice {
     Preparing {
         /// The leader that hands over.
         leader: NodeName,
+    },
+    /// A node is ready to be handed the lead, and this node is not logged in at its broker.
+    NotServed {
+        /// The node.
+        challenger: NodeName,
+    },
+    /// A node declared more than its certificate allows, or claimed a lead that it may not have.
+    Overreached {
+        /// The node.
+        from: NodeName,
+        /// The role that it declared.
+        role: Role,
+        /// The priority that it declared.
+        priority: u8,
+        /// What its certificate allows.
+        rights: Rights,
     },
     /// A message in another node's name was dropped.
     Misattributed {

@@ -124,7 +124,7 @@ impl Scene {
 
     fn hear_in(&mut self, epoch: Epoch, body: Body) {
         let message = self.message(epoch, body);
-        self.take(Input::Receive { from: name("edge"), message });
+        self.take(Input::Receive { from: name("edge"), rights: Rights::default(), message });
     }
 
     fn beat(&mut self) {
@@ -215,8 +215,8 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
     }
 }
 
-#[test]
-fn a_round_is_held_before_the_word_that_yields_the_next() {
+/// A leader to which a better candidate says that it is ready; the leader can log in at its broker or cannot.
+fn leading_beside_a_ready_challenger(logs_in: bool) -> Scene {
     let mut scene = Scene::new(Role::Auto, None);
     scene.take(Input::MemberAlive { member: member("edge", 2) });
     scene.members.push(member("edge", 2));
@@ -224,6 +224,9 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
     assert!(scene.machine.leadership.is_leading());
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
     for ms in 0..4500 {
+        if ms == 1000 && logs_in {
+            scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Up });
+        }
         if ms % 50 == 0 {
             scene.hear_in(epoch.clone(), Body::Status { over: None });
             scene.hear_in(epoch.clone(), Body::Ready);
@@ -233,12 +236,28 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
         }
         scene.run_for(1);
     }
-    let yields =
-        |effect: &Effect| matches!(effect, Effect::Send { message, .. } if matches!(message.body, Body::Yield { .. }));
-    let yielded = scene.position_of(yields).expect("a better candidate is handed the lead");
+    scene
+}
+
+fn is_yield(effect: &Effect) -> bool {
+    matches!(effect, Effect::Send { message, .. } if matches!(message.body, Body::Yield { .. }))
+}
+
+#[test]
+fn a_round_is_held_before_the_word_that_yields_the_next() {
+    let scene = leading_beside_a_ready_challenger(true);
+    let yielded = scene.position_of(is_yield).expect("a better candidate is handed the lead");
     assert_eq!(scene.effects[yielded - 1], Effect::HoldRound);
     let snapshot = scene.position_of(|effect| *effect == Effect::SendSnapshot { to: name("edge") });
     assert!(snapshot.is_some_and(|snapshot| snapshot < yielded));
+}
+
+#[test]
+fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
+    let scene = leading_beside_a_ready_challenger(false);
+    assert_eq!(scene.position_of(is_yield), None);
+    assert!(scene.machine.leadership.is_leading());
+    assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
 }
 
 #[test]
@@ -326,8 +345,56 @@ fn a_message_in_anothers_name_is_dropped() {
     let mut before = scene.machine.clone();
     let ended = Epoch::new(7, name("edge"));
     let message = scene.message(ended.clone(), Body::Resign { epoch: ended, last_round: 40 });
-    scene.take(Input::Receive { from: name("gauss"), message });
+    scene.take(Input::Receive { from: name("gauss"), rights: Rights::default(), message });
     assert_eq!(scene.notices(), [&Notice::Misattributed { from: name("gauss"), claimed: name("edge") }]);
     before.deadline = scene.machine.deadline;
     assert_eq!(scene.machine, before);
+}
+
+/// Times after the start at which a node is followed, as far as its certificate allows it to lead.
+fn is_followed(rights: Rights) -> bool {
+    let mut scene = Scene::new(Role::Auto, None);
+    scene.take(Input::MemberAlive { member: member("edge", 2) });
+    for _ in 0..10 {
+        let successors = vec![name("euclid")];
+        let body = Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors };
+        let message = scene.message(Epoch::new(7, name("edge")), body);
+        scene.take(Input::Receive { from: name("edge"), rights, message });
+        scene.run_for(50);
+    }
+    let overreached = scene.notices().iter().any(|notice| matches!(notice, Notice::Overreached { .. }));
+    assert_eq!(overreached, !rights.allow(Role::Edge, 100));
+    scene.machine.election().leader() == Some(&name("edge"))
+}
+
+#[test]
+fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
+    assert!(is_followed(Rights::default()));
+    assert!(is_followed(Rights { role: Role::Edge, priority: 100 }));
+    assert!(is_followed(Rights { role: Role::Auto, priority: 50 }), "as an auto node");
+    assert!(!is_followed(Rights::NONE));
+}
+
+/// A leader hands its lead to an `edge`, but not to a node that only says that it is one.
+#[test]
+fn a_declared_role_beyond_the_certificate_takes_no_lead() {
+    for (role, is_offered) in [(Role::Edge, true), (Role::Auto, false)] {
+        let mut scene = Scene::new(Role::Auto, None);
+        scene.take(Input::OwnBroker { address: Some(broker(1)) });
+        scene.take(Input::LinkChanged { broker: broker(1).into(), state: LinkState::Up });
+        scene.run_for(2000);
+        assert!(scene.machine.election().is_leading());
+        scene.take(Input::MemberAlive { member: member("zeno", 2) });
+        for _ in 0..100 {
+            let epoch = scene.machine.election().epoch().unwrap().clone();
+            let message = ElectionMessage { from: name("zeno"), ..scene.message(epoch, Body::Status { over: None }) };
+            let rights = Rights { role, priority: 100 };
+            scene.take(Input::Receive { from: name("zeno"), rights, message });
+            scene.run_for(50);
+        }
+        let offered = scene.position_of(|effect| {
+            matches!(effect, Effect::Send { message: ElectionMessage { body: Body::Offer, .. }, .. })
+        });
+        assert_eq!(offered.is_some(), is_offered, "{role:?}");
+    }
 }

@@ -9,11 +9,12 @@ use crate::model::epoch::Epoch;
 use crate::model::time::Timestamp;
 
 /// Filter that tells rounds that have just been made from those that waited.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct StalenessFilter {
     /// The present leadership and its least delay, to which the delay of its rounds is compared.
     delay: Option<(Epoch, LeadersDelay)>,
-    newest_at: Option<Timestamp>,
+    /// Arrival of the last round; before any, the time of the start.
+    newest_at: Timestamp,
     /// Arrival of the first round after none had come for [`MAX_ROUND_AGE`].
     resumed_at: Option<Timestamp>,
 }
@@ -61,13 +62,18 @@ impl LeadersDelay {
 const TOLERANCE_US: i64 = 250_000;
 
 impl StalenessFilter {
+    /// A filter of a node that starts: nothing can have waited for it before.
+    pub fn new(now: Timestamp) -> Self {
+        Self { delay: None, newest_at: now, resumed_at: None }
+    }
+
     /// Whether a round of `epoch`, whose order is right, spent no more than [`MAX_ROUND_WAIT`] in queues. A node that was
     /// stopped, or a link that was, finds the rounds of that time waiting.
     ///
-    /// The first round of a leadership is fresh: its clock is not known. After a time without rounds it is not, because it
-    /// may have waited; then a stream has to be live for [`LIVE_STREAM_TIME`] first.
+    /// The first round of a leadership is fresh: its clock is not known. After a time without rounds, since the start too,
+    /// it is not, because it may have waited; then a stream has to be live for [`LIVE_STREAM_TIME`] first.
     pub fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
-        if self.newest_at.replace(received_at).is_some_and(|newest_at| received_at.since(newest_at) > MAX_ROUND_AGE) {
+        if received_at.since(std::mem::replace(&mut self.newest_at, received_at)) > MAX_ROUND_AGE {
             self.resumed_at = Some(received_at);
         }
         let known = self.delay.take().filter(|(of, _)| of == epoch).map(|(_, delay)| delay);
@@ -94,7 +100,7 @@ mod tests {
     #[test]
     fn rounds_that_waited_are_old_whatever_the_leaders_clock_says() {
         for ahead in [0, 3_600_000] {
-            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::default());
+            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
             for round in 0..20 {
                 assert!(filter.is_fresh(&epoch, ms(ahead + 100 * round), ms(100 * round + 2)), "round {round}");
             }
@@ -106,7 +112,7 @@ mod tests {
 
     #[test]
     fn a_new_leadership_has_a_clock_of_its_own() {
-        let mut filter = StalenessFilter::default();
+        let mut filter = StalenessFilter::new(ms(60_000));
         assert!(filter.is_fresh(&Epoch::new(3, NodeName::from_static("edge")), ms(0), ms(60_000)));
         assert!(filter.is_fresh(&Epoch::new(4, NodeName::from_static("gauss")), ms(0), ms(60_300)));
     }
@@ -115,7 +121,7 @@ mod tests {
     fn of_a_leadership_that_began_while_the_node_was_stopped_only_what_is_made_now_is_taken() {
         let (edge, gauss) =
             (Epoch::new(3, NodeName::from_static("edge")), Epoch::new(4, NodeName::from_static("gauss")));
-        let mut filter = StalenessFilter::default();
+        let mut filter = StalenessFilter::new(ms(0));
         assert!(filter.is_fresh(&edge, ms(0), ms(1)));
         // Stopped for eleven seconds, it hands out a round of its own, and then finds those of its successor.
         assert!(filter.is_fresh(&edge, ms(11_000), ms(11_000)));
@@ -128,7 +134,7 @@ mod tests {
     #[test]
     fn a_leader_whose_clock_was_set_is_believed_after_a_second() {
         for (step_ms, most) in [(5_000, 0), (-5_000, 11), (-31_536_000_000_i64, 11)] {
-            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::default());
+            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
             let refused = (0..100).filter(|n| {
                 let fused_at = ms(100 * n).shifted(if *n < 50 { 0 } else { 1000 * step_ms });
                 !filter.is_fresh(&epoch, fused_at, ms(100 * n + 1))
@@ -138,8 +144,16 @@ mod tests {
     }
 
     #[test]
+    fn a_node_that_is_stopped_as_it_starts_takes_only_what_is_made_now() {
+        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        assert!((1..30).all(|n| !filter.is_fresh(&epoch, ms(100 * n), ms(3000))));
+        let live: Vec<_> = (30..40).filter(|n| filter.is_fresh(&epoch, ms(100 * n), ms(100 * n + 2))).collect();
+        assert_eq!(live, Vec::from_iter(32..40));
+    }
+
+    #[test]
     fn a_way_that_became_longer_is_believed_in_the_end() {
-        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::default());
+        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
         let is_fresh = |n: u64, filter: &mut StalenessFilter| {
             filter.is_fresh(&epoch, ms(100 * n), ms(100 * n + if n < 10 { 1 } else { 1500 }))
         };

@@ -3,6 +3,8 @@
 //! A superseded leader is refused, and so is one that was not elected. Nobody is refused for good: word of an election may
 //! be lost, and who reaches a broker may forge any epoch.
 
+use std::time::Duration;
+
 use crate::leadership::round_filter::{EpochGate, Refusal};
 use crate::leadership::timers::{ELECTED_SILENCE, EPOCH_MEMORY, SUCCESSOR_CREDIT};
 use crate::leadership::view::Leadership;
@@ -17,6 +19,11 @@ const TERMS_AHEAD: u64 = 2;
 /// Number of rounds by which the standby that takes over may be ahead of the elected leader's last. A standby that still
 /// leads on its own counts its own rounds, and is to be told to follow.
 const MAX_ROUNDS_AHEAD: u64 = 16;
+
+/// Most rounds that a leader publishes in a time: one each millisecond.
+fn max_rounds_in(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+}
 
 /// Filter of one topic: admits messages in the order of epoch, aggregator and round, of those that may lead.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -188,7 +195,12 @@ impl SuccessionFilter {
         received_at: Timestamp,
         may_lead: bool,
     ) -> Result<(), Refusal> {
-        let quiet = received_at.since(*self.newest_at.get_or_insert(received_at)) >= EPOCH_MEMORY;
+        let silence = received_at.since(*self.newest_at.get_or_insert(received_at));
+        let quiet = silence >= EPOCH_MEMORY;
+        let limit = |last: u64| last.saturating_add(MAX_ROUNDS_AHEAD).saturating_add(max_rounds_in(silence));
+        if !quiet && self.gate.latest().is_some_and(|(latest, last)| latest == epoch && round > limit(last)) {
+            return Err(Refusal::Implausible);
+        }
         let mut admitted = self.gate.admit(epoch, round);
         if admitted.is_err() && quiet && may_lead {
             self.gate = EpochGate::default();
@@ -207,6 +219,7 @@ impl SuccessionFilter {
 mod tests {
     use super::*;
     use crate::leadership::view::Position;
+    use crate::wire::MAX_INTEGER;
 
     fn epoch(term: u64, leader: &str) -> Epoch {
         Epoch::new(term, NodeName::new(leader).unwrap())
@@ -264,6 +277,21 @@ mod tests {
         let unknown = epoch(9, "gauss");
         assert_eq!(filter.admit(&unknown, 4, at(300), &after), Err(Refusal::NotElected));
         assert_eq!(filter.admit(&unknown, 5, at(500), &after), Ok(()), "the elected has fallen silent");
+    }
+
+    #[test]
+    fn a_forged_round_of_the_elected_epoch_does_not_silence_it() {
+        let (edge, leadership) = (epoch(7, "edge"), led_by(epoch(7, "edge"), Some("euclid")));
+        let mut filter = SuccessionFilter::new(0);
+        for round in 1..100 {
+            assert_eq!(filter.admit(&edge, round, at(100 * round), &leadership), Ok(()), "round {round}");
+            let forged = filter.admit(&edge, MAX_INTEGER, at(100 * round + 50), &leadership);
+            assert_eq!(forged, Err(Refusal::Implausible));
+        }
+        let after_a_gap = filter.admit(&edge, 120, at(12_000), &leadership);
+        assert_eq!(after_a_gap, Ok(()), "rounds that were lost on the way");
+        let after_a_sleep = filter.admit(&edge, 100_000, at(15_000), &leadership);
+        assert_eq!(after_a_sleep, Ok(()), "a machine whose clock stood still while it slept");
     }
 
     #[test]

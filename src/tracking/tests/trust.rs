@@ -94,8 +94,11 @@ fn a_liar_that_was_silent_is_still_a_liar() {
 fn of_the_silent_those_are_forgotten_of_whom_least_is_known() {
     let mut dormant = DormantCounts::default();
     let config = ReputationConfig::default();
-    dormant.keep([(name("liar"), TrustCounts::new(0, 40, &config)), (name("hero"), TrustCounts::new(40, 0, &config))]);
-    dormant.keep((0..2 * DormantCounts::MAX).map(|n| (name(&format!("a{n}")), TrustCounts::new(1, 0, &config))));
+    dormant.keep([
+        (name("liar"), TrustCounts::new(0.0, 40.0, &config)),
+        (name("hero"), TrustCounts::new(40.0, 0.0, &config)),
+    ]);
+    dormant.keep((0..2 * DormantCounts::MAX).map(|n| (name(&format!("a{n}")), TrustCounts::new(1.0, 0.0, &config))));
     assert_eq!((dormant.of(&name("liar")).trust(&config), dormant.of(&name("hero")).trust(&config)), (0.0, 1.0));
     let known = (0..2 * DormantCounts::MAX).filter(|n| dormant.of(&name(&format!("a{n}"))) != TrustCounts::default());
     assert_eq!(known.count(), DormantCounts::MAX - 2);

@@ -30,6 +30,8 @@ impl WeightedVoting {
         others.truncate(limits.max_vehicles.saturating_sub(self.vehicles.len()));
         let known = [heard, others].concat();
         self.take_over_labels(&known, limits.max_labels);
+        // Evidence that is no longer in the ledger does not count any more.
+        self.model.vehicles.iter_mut().for_each(|vehicle| vehicle.inherited = Confusion::default());
         for (node, labels) in known {
             let mut inherited = Confusion::default();
             for (label, (correct, incorrect)) in labels {

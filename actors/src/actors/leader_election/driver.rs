@@ -1,6 +1,6 @@
 //! From messages to the inputs of the node's leadership, and from its effects to the node's parts.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
@@ -8,8 +8,9 @@ use ecod::leadership::cell_time::{CellTime, ClockEvent};
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::Encoding;
+use ecod::wire::{Encoding, RejectReason};
 use ractor::ActorRef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -38,6 +39,8 @@ pub struct ElectionDriver {
     parts: Parts,
     leadership: watch::Sender<Leadership>,
     counters: Arc<Counters>,
+    /// Nodes that declared more than their certificate allows.
+    overreached: BTreeSet<NodeName>,
     /// The deadline for which the timer is set.
     alarm: Timestamp,
     timer: Option<AbortHandle>,
@@ -70,6 +73,7 @@ impl ElectionDriver {
             parts,
             leadership,
             counters,
+            overreached: BTreeSet::new(),
             alarm: Timestamp(u64::MAX),
             timer: None,
             myself,
@@ -82,15 +86,15 @@ impl ElectionDriver {
             MembershipEvent::Changed { member } => Input::MemberChanged { member: as_seen(&member) },
             MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
             MembershipEvent::Down { name } => Input::MemberDown { name },
-            MembershipEvent::Received { from, payload, .. } => match ElectionMessage::decode(&payload) {
+            MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
                 Ok(message) => {
                     if message.from == from {
                         self.cell_time.receive(&message, clock::now());
                     }
-                    Input::Receive { from, message }
+                    Input::Receive { from, rights, message }
                 }
                 Err(reason) => {
-                    self.counters.reject(reason);
+                    self.counters.reject(reason, from.as_str());
                     return tracing::debug!(%from, %reason, "election message dropped");
                 }
             },
@@ -168,6 +172,17 @@ impl ElectionDriver {
                 });
             }
             Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
+            Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),
+            Effect::Log { notice: Notice::Overreached { from, role, priority, rights } } => {
+                self.counters.count(Event::Overreached);
+                if self.overreached.insert(from.clone()) {
+                    tracing::warn!(
+                        %from, ?role, priority, ?rights,
+                        "a node declares more than its certificate allows and counts as what that says; issue it a \
+                         certificate by `ecod-node pki issue`, or lower its `role` or `election.priority`"
+                    );
+                }
+            }
             Effect::Log { notice } => log(notice),
         }
         None
@@ -233,6 +248,10 @@ fn log(notice: Notice) {
         Notice::ProcessGone { peer, broker } => tracing::info!(%peer, %broker, "process is gone"),
         Notice::LeaderDisconnected { peer } => tracing::info!(%peer, "connection of the leader broke"),
         Notice::Preparing { leader } => tracing::info!(%leader, "preparing to take over"),
+        Notice::NotServed { challenger } => {
+            tracing::debug!(%challenger, "the lead is not handed over yet: no login at the challenger's broker");
+        }
+        Notice::Overreached { .. } => {}
         Notice::Misattributed { from, claimed } => {
             tracing::debug!(%from, %claimed, "election message in another's name dropped");
         }

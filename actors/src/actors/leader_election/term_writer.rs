@@ -38,9 +38,20 @@ pub(super) enum TermState {
     NoDisk,
 }
 
+/// Maximum term that is believed of a disk: no cell counts so far in a thousand years. Earlier versions wrote terms that
+/// were forged, and that left no room for elections.
+const MAX_SAVED_TERM: u64 = 1 << 40;
+
 /// The highest term that an earlier run of the node knew; 0 without any.
 pub fn saved_term(file: Option<&StateFile>) -> u64 {
-    file.and_then(|file| file.load(|_| true)).unwrap_or(0)
+    let Some(file) = file else { return 0 };
+    match file.load(|_| true).unwrap_or(0) {
+        term if term <= MAX_SAVED_TERM => term,
+        _ => {
+            file.set_aside("no cell has had so many leaderships: the term was forged");
+            0
+        }
+    }
 }
 
 impl TermWriter {
@@ -124,6 +135,17 @@ mod tests {
             writer.save(term);
             assert_eq!(writer.wait_for(term).await, TermState::Saved);
             assert_eq!(saved_term(Some(&file(directory.path()))), term);
+        }
+    }
+
+    #[test]
+    fn a_forged_term_on_disk_is_set_aside() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = file(directory.path());
+        for (saved, read) in [(7, 7), (1_795_239_882, 1_795_239_882), ((1 << 53) - 1, 0), (u64::MAX, 0)] {
+            file.save(&saved).unwrap();
+            assert_eq!(saved_term(Some(&file)), read);
+            assert_eq!(file.path().exists(), read > 0);
         }
     }
 

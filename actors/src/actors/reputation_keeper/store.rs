@@ -3,12 +3,17 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use ecod::leadership::ledger_resync::MAX_FIRST_VOTES;
+use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
-use ecod::wire::{LedgerEntry, LedgerMark, Reputation, SCHEMA_VERSION};
+use ecod::wire::{LedgerEntry, LedgerMark, LedgerShare, Reputation, SCHEMA_VERSION};
 use serde::{Deserialize, Serialize};
 
 use super::ReputationKeeperArguments;
+use crate::platform::state_file::StateFile;
+use crate::transport::pki::EvidenceSigner;
 
 /// Evidence about vehicles; it outlives the runs of the actor that keeps it.
 #[derive(Debug)]
@@ -26,10 +31,39 @@ impl ReputationStore {
         if self.by_evidence { self.ledger.reputations(config) } else { self.standing.clone() }
     }
 
-    fn take(&mut self, saved: Saved) {
-        self.ledger.merge_entries(saved.entries, None);
-        self.ledger.merge_marks(saved.marks, None);
-        self.standing = saved.standing;
+    /// Takes over what was saved, as far as it is evidence. Where evidence is signed, `signer` verifies it.
+    fn take(&mut self, saved: Saved, signer: Option<&mut EvidenceSigner>) {
+        let Saved { mut entries, mut marks, statements, standing, signed, reset_at_us, .. } = saved;
+        self.standing = standing;
+        if reset_at_us > self.ledger.reset_at() {
+            self.ledger = ReputationLedger::reset(reset_at_us);
+        }
+        let (counts, statement_count) = (entries.len(), statements.len());
+        entries.retain(|entry| entry.correct.saturating_add(entry.incorrect) <= MAX_FIRST_VOTES);
+        marks.retain(|mark| mark.correct.saturating_add(mark.incorrect) <= MAX_FIRST_VOTES);
+        if signer.is_some() && !signed {
+            (entries, marks) = (Vec::new(), Vec::new());
+        }
+        if entries.len() < counts {
+            let dropped = counts - entries.len();
+            tracing::warn!(
+                dropped,
+                "saved evidence not used: it is not signed, or claims more votes than there can be"
+            );
+        }
+        self.ledger.merge_entries(entries, None);
+        self.ledger.merge_marks(marks, None);
+        match signer {
+            Some(signer) => {
+                let is_valid = |share: &LedgerShare| signer.verify_again(share).is_ok();
+                let valid: Vec<_> = statements.into_iter().filter(is_valid).map(Arc::new).collect();
+                if valid.len() < statement_count {
+                    tracing::info!(dropped = statement_count - valid.len(), "saved evidence of revoked nodes not used");
+                }
+                valid.iter().for_each(|share| _ = self.ledger.merge_statement(share, None));
+            }
+            None => statements.iter().for_each(|share| _ = self.ledger.merge_share(share, None)),
+        }
     }
 }
 
@@ -58,21 +92,50 @@ pub(super) struct Saved {
     schema: u32,
     cell: NodeName,
     node: NodeName,
+    /// Counts; where evidence is signed, those of the node's own.
     entries: Vec<LedgerEntry>,
     #[serde(default)]
     marks: Vec<LedgerMark>,
     standing: BTreeMap<NodeName, Reputation>,
+    /// Whether the counts of others are in `statements`.
+    #[serde(default)]
+    signed: bool,
+    /// What other aggregators signed.
+    #[serde(default)]
+    statements: Vec<LedgerShare>,
+    #[serde(default)]
+    reset_at_us: Timestamp,
 }
 
 impl Saved {
     pub(super) fn of(store: &ReputationStore, arguments: &ReputationKeeperArguments) -> Self {
+        let (ledger, signed) = (&store.ledger, arguments.credentials.is_some());
+        let is_kept = |term: u64, aggregator: &NodeName| {
+            !signed || (*aggregator == arguments.name && !ledger.is_stated(&Epoch::new(term, aggregator.clone())))
+        };
+        Self {
+            entries: ledger.entries().filter(|entry| is_kept(entry.epoch, &entry.aggregator)).collect(),
+            marks: ledger.marks().filter(|mark| is_kept(mark.epoch, &mark.aggregator)).collect(),
+            standing: store.standing.clone(),
+            signed,
+            statements: ledger.statements().map(|share| LedgerShare::clone(share)).collect(),
+            reset_at_us: ledger.reset_at(),
+            ..Self::reset(&arguments.cell, &arguments.name, Timestamp::default())
+        }
+    }
+
+    /// No evidence, and none from before a time.
+    fn reset(cell: &NodeName, node: &NodeName, reset_at_us: Timestamp) -> Self {
         Self {
             schema: SCHEMA_VERSION,
-            cell: arguments.cell.clone(),
-            node: arguments.name.clone(),
-            entries: store.ledger.entries().collect(),
-            marks: store.ledger.marks().collect(),
-            standing: store.standing.clone(),
+            cell: cell.clone(),
+            node: node.clone(),
+            entries: Vec::new(),
+            marks: Vec::new(),
+            standing: BTreeMap::new(),
+            signed: true,
+            statements: Vec::new(),
+            reset_at_us,
         }
     }
 
@@ -81,8 +144,16 @@ impl Saved {
     }
 }
 
+/// Empties the file, so that a node which starts with it tells others to forget evidence from before `reset_at`.
+///
+/// # Errors
+/// When the disk refuses it.
+pub fn reset_saved(file: &StateFile, cell: &NodeName, node: &NodeName, reset_at: Timestamp) -> std::io::Result<()> {
+    file.save(&Saved::reset(cell, node, reset_at))
+}
+
 /// Reads the file into the store, once in its life.
-pub(super) fn restore(arguments: &ReputationKeeperArguments) {
+pub(super) fn restore(arguments: &ReputationKeeperArguments, signer: Option<&mut EvidenceSigner>) {
     let mut store = arguments.reputations.open();
     if std::mem::replace(&mut store.restored, true) {
         return;
@@ -92,8 +163,8 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments) {
         return;
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
-        tracing::info!(path = %file.path().display(), entries = saved.entries.len(), "reputations restored");
-        store.take(saved);
+        store.take(saved, signer);
+        tracing::info!(path = %file.path().display(), entries = store.ledger.entries().count(), "reputations restored");
     }
 }
 
@@ -102,7 +173,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments) {
 pub fn read_saved(bytes: &[u8]) {
     if let Ok(saved) = serde_json::from_slice(bytes) {
         let store = SharedReputations::new(true);
-        store.open().take(saved);
+        store.open().take(saved, None);
         drop(store.open().reputations(&ReputationConfig::default()));
     }
 }

@@ -5,9 +5,11 @@ use std::net::{Ipv4Addr, SocketAddr};
 use ecod::leadership::Position;
 use ecod::model::time::Timestamp;
 use ecod::wire::LedgerEntry;
+use tempfile::TempDir;
 
 use super::*;
 use crate::messages::actor_slot::listening;
+use crate::transport::pki::{Authority, TlsConfig};
 
 fn name(name: &str) -> NodeName {
     NodeName::new(name).unwrap()
@@ -23,31 +25,46 @@ fn counted(epoch: u64, aggregator: &str) -> LedgerEntry {
 }
 
 fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> Delivery<Arc<LedgerShare>> {
-    let share = LedgerShare { schema: SCHEMA_VERSION, node: name(from), epoch: leads, entries, marks: Vec::new() };
+    let share = LedgerShare {
+        schema: SCHEMA_VERSION,
+        node: name(from),
+        epoch: leads,
+        entries,
+        marks: Vec::new(),
+        signed: None,
+        reset_at_us: None,
+    };
     Delivery::local(Arc::new(share), Timestamp(0))
 }
 
-#[tokio::test]
-async fn evidence_of_others_is_judged_counted_and_answered() {
-    let (gateway, mut published) = listening::slot().await;
-    let members = [("edge", Role::Edge), ("mallory", Role::Cav)].map(|(node, role)| member(node, role)).to_vec();
+/// What the keeper of `euclid` is given, which follows `edge` in term 7.
+fn arguments(gateway: &ActorSlot<GatewayMessage>, counters: &Arc<Counters>) -> ReputationKeeperArguments {
+    let roles = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)];
+    let members = roles.map(|(node, role)| member(node, role)).to_vec();
     let epoch = Some(Epoch::new(7, name("edge")));
     let leadership = Leadership { position: Position::Following, epoch, standby: None, term: 7 };
-    let counters = Arc::<Counters>::default();
-    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments {
+    ReputationKeeperArguments {
         name: name("euclid"),
         cell: name("lot"),
         reputation: ReputationConfig::default(),
         config: ReputationKeeperConfig::default(),
         reputations: SharedReputations::new(true),
         file: None,
+        credentials: None,
         newest: watch::channel(None).1,
         members: watch::channel(members).1,
         leadership: watch::channel(leadership).1,
         gateway: gateway.clone(),
         fuser: ActorSlot::default(),
-        counters: Arc::clone(&counters),
-    });
+        counters: Arc::clone(counters),
+    }
+}
+
+#[tokio::test]
+async fn evidence_of_others_is_judged_counted_and_answered() {
+    let (gateway, mut published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let mut keeper = ReputationKeeperState::new(arguments(&gateway, &counters));
     let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
     keeper.arguments.reputations.open().ledger.record(3, &name("euclid"), &own);
 
@@ -61,5 +78,147 @@ async fn evidence_of_others_is_judged_counted_and_answered() {
 
     gateway.get().unwrap().drain_and_wait(None).await.unwrap();
     let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else { panic!("the leader is told") };
-    assert_eq!(share.entries.len(), 2, "a node that has led tells a new leader all it knows");
+    assert_eq!(share.entries.len(), 1, "a node that has led tells a new leader what it counted before");
+}
+
+/// A cell's CA, and the credentials that it issues.
+struct Certificates {
+    directory: TempDir,
+    authority: Authority,
+}
+
+impl Certificates {
+    fn new() -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let authority = Authority::init(directory.path(), &name("lot"), clock::now()).unwrap();
+        Self { directory, authority }
+    }
+
+    fn of(&mut self, node: &str) -> Arc<Credentials> {
+        let day = Duration::from_secs(86_400);
+        self.authority.issue(&name(node), Role::Auto, day, clock::now()).unwrap();
+        let (certificate, key) = self.authority.files_of(&name(node));
+        let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
+        let files = TlsConfig { ca, certificate, key, revocation_list: Some(list) };
+        Arc::new(Credentials::load(&files, &name(node)).unwrap())
+    }
+
+    fn signed(&mut self, by: &str, share: &Delivery<Arc<LedgerShare>>) -> Delivery<Arc<LedgerShare>> {
+        let signed = EvidenceSigner::new(name("lot"), self.of(by)).sign(LedgerShare::clone(&share.message)).unwrap();
+        Delivery::local(Arc::new(signed), share.received_at)
+    }
+}
+
+#[tokio::test]
+async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_revoked() {
+    let (gateway, mut published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let mut certificates = Certificates::new();
+    let file = StateFile::new(certificates.directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let credentials = Some(certificates.of("euclid"));
+    let with = || ReputationKeeperArguments {
+        credentials: credentials.clone(),
+        file: Some(file.clone()),
+        ..arguments(&gateway, &counters)
+    };
+    let mut keeper = ReputationKeeperState::new(with());
+    let votes = |keeper: &ReputationKeeperState| {
+        keeper.arguments.reputations.open().ledger.totals().get(&name("gauss")).copied().unwrap_or_default()
+    };
+    let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
+    keeper.record(&Epoch::new(3, name("euclid")), 1, &[own], None);
+    keeper.resync.step_down();
+
+    let said = share("edge", Some(7), vec![counted(7, "edge")]);
+    keeper.merge(&said);
+    let forged = certificates.signed("gauss", &said);
+    keeper.merge(&forged);
+    assert_eq!((counters.rejects(RejectReason::BadSignature), votes(&keeper)), (2, (1, 0)));
+    let own_word = certificates.signed("gauss", &share("gauss", None, vec![counted(6, "gauss")]));
+    keeper.merge(&own_word);
+    assert_eq!((counters.rejects(RejectReason::Unattested), votes(&keeper)), (1, (1, 0)));
+    let said = certificates.signed("edge", &said);
+    keeper.merge(&said);
+    assert_eq!(votes(&keeper), (1, 1));
+    keeper.save().await;
+
+    let mut again = ReputationKeeperState::new(with());
+    store::restore(&again.arguments, again.signer.as_mut());
+    assert_eq!(votes(&again), (1, 1), "after a restart");
+    gateway.get().unwrap().drain_and_wait(None).await.unwrap();
+    let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else { panic!("a round's evidence") };
+    assert_eq!(EvidenceSigner::new(name("lot"), certificates.of("edge")).verify(&share), Ok(()));
+
+    certificates.authority.revoke(&name("edge"), clock::now()).unwrap();
+    tokio::time::sleep(Duration::from_millis(1100)).await;
+    assert!(again.signer.as_mut().unwrap().reload() && again.drop_revoked());
+    assert_eq!(votes(&again), (1, 0), "and only that");
+    again.merge(&said);
+    assert_eq!(votes(&again), (1, 0), "nor does it come back");
+    again.save().await;
+    let text = std::fs::read_to_string(file.path()).unwrap();
+    assert!(text.contains("euclid") && !text.contains("edge"), "it is gone from the disk: {text}");
+    let mut last = ReputationKeeperState::new(with());
+    store::restore(&last.arguments, last.signer.as_mut());
+    assert_eq!(votes(&last), (1, 0));
+}
+
+#[tokio::test]
+async fn a_ledger_that_an_earlier_version_let_be_poisoned_is_not_used() {
+    let (gateway, _published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let mut certificates = Certificates::new();
+    let file = StateFile::new(certificates.directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let entry = |node: &str, incorrect: u64| {
+        format!(
+            r#"{{"epoch":1,"aggregator":"edge","node":"{node}","label":"cup","correct":0,"incorrect":{incorrect}}}"#
+        )
+    };
+    let saved =
+        |entries: &str| format!(r#"{{"schema":1,"cell":"lot","node":"euclid","entries":[{entries}],"standing":{{}}}}"#);
+    let text = saved(&[entry("honest", 1_000_000_000), entry("other", 7)].join(","));
+    let vehicles = |credentials: Option<Arc<Credentials>>| {
+        std::fs::write(file.path(), &text).unwrap();
+        let arguments =
+            ReputationKeeperArguments { credentials, file: Some(file.clone()), ..arguments(&gateway, &counters) };
+        let mut keeper = ReputationKeeperState::new(arguments);
+        store::restore(&keeper.arguments, keeper.signer.as_mut());
+        keeper.arguments.reputations.open().ledger.totals().len()
+    };
+    assert_eq!(vehicles(None), 1, "what can be is read");
+    assert_eq!(vehicles(Some(certificates.of("euclid"))), 0, "nobody signed it");
+
+    reset_saved(&file, &name("lot"), &name("euclid"), Timestamp(5)).unwrap();
+    let mut keeper =
+        ReputationKeeperState::new(ReputationKeeperArguments { file: Some(file), ..arguments(&gateway, &counters) });
+    store::restore(&keeper.arguments, keeper.signer.as_mut());
+    assert_eq!(keeper.arguments.reputations.open().ledger.reset_at(), Timestamp(5));
+}
+
+#[tokio::test]
+async fn a_saved_ledger_with_any_byte_changed_is_set_aside() {
+    let (gateway, _published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let directory = tempfile::tempdir().unwrap();
+    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let with = || ReputationKeeperArguments { file: Some(file.clone()), ..arguments(&gateway, &counters) };
+    let mut keeper = ReputationKeeperState::new(with());
+    keeper.merge(&share("edge", Some(7), vec![counted(7, "edge")]));
+    keeper.save().await;
+    let saved = std::fs::read(file.path()).unwrap();
+    let vehicles = || {
+        let keeper = ReputationKeeperState::new(with());
+        store::restore(&keeper.arguments, None);
+        keeper.arguments.reputations.open().ledger.totals().len()
+    };
+    assert_eq!(vehicles(), 1);
+    for place in 0..saved.len() {
+        for change in [0x01, 0x10, 0x20, 0x80] {
+            let mut damaged = saved.clone();
+            damaged[place] ^= change;
+            std::fs::write(file.path(), damaged).unwrap();
+            assert_eq!(vehicles(), 0, "byte {place} ^ {change:#x}");
+            assert!(!file.path().exists() && file.path().with_extension("set-aside").exists());
+        }
+    }
 }

@@ -50,6 +50,7 @@ impl NodeBuilder {
             run: clock::now().micros(),
             role: self.config.role,
             broker: *self.broker_address.borrow(),
+            credentials: self.security.credentials.clone(),
             // Others look for it where it was.
             config: MembershipConfig { bind: self.gossip_address.borrow().or(membership.bind), ..membership.clone() },
             events,
@@ -192,6 +193,7 @@ impl NodeBuilder {
             config: self.config.reputations.clone(),
             reputations: self.reputations.clone(),
             file: self.state_file("reputations"),
+            credentials: self.security.credentials.clone(),
             newest: self.newest.reputations.subscribe(),
             members: self.members(),
             leadership: self.leadership(),

@@ -19,7 +19,7 @@ use super::live_state::kind_label;
 use super::node_monitor::NodeMonitor;
 use super::process_metrics;
 use crate::platform::clock;
-use crate::telemetry::counters::{Event, OTHERS, Shed, ShedReason};
+use crate::telemetry::counters::{Event, OTHERS, Shed, ShedReason, SourceCount};
 use crate::transport::mqtt::LinkState;
 
 /// Content type of [`metrics`].
@@ -131,6 +131,11 @@ fn traffic(registry: &mut Registry, monitor: &NodeMonitor) {
     counters(registry, "reports_received", "Vehicles' reports, used or not", reports);
     let rejected = snapshot.rejects.iter().map(|(reason, times)| (vec![("reason", (*reason).to_owned())], *times));
     counters(registry, "payloads_rejected", "Payloads that were not used, by reason", rejected);
+    let rejected_of = sources.counters.rejects_by_source().into_iter().map(|SourceCount { reason, source, times }| {
+        (vec![("reason", reason.as_str().to_owned()), ("source", source)], times)
+    });
+    let help = "Payloads that were not used, by reason and sender; bounded";
+    counters(registry, "payloads_rejected_by_source", help, rejected_of);
     // Rates need a series that exists before its first increase.
     let zeros = ShedReason::ALL.iter().map(|&reason| Shed { reason, source: OTHERS.to_owned(), times: 0 });
     let shed = zeros.chain(sources.counters.all_shed()).map(|Shed { reason, source, times }| {

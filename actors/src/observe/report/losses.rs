@@ -9,7 +9,7 @@ use crate::observe::recorder::CounterReading;
 use crate::telemetry::counters::Event;
 
 /// Events that count as losses.
-const EVENTS: [Event; 23] = [
+const EVENTS: [Event; 24] = [
     Event::PublishRefused,
     Event::PublishTooLarge,
     Event::InboxFull,
@@ -33,6 +33,7 @@ const EVENTS: [Event; 23] = [
     Event::ClientsFull,
     Event::ClientDenied,
     Event::ClientExpelled,
+    Event::Overreached,
 ];
 
 /// Sums of counters, which start at zero in every run of the node.

@@ -25,8 +25,16 @@ pub enum FrameEvent {
     WrongCell,
     /// Not sealed with the cell's key for this node.
     BadSeal,
+    /// Of a node without certificate in a cell that has them, or the reverse.
+    Uncertified,
+    /// A proof of a certificate that is not one of the cell, not valid, revoked, of another name or not by its owner.
+    Untrusted,
+    /// A session ended: its certificate was revoked or has expired.
+    Expelled,
     /// Received before, too late, or an answer without a recent request.
     Replayed,
+    /// Its counter is too far ahead of the last one. Nobody sends that many frames unheard: starts a handshake.
+    CounterJump,
     /// Authentic, from a session that is not established: starts a handshake.
     Unestablished,
     /// From a node whose name a later started node has.

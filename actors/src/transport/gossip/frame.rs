@@ -26,7 +26,15 @@ pub(crate) const MAX_FRAME_BYTES: usize = HEADER_BYTES + MAX_PAYLOAD_BYTES + SEA
 
 const SEAL_BYTES: usize = 16;
 const MAGIC: [u8; 2] = [0xec, 0x0d];
-const VERSION: u8 = 1;
+
+/// Version of a frame. A cell has one: nodes with certificates and nodes without do not admit each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Version {
+    /// Sessions prove the cell's key.
+    Key = 1,
+    /// Sessions prove the certificates of their nodes, too.
+    Certificate = 2,
+}
 
 /// Content of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,7 +49,8 @@ pub(crate) enum FrameKind {
     Payload = 4,
 }
 
-/// A step of the handshake. Each side proves that it is reachable now by returning the other's cookie:
+/// A step of the handshake. In a cell with certificates an [`Attestation`](super::handshake::Attestation) follows each
+/// proof and accept. Each side proves that it is reachable now by returning the other's cookie:
 ///
 /// ```text
 /// A ── Hello ─────────────────────────────────────▶ all, or a seed
@@ -98,16 +107,24 @@ pub(crate) enum NameClaim {
     Taken,
 }
 
-/// A greeting.
+/// A greeting. In frames of [`Version::Certificate`] a [`Greeting`] follows it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Hello {
     /// Name of the sender.
     pub(crate) name: NodeName,
 }
 
+/// More about a greeting.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Greeting {
+    /// Whether the sender asks for a new session: it lost the one there was, or hears nothing in it.
+    pub(crate) wants_session: bool,
+}
+
 /// The part of a frame that is authenticated and not encrypted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct FrameHeader {
+    pub(crate) version: Version,
     pub(crate) kind: FrameKind,
     pub(crate) sender: SessionId,
     pub(crate) counter: u64,
@@ -124,7 +141,12 @@ impl FrameHeader {
             return Err(FrameEvent::Malformed);
         };
         let [m0, m1, version, kind, c0, c1, c2, c3, rest @ ..] = head;
-        if [*m0, *m1] != MAGIC || *version != VERSION {
+        let version = match version {
+            1 => Version::Key,
+            2 => Version::Certificate,
+            _ => return Err(FrameEvent::Malformed),
+        };
+        if [*m0, *m1] != MAGIC {
             return Err(FrameEvent::Malformed);
         }
         let kind = match kind {
@@ -140,19 +162,22 @@ impl FrameHeader {
         let (Some(&sender), Some(&counter)) = (rest.first_chunk(), rest.last_chunk()) else {
             return Err(FrameEvent::Malformed);
         };
-        Ok(Self { kind, sender, counter: u64::from_be_bytes(counter) })
+        Ok(Self { version, kind, sender, counter: u64::from_be_bytes(counter) })
     }
 
     /// Writes a whole frame, sealed.
     pub(crate) fn write(&self, cell: [u8; 4], body: &[u8], seal: &FrameCipher) -> Vec<u8> {
         let mut frame = Vec::with_capacity(HEADER_BYTES + body.len() + SEAL_BYTES);
-        frame.extend_from_slice(&MAGIC);
-        frame.extend_from_slice(&[VERSION, self.kind as u8]);
-        frame.extend_from_slice(&cell);
-        frame.extend_from_slice(&self.sender);
-        frame.extend_from_slice(&self.counter.to_be_bytes());
+        frame.extend_from_slice(&self.bytes(cell));
         frame.extend_from_slice(body);
         seal.close(self.counter, &mut frame, HEADER_BYTES);
         frame
+    }
+
+    /// The head as it is on the wire.
+    pub(crate) fn bytes(&self, cell: [u8; 4]) -> [u8; HEADER_BYTES] {
+        let start: [&[u8]; 3] = [&MAGIC, &[self.version as u8, self.kind as u8], &cell];
+        let all = [&start.concat(), &self.sender[..], &self.counter.to_be_bytes()].concat();
+        all.try_into().unwrap_or([0; HEADER_BYTES])
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use ecod::model::names::NodeName;
@@ -10,30 +10,44 @@ use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
 use super::config::MembershipConfig;
-use super::frame::{FrameHeader, FrameKind};
-use super::key::{BROADCAST, CellKey, SessionId};
+use super::frame::{FrameHeader, FrameKind, Version};
+use super::handshake::Identity;
+use super::key::{BROADCAST, CellKey, SessionId, session_of};
 use super::machine::{GossipMachine, GossipOutput, GossipSetup};
 use super::node_id::NodeId;
+use super::trial_authority::TrialAuthority;
 
-const OWN: SessionId = [2; 16];
-const PEERS: SessionId = [1; 16];
+const OWN: &str = "own";
+const PEER: &str = "peer";
 /// 64 hexadecimal digits, which need no stretching.
 const KEY: &str = "0101010101010101010101010101010101010101010101010101010101010101";
+
+/// Certificates of both nodes, made once.
+static IDENTITIES: LazyLock<[Identity; 2]> = LazyLock::new(|| {
+    let mut authority = TrialAuthority::new();
+    [OWN, PEER].map(|name| authority.identity(name, Role::Auto))
+});
 
 /// A node that has met a peer, whose frames can then say anything.
 pub struct Listener {
     own: GossipMachine,
     key: CellKey,
+    version: Version,
+    sessions: [SessionId; 2],
     now: Timestamp,
     /// Frames of the peer that were forged; beyond those that it sent itself.
     forged: u64,
 }
 
 impl Listener {
-    /// A node and its peer, after their handshake.
-    pub fn meet() -> Self {
+    /// A node and its peer, after their handshake, in a cell with certificates or without.
+    pub fn meet(proves: bool) -> Self {
         let mut now = Timestamp(1_700_000_000_000_000);
-        let (mut own, mut peer) = (machine("own", OWN, now), machine("peer", PEERS, now));
+        let nodes = [(OWN, [2; 16]), (PEER, [1; 16])];
+        let identities = if proves { IDENTITIES.clone().map(Some) } else { [None, None] };
+        let [own_identity, peer_identity] = identities;
+        let mut own = machine(OWN, [2; 16], own_identity, now);
+        let mut peer = machine(PEER, [1; 16], peer_identity, now);
         let mut under_way = VecDeque::new();
         for _ in 0..100 {
             for (index, machine) in [&mut own, &mut peer].into_iter().enumerate() {
@@ -59,7 +73,9 @@ impl Listener {
             }
         }
         assert!(!own.members().is_empty(), "the nodes have met");
-        Self { own, key: key(), now, forged: 1 << 32 }
+        let sessions = nodes.map(|(node, nonce)| if proves { session_of(&name(node), &nonce) } else { nonce });
+        let version = if proves { Version::Certificate } else { Version::Key };
+        Self { own, key: key(), version, sessions, now, forged: 1 << 16 }
     }
 
     /// Processes a datagram from the peer's address.
@@ -68,17 +84,19 @@ impl Listener {
         self.settle();
     }
 
-    /// Processes a body sealed by the peer.
+    /// Processes a body sealed by the cell's key in the peer's session, or as a frame of a cell of the other kind.
     pub fn hear_sealed(&mut self, kind: u8, body: &[u8]) {
-        let (kind, to) = match kind % 4 {
-            0 => (FrameKind::Hello, BROADCAST),
-            1 => (FrameKind::Handshake, OWN),
-            2 => (FrameKind::Gossip, OWN),
-            _ => (FrameKind::Payload, OWN),
+        let [own, peer] = self.sessions;
+        let (kind, to, version) = match kind % 5 {
+            0 => (FrameKind::Hello, BROADCAST, self.version),
+            1 => (FrameKind::Handshake, own, self.version),
+            2 => (FrameKind::Gossip, own, self.version),
+            3 => (FrameKind::Payload, own, self.version),
+            _ => (FrameKind::Hello, BROADCAST, Version::Key),
         };
         self.forged += 1;
-        let head = FrameHeader { kind, sender: PEERS, counter: self.forged };
-        let frame = head.write(self.key.tag(), body, &self.key.seal(&PEERS, &to));
+        let head = FrameHeader { version, kind, sender: peer, counter: self.forged };
+        let frame = head.write(self.key.tag(), body, &self.key.seal(&peer, &to));
         self.hear(&frame);
     }
 
@@ -89,25 +107,35 @@ impl Listener {
         self.settle();
     }
 
+    /// Asserts that a node of a cell with certificates knows its peer only, whatever it heard.
+    pub fn assert_nobody_else(&self) {
+        let strangers = self.own.members().into_iter().filter(|member| member.name.as_str() != PEER);
+        assert!(self.version == Version::Key || strangers.count() == 0);
+    }
+
     fn settle(&mut self) {
         while self.own.poll().is_some() {}
     }
 }
 
-fn key() -> CellKey {
-    CellKey::new(KEY, &NodeName::from_static("lot-1"))
+fn name(text: &'static str) -> NodeName {
+    NodeName::from_static(text)
 }
 
-fn machine(name: &'static str, session: SessionId, now: Timestamp) -> GossipMachine {
+fn key() -> CellKey {
+    CellKey::new(KEY, &name("lot-1"))
+}
+
+fn machine(node: &'static str, session: SessionId, identity: Option<Identity>, now: Timestamp) -> GossipMachine {
     let own = NodeId {
-        name: NodeName::from_static(name),
+        name: name(node),
         run: now.micros(),
         life: now.micros(),
         role: Role::Auto,
         gossip: SocketAddr::from((Ipv4Addr::UNSPECIFIED, 17_884)),
         broker: None,
     };
-    let setup = GossipSetup { own, key: key(), session, secret: [7; 32], seed: 3, counters: Arc::default() };
+    let setup = GossipSetup { own, key: key(), session, identity, secret: [7; 32], seed: 3, counters: Arc::default() };
     GossipMachine::new(setup, &MembershipConfig::default(), now)
 }
 

@@ -10,6 +10,16 @@ use super::config::MembershipConfig;
 /// One run of a node's membership, drawn at random.
 pub(crate) type SessionId = [u8; 16];
 
+/// Random number that makes a session of its own for each run, in a cell with certificates.
+pub(crate) type SessionNonce = [u8; 16];
+
+/// The session of a node in a cell with certificates. Only a node of this name can show the nonce of it.
+pub(crate) fn session_of(name: &NodeName, nonce: &SessionNonce) -> SessionId {
+    let text: [&[u8]; 3] = [b"ecod session 2", nonce, name.as_str().as_bytes()];
+    let hash = digest::digest(&digest::SHA256, &text.concat());
+    hash.as_ref().first_chunk().copied().unwrap_or_default()
+}
+
 /// Receiver in frames for all nodes of the cell.
 pub(crate) const BROADCAST: SessionId = [0; 16];
 
@@ -95,6 +105,14 @@ impl CellKey {
     /// Public tag in every frame that tells cells apart.
     pub(crate) fn tag(&self) -> [u8; 4] {
         self.tag
+    }
+
+    /// The key of one session with certificates, of the secret that both sides agreed on and of their transcript.
+    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
+    pub(crate) fn session(&self, secret: &[u8], transcript: &[u8; 32]) -> Self {
+        let info: [&[u8]; 2] = [b"ecod session 2", transcript];
+        let salt = self.root.expand(&info, hkdf::HKDF_SHA256).map(hkdf::Salt::from);
+        Self { root: salt.expect("HKDF gives as much as a hash's length").extract(secret), tag: self.tag }
     }
 
     /// The cipher of frames from one session to another. The sender's frame counter is the nonce, so that no two frames

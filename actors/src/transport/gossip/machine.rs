@@ -21,7 +21,8 @@ use rand_chacha::ChaCha8Rng;
 use super::config::MembershipConfig;
 use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameKind, Introduction, NameClaim};
-use super::key::{CellKey, SessionId};
+use super::handshake::Identity;
+use super::key::{CellKey, SessionNonce};
 use super::node_id::NodeId;
 use super::sessions::{Arrival, FrameContent, Sessions};
 use super::swim::{Swim, SwimOutput};
@@ -43,7 +44,9 @@ pub(crate) struct GossipSetup {
     pub(crate) own: NodeId,
     pub(crate) key: CellKey,
     /// Random for each start, and unpredictable.
-    pub(crate) session: SessionId,
+    pub(crate) session: SessionNonce,
+    /// The node's certificates; `None` in a cell without.
+    pub(crate) identity: Option<Identity>,
     /// Secret of the cookies; random for each start.
     pub(crate) secret: [u8; 32],
     /// Seed of random numbers that need not be secret.
@@ -62,6 +65,8 @@ pub(crate) struct GossipMachine {
     seeds: Vec<SocketAddr>,
     /// Frames that wait for a session with their addressee.
     pending: HashMap<NodeName, PendingFrames>,
+    /// Nodes known by hearsay only, and when they were greeted.
+    unproven: HashMap<NodeName, Timestamp>,
     /// The name last reported as taken, and when.
     taken: Option<(NodeName, Timestamp)>,
     /// Whether the node has to learn its address from others.
@@ -79,18 +84,27 @@ struct PendingFrames {
 
 impl GossipMachine {
     pub(crate) fn new(setup: GossipSetup, config: &MembershipConfig, now: Timestamp) -> Self {
-        let GossipSetup { own, key, session, secret, seed, counters } = setup;
+        let GossipSetup { own, key, session, identity, secret, seed, counters } = setup;
+        let proves = identity.is_some();
         let clock = AwakeClock::new(now, STALL);
         Self {
             learns_address: own.gossip.ip().is_unspecified(),
-            sessions: Sessions::new(key, session, &secret, config.max_peers, Arc::clone(&counters), now),
-            gossip: Swim::new(own, config, seed),
+            sessions: Sessions::new(
+                key,
+                (&own.name, session, identity),
+                &secret,
+                config.max_peers,
+                Arc::clone(&counters),
+                now,
+            ),
+            gossip: Swim::new(own, config, proves, seed),
             clock,
             hello: config.hello(),
             hello_at: now,
             hello_count: 0,
             seeds: Vec::new(),
             pending: HashMap::new(),
+            unproven: HashMap::new(),
             taken: None,
             left: false,
             rng: ChaCha8Rng::seed_from_u64(seed.wrapping_add(1)),
@@ -168,6 +182,28 @@ impl GossipMachine {
         }
     }
 
+    /// Takes changed certificates and the time. Nodes whose certificate is no longer valid are down at once.
+    pub(crate) fn set_identity(&mut self, identity: Identity, now: Timestamp) {
+        let at = self.advance(now);
+        let (expelled, greeted) = self.sessions.set_identity(identity);
+        for name in expelled {
+            tracing::warn!(node = %name, "session ended: its certificate was revoked or has expired");
+            self.gossip.remove(&name, at);
+        }
+        for address in greeted {
+            self.send_hello(address, true, at);
+        }
+        self.flush_swim(at);
+    }
+
+    /// Gossips that a node is alive, true or not.
+    #[cfg(test)]
+    pub(crate) fn spread(&mut self, id: NodeId, now: Timestamp) {
+        let at = self.advance(now);
+        self.gossip.spread(id, at);
+        self.flush_swim(at);
+    }
+
     /// Tells all nodes that this one leaves. Afterwards nothing is sent or processed.
     pub(crate) fn leave(&mut self, now: Timestamp) {
         let at = self.advance(now);
@@ -193,11 +229,11 @@ impl GossipMachine {
                 self.meet(introduction, speaks, greeter, at);
             }
             FrameContent::Gossip { from, body } => self.gossip.receive(&from, &body, at)?,
-            FrameContent::Payload { from, body } => {
-                let event = MembershipEvent::Received { from, payload: Bytes::from(body), received_at: now };
+            FrameContent::Payload { from, rights, body } => {
+                let event = MembershipEvent::Received { from, rights, payload: Bytes::from(body), received_at: now };
                 self.outputs.push_back(GossipOutput::Tell(event));
             }
-            FrameContent::Stranger => self.send_hello(from, at),
+            FrameContent::Stranger => self.send_hello(from, true, at),
             FrameContent::NameTaken(name) => self.report_taken(name, at),
             FrameContent::Nothing => (),
         }
@@ -219,6 +255,7 @@ impl GossipMachine {
         if !speaks {
             return self.report_taken(id.name, at);
         }
+        self.gossip.note_met(&id);
         for (kind, body) in self.pending.remove(&id.name).map(|pending| pending.frames).unwrap_or_default() {
             self.send_or_queue(&id.name, seen_at, kind, &body, at);
         }
@@ -238,11 +275,15 @@ impl GossipMachine {
                 }
                 SwimOutput::Alive(id) => {
                     if self.sessions.end_earlier_run(&id.name, id.run, at) {
-                        self.send_hello(id.gossip, at);
+                        self.send_hello(id.gossip, false, at);
                     }
                     MembershipEvent::Alive { member: self.member(&id) }
                 }
                 SwimOutput::Changed(id) => MembershipEvent::Changed { member: self.member(&id) },
+                SwimOutput::Unproven(id) => {
+                    self.meet_unproven(id, at);
+                    continue;
+                }
                 SwimOutput::Suspected(name) => MembershipEvent::Suspected { name },
                 SwimOutput::Down(name) => MembershipEvent::Down { name },
             };
@@ -252,15 +293,19 @@ impl GossipMachine {
 
     /// Sends to a node, or queues a few frames until there is a session with it.
     fn send_or_queue(&mut self, to: &NodeName, address: SocketAddr, kind: FrameKind, body: &[u8], at: Timestamp) {
-        if let Some((to, frame)) = self.sessions.seal(to, kind, body) {
-            return self.outputs.push_back(GossipOutput::Send { to, frame });
+        if let Some((address, frame)) = self.sessions.seal(to, kind, body, at) {
+            self.outputs.push_back(GossipOutput::Send { to: address, frame });
+            if let Some(address) = self.sessions.unheard(to, at) {
+                self.send_hello(address, true, at);
+            }
+            return;
         }
         if !self.pending.contains_key(to) {
             if self.pending.len() >= MAX_PENDING || address.ip().is_unspecified() {
                 return self.counters.count(FrameEvent::NoSession);
             }
             self.pending.insert(to.clone(), PendingFrames { since: at, frames: Vec::new() });
-            self.send_hello(address, at);
+            self.send_hello(address, true, at);
         }
         match self.pending.get_mut(to) {
             Some(pending) if pending.frames.len() < MAX_PENDING_FRAMES => pending.frames.push((kind, body.to_vec())),
@@ -268,9 +313,19 @@ impl GossipMachine {
         }
     }
 
-    fn send_hello(&mut self, to: SocketAddr, at: Timestamp) {
+    /// Greets a node of which others tell, and whose certificate this node has not seen.
+    fn meet_unproven(&mut self, id: NodeId, at: Timestamp) {
+        self.unproven.retain(|_, greeted| at.since(*greeted) < UNPROVEN_INTERVAL);
+        let is_new = self.unproven.len() < MAX_UNPROVEN && !self.unproven.contains_key(&id.name);
+        if is_new && !id.gossip.ip().is_unspecified() {
+            self.unproven.insert(id.name, at);
+            self.send_hello(id.gossip, true, at);
+        }
+    }
+
+    fn send_hello(&mut self, to: SocketAddr, wants_session: bool, at: Timestamp) {
         if self.sessions.may_send_hello(at) {
-            let frame = self.sessions.hello(self.gossip.own());
+            let frame = self.sessions.hello(self.gossip.own(), wants_session);
             self.outputs.push_back(GossipOutput::Send { to, frame });
         }
     }
@@ -278,7 +333,7 @@ impl GossipMachine {
     /// Greets all seeds that do not belong to a living node, so that a returning seed hears of its cell before it leads
     /// on its own. Greets the multicast group too, less often once other nodes are alive.
     fn send_hellos(&mut self) {
-        let frame = self.sessions.hello(self.gossip.own());
+        let frame = self.sessions.hello(self.gossip.own(), false);
         let known: Vec<_> = self.members().iter().map(|member| member.gossip).collect();
         let missing = self.seeds.iter().filter(|seed| !known.contains(seed));
         self.outputs.extend(missing.map(|seed| GossipOutput::Send { to: *seed, frame: frame.clone() }));
@@ -302,8 +357,12 @@ impl GossipMachine {
         }
     }
 
+    /// A node as others are told of it: by what it has proven itself, if nodes of the cell do, and not by hearsay.
     fn member(&self, id: &NodeId) -> Member {
-        id.member(self.sessions.address(&id.name))
+        let address = self.sessions.address(&id.name);
+        let Some((proven, rights)) = self.sessions.proven(&id.name) else { return id.member(address) };
+        let member = proven.member(address);
+        Member { role: rights.limit_role(member.role), ..member }
     }
 
     fn due(&self) -> Timestamp {
@@ -327,6 +386,10 @@ const MAX_PENDING_FRAMES: usize = 4;
 
 /// Greetings of seeds for each greeting of the multicast group, once other nodes are alive.
 const MULTICAST_EVERY: u64 = 10;
+
+/// Minimum time between two greetings of a node that is known by hearsay only, and maximum such nodes in that time.
+const UNPROVEN_INTERVAL: Duration = Duration::from_secs(1);
+const MAX_UNPROVEN: usize = 256;
 
 /// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);

@@ -23,7 +23,15 @@ pub(crate) struct NodeId {
     pub(crate) broker: Option<SocketAddr>,
 }
 
+/// Largest life that others may claim for a node. The node itself can always outbid it.
+pub(crate) const MAX_CLAIMED_LIFE: u64 = 1 << 53;
+
 impl NodeId {
+    /// Whether the node itself could have got to its life: it starts with the time of day, and grows by single steps.
+    pub(crate) fn has_plausible_life(&self) -> bool {
+        self.life <= 2 * MAX_CLAIMED_LIFE
+    }
+
     /// The node as other actors see it, at the `address` where it was seen. A broker on another machine's loopback
     /// address is left out: this machine would find its own there.
     pub(crate) fn member(&self, address: Option<SocketAddr>) -> Member {

@@ -1,6 +1,12 @@
 //! Replay protection by frame counters.
 
-/// Accepts every frame counter once, and none that is 128 or more behind the highest.
+use super::counters::FrameEvent;
+
+/// Largest step by which one frame moves a window. The counter is that of all frames of a sender, so a node that was
+/// out of reach may find it far ahead, but a forged one near the end would mute the sender.
+const MAX_JUMP: u64 = 1 << 20;
+
+/// Accepts every frame counter once, none that is 128 or more behind the highest, and none far ahead of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ReplayWindow {
     highest: u64,
@@ -14,19 +20,33 @@ impl ReplayWindow {
         Self { highest: floor, taken: u128::MAX }
     }
 
-    /// Accepts a counter; false when it was accepted before or is too old.
-    pub(crate) fn take(&mut self, counter: u64) -> bool {
+    /// Accepts a counter.
+    ///
+    /// # Errors
+    /// [`FrameEvent::Replayed`] when it was accepted before or is too old, [`FrameEvent::CounterJump`] when it is too far
+    /// ahead. The window is then as before.
+    pub(crate) fn take(&mut self, counter: u64) -> Result<(), FrameEvent> {
         if let Some(ahead) = counter.checked_sub(self.highest).filter(|ahead| *ahead > 0) {
+            if ahead > MAX_JUMP {
+                return Err(FrameEvent::CounterJump);
+            }
             self.taken = u32::try_from(ahead).ok().and_then(|ahead| self.taken.checked_shl(ahead)).unwrap_or(0) | 1;
             self.highest = counter;
-            return true;
+            return Ok(());
         }
         let behind = self.highest - counter;
-        let new = behind < u64::from(u128::BITS) && self.taken >> behind & 1 == 0;
-        if new {
-            self.taken |= 1 << behind;
+        if behind >= u64::from(u128::BITS) || self.taken >> behind & 1 == 1 {
+            return Err(FrameEvent::Replayed);
         }
-        new
+        self.taken |= 1 << behind;
+        Ok(())
+    }
+
+    /// Goes on after a counter that a fresh handshake has proven, however far ahead. It never goes back.
+    pub(crate) fn skip_to(&mut self, counter: u64) {
+        if counter > self.highest {
+            *self = Self::after(counter);
+        }
     }
 }
 
@@ -41,10 +61,25 @@ mod tests {
     #[test]
     fn late_frames_are_taken_once_and_very_late_ones_not() {
         let mut window = ReplayWindow::after(100);
-        assert!(!window.take(100) && !window.take(99) && !window.take(0), "before the session began");
-        assert!(window.take(102) && window.take(101) && !window.take(101) && !window.take(102));
-        assert!(window.take(102 + 127) && !window.take(101), "fell out of the window");
-        assert!(window.take(103) && window.take(u64::MAX) && !window.take(u64::MAX));
+        let mut take = |counter| window.take(counter).is_ok();
+        assert!(!take(100) && !take(99) && !take(0), "before the session began");
+        assert!(take(102) && take(101) && !take(101) && !take(102));
+        assert!(take(102 + 127) && !take(101), "fell out of the window");
+        assert!(take(103) && take(229 + MAX_JUMP) && !take(229 + MAX_JUMP));
+    }
+
+    #[test]
+    fn a_counter_far_ahead_moves_nothing_unless_a_handshake_proves_it() {
+        let mut window = ReplayWindow::after(100);
+        for counter in [u64::MAX, 101 + MAX_JUMP] {
+            assert_eq!(window.take(counter), Err(FrameEvent::CounterJump));
+        }
+        assert_eq!(window.take(101), Ok(()));
+        window.skip_to(u64::MAX - 1);
+        assert_eq!(window.take(102), Err(FrameEvent::Replayed));
+        assert_eq!(window.take(u64::MAX), Ok(()));
+        window.skip_to(5);
+        assert_eq!(window.take(u64::MAX), Err(FrameEvent::Replayed), "nothing goes back");
     }
 
     proptest! {
@@ -54,7 +89,7 @@ mod tests {
             let mut taken = BTreeSet::new();
             for counter in counters {
                 let recent = taken.last().is_none_or(|highest| counter + 128 > *highest) && counter + 128 > floor;
-                let new = window.take(counter);
+                let new = window.take(counter).is_ok();
                 prop_assert_eq!(new, counter > floor && recent && !taken.contains(&counter));
                 if new {
                     taken.insert(counter);

@@ -4,24 +4,32 @@
 //! before a restart, or meant for another node, does not decrypt. The sender's counter never repeats in a session, and
 //! the receiver accepts each value once. A node is admitted only when it returns a cookie just issued to its address: a
 //! recorded handshake admits nobody.
+//!
+//! In a cell with certificates a node proves its own in the handshake, too, and the keys of the session come of it. Then
+//! the cell's key alone reads and forges nothing but handshakes that fail.
 
-use std::collections::HashMap;
+mod admission;
+mod peers;
+
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::counters::{FrameCounters, FrameEvent};
-use super::frame::{FrameHeader, FrameKind, HEADER_BYTES, Handshake, Hello, Introduction, NameClaim};
-use super::key::{BROADCAST, CellKey, Cookie, CookieFactory, FrameCipher, SessionId};
+use super::frame::{FrameHeader, FrameKind, Greeting, HEADER_BYTES, Hello, Introduction, Version};
+use super::handshake::{Identity, Prover};
+use super::key::{BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of};
 use super::node_id::NodeId;
-use super::replay_window::ReplayWindow;
-use super::reply_throttle::ReplyThrottle;
+use super::refusals::Refusals;
+use super::reply_throttle::{ReplyThrottle, VerificationThrottle};
 use crate::platform::throttle::TokenBucket;
+use peers::PeerTable;
 
 /// All sessions of a node.
 pub(crate) struct Sessions {
@@ -31,28 +39,17 @@ pub(crate) struct Sessions {
     everybody: FrameCipher,
     /// Counter of the last frame sent to any node.
     counter: u64,
-    peers: HashMap<SessionId, PeerSession>,
-    /// The session that is accepted for a name.
-    session_by_name: HashMap<NodeName, SessionId>,
-    /// Throttles of answers to greetings, of answers to challenges, and of own greetings.
+    peers: PeerTable,
+    /// The proof of this node's certificate, in a cell with certificates.
+    prover: Option<Prover>,
+    /// Throttles of answers to greetings, of answers to challenges, of verifications, and of own greetings.
     challenges: ReplyThrottle,
     proofs: ReplyThrottle,
+    verifications: VerificationThrottle,
     greetings: TokenBucket,
-    max_peers: usize,
     other_key_seen: bool,
+    certified: Refusals,
     counters: Arc<FrameCounters>,
-}
-
-struct PeerSession {
-    name: NodeName,
-    run: u64,
-    address: SocketAddr,
-    to: FrameCipher,
-    from: FrameCipher,
-    window: ReplayWindow,
-    heard: Timestamp,
-    /// Time since which another session is accepted for the name.
-    superseded: Option<Timestamp>,
 }
 
 /// State of a name in the gossip.
@@ -87,8 +84,8 @@ pub(crate) enum FrameContent {
     /// A message of the SWIM protocol.
     Gossip { from: NodeName, body: Vec<u8> },
     /// A datagram of the sender's other actors.
-    Payload { from: NodeName, body: Vec<u8> },
-    /// A frame of a session that is not established: greet its sender.
+    Payload { from: NodeName, rights: Rights, body: Vec<u8> },
+    /// A frame of a session that is not established, or not any more: greet its sender.
     Stranger,
     /// Two running nodes have this name.
     NameTaken(NodeName),
@@ -97,52 +94,86 @@ pub(crate) enum FrameContent {
 }
 
 impl Sessions {
+    /// No sessions. `nonce` is the node's session itself in a cell without certificates.
     pub(crate) fn new(
         key: CellKey,
-        own: SessionId,
+        (name, nonce, identity): (&NodeName, SessionNonce, Option<Identity>),
         secret: &[u8; 32],
         max_peers: usize,
         counters: Arc<FrameCounters>,
         now: Timestamp,
     ) -> Self {
+        let own = if identity.is_some() { session_of(name, &nonce) } else { nonce };
         Self {
             everybody: key.seal(&own, &BROADCAST),
             key,
             own,
             cookies: CookieFactory::new(secret),
             counter: 0,
-            peers: HashMap::new(),
-            session_by_name: HashMap::new(),
+            peers: PeerTable::new(max_peers),
+            prover: identity.map(|identity| Prover::new(identity, nonce)),
             challenges: ReplyThrottle::new(now),
             proofs: ReplyThrottle::new(now),
+            verifications: VerificationThrottle::new(now),
             greetings: TokenBucket::new(HELLO_BURST, HELLO_INTERVAL, now),
-            max_peers,
             other_key_seen: false,
+            certified: Refusals::default(),
             counters,
         }
     }
 
-    /// A greeting frame for any node of the cell.
-    pub(crate) fn hello(&mut self, own: &NodeId) -> Vec<u8> {
+    /// Whether sessions prove certificates.
+    pub(crate) fn prove_certificates(&self) -> bool {
+        self.prover.is_some()
+    }
+
+    /// A greeting frame for any node of the cell; with `wants_session` for one that is to prove itself again.
+    pub(crate) fn hello(&mut self, own: &NodeId, wants_session: bool) -> Vec<u8> {
         let head = self.head(FrameKind::Hello);
-        head.write(self.key.tag(), &encode(&Hello { name: own.name.clone() }), &self.everybody)
+        let mut body = encode(&Hello { name: own.name.clone() });
+        if self.prove_certificates() {
+            body.extend(encode(&Greeting { wants_session }));
+        }
+        head.write(self.key.tag(), &body, &self.everybody)
     }
 
     /// A frame for the node of a name, and its address.
-    pub(crate) fn seal(&mut self, to: &NodeName, kind: FrameKind, body: &[u8]) -> Option<(SocketAddr, Vec<u8>)> {
+    pub(crate) fn seal(
+        &mut self,
+        to: &NodeName,
+        kind: FrameKind,
+        body: &[u8],
+        now: Timestamp,
+    ) -> Option<(SocketAddr, Vec<u8>)> {
         let head = self.head(kind);
-        let peer = self.peer(to)?;
-        Some((peer.address, head.write(self.key.tag(), body, &peer.to)))
+        let peer = self.peers.speaker_mut(to)?;
+        peer.unheard_since.get_or_insert(now);
+        Some((peer.address, head.write(self.key.tag(), body, peer.keys.to()?)))
+    }
+
+    /// Address of a node that has answered nothing for a while, and is to be greeted for a new session.
+    pub(crate) fn unheard(&mut self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
+        let proves = self.prove_certificates();
+        let peer = self.peers.speaker_mut(name).filter(|_| proves)?;
+        let since = peer.unheard_since.filter(|since| now.since(*since) >= UNHEARD_TIMEOUT)?;
+        peer.unheard_since = Some(now.max(since));
+        Some(peer.address)
     }
 
     /// Address of the node of a name.
     pub(crate) fn address(&self, name: &NodeName) -> Option<SocketAddr> {
-        Some(self.peer(name)?.address)
+        Some(self.peers.speaker(name)?.address)
+    }
+
+    /// Identity and rights of a node as it has proven them; `None` in a cell without certificates.
+    pub(crate) fn proven(&self, name: &NodeName) -> Option<(&NodeId, Rights)> {
+        let peer = self.peers.speaker(name)?;
+        Some((&peer.id, peer.proven.as_ref()?.rights))
     }
 
     /// Address of the node of a name, if it was heard lately.
     pub(crate) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
-        let peer = self.peer(name)?;
+        let peer = self.peers.speaker(name)?;
         (now.since(peer.heard) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
     }
 
@@ -151,202 +182,86 @@ impl Sessions {
         self.greetings.allow(now) || self.throttled()
     }
 
-    /// Ends the session of an earlier run of a node; false when there is none.
+    /// Ends the session of an earlier run of a node; false when there is none. Of a node that proves its certificate
+    /// only its own handshake does so.
     pub(crate) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
-        let speaker = self.session_by_name.get(name).and_then(|session| self.peers.get_mut(session));
-        let Some(peer) = speaker.filter(|peer| peer.run != run) else { return false };
-        peer.superseded = Some(now);
-        self.session_by_name.remove(name);
-        true
+        !self.prove_certificates() && self.peers.end_earlier_run(name, run, now)
+    }
+
+    /// Takes changed certificates and the time. Ends all sessions whose certificate is no longer valid; the result are
+    /// the nodes that had them, and those that are to be shown this node's new certificate.
+    pub(crate) fn set_identity(&mut self, identity: Identity) -> (Vec<NodeName>, Vec<SocketAddr>) {
+        let Some(prover) = &mut self.prover else { return Default::default() };
+        let certificate = prover.certificate().to_vec();
+        let has_changed = prover.set_identity(identity);
+        let is_renewed = prover.certificate() != certificate;
+        let expelled = self.peers.expel(|peer| {
+            peer.proven.as_ref().is_none_or(|proven| {
+                let expired = prover.has_expired(proven);
+                expired || has_changed && prover.verify(&peer.id.name, &proven.certificate, peer.address).is_none()
+            })
+        });
+        expelled.iter().for_each(|_| self.counters.count(FrameEvent::Expelled));
+        let greeted = if is_renewed { self.peers.addresses() } else { Vec::new() };
+        (expelled, greeted)
+    }
+
+    /// Forgets all sessions, as if they had given way to others.
+    #[cfg(test)]
+    pub(crate) fn forget_all(&mut self) {
+        self.peers.expel(|_| true);
     }
 
     /// Processes a datagram. An error means junk, which changed nothing.
     pub(crate) fn open(&mut self, frame: &[u8], arrival: &Arrival<'_>) -> Result<FrameContent, FrameEvent> {
         let head = FrameHeader::read(frame, self.key.tag())?;
+        if head.version != self.version() {
+            return Err(self.refuse_version(&head, frame, arrival.from));
+        }
         if head.sender == self.own {
             return if head.kind == FrameKind::Hello { Ok(FrameContent::Nothing) } else { Err(FrameEvent::Replayed) };
         }
-        let Some(body) = self.unseal(&head, frame) else {
-            self.note_other_key(head.kind, arrival.from);
-            return Err(FrameEvent::BadSeal);
-        };
-        if head.kind == FrameKind::Hello {
-            return self.handle_hello(&head, &decode(&body)?, arrival);
-        }
-        let known = self.peers.get_mut(&head.sender).map(|peer| {
-            let new = peer.window.take(head.counter);
-            peer.heard = if new { arrival.now } else { peer.heard };
-            new
-        });
-        if known == Some(false) {
-            return Err(FrameEvent::Replayed);
-        }
         match head.kind {
-            FrameKind::Handshake => self.handle_handshake(&head, decode(&body)?, arrival),
-            _ if known.is_none() => {
-                self.counters.count(FrameEvent::Unestablished);
-                Ok(FrameContent::Stranger)
+            FrameKind::Hello => {
+                let Some(body) = self.unseal(&head, &BROADCAST, frame) else {
+                    self.note_other_key(arrival.from);
+                    return Err(FrameEvent::BadSeal);
+                };
+                let (hello, rest) = decode_first::<Hello>(&body)?;
+                let wants_session = self.prove_certificates() && decode::<Greeting>(rest)?.wants_session;
+                self.handle_hello(&head, &hello, wants_session, arrival)
             }
-            kind => self.handle_body(&head.sender, kind, body, arrival.now),
-        }
-    }
-
-    /// Warns of a greeting under another key. Once only, as greetings are repeated for ever.
-    fn note_other_key(&mut self, kind: FrameKind, from: SocketAddr) {
-        if kind == FrameKind::Hello && !std::mem::replace(&mut self.other_key_seen, true) {
-            tracing::warn!(%from, "a node of this cell has another key, or none; its frames are ignored");
-        }
-    }
-
-    fn peer(&self, name: &NodeName) -> Option<&PeerSession> {
-        self.peers.get(self.session_by_name.get(name)?)
-    }
-
-    fn unseal(&self, head: &FrameHeader, frame: &[u8]) -> Option<Vec<u8>> {
-        let (open, sealed) = frame.split_at(HEADER_BYTES);
-        match self.peers.get(&head.sender) {
-            _ if head.kind == FrameKind::Hello => {
-                self.key.seal(&head.sender, &BROADCAST).open(head.counter, open, sealed)
-            }
-            Some(peer) => peer.from.open(head.counter, open, sealed),
-            None => self.key.seal(&head.sender, &self.own).open(head.counter, open, sealed),
-        }
-    }
-
-    /// Answers a greeting with a challenge. A known living node at its known address needs no handshake.
-    fn handle_hello(
-        &mut self,
-        head: &FrameHeader,
-        hello: &Hello,
-        arrival: &Arrival<'_>,
-    ) -> Result<FrameContent, FrameEvent> {
-        let is_accepted = self.session_by_name.get(&hello.name) == Some(&head.sender);
-        let is_there = self.peers.get(&head.sender).is_some_and(|peer| peer.address == arrival.from);
-        if is_accepted && is_there && (arrival.known)(&hello.name).is_some_and(|known| known.alive) {
-            return Ok(FrameContent::Nothing);
-        }
-        if !self.challenges.allow(&head.sender, arrival.now) && !self.throttled() {
-            return Ok(FrameContent::Nothing);
-        }
-        let cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
-        let challenge = Handshake::Challenge { cookie, name: arrival.own.name.clone() };
-        Ok(FrameContent::Answer(self.handshake(&head.sender, &challenge)))
-    }
-
-    fn handle_handshake(
-        &mut self,
-        head: &FrameHeader,
-        message: Handshake,
-        arrival: &Arrival<'_>,
-    ) -> Result<FrameContent, FrameEvent> {
-        let Arrival { from, now, own, known } = *arrival;
-        let (echo, cookie, introduction) = match message {
-            Handshake::Challenge { cookie: echo, name } => {
-                if !self.proofs.allow(&head.sender, now) && !self.throttled() {
-                    return Ok(FrameContent::Nothing);
+            FrameKind::Handshake => {
+                let body = self.unseal(&head, &self.own, frame).ok_or(FrameEvent::BadSeal)?;
+                if !self.prove_certificates() {
+                    self.peers.take_counter(&head, arrival.now)?;
                 }
-                let cookie = self.cookies.issue(&head.sender, from, slot(now));
-                let over = known(&name).filter(|known| !known.alive);
-                let claim = over.map_or(NameClaim::Free, |known| NameClaim::After(known.life));
-                let introduction = Introduction { id: own.clone(), seen_at: from, claim };
-                let proof = Handshake::Proof { echo, cookie, introduction };
-                return Ok(FrameContent::Answer(self.handshake(&head.sender, &proof)));
+                self.handle_handshake(&head, &body, arrival)
             }
-            Handshake::Proof { echo, cookie, introduction } => (echo, Some(cookie), introduction),
-            Handshake::Accept { echo, introduction } => (echo, None, introduction),
-        };
-        if !self.is_fresh(&head.sender, from, &echo, now) {
-            return Err(FrameEvent::Replayed);
+            kind => self.open_body(&head, kind, frame, arrival.now),
         }
-        if introduction.id.name == own.name {
-            return Ok(FrameContent::NameTaken(introduction.id.name));
-        }
-        let claim = self.admit(head, &introduction.id, from, now, known(&introduction.id.name))?;
-        let answer = cookie.map(|echo| {
-            let introduction = Introduction { id: own.clone(), seen_at: from, claim };
-            self.handshake(&head.sender, &Handshake::Accept { echo, introduction })
-        });
-        Ok(FrameContent::Met { introduction, answer, speaks: claim != NameClaim::Taken })
     }
 
-    /// Whether the cookie was issued to this session at this address a moment ago.
-    fn is_fresh(&self, session: &SessionId, from: SocketAddr, echo: &Cookie, now: Timestamp) -> bool {
-        let slot = slot(now);
-        [slot, slot.wrapping_sub(1)].iter().any(|slot| self.cookies.issue(session, from, *slot) == *echo)
-    }
-
-    /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
-    fn admit(
+    /// Opens a frame of an established session.
+    fn open_body(
         &mut self,
         head: &FrameHeader,
-        id: &NodeId,
-        address: SocketAddr,
-        now: Timestamp,
-        known: Option<KnownMember>,
-    ) -> Result<NameClaim, FrameEvent> {
-        let speaker = self.session_by_name.get(&id.name).copied();
-        let claim = match known {
-            Some(known) if known.alive && known.life > id.life && speaker != Some(head.sender) => NameClaim::Taken,
-            Some(known) if !known.alive && known.life >= id.life => NameClaim::After(known.life),
-            _ => NameClaim::Free,
-        };
-        if !self.peers.contains_key(&head.sender) {
-            self.make_room(now)?;
-            let peer = PeerSession {
-                name: id.name.clone(),
-                run: id.run,
-                address,
-                to: self.key.seal(&self.own, &head.sender),
-                from: self.key.seal(&head.sender, &self.own),
-                window: ReplayWindow::after(head.counter),
-                heard: now,
-                superseded: None,
-            };
-            self.peers.insert(head.sender, peer);
-        }
-        let taken = claim == NameClaim::Taken;
-        if let Some(peer) = self.peers.get_mut(&head.sender) {
-            peer.address = address;
-            peer.superseded = taken.then_some(now);
-        }
-        if !taken {
-            self.session_by_name.insert(id.name.clone(), head.sender);
-            if let Some(former) = speaker.filter(|former| *former != head.sender)
-                && let Some(peer) = self.peers.get_mut(&former)
-            {
-                peer.superseded = Some(now);
-            }
-        }
-        let keep = |session: &SessionId| *session == head.sender || Some(*session) == speaker;
-        self.peers.retain(|session, peer| peer.name != id.name || keep(session));
-        Ok(claim)
-    }
-
-    /// Removes the longest idle session when there are too many and it is idle for long enough.
-    fn make_room(&mut self, now: Timestamp) -> Result<(), FrameEvent> {
-        if self.peers.len() < self.max_peers {
-            return Ok(());
-        }
-        let longest_idle = self.peers.iter().min_by_key(|(_, peer)| peer.heard);
-        let may_go = longest_idle.filter(|(_, peer)| now.since(peer.heard) >= SESSION_IDLE_TIMEOUT);
-        let session = may_go.map(|(session, _)| *session).ok_or(FrameEvent::TooManyPeers)?;
-        if let Some(peer) = self.peers.remove(&session)
-            && self.session_by_name.get(&peer.name) == Some(&session)
-        {
-            self.session_by_name.remove(&peer.name);
-        }
-        Ok(())
-    }
-
-    fn handle_body(
-        &self,
-        session: &SessionId,
         kind: FrameKind,
-        body: Vec<u8>,
+        frame: &[u8],
         now: Timestamp,
     ) -> Result<FrameContent, FrameEvent> {
-        let Some(peer) = self.peers.get(session) else { return Err(FrameEvent::BadSeal) };
-        let from = peer.name.clone();
+        let Some(peer) = self.peers.get_mut(&head.sender) else {
+            // Without certificates the keys are known, and the node itself is not. With them it greets when unheard.
+            let unsealed = if self.prove_certificates() { None } else { self.unseal(head, &self.own, frame) };
+            return unsealed.map(|_| self.stranger(FrameEvent::Unestablished)).ok_or(FrameEvent::BadSeal);
+        };
+        let Some((body, taken)) = peer.keys.open(head, frame) else { return Err(FrameEvent::BadSeal) };
+        match taken {
+            Ok(()) => peer.note_heard(now),
+            Err(FrameEvent::CounterJump) => return Ok(self.stranger(FrameEvent::CounterJump)),
+            Err(reason) => return Err(reason),
+        }
+        let from = peer.id.name.clone();
         match peer.superseded {
             Some(since) if now.since(since) > MAX_TRANSIT => {
                 self.counters.count(FrameEvent::Superseded);
@@ -354,13 +269,42 @@ impl Sessions {
             }
             Some(_) => Err(FrameEvent::Superseded),
             None if kind == FrameKind::Gossip => Ok(FrameContent::Gossip { from, body }),
-            None => Ok(FrameContent::Payload { from, body }),
+            None => {
+                let rights = peer.proven.as_ref().map_or(Rights::default(), |proven| proven.rights);
+                Ok(FrameContent::Payload { from, rights, body })
+            }
         }
     }
 
-    fn handshake(&mut self, to: &SessionId, message: &Handshake) -> Vec<u8> {
-        let head = self.head(FrameKind::Handshake);
-        head.write(self.key.tag(), &encode(message), &self.key.seal(&self.own, to))
+    fn stranger(&self, event: FrameEvent) -> FrameContent {
+        self.counters.count(event);
+        FrameContent::Stranger
+    }
+
+    /// Warns of a greeting under another key. Once only, as greetings are repeated for ever.
+    fn note_other_key(&mut self, from: SocketAddr) {
+        if !std::mem::replace(&mut self.other_key_seen, true) {
+            tracing::warn!(%from, "a node of this cell has another key, or none; its frames are ignored");
+        }
+    }
+
+    /// Refuses a frame of a node with certificates where this one has none, or the reverse; a greeting tells who it is.
+    fn refuse_version(&mut self, head: &FrameHeader, frame: &[u8], from: SocketAddr) -> FrameEvent {
+        let greeting = if head.kind == FrameKind::Hello { self.unseal(head, &BROADCAST, frame) } else { None };
+        let hello = greeting.and_then(|body| decode_first::<Hello>(&body).ok().map(|(hello, _)| hello));
+        if let Some(Hello { name }) = hello {
+            match &mut self.prover {
+                Some(prover) => prover.log_uncertified(&name, from),
+                None => self.certified.log(&name, from, "it shows a certificate, and this node has no `[tls]`"),
+            }
+        }
+        FrameEvent::Uncertified
+    }
+
+    /// The body of a frame that the cell's key sealed.
+    fn unseal(&self, head: &FrameHeader, receiver: &SessionId, frame: &[u8]) -> Option<Vec<u8>> {
+        let (open, sealed) = frame.split_at_checked(HEADER_BYTES)?;
+        self.key.seal(&head.sender, receiver).open(head.counter, open, sealed)
     }
 
     /// Counts a frame that is not sent; always false.
@@ -369,9 +313,13 @@ impl Sessions {
         false
     }
 
+    fn version(&self) -> Version {
+        if self.prove_certificates() { Version::Certificate } else { Version::Key }
+    }
+
     fn head(&mut self, kind: FrameKind) -> FrameHeader {
         self.counter += 1;
-        FrameHeader { kind, sender: self.own, counter: self.counter }
+        FrameHeader { version: self.version(), kind, sender: self.own, counter: self.counter }
     }
 }
 
@@ -385,10 +333,8 @@ const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for which frames of a node's earlier run may still arrive.
 const MAX_TRANSIT: Duration = Duration::from_millis(500);
 
-/// Time slot of a cookie, which is valid in its slot and the next.
-fn slot(now: Timestamp) -> u64 {
-    now.micros() / 2_000_000
-}
+/// Time without an answer after which a node is asked for a new session: it may have lost the keys.
+const UNHEARD_TIMEOUT: Duration = Duration::from_millis(500);
 
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 fn encode(message: &impl Serialize) -> Vec<u8> {
@@ -397,6 +343,11 @@ fn encode(message: &impl Serialize) -> Vec<u8> {
 
 fn decode<T: DeserializeOwned>(body: &[u8]) -> Result<T, FrameEvent> {
     postcard::from_bytes(body).map_err(|_| FrameEvent::Malformed)
+}
+
+/// Decodes the beginning of a body; also gives the rest.
+fn decode_first<T: DeserializeOwned>(body: &[u8]) -> Result<(T, &[u8]), FrameEvent> {
+    postcard::take_from_bytes(body).map_err(|_| FrameEvent::Malformed)
 }
 
 #[cfg(test)]

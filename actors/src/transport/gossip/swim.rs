@@ -30,6 +30,8 @@ pub(crate) enum SwimOutput {
     Down(NodeName),
     /// A living node's identity changed.
     Changed(NodeId),
+    /// Others tell of a node that this one has not met, where only met ones count.
+    Unproven(NodeId),
 }
 
 /// This node's SWIM instance.
@@ -39,6 +41,8 @@ pub(crate) struct Swim {
     timers: BinaryHeap<Reverse<ScheduledTimer>>,
     scheduled: u64,
     alive: BTreeMap<NodeName, NodeId>,
+    /// Lives of the nodes that were met, by their own word, in a cell with certificates: hearsay does not go beyond.
+    lives: Option<BTreeMap<NodeName, u64>>,
     /// Time of this node's last renewal after it was declared down, and of the next.
     renewed_at: Option<Timestamp>,
     renew_at: Option<Timestamp>,
@@ -54,13 +58,14 @@ struct ScheduledTimer {
 }
 
 impl Swim {
-    pub(crate) fn new(own: NodeId, config: &MembershipConfig, seed: u64) -> Self {
+    pub(crate) fn new(own: NodeId, config: &MembershipConfig, proves: bool, seed: u64) -> Self {
         Self {
             foca: Foca::new(own, settings(config), ChaCha8Rng::seed_from_u64(seed), PostcardCodec),
             runtime: AccumulatingRuntime::new(),
             timers: BinaryHeap::new(),
             scheduled: 0,
             alive: BTreeMap::new(),
+            lives: proves.then(BTreeMap::new),
             renewed_at: None,
             renew_at: None,
             left: false,
@@ -97,13 +102,47 @@ impl Swim {
 
     /// Processes a message that `from` has authenticated.
     pub(crate) fn receive(&mut self, from: &NodeName, body: &[u8], now: Timestamp) -> Result<(), FrameEvent> {
-        let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, body).map_err(|_| FrameEvent::Malformed)?;
+        let mut updates = body;
+        let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, &mut updates);
+        let header = header.map_err(|_| FrameEvent::Malformed)?;
         if header.src.name != *from {
             return Err(FrameEvent::NameMismatch);
         }
-        let result = self.foca.handle_data(body, &mut self.runtime);
+        if !header.src.has_plausible_life() {
+            return Err(FrameEvent::Malformed);
+        }
+        let result = if self.lives.is_some() {
+            let body = self.without_hearsay(&header.src, body, updates).map_err(|_| FrameEvent::Malformed)?;
+            self.foca.handle_data(&body, &mut self.runtime)
+        } else {
+            self.foca.handle_data(body, &mut self.runtime)
+        };
         self.collect(now);
         result.map_err(|_| FrameEvent::Malformed)
+    }
+
+    /// A message without what it says of nodes that this one has not met, and of lives that a node has not claimed itself.
+    fn without_hearsay(&mut self, from: &NodeId, body: &[u8], updates: &[u8]) -> Result<Vec<u8>, postcard::Error> {
+        let Some((count, mut rest)) = updates.split_first_chunk::<2>() else { return Ok(body.to_vec()) };
+        self.note_met(from);
+        let mut kept = body.get(..body.len() - updates.len()).unwrap_or_default().to_vec();
+        let (mut codec, lives) = (PostcardCodec, self.lives.iter().flatten().collect::<BTreeMap<_, _>>());
+        let mut updates = Vec::new();
+        for _ in 0..u16::from_be_bytes(*count) {
+            let update: foca::Member<NodeId> = codec.decode_member(&mut rest)?;
+            let id = update.id();
+            match lives.get(&id.name) {
+                _ if id.name == self.foca.identity().name => updates.push(update),
+                Some(life) if id.life <= **life => updates.push(update),
+                Some(_) => {}
+                None if update.state() != State::Down => self.outputs.push_back(SwimOutput::Unproven(id.clone())),
+                None => {}
+            }
+        }
+        kept.extend(u16::try_from(updates.len()).unwrap_or(u16::MAX).to_be_bytes());
+        updates.iter().try_for_each(|update| codec.encode_member(update, &mut kept))?;
+        kept.extend_from_slice(rest);
+        Ok(kept)
     }
 
     /// Runs the timers that are due.
@@ -122,8 +161,36 @@ impl Swim {
 
     /// Announces this node to one that was just admitted.
     pub(crate) fn meet(&mut self, peer: NodeId, now: Timestamp) {
+        self.note_met(&peer);
         let announced = self.foca.announce(peer, &mut self.runtime);
         self.finish("announce", announced, now);
+    }
+
+    /// Notes what a node says of itself.
+    pub(crate) fn note_met(&mut self, peer: &NodeId) {
+        if let Some(lives) = &mut self.lives {
+            let life = lives.entry(peer.name.clone()).or_default();
+            *life = peer.life.max(*life);
+        }
+    }
+
+    /// Declares a node down that may no longer take part.
+    pub(crate) fn remove(&mut self, name: &NodeName, now: Timestamp) {
+        if let Some(lives) = &mut self.lives {
+            lives.remove(name);
+        }
+        let known = self.foca.iter_membership_state().find(|member| member.id().name == *name);
+        if let Some(id) = known.map(|member| member.id().clone()) {
+            let down = foca::Member::down(id);
+            let removed = self.foca.apply_many(std::iter::once(down), true, &mut self.runtime);
+            self.finish("removal", removed, now);
+        }
+    }
+
+    #[cfg(test)]
+    pub(crate) fn spread(&mut self, id: NodeId, now: Timestamp) {
+        let spread = self.foca.apply_many(std::iter::once(foca::Member::alive(id)), true, &mut self.runtime);
+        self.finish("lie", spread, now);
     }
 
     /// Takes a `life` after that of the node that had this name before.

@@ -157,7 +157,7 @@ impl Inbox {
     ) -> PacketOutcome {
         self.counters.count(Event::Received);
         self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
-            self.counters.reject(reason);
+            self.counters.reject(reason, &self.source(via, topic));
             tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
             PacketOutcome::Done
         })
@@ -286,6 +286,17 @@ impl Inbox {
             self.counters.count(Event::NameConflict);
             PacketOutcome::Namesake(status.id)
         })
+    }
+
+    /// Name of the node that a topic belongs to, or else the address of the broker.
+    fn source(&self, via: &BrokerAddress, topic: &[u8]) -> String {
+        let topic = std::str::from_utf8(topic).ok().and_then(|path| self.topics.parse(path));
+        match topic {
+            Some(Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Ledger(node) | Topic::Nodes(node)) => {
+                node.to_string()
+            }
+            _ => via.to_string(),
+        }
     }
 
     /// Counts a message that this node published itself.

@@ -177,7 +177,7 @@ impl LinkTask {
                 self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }
             if matches!(error, ConnectionError::Oversized(_)) {
-                self.setup.counters.reject(RejectReason::TooLarge);
+                self.setup.counters.reject(RejectReason::TooLarge, &self.broker.to_string());
                 if !std::mem::replace(&mut self.has_reported_oversized, true) {
                     let limit = self.setup.config.max_packet_bytes();
                     tracing::warn!(broker = %self.broker, limit, "link lost to a packet that is too large; if it is \

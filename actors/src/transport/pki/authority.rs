@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 use std::{fs, io};
 
+use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::Role;
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose, IsCa,
     Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, RevocationReason, RevokedCertParams, SerialNumber,
@@ -14,6 +14,7 @@ use rcgen::{
 use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 
+use super::subject::rights_uri;
 use super::{BROKER_NAME, OBSERVER_MARK};
 use crate::platform::state_file::replace_file;
 
@@ -137,14 +138,14 @@ impl Authority {
     }
 
     /// Makes a key and a certificate for a node, `nodes/<node>.key` and `nodes/<node>.pem`, in place of earlier ones,
-    /// which stay valid until they expire or are revoked.
+    /// which stay valid until they expire or are revoked. The node can declare no more than `rights` in the election.
     ///
     /// # Errors
     /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
     pub fn issue(
         &mut self,
         node: &NodeName,
-        role: Role,
+        rights: impl Into<Rights>,
         valid: Duration,
         now: Timestamp,
     ) -> Result<(), AuthorityError> {
@@ -156,7 +157,9 @@ impl Authority {
         parameters.use_authority_key_identifier_extension = true;
         parameters.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
-        if role != Role::Cav {
+        let rights = Some(rights.into()).filter(|rights: &Rights| rights.may_lead()).unwrap_or(Rights::NONE);
+        parameters.subject_alt_names.push(rcgen::SanType::URI(rights_uri(rights).try_into()?));
+        if rights.may_lead() {
             parameters.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
             let name = BROKER_NAME.try_into()?;
             parameters.subject_alt_names.push(rcgen::SanType::DnsName(name));
@@ -288,6 +291,8 @@ fn replace(path: &Path, text: &str, mode: u32) -> Result<(), AuthorityError> {
 #[cfg(test)]
 mod tests {
     use std::os::unix::fs::PermissionsExt;
+
+    use ecod::wire::Role;
 
     use super::*;
     use crate::platform::clock;

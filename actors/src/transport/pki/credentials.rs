@@ -6,17 +6,21 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use ecod::model::names::NodeName;
+use ecod::wire::Role;
 use rustls::client::{Resumption, WebPkiServerVerifier};
 use rustls::crypto::{CryptoProvider, ring as provider};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer, ServerName};
 use rustls::server::danger::ClientCertVerifier;
 use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
+use rustls::sign::Signer;
 use rustls::version::TLS13;
 use rustls::{ClientConfig, RootCertStore, ServerConfig};
 
+use super::attestation::signer;
 use super::broker_trust::RecordingVerifier;
-use super::{BROKER_NAME, BrokerTrust, CertificateSubject, TlsConfig};
+use super::subject::{rights_uri, role_name};
+use super::{BROKER_NAME, BrokerTrust, CertificateSubject, MAX_CERTIFICATE_BYTES, TlsConfig};
 
 /// Certificates of a node, reloaded when their files change.
 #[derive(Debug)]
@@ -48,8 +52,10 @@ pub struct LoadedCredentials {
     /// Verifier of certificates of the cell's brokers, which have `broker_name` at any address.
     pub(super) brokers: Arc<WebPkiServerVerifier>,
     pub(super) broker_name: ServerName<'static>,
-    certificates: Vec<CertificateDer<'static>>,
+    pub(super) certificates: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
+    /// Signer of the membership's handshakes.
+    pub(super) signer: Box<dyn Signer>,
 }
 
 /// An error in the files of a node's certificates.
@@ -75,6 +81,23 @@ pub enum CredentialsError {
         /// This node.
         node: NodeName,
     },
+    /// The node is configured to be more than its certificate allows.
+    #[error(
+        "keys `role` and `election.priority`: this node is to be {role} with priority {priority}, its certificate \
+         {path} allows at most {allowed}; issue one by `ecod-node pki issue {node} --role {role} --priority {priority}`"
+    )]
+    Overreached {
+        /// The file.
+        path: PathBuf,
+        /// This node.
+        node: NodeName,
+        /// The configured role.
+        role: &'static str,
+        /// The configured priority.
+        priority: u8,
+        /// What the certificate allows.
+        allowed: String,
+    },
     /// Key, certificate, CA and list do not belong together.
     #[error("table `tls`: {0}")]
     Unusable(String),
@@ -92,6 +115,19 @@ impl Credentials {
         let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
         let cache = Mutex::new(CachedCredentials { checked_at: Instant::now(), fingerprints, current });
         Ok(Self { files: files.clone(), node: node.clone(), cache })
+    }
+
+    /// Checks that the node's certificate allows what the node is configured to be.
+    ///
+    /// # Errors
+    /// [`CredentialsError::Overreached`] naming both.
+    pub fn check_rights(&self, role: Role, priority: u8) -> Result<(), CredentialsError> {
+        let rights = self.current().identity.rights_of(&self.node);
+        if rights.allow(role, priority) {
+            return Ok(());
+        }
+        let (path, node) = (self.files.certificate.clone(), self.node.clone());
+        Err(CredentialsError::Overreached { path, node, role: role_name(role), priority, allowed: rights_uri(rights) })
     }
 
     /// The present content of the files. While they are unusable, which is logged, the content before.
@@ -112,6 +148,13 @@ impl Credentials {
             }
         }
         Arc::clone(&cache.current)
+    }
+}
+
+impl LoadedCredentials {
+    /// The node's own certificate and key.
+    pub(super) fn own(&self) -> Option<(&CertificateDer<'static>, &PrivateKeyDer<'static>)> {
+        Some((self.certificates.first()?, &self.key))
     }
 }
 
@@ -146,6 +189,11 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         let (path, found) = (files.certificate.clone(), identity.name().clone());
         return Err(CredentialsError::WrongName { path, found, node: node.clone() });
     }
+    if own.len() > MAX_CERTIFICATE_BYTES {
+        let reason = format!("{} bytes, at most {MAX_CERTIFICATE_BYTES} fit a datagram", own.len());
+        return Err(file_error("tls.certificate", &files.certificate, &reason));
+    }
+    let signer = signer(&key).ok_or_else(|| file_error("tls.key", &files.key, "not an ECDSA P-256 key"))?;
     let clients = client_verifier(&roots, &lists)?;
     let mut server = ServerConfig::builder_with_provider(crypto())
         .with_protocol_versions(&[&TLS13])
@@ -170,7 +218,7 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
     let (server, client) = (Arc::new(server), Arc::new(client));
-    Ok(LoadedCredentials { identity, server, client, clients, brokers, broker_name, certificates, key })
+    Ok(LoadedCredentials { identity, server, client, clients, brokers, broker_name, certificates, key, signer })
 }
 
 fn client_verifier(
@@ -247,8 +295,6 @@ fn fingerprints(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
 
 #[cfg(test)]
 mod tests {
-    use ecod::wire::Role;
-
     use super::*;
     use crate::platform::clock;
     use crate::transport::pki::Authority;
@@ -273,5 +319,23 @@ mod tests {
         fs::copy(authority.revocation_list(), &list).unwrap();
         std::thread::sleep(RELOAD_INTERVAL);
         assert!(!Arc::ptr_eq(&credentials.current(), &before), "and against the next");
+    }
+
+    #[test]
+    fn a_node_that_is_to_be_more_than_its_certificate_allows_is_told_both() {
+        let (directory, euclid) = (tempfile::tempdir().unwrap(), NodeName::from_static("euclid"));
+        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        authority.issue(&euclid, Role::Auto, Duration::from_secs(60), clock::now()).unwrap();
+        let (certificate, key) = authority.files_of(&euclid);
+        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+        let credentials = Credentials::load(&files, &euclid).unwrap();
+        assert!(credentials.check_rights(Role::Auto, 100).is_ok() && credentials.check_rights(Role::Cav, 255).is_ok());
+        for (role, priority) in [(Role::Edge, 100), (Role::Auto, 101)] {
+            let error = credentials.check_rights(role, priority).unwrap_err().to_string();
+            let named = [role_name(role), &priority.to_string(), "ecod:role=auto;priority=100", "pki issue euclid"];
+            assert!(named.iter().all(|part| error.contains(part)), "{error}");
+        }
+        let observer = Credentials::load(&files, &NodeName::from_static("euclid--top")).unwrap();
+        assert!(observer.check_rights(Role::Auto, 0).is_err(), "an observer never leads");
     }
 }

@@ -2,13 +2,15 @@
 
 use std::time::Duration;
 
+use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use ecod::wire::Role;
 use x509_parser::certificate::X509Certificate;
 use x509_parser::extensions::GeneralName;
 use x509_parser::prelude::FromDer;
 
-use super::{BROKER_NAME, OBSERVER_MARK};
+use super::{BROKER_NAME, OBSERVER_MARK, RIGHTS_SCHEME};
 
 /// The node that a certificate names, and its rights. Its signature is verified elsewhere.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -16,6 +18,7 @@ pub struct CertificateSubject {
     name: NodeName,
     may_serve: bool,
     begins: Timestamp,
+    rights: Rights,
     expires: Timestamp,
 }
 
@@ -28,6 +31,9 @@ pub enum InvalidCertificate {
     /// Not exactly one common name, or one that is not a node's name.
     #[error("the certificate's common name is not the name of a node")]
     NoName,
+    /// Role and priority that cannot be understood.
+    #[error("the certificate's rights are not `ecod:role=auto|cav|edge;priority=0..255`")]
+    Rights,
 }
 
 impl CertificateSubject {
@@ -41,13 +47,21 @@ impl CertificateSubject {
         let (Some(name), None) = (names.next(), names.next()) else { return Err(InvalidCertificate::NoName) };
         let name = name.as_str().ok().and_then(|name| NodeName::new(name).ok()).ok_or(InvalidCertificate::NoName)?;
         let alternatives = parsed.subject_alternative_name().ok().flatten();
-        let may_serve = alternatives.is_some_and(|names| {
-            names.value.general_names.iter().any(|name| matches!(name, GeneralName::DNSName(BROKER_NAME)))
+        let alternatives = alternatives.map(|names| &names.value.general_names[..]).unwrap_or_default();
+        let may_serve = alternatives.iter().any(|name| matches!(name, GeneralName::DNSName(BROKER_NAME)));
+        let rights = alternatives.iter().find_map(|name| match name {
+            GeneralName::URI(uri) => uri.strip_prefix(RIGHTS_SCHEME),
+            _ => None,
         });
+        let rights = match rights {
+            _ if !may_serve => Rights::NONE,
+            Some(rights) => parse_rights(rights).ok_or(InvalidCertificate::Rights)?,
+            None => Rights::default(),
+        };
         let time = |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
         let validity = parsed.validity();
         let (begins, expires) = (time(validity.not_before.timestamp()), time(validity.not_after.timestamp()));
-        Ok(Self { name, may_serve, begins, expires })
+        Ok(Self { name, may_serve, rights, begins, expires })
     }
 
     /// The node's name.
@@ -65,6 +79,17 @@ impl CertificateSubject {
         self.begins
     }
 
+    /// Highest role and priority of the node in the election. A certificate of a version that wrote none allows all, if
+    /// it is one of a broker.
+    pub fn rights(&self) -> Rights {
+        self.rights
+    }
+
+    /// Rights of a node or observer that uses the certificate. An observer never leads.
+    pub fn rights_of(&self, name: &NodeName) -> Rights {
+        if *name == self.name { self.rights } else { Rights::NONE }
+    }
+
     /// End of the certificate's validity.
     pub fn expires(&self) -> Timestamp {
         self.expires
@@ -74,5 +99,69 @@ impl CertificateSubject {
     /// observer publishes nothing but a status, so that one certificate is one vehicle.
     pub fn may_act_as(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
+    }
+}
+
+/// The rights in a certificate, as its alternative name of kind URI.
+pub(super) fn rights_uri(rights: Rights) -> String {
+    format!("{RIGHTS_SCHEME}role={};priority={}", role_name(rights.role), rights.priority)
+}
+
+pub(super) fn role_name(role: Role) -> &'static str {
+    match role {
+        Role::Auto => "auto",
+        Role::Cav => "cav",
+        Role::Edge => "edge",
+    }
+}
+
+/// Reads `role=auto;priority=100`; entries that later versions may add are ignored.
+fn parse_rights(text: &str) -> Option<Rights> {
+    let entry = |key: &str| text.split(';').find_map(|entry| entry.strip_prefix(key)?.strip_prefix('='));
+    let role = match entry("role")? {
+        "auto" => Role::Auto,
+        "cav" => Role::Cav,
+        "edge" => Role::Edge,
+        _ => return None,
+    };
+    Some(Rights { role, priority: entry("priority")?.parse().ok()? })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rights_are_read_as_they_are_written_and_otherwise_not() {
+        let rights = Rights { role: Role::Auto, priority: 7 };
+        assert_eq!(rights_uri(rights), "ecod:role=auto;priority=7");
+        assert_eq!(parse_rights("role=auto;priority=7"), Some(rights));
+        assert_eq!(parse_rights("zone=3;priority=7;role=auto"), Some(rights));
+        for text in ["", "role=auto", "priority=7", "role=chief;priority=7", "role=auto;priority=256"] {
+            assert_eq!(parse_rights(text), None, "{text}");
+        }
+    }
+
+    /// The subject of a certificate for `edge` with these alternative names.
+    fn subject(names: Vec<rcgen::SanType>) -> Result<CertificateSubject, InvalidCertificate> {
+        let mut parameters = rcgen::CertificateParams::default();
+        parameters.distinguished_name.push(rcgen::DnType::CommonName, "edge");
+        parameters.subject_alt_names = names;
+        let certificate = parameters.self_signed(&rcgen::KeyPair::generate().unwrap()).unwrap();
+        CertificateSubject::of(certificate.der())
+    }
+
+    #[test]
+    fn a_certificate_of_a_version_that_wrote_no_rights_still_lets_a_broker_lead() {
+        let broker = || rcgen::SanType::DnsName(BROKER_NAME.try_into().unwrap());
+        let uri = |text: &str| rcgen::SanType::URI(text.try_into().unwrap());
+        assert_eq!(subject(vec![broker()]).unwrap().rights(), Rights::default());
+        assert_eq!(subject(vec![uri("https://example.org"), broker()]).unwrap().rights(), Rights::default());
+        assert_eq!(subject(Vec::new()).unwrap().rights(), Rights::NONE, "a vehicle's");
+        assert_eq!(subject(vec![uri("ecod:role=edge;priority=9")]).unwrap().rights(), Rights::NONE, "without a broker");
+        let both = subject(vec![broker(), uri("ecod:role=auto;priority=9")]).unwrap();
+        assert_eq!(both.rights(), Rights { role: Role::Auto, priority: 9 });
+        assert_eq!(both.rights_of(&NodeName::from_static("edge--top")), Rights::NONE, "an observer's");
+        assert_eq!(subject(vec![broker(), uri("ecod:role=chief")]), Err(InvalidCertificate::Rights));
     }
 }

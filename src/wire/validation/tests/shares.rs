@@ -1,9 +1,10 @@
 //! Shares of the ledger: the largest one fits, and each flaw has its reason.
 
 use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
 use crate::wire::{
-    Encoding, LedgerEntry, LedgerShare, Limits, MAX_INTEGER, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION,
-    decode_share, encode,
+    Encoding, LedgerEntry, LedgerShare, LedgerSignature, Limits, MAX_INTEGER, MAX_SHARE_ENTRIES, RejectReason,
+    SCHEMA_VERSION, decode_share, encode,
 };
 
 fn share() -> LedgerShare {
@@ -22,6 +23,8 @@ fn share() -> LedgerShare {
         epoch: Some(3),
         entries: vec![entry; MAX_SHARE_ENTRIES],
         marks: Vec::new(),
+        signed: Some(LedgerSignature { certificate: "A".repeat(4096), signature: "A".repeat(96) }),
+        reset_at_us: Some(Timestamp(MAX_INTEGER)),
     }
 }
 
@@ -36,12 +39,14 @@ fn reason(share: &LedgerShare) -> Option<RejectReason> {
 fn the_largest_share_fits_and_each_flaw_has_its_reason() {
     assert_eq!(reason(&share()), None);
     type Flaw = (fn(&mut LedgerShare), RejectReason);
-    let flaws: [Flaw; 5] = [
+    let flaws: [Flaw; 7] = [
         (|s| s.schema = 2, RejectReason::UnknownSchema),
         (|s| s.node = NodeName::from_static("gauss"), RejectReason::NodeMismatch),
         (|s| s.entries.truncate(1), RejectReason::TooManyObjects),
         (|s| s.entries[7].incorrect += 1, RejectReason::OutOfRange),
         (|s| s.entries[7].label = "".into(), RejectReason::InvalidLabel),
+        (|s| s.reset_at_us = Some(Timestamp(MAX_INTEGER + 1)), RejectReason::OutOfRange),
+        (|s| s.signed.as_mut().unwrap().certificate.push('A'), RejectReason::TooLarge),
     ];
     for (spoil, expected) in flaws {
         let mut share = share();

@@ -4,6 +4,10 @@ use ecod::wire::Role;
 use proptest::prelude::*;
 
 use super::*;
+use crate::transport::gossip::frame::Handshake;
+use crate::transport::gossip::handshake::Identity;
+
+mod certificates;
 
 const NOW: Timestamp = Timestamp(1_700_000_000_000_000);
 
@@ -16,18 +20,36 @@ struct End {
 
 impl End {
     fn new(name: &'static str, session: u8) -> Self {
+        Self::with(name, session, None)
+    }
+
+    fn with(name: &'static str, session: u8, identity: Option<Identity>) -> Self {
         let address = SocketAddr::from((Ipv4Addr::new(10, 0, 0, session), 1));
         let name = NodeName::from_static(name);
         let key = CellKey::new(&"07".repeat(32), &NodeName::from_static("lot-1"));
         let id = NodeId { name, run: 1, life: 1, role: Role::Auto, gossip: address, broker: None };
-        let sessions = Sessions::new(key, [session; 16], &[session; 32], 4, Arc::default(), NOW);
+        let sessions = Sessions::new(key, (&id.name, [session; 16], identity), &[session; 32], 4, Arc::default(), NOW);
         Self { sessions, id, address, known: None }
+    }
+
+    fn hello(&mut self) -> Vec<u8> {
+        self.sessions.hello(&self.id.clone(), false)
+    }
+
+    /// A frame with the word for the node of a name.
+    fn seal(&mut self, to: &NodeName, word: &[u8]) -> Vec<u8> {
+        self.sessions.seal(to, FrameKind::Payload, word, NOW).unwrap().1
     }
 
     fn open(&mut self, frame: &[u8], from: SocketAddr, now: Timestamp) -> Result<FrameContent, FrameEvent> {
         let known = self.known;
         self.sessions.open(frame, &Arrival { from, now, own: &self.id, known: &|_| known })
     }
+}
+
+fn payload(from: &End, body: &[u8]) -> FrameContent {
+    let rights = from.sessions.prover.as_ref().map_or(Rights::default(), |_| Role::Auto.into());
+    FrameContent::Payload { from: from.id.name.clone(), rights, body: body.to_vec() }
 }
 
 fn answer(opened: Result<FrameContent, FrameEvent>) -> Vec<u8> {
@@ -39,7 +61,7 @@ fn answer(opened: Result<FrameContent, FrameEvent>) -> Vec<u8> {
 
 /// The four frames of a handshake.
 fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
-    let hello = a.sessions.hello(&a.id.clone());
+    let hello = a.hello();
     let challenge = answer(b.open(&hello, a.address, NOW));
     let proof = answer(a.open(&challenge, b.address, NOW));
     let accept = answer(b.open(&proof, a.address, NOW));
@@ -51,14 +73,34 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
 fn introduced_nodes_understand_each_other_once() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
     introduce(&mut a, &mut b);
-    let (to, frame) = a.sessions.seal(&b.id.name, FrameKind::Payload, b"hi").unwrap();
+    let (to, frame) = a.sessions.seal(&b.id.name, FrameKind::Payload, b"hi", NOW).unwrap();
     assert_eq!(to, b.address);
-    let heard = FrameContent::Payload { from: a.id.name.clone(), body: b"hi".to_vec() };
+    let heard = payload(&a, b"hi");
     assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::Replayed));
     assert_eq!(a.open(&frame, b.address, NOW), Err(FrameEvent::Replayed), "sent back");
     assert_eq!(End::new("c", 3).open(&frame, a.address, NOW), Err(FrameEvent::BadSeal));
     assert_eq!(End::new("b", 4).open(&frame, a.address, NOW), Err(FrameEvent::BadSeal), "restarted");
+}
+
+/// A holder of the cell's key makes a frame in the name of a session that it saw.
+fn forge(key: &CellKey, sender: &SessionId, receiver: &SessionId, counter: u64) -> Vec<u8> {
+    let head = FrameHeader { version: Version::Key, kind: FrameKind::Payload, sender: *sender, counter };
+    head.write(key.tag(), b"forged", &key.seal(sender, receiver))
+}
+
+#[test]
+fn a_counter_from_beyond_mutes_nobody() {
+    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    introduce(&mut a, &mut b);
+    for counter in [u64::MAX, u64::MAX - 1, 1 << 53, 1 << 22] {
+        let frame = forge(&a.sessions.key, &[1; 16], &[2; 16], counter);
+        assert_eq!(b.open(&frame, a.address, NOW), Ok(FrameContent::Stranger), "{counter}");
+    }
+    assert_eq!(b.sessions.counters.get(FrameEvent::CounterJump), 4);
+    let frame = a.seal(&b.id.name, b"hi");
+    let heard = payload(&a, b"hi");
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
 }
 
 #[test]
@@ -73,26 +115,26 @@ fn recorded_handshakes_admit_nobody() {
     let mut restarted = End::new("b", 3);
     assert!(matches!(restarted.open(&hello, a.address, NOW), Ok(FrameContent::Answer(_))), "at most a challenge");
     assert_eq!(restarted.open(&proof, a.address, NOW), Err(FrameEvent::BadSeal));
-    assert!(restarted.sessions.peers.is_empty());
+    assert!(restarted.sessions.peers.len() == 0);
 }
 
 #[test]
 fn a_proof_from_elsewhere_or_too_late_is_none() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
-    let hello = a.sessions.hello(&a.id.clone());
+    let hello = a.hello();
     let challenge = answer(b.open(&hello, a.address, NOW));
     let proof = answer(a.open(&challenge, b.address, NOW));
     let elsewhere = SocketAddr::from(([10, 0, 0, 9], 1));
     assert_eq!(b.open(&proof, elsewhere, NOW), Err(FrameEvent::Replayed));
     assert_eq!(b.open(&proof, a.address, NOW + Duration::from_secs(5)), Err(FrameEvent::Replayed));
-    assert!(b.sessions.peers.is_empty());
+    assert!(b.sessions.peers.len() == 0);
 }
 
 #[test]
 fn frames_of_strangers_cause_a_greeting_and_count() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
     introduce(&mut a, &mut b);
-    let (_, frame) = a.sessions.seal(&b.id.name, FrameKind::Gossip, b"news").unwrap();
+    let frame = a.seal(&b.id.name, b"news");
     b.sessions.peers.clear();
     assert_eq!(b.open(&frame, a.address, NOW), Ok(FrameContent::Stranger));
     assert_eq!(b.sessions.counters.get(FrameEvent::Unestablished), 1);
@@ -105,7 +147,7 @@ fn the_table_is_bounded_and_only_the_silent_give_way() {
         introduce(&mut End::new(name, session), &mut b);
     }
     let mut late = End::new("z", 5);
-    let hello = late.sessions.hello(&late.id.clone());
+    let hello = late.hello();
     let mut try_at = |now| {
         let challenge = answer(b.open(&hello, late.address, now));
         let proof = answer(late.open(&challenge, b.address, now));
@@ -119,7 +161,7 @@ fn the_table_is_bounded_and_only_the_silent_give_way() {
 #[test]
 fn junk_is_told_apart() {
     let mut a = End::new("a", 1);
-    let hello = End::new("b", 2).sessions.hello(&a.id.clone());
+    let hello = End::new("b", 2).hello();
     let from = SocketAddr::from(([10, 0, 0, 9], 1));
     let mut elsewhere = hello.clone();
     elsewhere[4] ^= 1;
@@ -137,8 +179,9 @@ proptest! {
         introduce(&mut a, &mut b);
         let kind = [FrameKind::Hello, FrameKind::Handshake, FrameKind::Gossip, FrameKind::Payload][usize::from(kind) - 1];
         let head = a.sessions.head(kind);
-        let seal = if kind == FrameKind::Hello { &a.sessions.everybody } else { &a.sessions.peers[&[2; 16]].to };
-        let frame = head.write(a.sessions.key.tag(), &body, seal);
+        let seal = if kind == FrameKind::Hello { &BROADCAST } else { &[2; 16] };
+        let seal = a.sessions.key.seal(&[1; 16], seal);
+        let frame = head.write(a.sessions.key.tag(), &body, &seal);
         let _ = b.open(&frame, a.address, NOW);
         prop_assert_eq!(b.sessions.peers.len(), 1);
     }

@@ -1,4 +1,4 @@
-//! Counts of messages shed under overload, by reason and source.
+//! Counts of messages that were not used, by reason and source.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -32,21 +32,28 @@ impl ShedReason {
     }
 }
 
-/// Messages of one source shed for one reason.
+/// Messages of one source that were not used for one reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Shed {
+pub struct SourceCount<R> {
     /// Why.
-    pub reason: ShedReason,
+    pub reason: R,
     /// Name of the node, or address or id of the broker's client.
     pub source: String,
     /// Number of messages.
     pub times: u64,
 }
 
+/// Messages of one source shed for one reason.
+pub type Shed = SourceCount<ShedReason>;
+
 /// Counts by reason and source.
-#[derive(Debug, Default)]
-pub(super) struct Shedding {
-    counts: Mutex<BTreeMap<(ShedReason, String), u64>>,
+#[derive(Debug)]
+pub(super) struct CountsBySource<R>(Mutex<BTreeMap<(R, String), u64>>);
+
+impl<R> Default for CountsBySource<R> {
+    fn default() -> Self {
+        Self(Mutex::default())
+    }
 }
 
 /// Maximum pairs of reason and source with a count of their own; further sources share [`OTHERS`].
@@ -55,41 +62,32 @@ const MAX_TRACKED_SOURCES: usize = 64;
 /// Source name under which further sources are counted together.
 pub const OTHERS: &str = "others";
 
-impl Shedding {
-    /// Counts one message; the first of each source is also a warning.
-    pub(super) fn count(&self, reason: ShedReason, source: &str) {
+impl<R: Copy + Ord> CountsBySource<R> {
+    /// Counts one message; true for the first of a source.
+    pub(super) fn count(&self, reason: R, source: &str) -> bool {
         let mut counts = self.counts();
         let key = (reason, source.to_owned());
         if let Some(times) = counts.get_mut(&key) {
             *times += 1;
-        } else if counts.len() < MAX_TRACKED_SOURCES {
-            counts.insert(key, 1);
-            tracing::warn!(source, reason = reason.as_str(), "more comes in than is taken, the rest is left out");
-        } else {
-            *counts.entry((reason, OTHERS.to_owned())).or_default() += 1;
+            return false;
         }
+        let has_room = counts.len() < MAX_TRACKED_SOURCES;
+        let key = if has_room { key } else { (reason, OTHERS.to_owned()) };
+        *counts.entry(key).or_default() += 1;
+        has_room
     }
 
-    /// Counts by reason over all sources, zeros included.
-    pub(super) fn sums(&self) -> BTreeMap<&'static str, u64> {
-        let mut sums: BTreeMap<_, _> = ShedReason::ALL.iter().map(|reason| (reason.as_str(), 0)).collect();
-        for ((reason, _), times) in &*self.counts() {
-            *sums.entry(reason.as_str()).or_default() += times;
-        }
-        sums
-    }
-
-    pub(super) fn snapshot(&self) -> Vec<Shed> {
-        let shed = |((reason, source), times): (&(ShedReason, String), &u64)| Shed {
+    pub(super) fn snapshot(&self) -> Vec<SourceCount<R>> {
+        let count = |((reason, source), times): (&(R, String), &u64)| SourceCount {
             reason: *reason,
             source: source.clone(),
             times: *times,
         };
-        self.counts().iter().map(shed).collect()
+        self.counts().iter().map(count).collect()
     }
 
-    fn counts(&self) -> MutexGuard<'_, BTreeMap<(ShedReason, String), u64>> {
-        self.counts.lock().unwrap_or_else(PoisonError::into_inner)
+    fn counts(&self) -> MutexGuard<'_, BTreeMap<(R, String), u64>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -99,23 +97,17 @@ mod tests {
 
     #[test]
     fn sources_are_told_apart_until_there_are_too_many() {
-        let shedding = Shedding::default();
+        let shed = CountsBySource::default();
         for source in 0..2 * MAX_TRACKED_SOURCES {
-            for _ in 0..2 {
-                shedding.count(ShedReason::ReportThrottled, &format!("v{source:03}"));
+            for time in 0..2 {
+                let is_first = shed.count(ShedReason::ReportThrottled, &format!("v{source:03}"));
+                assert_eq!(is_first, time == 0 && source < MAX_TRACKED_SOURCES, "source {source}");
             }
         }
-        let snapshot = shedding.snapshot();
+        let snapshot = shed.snapshot();
         assert_eq!(snapshot.len(), MAX_TRACKED_SOURCES + 1);
-        assert_eq!(snapshot.iter().map(|shed| shed.times).sum::<u64>(), 4 * MAX_TRACKED_SOURCES as u64);
-        let others = snapshot.iter().find(|shed| shed.source == OTHERS).unwrap();
+        assert_eq!(snapshot.iter().map(|count| count.times).sum::<u64>(), 4 * MAX_TRACKED_SOURCES as u64);
+        let others = snapshot.iter().find(|count| count.source == OTHERS).unwrap();
         assert_eq!(others.times, 2 * MAX_TRACKED_SOURCES as u64);
-        let sums = shedding.sums();
-        let expected =
-            [("broker_throttled", 0), ("ledger_throttled", 0), ("report_replaced", 0), ("status_throttled", 0)];
-        assert_eq!(
-            sums,
-            BTreeMap::from_iter(expected.into_iter().chain([("report_throttled", 4 * MAX_TRACKED_SOURCES as u64)]))
-        );
     }
 }

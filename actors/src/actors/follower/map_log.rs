@@ -1,0 +1,85 @@
+//! The file to which accepted maps are appended.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use ecod::model::time::Timestamp;
+
+use crate::messages::newest::ReceivedMap;
+
+/// Time after a failure until the file is opened again.
+const RETRY_PAUSE: Duration = Duration::from_secs(60);
+
+/// A file of maps with their times of receipt, one JSON object a line. A disk that refuses it costs its lines only.
+pub(super) struct MapLog {
+    path: PathBuf,
+    file: Option<BufWriter<File>>,
+    retry_at: Timestamp,
+}
+
+impl MapLog {
+    /// A log that is opened with the first map.
+    pub(super) fn new(path: PathBuf) -> Self {
+        Self { path, file: None, retry_at: Timestamp::default() }
+    }
+
+    /// Appends a map. A failure is logged, and ends attempts for [`RETRY_PAUSE`].
+    pub(super) fn append(&mut self, map: &ReceivedMap) {
+        if self.file.is_none() && map.received_at < self.retry_at {
+            return;
+        }
+        if let Err(error) = self.write(map) {
+            self.file = None;
+            self.retry_at = map.received_at + RETRY_PAUSE;
+            let (path, retry_in) = (self.path.display(), RETRY_PAUSE.as_secs());
+            tracing::warn!(%path, %error, retry_in_s = retry_in, "maps are not logged; make room, or change `map_log`");
+        }
+    }
+
+    fn write(&mut self, map: &ReceivedMap) -> io::Result<()> {
+        let file = match &mut self.file {
+            Some(file) => file,
+            None => {
+                let file = File::options().create(true).append(true).open(&self.path)?;
+                self.file.insert(BufWriter::new(file))
+            }
+        };
+        serde_json::to_writer(&mut *file, map)?;
+        file.write_all(b"\n")?;
+        file.flush()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ecod::wire::{GlobalMap, SCHEMA_VERSION};
+
+    use super::*;
+
+    fn map(received_at: Timestamp) -> ReceivedMap {
+        let map: GlobalMap = serde_json::from_value(serde_json::json!({
+            "schema": SCHEMA_VERSION, "aggregator": "edge", "epoch": 1, "round": 1, "fused_at_us": 0,
+            "landmarks": [], "objects": []
+        }))
+        .unwrap();
+        ReceivedMap { received_at, map: Arc::new(map) }
+    }
+
+    #[test]
+    fn a_log_that_cannot_be_written_is_tried_again_later() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("absent").join("maps.jsonl");
+        let mut log = MapLog::new(path.clone());
+        log.append(&map(Timestamp(0)));
+        std::fs::create_dir(path.parent().unwrap()).unwrap();
+        log.append(&map(Timestamp(0) + RETRY_PAUSE / 2));
+        assert!(!path.exists());
+        log.append(&map(Timestamp(0) + RETRY_PAUSE));
+        log.append(&map(Timestamp(0) + RETRY_PAUSE));
+        assert_eq!(std::fs::read_to_string(&path).unwrap().lines().count(), 2);
+    }
+}

@@ -1,0 +1,57 @@
+//! `ecod-node reset`: forgets the evidence about vehicles, or the highest term.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use anyhow::{Context, anyhow};
+use clap::{ArgGroup, Args};
+
+use super::{Failure, print};
+use crate::actors::reputation_keeper::reset_saved;
+use crate::node::config::NodeConfig;
+use crate::platform::clock;
+use crate::platform::state_file::StateFile;
+
+/// Flags of `reset`.
+#[derive(Debug, Args)]
+#[command(group(ArgGroup::new("what").required(true).multiple(true)))]
+pub(super) struct ResetArguments {
+    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// Forget the evidence behind the reputations. In a cell without certificates all nodes forget it
+    #[arg(long, group = "what")]
+    reputations: bool,
+    /// Forget the highest term of leadership
+    #[arg(long, group = "what")]
+    term: bool,
+}
+
+/// Resets the files; the node must not run.
+pub(super) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
+    let config =
+        NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new()).map_err(Failure::usage)?;
+    let missing = |key: &str, what: &str| Failure::usage(anyhow!("key `{key}`: {what}"));
+    let directory = config.state_dir.as_deref().ok_or_else(|| missing("state_dir", "not set, so nothing is saved"))?;
+    let name = config.name.as_ref().ok_or_else(|| missing("name", "not set, so the node's files are not known"))?;
+    let file = |what: &str| StateFile::new(directory, &config.cell, name, what);
+    let _lock = StateFile::lock(directory, &config.cell, name)
+        .with_context(|| format!("{name} runs and would write its state again; stop it, and repeat the command"))?;
+    let mut done = String::new();
+    if arguments.reputations {
+        if !config.may_lead() {
+            return Err(Failure::usage(anyhow!(
+                "{name} never leads and keeps no evidence: reset a node that may lead"
+            )));
+        }
+        let file = file("reputations");
+        reset_saved(&file, &config.cell, name, clock::now()).with_context(|| file.path().display().to_string())?;
+        done += &format!("reset {}\n", file.path().display());
+    }
+    if arguments.term {
+        let file = file("term");
+        file.delete().with_context(|| file.path().display().to_string())?;
+        done += &format!("removed {}\n", file.path().display());
+    }
+    Ok(print(&(done + "start the node again\n"))?)
+}

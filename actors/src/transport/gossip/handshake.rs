@@ -1,0 +1,275 @@
+//! Proof of certificates in the handshake: transcripts, signatures, and the keys that come of it.
+//!
+//! The prover signs with its proof, the accepter with its accept. Each names in its transcript both sessions, both
+//! cookies and its own ephemeral key; the accepter's transcript includes the prover's. The frame keys depend on the
+//! accepter's transcript. So two nodes with the same keys agree on everything in it, and on each other's certificate.
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::leadership::Rights;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ring::agreement::{self, EphemeralPrivateKey, UnparsedPublicKey, X25519};
+use ring::digest;
+use ring::rand::SystemRandom;
+use rustls::pki_types::UnixTime;
+use serde::{Deserialize, Serialize};
+
+use super::counters::FrameEvent;
+use super::frame::HEADER_BYTES;
+use super::key::{CellKey, Cookie, SessionId, SessionNonce, session_of};
+use super::refusals::Refusals;
+use super::replay_window::ReplayWindow;
+use super::session_keys::KeySet;
+use crate::transport::pki::{CertificateSubject, Distrust, LoadedCredentials, is_signed_by};
+
+/// Certificates of this node, and the time at which others' are verified.
+#[derive(Clone)]
+pub(crate) struct Identity {
+    pub(crate) credentials: Arc<LoadedCredentials>,
+    /// This machine's wall clock.
+    pub(crate) wall: UnixTime,
+}
+
+/// The proof of a certificate, behind a [`Handshake`](super::frame::Handshake) in the same frame.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Attestation {
+    /// Public X25519 key for this handshake.
+    pub(crate) ephemeral: [u8; 32],
+    /// With the name, the preimage of the sender's session: nobody takes the session of another name.
+    pub(crate) nonce: SessionNonce,
+    /// The sender's certificate in DER.
+    pub(crate) certificate: Vec<u8>,
+    /// Its owner's signature of the transcript.
+    pub(crate) signature: Vec<u8>,
+}
+
+/// Hash of all that one side signs.
+pub(crate) type Transcript = [u8; 32];
+
+/// Side of a handshake; its label in what it signs, so that no signature can be given back to its maker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Side {
+    Prover,
+    Accepter,
+}
+
+/// A message of a handshake as it is signed.
+pub(crate) struct SignedMessage<'a> {
+    pub(crate) side: Side,
+    /// Head of its frame, with the sender's session and counter.
+    pub(crate) head: [u8; HEADER_BYTES],
+    pub(crate) receiver: SessionId,
+    /// The prover's transcript for an accepter; the accepter's name for a prover.
+    pub(crate) context: &'a [u8],
+    /// The encoded message.
+    pub(crate) message: &'a [u8],
+}
+
+/// The owner of a verified certificate.
+#[derive(Debug, Clone)]
+pub(crate) struct Proven {
+    pub(crate) certificate: Vec<u8>,
+    pub(crate) expires: Timestamp,
+    pub(crate) rights: Rights,
+}
+
+/// This node's side of handshakes in a cell with certificates.
+pub(crate) struct Prover {
+    identity: Identity,
+    nonce: SessionNonce,
+    random: SystemRandom,
+    pending: HashMap<PendingKey, PendingProof>,
+    refusals: Refusals,
+}
+
+/// Session, address and cookie of a challenger: a forged challenge does not replace an honest one's proof.
+pub(crate) type PendingKey = (SessionId, SocketAddr, Cookie);
+
+/// A proof that was sent and not yet accepted.
+pub(crate) struct PendingProof {
+    since: Timestamp,
+    private: EphemeralPrivateKey,
+    transcript: Transcript,
+    /// Name of the challenger.
+    pub(crate) accepter: NodeName,
+}
+
+impl Prover {
+    pub(crate) fn new(identity: Identity, nonce: SessionNonce) -> Self {
+        Self { identity, nonce, random: SystemRandom::new(), pending: HashMap::new(), refusals: Refusals::default() }
+    }
+
+    /// Replaces the certificates and the time; true when the certificates are others.
+    pub(crate) fn set_identity(&mut self, identity: Identity) -> bool {
+        let has_changed = !Arc::ptr_eq(&self.identity.credentials, &identity.credentials);
+        self.identity = identity;
+        if has_changed {
+            self.refusals = Refusals::default();
+        }
+        has_changed
+    }
+
+    #[cfg(test)]
+    pub(crate) fn identity(&self) -> &Identity {
+        &self.identity
+    }
+
+    /// The node's certificate in DER.
+    pub(crate) fn certificate(&self) -> &[u8] {
+        self.identity.credentials.certificate()
+    }
+
+    /// Whether a certificate that was verified before has expired meanwhile.
+    pub(crate) fn has_expired(&self, proven: &Proven) -> bool {
+        proven.expires.micros() / 1_000_000 < self.identity.wall.as_secs()
+    }
+
+    /// Whether a node's certificate proves its name.
+    pub(crate) fn verify(&mut self, name: &NodeName, certificate: &[u8], from: SocketAddr) -> Option<Proven> {
+        let checked = self.identity.credentials.verify_node(certificate, self.identity.wall);
+        let refusal = match checked {
+            Ok(subject) if subject.may_act_as(name.as_str()) => return Some(proven(&subject, name, certificate)),
+            Ok(subject) => format!("its certificate is for {}", subject.name()),
+            Err(Distrust::Untrusted(error)) => error.to_string(),
+            Err(Distrust::Invalid(error)) => error.to_string(),
+        };
+        self.refusals.log(name, from, &refusal);
+        None
+    }
+
+    /// A key pair for one handshake; `None` when the system gives no random numbers.
+    pub(crate) fn draw_ephemeral(&self) -> Option<(EphemeralPrivateKey, [u8; 32])> {
+        let private = EphemeralPrivateKey::generate(&X25519, &self.random).ok()?;
+        let public = private.compute_public_key().ok()?;
+        let public = public.as_ref().try_into().ok()?;
+        Some((private, public))
+    }
+
+    /// This node's proof for a message, and the transcript of it.
+    pub(crate) fn attest(&self, signed: &SignedMessage<'_>, ephemeral: [u8; 32]) -> Option<(Attestation, Transcript)> {
+        let (nonce, certificate) = (self.nonce, self.certificate().to_vec());
+        let mut attestation = Attestation { ephemeral, nonce, certificate, signature: Vec::new() };
+        let transcript = signed.transcript(&attestation);
+        attestation.signature = self.identity.credentials.sign(&signed.side.statement(&transcript)).ok()?;
+        Some((attestation, transcript))
+    }
+
+    /// Verifies another node's proof of its name for a message.
+    pub(crate) fn check(
+        &mut self,
+        signed: &SignedMessage<'_>,
+        attestation: &Attestation,
+        (name, session, from): (&NodeName, &SessionId, SocketAddr),
+    ) -> Result<(Proven, Transcript), FrameEvent> {
+        if session_of(name, &attestation.nonce) != *session {
+            return Err(FrameEvent::Untrusted);
+        }
+        let transcript = signed.transcript(attestation);
+        let statement = signed.side.statement(&transcript);
+        if !is_signed_by(&attestation.certificate, &statement, &attestation.signature) {
+            return Err(FrameEvent::Untrusted);
+        }
+        let proven = self.verify(name, &attestation.certificate, from).ok_or(FrameEvent::Untrusted)?;
+        Ok((proven, transcript))
+    }
+
+    /// Whether a challenge needs an answer: the proof for it is not under way already.
+    pub(crate) fn wants_proof(&mut self, key: &PendingKey, now: Timestamp) -> bool {
+        self.pending.retain(|_, proof| now.since(proof.since) < PROOF_TIMEOUT);
+        let repeated = |proof: &PendingProof| now.since(proof.since) >= PROOF_RETRY;
+        self.pending.len() < MAX_PENDING_PROOFS && self.pending.get(key).is_none_or(repeated)
+    }
+
+    /// Remembers a proof that is sent.
+    pub(crate) fn expect_accept(
+        &mut self,
+        key: PendingKey,
+        (private, transcript): (EphemeralPrivateKey, Transcript),
+        accepter: NodeName,
+        now: Timestamp,
+    ) {
+        self.pending.insert(key, PendingProof { since: now, private, transcript, accepter });
+    }
+
+    /// Proofs to a session at an address that wait for an accept.
+    pub(crate) fn pending(&self, session: &SessionId, address: SocketAddr) -> Vec<(PendingKey, Transcript, NodeName)> {
+        let to = self.pending.iter().filter(|((to, at, _), _)| to == session && *at == address);
+        to.map(|(key, proof)| (*key, proof.transcript, proof.accepter.clone())).collect()
+    }
+
+    /// The ephemeral key of a proof that was accepted. No other proof to the session waits any more.
+    pub(crate) fn take_pending(&mut self, key: &PendingKey) -> Option<EphemeralPrivateKey> {
+        let proof = self.pending.remove(key);
+        self.pending.retain(|(session, ..), _| *session != key.0);
+        proof.map(|proof| proof.private)
+    }
+
+    /// Logs that a node without certificate, or with one where this node has none, was refused.
+    pub(crate) fn log_uncertified(&mut self, name: &NodeName, from: SocketAddr) {
+        self.refusals.log(name, from, "it shows no certificate: it has no `[tls]`, or an earlier version of ecod-node");
+    }
+}
+
+impl Side {
+    /// The text that is signed.
+    fn statement(self, transcript: &Transcript) -> Vec<u8> {
+        [self.label(), transcript].concat()
+    }
+
+    /// No TLS signature begins like this, so that the key can serve both.
+    fn label(self) -> &'static [u8] {
+        match self {
+            Self::Prover => b"ecod membership 2 proof\0",
+            Self::Accepter => b"ecod membership 2 accept\0",
+        }
+    }
+}
+
+impl SignedMessage<'_> {
+    /// Hash of the message with all that it must not be separated from, each part with its length.
+    fn transcript(&self, attestation: &Attestation) -> Transcript {
+        let Attestation { ephemeral, nonce, certificate, signature: _ } = attestation;
+        let mut hash = digest::Context::new(&digest::SHA256);
+        let parts: [&[u8]; 8] =
+            [self.side.label(), &self.head, &self.receiver, self.context, self.message, ephemeral, nonce, certificate];
+        for part in parts {
+            hash.update(&(part.len() as u64).to_be_bytes());
+            hash.update(part);
+        }
+        hash.finish().as_ref().try_into().unwrap_or_default()
+    }
+}
+
+/// The keys of a handshake: a function of the cell's key, the ephemeral keys and the accepter's transcript.
+pub(crate) fn agree(
+    cell: &CellKey,
+    (private, theirs): (EphemeralPrivateKey, &[u8; 32]),
+    transcript: &Transcript,
+    (own, other): (&SessionId, &SessionId),
+    is_confirmed: bool,
+) -> Result<KeySet, FrameEvent> {
+    let theirs = UnparsedPublicKey::new(&X25519, theirs);
+    let agreed = agreement::agree_ephemeral(private, &theirs, |secret| {
+        let session = cell.session(secret, transcript);
+        (session.seal(own, other), session.seal(other, own))
+    });
+    let (to, from) = agreed.map_err(|_| FrameEvent::Untrusted)?;
+    Ok(KeySet { to, from, window: ReplayWindow::after(0), is_confirmed })
+}
+
+fn proven(subject: &CertificateSubject, name: &NodeName, certificate: &[u8]) -> Proven {
+    Proven { certificate: certificate.to_vec(), expires: subject.expires(), rights: subject.rights_of(name) }
+}
+
+/// Time for which an accept is waited for.
+const PROOF_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Time after which a challenge that comes again is answered with another proof.
+const PROOF_RETRY: Duration = Duration::from_millis(200);
+
+/// Maximum proofs that wait for an accept.
+const MAX_PENDING_PROOFS: usize = 512;

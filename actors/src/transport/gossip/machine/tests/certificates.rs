@@ -1,0 +1,170 @@
+//! Cells whose nodes prove certificates.
+
+use super::*;
+use crate::transport::gossip::trial_authority::TrialAuthority;
+
+/// A cell with certificates, and its CA.
+struct CertifiedCell {
+    cell: Cell,
+    authority: TrialAuthority,
+}
+
+impl CertifiedCell {
+    fn new(multicast: bool) -> Self {
+        Self { cell: Cell::new(multicast), authority: TrialAuthority::new() }
+    }
+
+    fn of(nodes: usize) -> Self {
+        let mut certified = Self::new(true);
+        (1..=nodes).for_each(|node| certified.start(node));
+        certified.cell.run(3000);
+        certified
+    }
+
+    fn start(&mut self, node: usize) {
+        let identity = self.authority.identity(&name(node), Role::Auto);
+        let run = self.cell.now.micros();
+        self.cell.start_as(node, &name(node), (KEY, Some(identity)), run);
+    }
+
+    fn machine(&mut self, node: usize) -> &mut GossipMachine {
+        &mut self.cell.nodes.get_mut(&node).unwrap().machine
+    }
+
+    /// Hands a node changed files.
+    fn set_identity(&mut self, node: usize, identity: Identity) {
+        let now = self.cell.now;
+        self.machine(node).set_identity(identity, now);
+        self.cell.deliver();
+    }
+
+    fn events(&self, node: usize) -> &[MembershipEvent] {
+        &self.cell.nodes[&node].events
+    }
+}
+
+#[test]
+fn nodes_with_certificates_find_each_other() {
+    let mut certified = CertifiedCell::of(6);
+    certified.cell.assert_complete();
+    certified.cell.nodes.remove(&3);
+    certified.cell.run(1500);
+    certified.cell.assert_complete();
+    certified.start(3);
+    certified.cell.run(3000);
+    certified.cell.assert_complete();
+}
+
+#[test]
+fn nodes_with_certificates_find_each_other_by_one_seed() {
+    let mut certified = CertifiedCell::new(false);
+    for node in 1..=5 {
+        certified.start(node);
+        certified.machine(node).set_seeds(vec![address(1)]);
+    }
+    certified.cell.run(3000);
+    certified.cell.assert_complete();
+}
+
+#[test]
+fn a_cell_with_certificates_forms_over_a_network_that_loses_a_fifth() {
+    let mut certified = CertifiedCell::new(true);
+    certified.cell.loss_percent = 20;
+    (1..=4).for_each(|node| certified.start(node));
+    certified.cell.run(6000);
+    certified.cell.loss_percent = 0;
+    certified.cell.run(3000);
+    certified.cell.assert_complete();
+}
+
+#[test]
+fn a_key_without_a_certificate_of_the_cell_admits_nobody() {
+    let mut certified = CertifiedCell::of(3);
+    let now = certified.cell.now.micros();
+    certified.cell.forget_events();
+    certified.cell.start(4, "node-4");
+    let strange = TrialAuthority::new().identity("node-5", Role::Auto);
+    certified.cell.start_as(5, "node-5", (KEY, Some(strange)), now);
+    certified.cell.run(5000);
+    for node in 1..=3 {
+        assert_eq!(certified.events(node), [], "{node}");
+        let machine = certified.machine(node);
+        assert_eq!(machine.members().len(), 2);
+        assert!(machine.counters.get(FrameEvent::Uncertified) > 0 && machine.counters.get(FrameEvent::Untrusted) > 0);
+    }
+    assert!(certified.cell.sees(4).is_empty() && certified.cell.sees(5).is_empty());
+}
+
+#[test]
+fn a_revoked_node_is_down_when_the_list_is_read_and_stays_out_until_it_has_a_new_certificate() {
+    let mut certified = CertifiedCell::of(4);
+    certified.cell.forget_events();
+    certified.authority.revoke(&node_name(4));
+    for node in 1..=3 {
+        let files = certified.authority.files(&node_name(node));
+        certified.set_identity(node, TrialAuthority::read(&files, &name(node)));
+        assert_eq!(certified.events(node), [MembershipEvent::Down { name: node_name(4) }], "{node}");
+    }
+    certified.cell.forget_events();
+    certified.cell.run(5000);
+    for node in 1..=3 {
+        assert_eq!(certified.events(node), [], "{node}");
+        assert!(!certified.cell.sees(node).contains("node-4"));
+    }
+    let renewed = certified.authority.identity("node-4", Role::Auto);
+    certified.set_identity(4, renewed);
+    certified.cell.run(5000);
+    certified.cell.assert_complete();
+}
+
+#[test]
+fn a_certificate_renewed_while_its_node_runs_is_shown_to_all_without_a_gap() {
+    let mut certified = CertifiedCell::of(3);
+    certified.cell.forget_events();
+    let renewed = certified.authority.identity("node-1", Role::Auto);
+    certified.set_identity(1, renewed);
+    certified.cell.run(3000);
+    assert_eq!(certified.cell.events(), 0);
+}
+
+#[test]
+fn nodes_of_which_one_lost_its_sessions_talk_again_within_a_second() {
+    let mut certified = CertifiedCell::of(2);
+    certified.machine(1).sessions.forget_all();
+    for _ in 0..20 {
+        for (from, to) in [(1, 2), (2, 1)] {
+            let now = certified.cell.now;
+            certified.machine(from).send(&node_name(to), b"beat", now);
+        }
+        certified.cell.run(50);
+    }
+    certified.cell.forget_events();
+    for (from, to) in [(1, 2), (2, 1)] {
+        let now = certified.cell.now;
+        certified.machine(from).send(&node_name(to), b"beat", now);
+    }
+    certified.cell.run(10);
+    for node in [1, 2] {
+        let received = |event: &MembershipEvent| matches!(event, MembershipEvent::Received { .. });
+        assert!(certified.events(node).iter().any(received), "{node}: {:?}", certified.events(node));
+    }
+}
+
+/// A member lies about another: a later life, another address, another role.
+#[test]
+fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
+    let mut certified = CertifiedCell::of(3);
+    certified.cell.forget_events();
+    let before = certified.machine(1).members();
+    for life in [u64::MAX, 1 << 53, certified.cell.now.micros() + 1000] {
+        let (gossip, broker) = (address(9), Some(address(9)));
+        let lie = NodeId { name: node_name(3), run: 7, life, role: Role::Edge, gossip, broker };
+        let now = certified.cell.now;
+        certified.machine(2).spread(lie, now);
+        certified.cell.run(2000);
+    }
+    assert_eq!(certified.machine(1).members(), before);
+    let is_news =
+        |event: &MembershipEvent| matches!(event, MembershipEvent::Alive { .. } | MembershipEvent::Down { .. });
+    assert!(!certified.events(1).iter().any(is_news), "{:?}", certified.events(1));
+}

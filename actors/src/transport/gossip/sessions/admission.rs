@@ -1,0 +1,314 @@
+//! Steps of the handshake, and the admission of the node that completes it.
+
+use std::net::SocketAddr;
+
+use ecod::model::time::Timestamp;
+
+use super::peers::PeerSession;
+use super::{Arrival, FrameContent, KnownMember, Sessions, decode, decode_first, encode};
+use crate::transport::gossip::counters::FrameEvent;
+use crate::transport::gossip::frame::{FrameHeader, FrameKind, Handshake, Hello, Introduction, NameClaim};
+use crate::transport::gossip::handshake::{Attestation, Proven, Side, SignedMessage, Transcript, agree};
+use crate::transport::gossip::key::{Cookie, SessionId};
+use crate::transport::gossip::node_id::{MAX_CLAIMED_LIFE, NodeId};
+use crate::transport::gossip::replay_window::ReplayWindow;
+use crate::transport::gossip::session_keys::{KeyRing, KeySet};
+
+/// A node that has proven its name in a handshake, with the keys that came of it.
+struct Admission {
+    proven: Option<Proven>,
+    keys: Option<KeySet>,
+    is_proof: bool,
+}
+
+impl Sessions {
+    /// Answers a greeting with a challenge. A known living node at its known address needs no handshake, unless it asks
+    /// for one.
+    pub(super) fn handle_hello(
+        &mut self,
+        head: &FrameHeader,
+        hello: &Hello,
+        wants_session: bool,
+        arrival: &Arrival<'_>,
+    ) -> Result<FrameContent, FrameEvent> {
+        let is_accepted = self.peers.speaker_id(&hello.name) == Some(head.sender);
+        let is_there = self.peers.get(&head.sender).is_some_and(|peer| peer.address == arrival.from);
+        let is_alive = || (arrival.known)(&hello.name).is_some_and(|known| known.alive);
+        if !wants_session && is_accepted && is_there && is_alive() {
+            return Ok(FrameContent::Nothing);
+        }
+        if !self.challenges.allow(&head.sender, arrival.now) && !self.throttled() {
+            return Ok(FrameContent::Nothing);
+        }
+        let cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
+        let challenge = Handshake::Challenge { cookie, name: arrival.own.name.clone() };
+        Ok(FrameContent::Answer(self.handshake(&head.sender, &challenge)))
+    }
+
+    /// Takes a step of the handshake.
+    pub(super) fn handle_handshake(
+        &mut self,
+        head: &FrameHeader,
+        body: &[u8],
+        arrival: &Arrival<'_>,
+    ) -> Result<FrameContent, FrameEvent> {
+        let (message, attestation) = decode_first::<Handshake>(body)?;
+        let signed = body.get(..body.len() - attestation.len()).unwrap_or_default();
+        match message {
+            Handshake::Challenge { cookie, name } => {
+                if !self.proofs.allow(&head.sender, arrival.now) && !self.throttled() {
+                    return Ok(FrameContent::Nothing);
+                }
+                let claim = (arrival.known)(&name).filter(|known| !known.alive);
+                let claim = claim.map_or(NameClaim::Free, |known| NameClaim::After(known.life));
+                let introduction = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
+                let own_cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
+                let proof = Handshake::Proof { echo: cookie, cookie: own_cookie, introduction };
+                if self.prove_certificates() {
+                    let frame = self.prove(&head.sender, &proof, (cookie, arrival.from), &name, arrival.now);
+                    return Ok(frame.map_or(FrameContent::Nothing, FrameContent::Answer));
+                }
+                Ok(FrameContent::Answer(self.handshake(&head.sender, &proof)))
+            }
+            Handshake::Proof { echo, cookie, introduction } => {
+                self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
+                if introduction.id.name == arrival.own.name && !self.prove_certificates() {
+                    return Ok(FrameContent::NameTaken(introduction.id.name));
+                }
+                if !self.prove_certificates() {
+                    let admission = Admission { proven: None, keys: None, is_proof: true };
+                    let claim = self.admit(head, &introduction.id, admission, arrival)?;
+                    let answer = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
+                    let accept = Handshake::Accept { echo: cookie, introduction: answer };
+                    let answer = Some(self.handshake(&head.sender, &accept));
+                    return Ok(FrameContent::Met { introduction, answer, speaks: claim != NameClaim::Taken });
+                }
+                let attestation = decode(attestation)?;
+                self.take_proof(head, (signed, &attestation), introduction, &cookie, arrival)
+            }
+            Handshake::Accept { echo, introduction } => {
+                self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
+                let admission = if self.prove_certificates() {
+                    self.take_accept(head, (signed, &decode(attestation)?), &introduction, arrival)?
+                } else {
+                    Admission { proven: None, keys: None, is_proof: false }
+                };
+                if introduction.id.name == arrival.own.name {
+                    return Ok(FrameContent::NameTaken(introduction.id.name));
+                }
+                let claim = self.admit(head, &introduction.id, admission, arrival)?;
+                Ok(FrameContent::Met { introduction, answer: None, speaks: claim != NameClaim::Taken })
+            }
+        }
+    }
+
+    /// Whether a cookie was issued to this session at this address a moment ago, and the introduction is plausible.
+    fn check_freshness(
+        &self,
+        session: &SessionId,
+        echo: &Cookie,
+        introduction: &Introduction,
+        arrival: &Arrival<'_>,
+    ) -> Result<(), FrameEvent> {
+        let slot = slot(arrival.now);
+        let issued = |slot| self.cookies.issue(session, arrival.from, slot) == *echo;
+        if !issued(slot) && !issued(slot.wrapping_sub(1)) {
+            return Err(FrameEvent::Replayed);
+        }
+        let claimed = if let NameClaim::After(life) = introduction.claim { life } else { 0 };
+        let is_plausible = introduction.id.has_plausible_life() && claimed <= MAX_CLAIMED_LIFE;
+        if is_plausible { Ok(()) } else { Err(FrameEvent::Malformed) }
+    }
+
+    /// A proof of this node's certificate to a challenger; `None` while the one before may still be answered.
+    fn prove(
+        &mut self,
+        to: &SessionId,
+        proof: &Handshake,
+        (cookie, address): (Cookie, SocketAddr),
+        accepter: &ecod::model::names::NodeName,
+        now: Timestamp,
+    ) -> Option<Vec<u8>> {
+        let pending = (*to, address, cookie);
+        let wants_proof = self.prover.as_mut()?.wants_proof(&pending, now);
+        let head = self.head(FrameKind::Handshake);
+        let message = encode(proof);
+        let prover = self.prover.as_mut().filter(|_| wants_proof)?;
+        let (private, public) = prover.draw_ephemeral()?;
+        let signed = SignedMessage {
+            side: Side::Prover,
+            head: head.bytes(self.key.tag()),
+            receiver: *to,
+            context: accepter.as_str().as_bytes(),
+            message: &message,
+        };
+        let (attestation, transcript) = prover.attest(&signed, public)?;
+        prover.expect_accept(pending, (private, transcript), accepter.clone(), now);
+        Some(self.write_handshake(&head, to, &message, &attestation))
+    }
+
+    /// Verifies a proof, and accepts it with this node's own.
+    fn take_proof(
+        &mut self,
+        head: &FrameHeader,
+        (message, attestation): (&[u8], &Attestation),
+        introduction: Introduction,
+        echo: &Cookie,
+        arrival: &Arrival<'_>,
+    ) -> Result<FrameContent, FrameEvent> {
+        if self.peers.get(&head.sender).is_some_and(|peer| head.counter <= peer.proof_counter) {
+            return Err(FrameEvent::Replayed);
+        }
+        if !self.verifications.allow(arrival.from.ip(), arrival.now) && !self.throttled() {
+            return Ok(FrameContent::Nothing);
+        }
+        let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
+        let signed = SignedMessage {
+            side: Side::Prover,
+            head: head.bytes(self.key.tag()),
+            receiver: self.own,
+            context: arrival.own.name.as_str().as_bytes(),
+            message,
+        };
+        let claimed = (&introduction.id.name, &head.sender, arrival.from);
+        let (proven, transcript) = prover.check(&signed, attestation, claimed)?;
+        if introduction.id.name == arrival.own.name {
+            return Ok(FrameContent::NameTaken(introduction.id.name));
+        }
+        let Some((private, public)) = prover.draw_ephemeral() else { return Ok(FrameContent::Nothing) };
+        // Drawn up before the keys are known: the answer's claim depends on the gossip and the table only.
+        let claim = self.claim(head, &introduction.id, arrival);
+        let answer = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
+        let accept = encode(&Handshake::Accept { echo: *echo, introduction: answer });
+        let own_head = self.head(FrameKind::Handshake);
+        let own_head_bytes = own_head.bytes(self.key.tag());
+        let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
+        let signed = accepted(own_head_bytes, head.sender, &transcript, &accept);
+        let Some((own_attestation, transcript)) = prover.attest(&signed, public) else {
+            return Ok(FrameContent::Nothing);
+        };
+        let keys = agree(&self.key, (private, &attestation.ephemeral), &transcript, (&self.own, &head.sender), false)?;
+        let admission = Admission { proven: Some(proven), keys: Some(keys), is_proof: true };
+        let claim = self.admit(head, &introduction.id, admission, arrival)?;
+        let answer = self.write_handshake(&own_head, &head.sender, &accept, &own_attestation);
+        Ok(FrameContent::Met { introduction, answer: Some(answer), speaks: claim != NameClaim::Taken })
+    }
+
+    /// Verifies the accept of a proof that this node sent.
+    fn take_accept(
+        &mut self,
+        head: &FrameHeader,
+        (message, attestation): (&[u8], &Attestation),
+        introduction: &Introduction,
+        arrival: &Arrival<'_>,
+    ) -> Result<Admission, FrameEvent> {
+        let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
+        let name = &introduction.id.name;
+        let head_bytes = head.bytes(self.key.tag());
+        let mut refusal = FrameEvent::Replayed;
+        for (pending, proof, accepter) in prover.pending(&head.sender, arrival.from) {
+            if accepter != *name {
+                continue;
+            }
+            let signed = accepted(head_bytes, self.own, &proof, message);
+            match prover.check(&signed, attestation, (name, &head.sender, arrival.from)) {
+                Ok((proven, transcript)) => {
+                    let Some(private) = prover.take_pending(&pending) else { continue };
+                    let sessions = (&self.own, &head.sender);
+                    let keys = agree(&self.key, (private, &attestation.ephemeral), &transcript, sessions, true)?;
+                    return Ok(Admission { proven: Some(proven), keys: Some(keys), is_proof: false });
+                }
+                Err(reason) => refusal = reason,
+            }
+        }
+        Err(refusal)
+    }
+
+    /// Other claims to the name of a node that has just proven itself.
+    fn claim(&self, head: &FrameHeader, id: &NodeId, arrival: &Arrival<'_>) -> NameClaim {
+        let is_speaker = self.peers.speaker_id(&id.name) == Some(head.sender);
+        match (arrival.known)(&id.name) {
+            Some(KnownMember { life, alive: true }) if life > id.life && !is_speaker => NameClaim::Taken,
+            Some(KnownMember { life, alive: false }) if life >= id.life => NameClaim::After(life),
+            _ => NameClaim::Free,
+        }
+    }
+
+    /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
+    fn admit(
+        &mut self,
+        head: &FrameHeader,
+        id: &NodeId,
+        admission: Admission,
+        arrival: &Arrival<'_>,
+    ) -> Result<NameClaim, FrameEvent> {
+        let (address, now) = (arrival.from, arrival.now);
+        let claim = self.claim(head, id, arrival);
+        let Admission { proven, keys, is_proof } = admission;
+        if let Some(peer) = self.peers.get_mut(&head.sender) {
+            peer.address = address;
+            match keys {
+                Some(keys) => peer.keys.add(keys),
+                None => peer.keys.skip_to(head.counter),
+            }
+            if proven.is_some() {
+                (peer.id, peer.proven) = (id.clone(), proven);
+            }
+            peer.note_heard(now);
+            if is_proof {
+                peer.proof_counter = head.counter;
+            }
+        } else {
+            let keys = keys.unwrap_or_else(|| KeySet {
+                to: self.key.seal(&self.own, &head.sender),
+                from: self.key.seal(&head.sender, &self.own),
+                window: ReplayWindow::after(head.counter),
+                is_confirmed: true,
+            });
+            let peer = PeerSession {
+                id: id.clone(),
+                proven,
+                address,
+                keys: KeyRing::new(keys),
+                proof_counter: if is_proof { head.counter } else { 0 },
+                heard: now,
+                unheard_since: None,
+                superseded: None,
+            };
+            self.peers.insert(head.sender, peer)?;
+        }
+        self.peers.settle(head.sender, &id.name, claim != NameClaim::Taken, now);
+        Ok(claim)
+    }
+
+    fn handshake(&mut self, to: &SessionId, message: &Handshake) -> Vec<u8> {
+        let head = self.head(FrameKind::Handshake);
+        head.write(self.key.tag(), &encode(message), &self.key.seal(&self.own, to))
+    }
+
+    fn write_handshake(
+        &self,
+        head: &FrameHeader,
+        to: &SessionId,
+        message: &[u8],
+        attestation: &Attestation,
+    ) -> Vec<u8> {
+        let body = [message, &encode(attestation)].concat();
+        head.write(self.key.tag(), &body, &self.key.seal(&self.own, to))
+    }
+}
+
+/// The accepter's message as it is signed.
+fn accepted<'a>(
+    head: [u8; super::HEADER_BYTES],
+    receiver: SessionId,
+    proof: &'a Transcript,
+    message: &'a [u8],
+) -> SignedMessage<'a> {
+    SignedMessage { side: Side::Accepter, head, receiver, context: proof, message }
+}
+
+/// Time slot of a cookie, which is valid in its slot and the next.
+fn slot(now: Timestamp) -> u64 {
+    now.micros() / 2_000_000
+}

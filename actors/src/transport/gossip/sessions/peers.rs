@@ -1,0 +1,152 @@
+//! Table of the sessions with other nodes.
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+
+use super::SESSION_IDLE_TIMEOUT;
+use crate::transport::gossip::counters::FrameEvent;
+use crate::transport::gossip::frame::FrameHeader;
+use crate::transport::gossip::handshake::Proven;
+use crate::transport::gossip::key::SessionId;
+use crate::transport::gossip::node_id::NodeId;
+use crate::transport::gossip::session_keys::KeyRing;
+
+/// Sessions by their number, and the one that is accepted for each name.
+pub(super) struct PeerTable {
+    peers: HashMap<SessionId, PeerSession>,
+    session_by_name: HashMap<NodeName, SessionId>,
+    max_peers: usize,
+}
+
+/// An established session.
+pub(super) struct PeerSession {
+    /// The node as it introduced itself.
+    pub(super) id: NodeId,
+    /// Its certificate, in a cell that has them.
+    pub(super) proven: Option<Proven>,
+    pub(super) address: SocketAddr,
+    pub(super) keys: KeyRing,
+    /// Counter of the frame with its last proof: no earlier one is accepted.
+    pub(super) proof_counter: u64,
+    pub(super) heard: Timestamp,
+    /// Time of the first frame sent to it after it was heard.
+    pub(super) unheard_since: Option<Timestamp>,
+    /// Time since which another session is accepted for the name.
+    pub(super) superseded: Option<Timestamp>,
+}
+
+impl PeerSession {
+    pub(super) fn note_heard(&mut self, now: Timestamp) {
+        self.heard = now;
+        self.unheard_since = None;
+    }
+}
+
+impl PeerTable {
+    pub(super) fn new(max_peers: usize) -> Self {
+        Self { peers: HashMap::new(), session_by_name: HashMap::new(), max_peers }
+    }
+
+    pub(super) fn get(&self, session: &SessionId) -> Option<&PeerSession> {
+        self.peers.get(session)
+    }
+
+    pub(super) fn get_mut(&mut self, session: &SessionId) -> Option<&mut PeerSession> {
+        self.peers.get_mut(session)
+    }
+
+    /// Number of the session that is accepted for a name.
+    pub(super) fn speaker_id(&self, name: &NodeName) -> Option<SessionId> {
+        self.session_by_name.get(name).copied()
+    }
+
+    /// The session that is accepted for a name.
+    pub(super) fn speaker(&self, name: &NodeName) -> Option<&PeerSession> {
+        self.peers.get(self.session_by_name.get(name)?)
+    }
+
+    pub(super) fn speaker_mut(&mut self, name: &NodeName) -> Option<&mut PeerSession> {
+        self.peers.get_mut(self.session_by_name.get(name)?)
+    }
+
+    /// Addresses of all nodes.
+    pub(super) fn addresses(&self) -> Vec<SocketAddr> {
+        self.peers.values().map(|peer| peer.address).collect()
+    }
+
+    /// Takes the counter of a handshake's frame in a cell without certificates. One far ahead may come, as the handshake
+    /// itself proves that it is fresh.
+    pub(super) fn take_counter(&mut self, head: &FrameHeader, now: Timestamp) -> Result<(), FrameEvent> {
+        let Some(peer) = self.peers.get_mut(&head.sender) else { return Ok(()) };
+        match peer.keys.take(head.counter) {
+            Err(FrameEvent::Replayed) => Err(FrameEvent::Replayed),
+            _ => {
+                peer.note_heard(now);
+                Ok(())
+            }
+        }
+    }
+
+    /// Adds a session, if there is room: the longest idle one gives way when it is idle for long enough.
+    pub(super) fn insert(&mut self, session: SessionId, peer: PeerSession) -> Result<(), FrameEvent> {
+        if self.peers.len() >= self.max_peers {
+            let longest_idle = self.peers.iter().min_by_key(|(_, peer)| peer.heard);
+            let may_go = longest_idle.filter(|(_, idle)| peer.heard.since(idle.heard) >= SESSION_IDLE_TIMEOUT);
+            let session = may_go.map(|(session, _)| *session).ok_or(FrameEvent::TooManyPeers)?;
+            self.remove(&session);
+        }
+        self.peers.insert(session, peer);
+        Ok(())
+    }
+
+    /// Accepts a session for its name, or notes that another one is.
+    pub(super) fn settle(&mut self, session: SessionId, name: &NodeName, is_accepted: bool, now: Timestamp) {
+        let former = self.speaker_id(name);
+        if is_accepted {
+            self.session_by_name.insert(name.clone(), session);
+            if let Some(peer) = former.filter(|former| *former != session).and_then(|former| self.get_mut(&former)) {
+                peer.superseded = Some(now);
+            }
+        }
+        if let Some(peer) = self.get_mut(&session) {
+            peer.superseded = (!is_accepted).then_some(now);
+        }
+        let keep = |known: &SessionId| *known == session || Some(*known) == former;
+        self.peers.retain(|known, peer| peer.id.name != *name || keep(known));
+    }
+
+    /// Ends the session of an earlier run of a node; false when there is none.
+    pub(super) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
+        let Some(peer) = self.speaker_mut(name).filter(|peer| peer.id.run != run) else { return false };
+        peer.superseded = Some(now);
+        self.session_by_name.remove(name);
+        true
+    }
+
+    /// Ends sessions; the result are the nodes whose accepted session ended.
+    pub(super) fn expel(&mut self, mut is_expelled: impl FnMut(&PeerSession) -> bool) -> Vec<NodeName> {
+        let expelled = self.peers.iter().filter(|(_, peer)| is_expelled(peer)).map(|(session, _)| *session);
+        let expelled: Vec<_> = expelled.collect();
+        expelled.iter().filter_map(|session| self.remove(session)).collect()
+    }
+
+    /// Removes a session; its node's name if it was accepted for it.
+    fn remove(&mut self, session: &SessionId) -> Option<NodeName> {
+        let name = self.peers.remove(session)?.id.name;
+        (self.session_by_name.get(&name) == Some(session)).then(|| self.session_by_name.remove(&name))?;
+        Some(name)
+    }
+
+    #[cfg(test)]
+    pub(super) fn len(&self) -> usize {
+        self.peers.len()
+    }
+
+    #[cfg(test)]
+    pub(super) fn clear(&mut self) {
+        self.peers.clear();
+    }
+}

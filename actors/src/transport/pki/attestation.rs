@@ -1,0 +1,57 @@
+//! Proof of a node's certificate outside TLS: the membership's handshake uses the same files, CA and revocation list.
+
+use rustls::SignatureScheme;
+use rustls::crypto::ring::sign::any_ecdsa_type;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
+use rustls::sign::Signer;
+use x509_parser::certificate::X509Certificate;
+use x509_parser::prelude::FromDer;
+
+use super::{CertificateSubject, InvalidCertificate, LoadedCredentials};
+
+/// Largest certificate in DER that fits a handshake's datagram.
+pub(crate) const MAX_CERTIFICATE_BYTES: usize = 840;
+
+/// Why a certificate proves no node of the cell.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub(crate) enum Distrust {
+    /// Not of the cell's CA, not valid now, revoked, or not for clients.
+    #[error("{0}")]
+    Untrusted(rustls::Error),
+    /// It names no node.
+    #[error(transparent)]
+    Invalid(#[from] InvalidCertificate),
+}
+
+impl LoadedCredentials {
+    /// The node's own certificate in DER.
+    pub(crate) fn certificate(&self) -> &[u8] {
+        self.certificates.first().map_or(&[], |certificate| certificate)
+    }
+
+    /// The signature of a message by the node's key: ECDSA over P-256 with SHA-256, in DER.
+    pub(crate) fn sign(&self, message: &[u8]) -> Result<Vec<u8>, rustls::Error> {
+        self.signer.sign(message)
+    }
+
+    /// Verifies that a certificate is directly signed by the cell's CA, valid at this time and not revoked.
+    pub(crate) fn verify_node(&self, certificate: &[u8], wall: UnixTime) -> Result<CertificateSubject, Distrust> {
+        let subject = CertificateSubject::of(certificate)?;
+        let verified = self.clients.verify_client_cert(&CertificateDer::from(certificate), &[], wall);
+        verified.map(|_| subject).map_err(Distrust::Untrusted)
+    }
+}
+
+/// Signer with a node's key; `None` for a key other than ECDSA P-256.
+pub(super) fn signer(key: &PrivateKeyDer<'_>) -> Option<Box<dyn Signer>> {
+    any_ecdsa_type(key).ok()?.choose_scheme(&[SignatureScheme::ECDSA_NISTP256_SHA256])
+}
+
+/// Whether the owner of a certificate signed a message.
+pub(crate) fn is_signed_by(certificate: &[u8], message: &[u8], signature: &[u8]) -> bool {
+    use ring::signature::{ECDSA_P256_SHA256_ASN1, UnparsedPublicKey};
+
+    let Ok((_, parsed)) = X509Certificate::from_der(certificate) else { return false };
+    let key = UnparsedPublicKey::new(&ECDSA_P256_SHA256_ASN1, &parsed.public_key().subject_public_key.data);
+    key.verify(message, signature).is_ok()
+}

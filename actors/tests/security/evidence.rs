@@ -1,0 +1,128 @@
+//! A candidate that does not lead, and forges evidence about vehicles.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
+use ecod::reputation::Evidence;
+use ecod::wire::{Encoding, LedgerEntry, LedgerShare, RejectReason, Reputation, Role, SCHEMA_VERSION, encode};
+use ecod_actors::messages::reputation_keeper::ReputationKeeperMessage;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::pki::{Credentials, EvidenceSigner, TlsConfig};
+use tokio::time::{Instant, sleep};
+
+use crate::fixture::{Client, DAY, Pki, SOON, client_config, node as name};
+
+fn config(node: &str, role: Role, tls: &TlsConfig, state: &Path) -> NodeConfig {
+    let ball = LandmarkConfig {
+        id: "ball".into(),
+        x_m: 1.0,
+        y_m: 0.0,
+        facing_deg: None,
+        vacancy: None,
+        synonyms: BTreeMap::default(),
+    };
+    let mut config = NodeConfig {
+        name: Some(name(node)),
+        cell: NodeName::from_static("lot"),
+        role,
+        listen: Some("127.0.0.1:0".parse().unwrap()),
+        landmarks: vec![ball],
+        tls: Some(tls.clone()),
+        state_dir: Some(state.to_owned()),
+        ..NodeConfig::default()
+    };
+    config.reputations.publish_period_s = 0.1;
+    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+    config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
+    config
+}
+
+async fn until(what: &str, is_reached: impl Fn() -> bool) {
+    let end = Instant::now() + SOON;
+    while !is_reached() {
+        assert!(Instant::now() < end, "never: {what}");
+        sleep(Duration::from_millis(20)).await;
+    }
+}
+
+fn reputations(node: &NodeHandle) -> BTreeMap<NodeName, Reputation> {
+    node.newest_reputations().borrow().as_ref().map(|newest| newest.message.reputations.clone()).unwrap_or_default()
+}
+
+/// Counts by which the liar is always right and the honest vehicle never.
+fn inverted(epoch: u64, aggregator: &str) -> LedgerShare {
+    let entry = |node: &str, correct, incorrect| {
+        let (aggregator, node, label) = (name(aggregator), name(node), "cup".into());
+        LedgerEntry { epoch, aggregator, node, label, correct, incorrect }
+    };
+    LedgerShare {
+        schema: SCHEMA_VERSION,
+        node: name("gauss"),
+        epoch: None,
+        entries: vec![entry("honest", 0, 1_000_000_000), entry("liar", 1_000_000_000, 0)],
+        marks: Vec::new(),
+        signed: None,
+        reset_at_us: None,
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_candidate_that_does_not_lead_changes_no_reputation_by_forged_evidence() {
+    let (mut pki, state) = (Pki::new(), tempfile::tempdir().unwrap());
+    let [edge_files, gauss_files] =
+        [("edge", Role::Edge), ("gauss", Role::Auto)].map(|(node, role)| pki.issue(node, role, DAY));
+    let start_edge = || node::start(config("edge", Role::Edge, &edge_files, state.path()));
+    let edge = start_edge().await.unwrap();
+    let mut candidate = config("gauss", Role::Auto, &gauss_files, state.path());
+    candidate.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
+    let gauss = node::start(candidate).await.unwrap();
+    until("a leader and a candidate", || edge.leadership().borrow().is_leading() && edge.members().borrow().len() == 1)
+        .await;
+
+    let term = edge.leadership().borrow().epoch.as_ref().unwrap().term;
+    let evidence = [("honest", true), ("liar", false)].map(|(node, correct)| {
+        let label = "cup".into();
+        std::iter::repeat_n(Evidence { node: name(node), label, correct }, 40)
+    });
+    let (epoch, evidence) = (Epoch::new(term, name("edge")), evidence.into_iter().flatten().collect());
+    let round = 50 + edge.newest_reputations().borrow().as_ref().map_or(0, |newest| newest.message.round);
+    let record = ReputationKeeperMessage::Record { epoch, round, evidence, reputations: None };
+    assert!(edge.slots().keeper.send(record));
+    until("reputations", || reputations(&edge).len() == 2).await;
+    let honest = reputations(&edge);
+    assert!(honest[&name("honest")].score > 0.8 && honest[&name("liar")].score < 0.35, "{honest:?}");
+    until("evidence at the candidate", || gauss.counters().events(Event::LedgerMerged) > 0).await;
+
+    let mut attacker = Client::new(edge.broker_address().unwrap(), "gauss", &client_config("gauss", &gauss_files));
+    attacker.log_in().await.unwrap();
+    let credentials = Arc::new(Credentials::load(&gauss_files, &name("gauss")).unwrap());
+    let signer = EvidenceSigner::new(NodeName::from_static("lot"), credentials);
+    let others = [(1, "edge"), (term, "edge"), (term, "long-gone")].map(|(term, node)| inverted(term, node));
+    let own = [1, term].map(|term| signer.sign(inverted(term, "gauss")).unwrap());
+    let posing = others.clone().map(|share| signer.sign(share).unwrap());
+    for share in others.iter().chain(&posing).chain(&own) {
+        let payload = encode(share, Encoding::Json);
+        attacker.publish_all_and_wait("ecod/v1/lot/ledger/gauss", false, &payload).await.unwrap();
+    }
+    let refused = |reason| edge.counters().rejects(reason);
+    until("all refused", || refused(RejectReason::BadSignature) >= 6 && refused(RejectReason::Unattested) >= 2).await;
+
+    sleep(Duration::from_millis(300)).await;
+    assert_eq!(reputations(&edge), honest);
+    edge.stop().await;
+    let edge = start_edge().await.unwrap();
+    until("reputations after a restart", || edge.leadership().borrow().is_leading() && !reputations(&edge).is_empty())
+        .await;
+    assert_eq!(reputations(&edge), honest);
+    for node in [gauss, edge] {
+        node.stop().await;
+    }
+}

@@ -1,0 +1,60 @@
+//! Shares of the ledger: nobody forges one, and what is taken stays within bounds.
+
+#![no_main]
+
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+use std::time::Duration;
+
+use ecod::leadership::ledger_resync::LedgerResync;
+use ecod::leadership::{Leadership, Position};
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::reputation::{MAX_ENTRIES, MAX_LANES, ReputationConfig, ReputationLedger};
+use ecod::wire::{LedgerShare, Limits, Role, decode};
+use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::{Authority, Credentials, EvidenceSigner, TlsConfig};
+use libfuzzer_sys::fuzz_target;
+
+const HONEST: &[u8] = br#"{"schema":1,"node":"edge","epoch":7,"entries":[
+    {"epoch":7,"aggregator":"edge","node":"euclid","label":"cup","correct":410,"incorrect":22}]}"#;
+
+/// The signer of `edge`, and a share that it signed.
+static EDGE: LazyLock<(Mutex<EvidenceSigner>, LedgerShare)> = LazyLock::new(|| {
+    let (cell, edge) = (NodeName::from_static("lot"), NodeName::from_static("edge"));
+    let directory = std::env::temp_dir().join(format!("fuzz-share-{}", std::process::id()));
+    let mut authority = Authority::init(&directory, &cell, clock::now()).expect("a new directory");
+    authority.issue(&edge, Role::Edge, Duration::from_secs(86_400), clock::now()).expect("a certificate");
+    let (certificate, key) = authority.files_of(&edge);
+    let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) };
+    let signer = EvidenceSigner::new(cell, Arc::new(Credentials::load(&files, &edge).expect("just made")));
+    let honest = decode(HONEST, &Limits::default()).expect("a share");
+    let honest = signer.sign(honest).expect("a key of the right kind");
+    (Mutex::new(signer), honest)
+});
+
+fuzz_target!(|input: &[u8]| {
+    let Ok(share) = decode::<LedgerShare>(input, &Limits::default()) else { return };
+    let (signer, honest) = &*EDGE;
+    let mut signer = signer.lock().unwrap_or_else(PoisonError::into_inner);
+    assert!(signer.verify(&share).is_err(), "no fuzzer has the key");
+    let transplanted = LedgerShare { signed: honest.signed.clone(), ..share };
+    let is_honest = transplanted.entries == honest.entries && transplanted.marks == honest.marks;
+    assert_eq!(signer.verify(&transplanted).is_ok(), is_honest);
+
+    let candidates = [transplanted.node.clone()];
+    let epoch = Some(Epoch::new(7, NodeName::from_static("edge")));
+    let leadership = Leadership { position: Position::Following, epoch, standby: None, term: 1 << 40 };
+    for new in [LedgerResync::new, LedgerResync::signed] {
+        let mut resync = new(NodeName::from_static("gauss"), 10);
+        let mut ledger = ReputationLedger::default();
+        for at in [1_000_000, 2_000_000] {
+            let _merged = resync.merge(&transplanted, &mut ledger, &candidates, &leadership, Timestamp(at));
+            let _shares = resync.tick(&ledger, &leadership, Timestamp(at));
+        }
+        assert!(ledger.lanes() <= MAX_LANES && ledger.entries().count() <= MAX_ENTRIES);
+        let reputations = ledger.reputations(&ReputationConfig::default());
+        assert!(reputations.values().all(|reputation| (0.3..=1.0).contains(&reputation.score)));
+        ledger.retain_statements(|_| false);
+    }
+});

@@ -1,0 +1,130 @@
+use super::message::MAX_ROUND_STEP;
+use super::*;
+use crate::wire::Role;
+
+const NOW: Timestamp = Timestamp(1_000_000);
+
+fn euclid() -> Election {
+    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 7, NOW);
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
+    election.handle(ElectionInput::Health { health }, NOW);
+    election
+}
+
+/// A message of a node that follows or leads `epoch`, and hears this one.
+fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> ElectionMessage {
+    ElectionMessage {
+        schema: SCHEMA_VERSION,
+        from: from.clone(),
+        run: 1,
+        seq,
+        candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+        term: epoch.map_or(0, |epoch| epoch.term),
+        epoch: epoch.cloned(),
+        hears_you: true,
+        body,
+        clock: None,
+    }
+}
+
+fn received(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> ElectionInput {
+    ElectionInput::Receive { message: message(from, seq, epoch, body) }
+}
+
+fn beat_after(after: Option<&Epoch>) -> Body {
+    Body::Beat { every_ms: 50, round: 1, followers: 1, after: after.cloned(), successors: Vec::new() }
+}
+
+/// A message of edge, the leader of term 8, that knows `term`.
+fn of_edge(seq: u64, term: u64, body: Body) -> ElectionInput {
+    let message = message(&NodeName::from_static("edge"), seq, Some(&epoch_of_edge()), body);
+    ElectionInput::Receive { message: ElectionMessage { term, ..message } }
+}
+
+fn epoch_of_edge() -> Epoch {
+    Epoch::new(8, NodeName::from_static("edge"))
+}
+
+fn beat(round: u64) -> Body {
+    let successors = vec![NodeName::from_static("euclid")];
+    Body::Beat { every_ms: 50, round, followers: 1, after: None, successors }
+}
+
+fn is_counted(effects: &[ElectionEffect]) -> bool {
+    effects.contains(&ElectionEffect::CountImplausible { from: NodeName::from_static("edge") })
+}
+
+#[test]
+fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
+    let mut election = euclid();
+    let mut hear = |seq, term| {
+        let effects = election.handle(of_edge(seq, term, Body::Status { over: None }), NOW);
+        let forged = Epoch::new(term, NodeName::from_static("edge"));
+        election.handle(ElectionInput::Round { epoch: forged, round: 1 }, NOW);
+        (election.term(), is_counted(&effects))
+    };
+    let cell = 5000;
+    assert_eq!(hear(1, cell), (cell, false), "a node that joins learns the cell's term");
+    assert_eq!(hear(2, MAX_TERM), (cell, true));
+    assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), (cell, true));
+    assert_eq!(hear(4, cell + 1), (cell + 1, false));
+}
+
+/// First round of euclid's own leadership after the leader's beats with these rounds, and the beats that were counted.
+fn succeeded_after(rounds: &[u64]) -> (u64, usize) {
+    let mut election = euclid();
+    let beats = (1..).zip(rounds).map(|(seq, round)| of_edge(seq, 8, beat(*round)));
+    let counted = beats.filter(|beat| is_counted(&election.handle(beat.clone(), NOW))).count();
+    let gone = ElectionInput::PeerGone { peer: NodeName::from_static("edge") };
+    let first_round = election.handle(gone, NOW).into_iter().find_map(|effect| match effect {
+        ElectionEffect::Lead { first_round, .. } => Some(first_round),
+        _ => None,
+    });
+    (first_round.unwrap(), counted)
+}
+
+#[test]
+fn a_forged_round_does_not_move_the_first_round_of_the_next_leader() {
+    assert_eq!(succeeded_after(&[88]), (89, 0));
+    assert_eq!(succeeded_after(&[88, 88 + MAX_ROUND_STEP + 1]), (89, 1));
+    assert_eq!(succeeded_after(&[3 * MAX_ROUND_STEP]), (3 * MAX_ROUND_STEP + 1, 0), "a node that joins an old cell");
+    assert_eq!(succeeded_after(&[MAX_ROUND]), (1, 0), "rounds begin anew rather than beyond what receivers take");
+}
+
+#[test]
+fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
+    let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
+    let mut now = Timestamp(1_000_000);
+    let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
+    election.handle(ElectionInput::Health { health }, now);
+    let status = || Body::Status { over: None };
+    for seq in 1.. {
+        election.handle(received(&hopper, seq, None, status()), now);
+        now = election.next_deadline();
+        election.tick(now);
+        if election.is_leading() {
+            break;
+        }
+    }
+    let (own, next) = (election.epoch().cloned(), Epoch::new(2, gauss.clone()));
+    election.handle(received(&gauss, 1, Some(&next), beat_after(own.as_ref())), now);
+    assert_eq!(election.leader(), Some(&gauss));
+    let effects = election.handle(received(&hopper, 1000, own.as_ref(), status()), now);
+    let is_answer = |effect: &ElectionEffect| matches!(effect, ElectionEffect::Send { to, message } if *to == hopper && message.epoch.as_ref() == Some(&next));
+    assert!(effects.iter().any(is_answer), "{effects:?}");
+}
+
+#[test]
+fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
+    let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
+    let (before, next) = (Epoch::new(1, edge.clone()), Epoch::new(2, gauss.clone()));
+    let now = Timestamp(1_000_000);
+    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, now);
+    election.handle(received(&edge, 1, Some(&before), beat_after(None)), now);
+    election.handle(received(&edge, 2, Some(&next), Body::Status { over: None }), now);
+    assert_eq!(election.leader(), Some(&gauss));
+    election.handle(ElectionInput::Round { epoch: next, round: 2 }, now);
+    election.handle(received(&gauss, 1, Some(&before), Body::Status { over: None }), now);
+    assert_eq!(election.leader(), Some(&gauss));
+}

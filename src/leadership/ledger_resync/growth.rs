@@ -1,0 +1,76 @@
+//! Plausible growth of counts: votes are cast one after the other, and no lane leaps.
+
+use std::collections::BTreeMap;
+
+use crate::model::epoch::Epoch;
+use crate::model::time::Timestamp;
+use crate::reputation::{EntryKey, ReputationLedger};
+use crate::wire::{LedgerEntry, LedgerMark, LedgerShare};
+
+/// Maximum number of votes of a vehicle for one label in a leadership when this node first hears of them: 100 million,
+/// three years at one a second.
+pub const MAX_FIRST_VOTES: u64 = 100_000_000;
+
+/// Maximum number of votes of a vehicle for one label in a second, from then on: 1024 objects in ten reports.
+const MAX_VOTES_PER_S: u64 = 10_240;
+
+/// Votes by which a count may be ahead of that.
+const ALLOWANCE: u64 = 1024;
+
+/// Votes from one mark to the next.
+const MARK_VOTES: u64 = 32;
+
+/// Number of votes of each count when this node first heard of it, and when that was.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct GrowthLimit {
+    /// Marks have no label.
+    first: BTreeMap<EntryKey, (Timestamp, u64)>,
+}
+
+impl GrowthLimit {
+    /// Whether a count is plausible. The first one of a vehicle and label is noted by [`Self::note`].
+    pub(super) fn admits(&self, entry: &LedgerEntry, now: Timestamp) -> bool {
+        self.admits_votes(&key_of(entry), entry.correct.saturating_add(entry.incorrect), now)
+    }
+
+    /// Whether a mark is plausible.
+    pub(super) fn admits_mark(&self, mark: &LedgerMark, now: Timestamp) -> bool {
+        let votes = mark.correct.saturating_add(mark.incorrect);
+        votes == mark.number.saturating_mul(MARK_VOTES) && self.admits_votes(&key_of_mark(mark), votes, now)
+    }
+
+    /// Notes the counts of a share that the ledger has now.
+    pub(super) fn note(&mut self, share: &LedgerShare, ledger: &ReputationLedger, now: Timestamp) {
+        for entry in share.entries.iter().filter(|entry| !ledger.lacks_entry(entry)) {
+            self.first.entry(key_of(entry)).or_insert((now, entry.correct + entry.incorrect));
+        }
+        for mark in share.marks.iter().filter(|mark| !ledger.lacks_mark(mark)) {
+            self.first.entry(key_of_mark(mark)).or_insert((now, mark.correct + mark.incorrect));
+        }
+    }
+
+    /// Forgets the lanes that are not `known`.
+    pub(super) fn retain(&mut self, is_known: impl Fn(&Epoch) -> bool) {
+        self.first.retain(|key, _| is_known(&key.lane));
+    }
+
+    /// Number of counts that are noted.
+    pub(super) fn len(&self) -> usize {
+        self.first.len()
+    }
+
+    fn admits_votes(&self, key: &EntryKey, votes: u64, now: Timestamp) -> bool {
+        let Some((at, first)) = self.first.get(key) else { return votes <= MAX_FIRST_VOTES };
+        votes <= first + ALLOWANCE + now.since(*at).as_millis() as u64 * MAX_VOTES_PER_S / 1000
+    }
+}
+
+fn key_of(entry: &LedgerEntry) -> EntryKey {
+    let lane = Epoch::new(entry.epoch, entry.aggregator.clone());
+    EntryKey { lane, node: entry.node.clone(), label: entry.label.clone() }
+}
+
+fn key_of_mark(mark: &LedgerMark) -> EntryKey {
+    let lane = Epoch::new(mark.epoch, mark.aggregator.clone());
+    EntryKey { lane, node: mark.node.clone(), label: Default::default() }
+}

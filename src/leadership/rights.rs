@@ -1,0 +1,83 @@
+//! Rights of a node in the election, as its certificate proves them.
+
+use crate::leadership::config::ElectionConfig;
+use crate::leadership::election::{Body, Candidacy, ElectionMessage};
+use crate::wire::Role;
+
+/// The most that a node may declare of itself as a candidate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Rights {
+    /// The highest role: `edge` above `auto` above `cav`.
+    pub role: Role,
+    /// The highest priority.
+    pub priority: u8,
+}
+
+/// Rights of all nodes in a cell without certificates: a node is what it declares.
+impl Default for Rights {
+    fn default() -> Self {
+        Self { role: Role::Edge, priority: u8::MAX }
+    }
+}
+
+/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by default.
+impl From<Role> for Rights {
+    fn from(role: Role) -> Self {
+        Self { role, priority: ElectionConfig::default().priority }
+    }
+}
+
+impl Rights {
+    /// The rights of a node that never leads.
+    pub const NONE: Self = Self { role: Role::Cav, priority: 0 };
+
+    /// Whether a node may lead at all.
+    pub fn may_lead(self) -> bool {
+        self.role != Role::Cav
+    }
+
+    /// Whether a node may declare this role and priority. A priority says nothing about a node that never leads.
+    pub fn allow(self, role: Role, priority: u8) -> bool {
+        role == Role::Cav || rank(role) <= rank(self.role) && priority <= self.priority
+    }
+
+    /// The lower of two roles.
+    pub fn limit_role(self, role: Role) -> Role {
+        if rank(role) <= rank(self.role) { role } else { self.role }
+    }
+
+    /// The message as far as its sender may say it; `None` for a claim that only a possible leader may make.
+    pub(crate) fn limit(self, mut message: ElectionMessage) -> Option<ElectionMessage> {
+        let claims = matches!(
+            message.body,
+            Body::Beat { .. } | Body::Ready | Body::Yield { .. } | Body::Offer | Body::Resign { .. }
+        );
+        let Candidacy { role, priority, .. } = message.candidacy;
+        message.candidacy.role = self.limit_role(role);
+        message.candidacy.priority = priority.min(self.priority);
+        (self.may_lead() || !claims).then_some(message)
+    }
+}
+
+fn rank(role: Role) -> u8 {
+    match role {
+        Role::Cav => 0,
+        Role::Auto => 1,
+        Role::Edge => 2,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nobody_may_declare_more_than_the_certificate_says() {
+        let auto = Rights { role: Role::Auto, priority: 100 };
+        assert!(auto.allow(Role::Auto, 100) && auto.allow(Role::Auto, 7) && auto.allow(Role::Cav, 255));
+        assert!(!auto.allow(Role::Auto, 101) && !auto.allow(Role::Edge, 100));
+        assert!(Rights::default().allow(Role::Edge, 255) && !Rights::NONE.allow(Role::Auto, 0));
+        assert_eq!(auto.limit_role(Role::Edge), Role::Auto);
+        assert_eq!(Rights::default().limit_role(Role::Cav), Role::Cav);
+    }
+}

@@ -1,0 +1,125 @@
+//! Shares of the ledger: the evidence behind the reputations.
+
+use minicbor::{Decode, Encode};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::compact::{Form, Text};
+use crate::model::epoch::Epoch;
+use crate::model::names::{Label, NodeName};
+use crate::model::time::Timestamp;
+
+/// A part of the evidence for reputations; receivers keep the larger of every count.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LedgerShare {
+    /// Major version of the payload, as of every payload.
+    #[n(0)]
+    pub schema: u32,
+    /// The sender; equals the last level of the topic.
+    #[n(1)]
+    pub node: NodeName,
+    /// Term of the sender's leadership; absent when it does not lead.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(2)]
+    pub epoch: Option<u64>,
+    /// Counts, at most 512.
+    #[n(3)]
+    pub entries: Vec<LedgerEntry>,
+    /// Marks, at most 512; without them earlier and later votes cannot be separated.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(4), default)]
+    pub marks: Vec<LedgerMark>,
+    /// Signature of the aggregator that counted, in cells with certificates; all counts and marks are then its own, of
+    /// one leadership.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(5)]
+    pub signed: Option<LedgerSignature>,
+    /// Time of the last reset of the cell's evidence, in cells without certificates; absent if there was none. Evidence
+    /// from before does not count.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(6)]
+    pub reset_at_us: Option<Timestamp>,
+}
+
+impl LedgerShare {
+    /// The bytes that an aggregator signs: the compact encoding of `["ecod ledger 1", cell, entries, marks]`. Sender and
+    /// term are not among them, so that others can pass the counts on.
+    ///
+    /// # Panics
+    /// Never: it writes into memory.
+    #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
+    pub fn signed_bytes(&self, cell: &NodeName) -> Vec<u8> {
+        let content = ("ecod ledger 1", cell, &self.entries, &self.marks);
+        minicbor::to_vec(content).expect("shares are written into memory")
+    }
+
+    /// The leadership whose counts these are. `None` without counts and marks, and for those of several leaderships.
+    pub fn lane(&self) -> Option<Epoch> {
+        let entries = self.entries.iter().map(|entry| (entry.epoch, &entry.aggregator));
+        let mut lanes = entries.chain(self.marks.iter().map(|mark| (mark.epoch, &mark.aggregator)));
+        let (term, aggregator) = lanes.next()?;
+        lanes.all(|lane| lane == (term, aggregator)).then(|| Epoch::new(term, aggregator.clone()))
+    }
+
+    /// Whether it has neither counts nor marks.
+    pub fn is_empty(&self) -> bool {
+        self.entries.is_empty() && self.marks.is_empty()
+    }
+}
+
+/// Signature under the counts of one leadership, and the certificate to verify it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LedgerSignature {
+    /// The aggregator's X.509 certificate in DER, as base64.
+    #[n(0)]
+    pub certificate: String,
+    /// ECDSA signature (P-256, SHA-256) in DER of the cell's name, the counts and the marks, as base64.
+    #[n(1)]
+    pub signature: String,
+}
+
+/// The numbers of right and wrong votes of one vehicle for one label under one leadership.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LedgerEntry {
+    /// Term of the leadership that counted.
+    #[n(0)]
+    pub epoch: u64,
+    /// Its aggregator.
+    #[n(1)]
+    pub aggregator: NodeName,
+    /// The vehicle.
+    #[n(2)]
+    pub node: NodeName,
+    /// The label that it stated.
+    #[cbor(n(3), with = "Text")]
+    pub label: Label,
+    /// Number of votes that agreed with the verdict, since the leadership began.
+    #[n(4)]
+    pub correct: u64,
+    /// Number of votes that did not.
+    #[n(5)]
+    pub incorrect: u64,
+}
+
+/// The numbers of right and wrong votes of one vehicle under one leadership at an earlier number of votes; written once.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LedgerMark {
+    /// Term of the leadership that counted.
+    #[n(0)]
+    pub epoch: u64,
+    /// Its aggregator.
+    #[n(1)]
+    pub aggregator: NodeName,
+    /// The vehicle.
+    #[n(2)]
+    pub node: NodeName,
+    /// Its number of votes then, divided by 32.
+    #[n(3)]
+    pub number: u64,
+    /// Number of those that agreed with the verdict.
+    #[n(4)]
+    pub correct: u64,
+    /// Number of those that did not.
+    #[n(5)]
+    pub incorrect: u64,
+}
