@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -49,7 +49,7 @@ eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics f
 
 # All programs are built before the first test: those of ecod-lab need ecod-node beside it.
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
-test: PACKAGES += mosquitto mosquitto-clients
+test: PACKAGES += libfaketime mosquitto mosquitto-clients
 test: setup ## all tests
 	cargo test --locked
 
@@ -66,6 +66,10 @@ sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of S
 trials: PACKAGES += iproute2 mosquitto nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
 	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact trials --nocapture
+
+clocks: PACKAGES += libfaketime
+clocks: setup ## real cells with wrong clocks that step, as vehicle and as leader; TRIAL=NAME runs those with it in their name
+	cargo test --release --locked -p ecod-actors --test clocks -- --ignored --exact all --nocapture
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1

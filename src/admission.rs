@@ -1,4 +1,6 @@
 //! Reports that count: the freshest of each vehicle, their age, and the offset of its clock.
 
+pub mod live_stream;
 pub mod minimum_delay;
 pub mod report_window;
+pub mod timeliness;

@@ -24,6 +24,7 @@ pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
 
 use crate::admission::report_window::{Admitted, ReportWindow};
+use crate::admission::timeliness::Timeliness;
 use crate::aggregator::round::{FirstRound, RoundTrigger};
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -33,7 +34,9 @@ use crate::perception::landmark::{Landmark, LandmarkIndex};
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
-use crate::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts};
+use crate::wire::{
+    FusedObject, GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts,
+};
 
 /// A closed round.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,6 +60,8 @@ pub struct Fused {
 pub struct Aggregator {
     leads: Option<Epoch>,
     next_round: u64,
+    /// The cell's time less the time of the caller in microseconds.
+    cell_offset_us: i64,
     windows: [ReportWindow; ReportKind::COUNT],
     rounds: RoundTrigger,
     pace: Option<Pace>,
@@ -85,6 +90,7 @@ impl Aggregator {
         Self {
             leads: None,
             next_round: 1,
+            cell_offset_us: 0,
             windows: [ReportWindow::new(window.clone()), ReportWindow::new(window)],
             rounds: RoundTrigger::new(round, now),
             pace,
@@ -215,13 +221,19 @@ impl Aggregator {
 
     fn number_verdicts(&mut self, epoch: &Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {
         let round = self.take_round_number();
-        Verdicts::new(epoch, round, now, verdicts)
+        Verdicts::new(epoch, round, self.in_cell_time(now), verdicts)
     }
 
     fn take_round_number(&mut self) -> u64 {
         let round = self.next_round;
         self.next_round = round.saturating_add(1);
         round
+    }
+
+    /// The share of the vehicles heard lately whose reports are usable by their time.
+    pub fn timeliness(&self, now: Timestamp) -> Timeliness {
+        let [detections, votes] = self.windows.each_ref().map(|window| window.timeliness(now));
+        Timeliness { timely: detections.timely + votes.timely, untimely: detections.untimely + votes.untimely }
     }
 
     /// VOTE's trust in each vehicle, from the evidence of this aggregator.
@@ -242,8 +254,17 @@ impl Aggregator {
     /// Takes over the identities of the objects in another aggregator's map, received at `now`.
     pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
         if let Some(tracks) = &mut self.tracks {
-            tracks.adopt_map(map, now);
+            let mut map = map.clone();
+            date_objects(&mut map.objects, self.cell_offset_us.saturating_neg());
+            tracks.adopt_map(&map, now);
         }
+    }
+
+    /// Notes the cell's time less the time given as `now` in microseconds, 0 at first. Reports and rounds are dated in the
+    /// cell's time, which may jump; everything else goes by `now`, which does not.
+    pub fn set_cell_offset(&mut self, offset_us: i64) {
+        self.cell_offset_us = offset_us;
+        self.windows.iter_mut().for_each(|window| window.set_cell_offset(offset_us));
     }
 
     /// Numbers of reports and objects so far that tracking could not use.
@@ -268,6 +289,10 @@ impl Aggregator {
         self.vote.as_ref().map_or(0, Vote::ignored)
     }
 
+    fn in_cell_time(&self, at: Timestamp) -> Timestamp {
+        at.shifted(self.cell_offset_us)
+    }
+
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
         let tracks = self.tracks.as_mut().map(|tracks| tracks.close(now)).unwrap_or_default();
@@ -283,22 +308,32 @@ impl Aggregator {
             return None;
         }
         let round = self.take_round_number();
-        let TracksRound { objects, pose_corrections, oldest_capture, evidence: seen } = tracks;
+        let fused_at = self.in_cell_time(now);
+        let TracksRound { mut objects, pose_corrections, oldest_capture, evidence: seen } = tracks;
+        date_objects(&mut objects, self.cell_offset_us);
         let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
         evidence.extend(seen);
+        let oldest = [pace.as_ref().and_then(|pace| pace.oldest_capture), oldest_capture].into_iter().flatten().min();
         let map = pace.map(|pace| GlobalMap {
             schema: SCHEMA_VERSION,
             aggregator: epoch.leader.clone(),
             epoch: epoch.term,
             round,
-            fused_at_us: now,
-            oldest_capture_us: [pace.oldest_capture, oldest_capture].into_iter().flatten().min(),
+            fused_at_us: fused_at,
+            oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
             landmarks: pace.landmarks,
             objects,
             pose_corrections,
         });
-        let verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, now, verdicts));
+        let verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
         Some(Fused { epoch, round, map, verdicts, evidence, reputations })
+    }
+}
+
+/// Moves the dates of objects to another clock.
+fn date_objects(objects: &mut [FusedObject], offset_us: i64) {
+    for object in objects.iter_mut().filter(|_| offset_us != 0) {
+        object.first_seen_us = object.first_seen_us.map(|first_seen| first_seen.shifted(offset_us));
     }
 }

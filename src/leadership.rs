@@ -7,12 +7,14 @@
 //! | a node keeps links to the brokers of leader and standby | [`links::Links`] |
 //! | all of that, as one machine of inputs and effects | [`node::LeadershipNode`] |
 //! | receivers accept or refuse each round | [`round_filter::RoundFilter`], [`round_filter::PublisherFilter`] |
+//! | nodes agree on the cell's time | [`cell_time::CellTime`] |
 //! | candidates replicate the evidence about vehicles | [`ledger_resync::LedgerResync`] |
 //!
 //! Machines meet in one value, [`Leadership`]: the node tells it, all others read it. [`timers`] relates every timer to the
 //! others.
 
 pub mod address;
+pub mod cell_time;
 pub mod config;
 pub mod echo;
 pub mod election;

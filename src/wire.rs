@@ -59,7 +59,7 @@ pub struct ObjectReport {
     /// Counts up by one with every report of a node since it started.
     #[n(2)]
     pub seq: u64,
-    /// Capture time of the frame, by the node's own clock.
+    /// Capture time of the frame: in the cell's time with `clock_error_us`, otherwise by the sender's own clock.
     #[n(3)]
     pub captured_at_us: Timestamp,
     /// Pose of the camera; absent when it is not known.
@@ -77,6 +77,10 @@ pub struct ObjectReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(7)]
     pub view: Option<FieldOfView>,
+    /// Largest error in microseconds of the sender's estimate of the cell's time; absent when it has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(8)]
+    pub clock_error_us: Option<u32>,
 }
 
 impl ObjectReport {
@@ -91,6 +95,7 @@ impl ObjectReport {
             objects: Vec::new(),
             seen: None,
             view: None,
+            clock_error_us: None,
         }
     }
 }
@@ -136,10 +141,10 @@ pub struct GlobalMap {
     /// Counts up by one with every round of an epoch.
     #[n(3)]
     pub round: u64,
-    /// Time when the round closed, by the aggregator's clock.
+    /// Time when the round closed, in the cell's time.
     #[n(4)]
     pub fused_at_us: Timestamp,
-    /// Capture time, on the aggregator's clock, of the oldest report in the map; absent when it rests on none.
+    /// Capture time, in the cell's time, of the oldest report in the map; absent when it rests on none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(5)]
     pub oldest_capture_us: Option<Timestamp>,
@@ -198,7 +203,7 @@ pub struct Verdicts {
     /// Counts up by one with every round of an epoch.
     #[n(3)]
     pub round: u64,
-    /// Time when the round closed, by the aggregator's clock.
+    /// Time when the round closed, in the cell's time.
     #[n(4)]
     pub fused_at_us: Timestamp,
     /// One entry per known location.

@@ -227,7 +227,8 @@ impl Cell {
             }
             Effect::AskParts => {
                 let links = (0..nodes).map(|index| (broker(index).into(), LinkState::Up)).collect();
-                let sample = HealthSample { broker_serves: true, links: Some(links), fuser_runs: true };
+                let sample =
+                    HealthSample { broker_serves: true, links: Some(links), fuser_runs: true, rejects_reports: false };
                 return Some(Input::PartsAnswered { sample });
             }
             Effect::HoldRound

@@ -1,5 +1,6 @@
 //! The machine below a node: clock, state files, bounded slots, throttles.
 
+pub mod cell_clock;
 pub mod clock;
 pub mod latest_slot;
 pub mod secret;

@@ -237,7 +237,8 @@ impl Vehicle {
                 let brokers = self.members.values().filter_map(|member| member.broker.clone());
                 let brokers = brokers.chain([broker(self.index).into()]);
                 let links = brokers.map(|broker| (broker, LinkState::Up)).collect();
-                let sample = HealthSample { broker_serves: true, links: Some(links), fuser_runs: true };
+                let sample =
+                    HealthSample { broker_serves: true, links: Some(links), fuser_runs: true, rejects_reports: false };
                 return Some(Input::PartsAnswered { sample });
             }
             // Nobody restarts here, and everybody sends to all.

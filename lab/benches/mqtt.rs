@@ -107,6 +107,7 @@ async fn join(
         status,
         mqtt: MqttConfig { version, ..MqttConfig::default() },
         security: Security::default(),
+        clock: Default::default(),
         counters: Arc::new(Counters::default()),
         subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
         seed: 1,

@@ -44,10 +44,4 @@ impl MinimumDelay {
     pub fn observed(&self) -> u64 {
         self.observed
     }
-
-    /// Microseconds to add to the sender's clock to get the receiver's; 0 within `tolerance_us`.
-    pub fn clock_offset(&self, tolerance_us: i64) -> i64 {
-        let least = self.least();
-        if least == i64::MAX || least.abs() <= tolerance_us { 0 } else { least }
-    }
 }

@@ -53,6 +53,11 @@ pub enum Command {
         /// The reputations.
         reputations: BTreeMap<NodeName, Reputation>,
     },
+    /// [`Aggregator::set_cell_offset`].
+    SetCellOffset {
+        /// The cell's time less the aggregator's clock in microseconds.
+        offset_us: i64,
+    },
 }
 
 impl Aggregator {
@@ -66,6 +71,7 @@ impl Aggregator {
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::Resume { reputations } => self.resume(reputations),
+            Command::SetCellOffset { offset_us } => self.set_cell_offset(*offset_us),
         }
         None
     }

@@ -46,6 +46,7 @@
 #![deny(clippy::indexing_slicing)]
 
 mod awake_clock;
+mod clock_stamps;
 mod following;
 mod handover;
 mod interface;
@@ -57,6 +58,7 @@ mod seeking;
 
 pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
+pub use clock_stamps::{AnsweredStamps, ClockStamps};
 pub use interface::{ElectionEffect, ElectionInput, Health};
 use message::MAX_ROUND_STEP;
 pub use message::{
@@ -372,6 +374,7 @@ impl Election {
             epoch: self.current_epoch().cloned(),
             hears_you,
             body,
+            clock: None,
         };
         self.effects.push(ElectionEffect::Send { to: to.clone(), message });
     }

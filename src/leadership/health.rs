@@ -35,6 +35,8 @@ pub struct HealthSample {
     pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
     /// Whether the fuser runs.
     pub fuser_runs: bool,
+    /// Whether it rejects nearly all vehicles' reports for their time.
+    pub rejects_reports: bool,
 }
 
 impl HealthMonitor {
@@ -116,7 +118,8 @@ impl HealthMonitor {
     }
 
     /// The parts as the election wants to know them. A node that uses an external broker, its own, or both, needs one
-    /// of them. A stalled link is none, but in a leader with `no_other` to lead, which would only make way for nobody.
+    /// of them. A stalled link is none, nor are reports usable that the fuser rejects, but in a leader with `no_other` to
+    /// lead, which would only make way for nobody.
     pub fn health(&self, plane: &DataPlane, brokers: &Brokers, no_other: bool, round_period: Duration) -> Health {
         let external = self.is_up(plane.external.as_ref(), no_other);
         let embedded = plane.embedded && self.sample.broker_serves;
@@ -127,6 +130,7 @@ impl HealthMonitor {
             fuser: self.sample.fuser_runs && closes_rounds,
             gateway: self.sample.links.is_some()
                 && (external || (embedded && self.is_up(brokers.own.as_ref(), no_other))),
+            reports: no_other || !self.sample.rejects_reports,
             load_percent: self.load_percent,
         }
     }
@@ -161,10 +165,14 @@ mod tests {
         format!("127.0.0.1:{port}").parse().unwrap()
     }
 
+    fn sample(links: Option<BTreeMap<BrokerAddress, LinkState>>) -> HealthSample {
+        HealthSample { broker_serves: true, links, fuser_runs: true, rejects_reports: false }
+    }
+
     /// A monitor of parts that answered, and have closed a round.
     fn monitor(now: Timestamp) -> HealthMonitor {
         let mut monitor = HealthMonitor::new(now);
-        monitor.note_sample(HealthSample { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true });
+        monitor.note_sample(sample(Some(BTreeMap::new())));
         monitor.note_look(1, 0, now);
         monitor
     }
@@ -215,13 +223,26 @@ mod tests {
     }
 
     #[test]
+    fn a_leader_that_rejects_nearly_all_reports_makes_way_if_another_could_lead() {
+        let mut monitor = monitor(Timestamp(60_000_000));
+        let (plane, brokers) =
+            (DataPlane { external: None, embedded: true }, Brokers { own: Some(address(1)), ..Brokers::default() });
+        monitor.note_sample(HealthSample {
+            rejects_reports: true,
+            ..sample(Some(BTreeMap::from([(address(1), LinkState::Up)])))
+        });
+        assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
+        assert!(monitor.health(&plane, &brokers, true, PERIOD).is_fit(), "nobody else could do better");
+    }
+
+    #[test]
     fn a_link_that_came_up_unnoticed_is_found_by_asking() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
         let plane = DataPlane { external: None, embedded: true };
         let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
         let links = |state| Some(BTreeMap::from([(address(1), state)]));
-        let answer = |state| HealthSample { broker_serves: true, links: links(state), fuser_runs: true };
+        let answer = |state| sample(links(state));
         monitor.note_sample(answer(LinkState::Up));
         assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
         monitor.note_sample(answer(LinkState::Down));

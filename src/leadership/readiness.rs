@@ -24,6 +24,11 @@ pub fn round_timeout(round_period: Duration) -> Duration {
 }
 
 impl Readiness {
+    /// A node that is not ready.
+    pub fn not(reason: String) -> Self {
+        Self { ready: false, reason }
+    }
+
     /// Judges from the leadership, the epoch and arrival of the last accepted round, and whether a broker carries what
     /// the node publishes. Without a `timeout` rounds are not waited for.
     pub fn judge(
@@ -33,7 +38,7 @@ impl Readiness {
         timeout: Option<Duration>,
         now: Timestamp,
     ) -> Self {
-        let not = |reason: String| Self { ready: false, reason };
+        let not = Self::not;
         let Some(epoch) = leadership.present_epoch() else {
             return not("no leader known".into());
         };

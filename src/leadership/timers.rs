@@ -39,6 +39,8 @@
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
 //! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from a far future would be the last |
+//! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
+//! | [`MIN_CLOCK_JUMP`] | 1 s | [`MAX_ROUND_AGE`] | a report's age tells by which time, before or after a jump, it is stamped |
 
 use std::time::Duration;
 
@@ -124,6 +126,14 @@ pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
 /// Least time between two transfers of all evidence to new leaders: leaders may seem to come and go fast.
 pub const FULL_RESYNC_PAUSE: Duration = Duration::from_secs(5);
 
+/// Time for which the stamps of a node are compared to later ones.
+pub const CLOCK_MEMORY: Duration = Duration::from_secs(15);
+
+/// Error of the cell's time from which it jumps; a smaller one is slewed away.
+pub const MIN_CLOCK_JUMP: Duration = MAX_ROUND_AGE;
+
+/// Rate at which the leader slews the cell's time, in parts per million.
+pub const MAX_CLOCK_SLEW: i64 = 5_000;
 /// Time after the end of a leadership in which evidence that its leader sends is still accepted of it.
 pub const LAST_WORD_TIME: Duration = Duration::from_secs(5);
 

@@ -124,7 +124,7 @@ pub struct FusedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(11), with = "Half", has_nil)]
     pub age_s: Option<f64>,
-    /// Time of the first detection, by the aggregator's clock.
+    /// Time of the first detection, in the cell's time.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(12)]
     pub first_seen_us: Option<Timestamp>,

@@ -274,7 +274,7 @@ impl Node {
     pub(crate) fn sample(&self) -> HealthSample {
         let links = || self.links.iter().map(|(broker, state)| (address_of(*broker), *state)).collect();
         let links = self.gateway_works.then(links);
-        HealthSample { broker_serves: self.broker_works, links, fuser_runs: true }
+        HealthSample { broker_serves: self.broker_works, links, fuser_runs: true, rejects_reports: false }
     }
 }
 

@@ -31,6 +31,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::observe::recorder::{LogItem, LogSender};
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::telemetry::spans::Spans;
@@ -52,6 +53,8 @@ pub struct FollowerArguments {
     pub election: ActorSlot<LeaderElectionMessage>,
     /// Goes on from the maps taken, when the node leads.
     pub fuser: ActorSlot<FuserMessage>,
+    /// The cell's time.
+    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// The node's spans.
@@ -71,6 +74,7 @@ pub struct FollowerState {
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
     fuser: ActorSlot<FuserMessage>,
+    clock: CellClock,
     counters: Arc<Counters>,
     spans: Spans,
 }
@@ -119,10 +123,20 @@ impl Actor for Follower {
 
 impl FollowerState {
     fn new(arguments: FollowerArguments) -> Self {
-        let FollowerArguments { newest, log, recording, saved_term, leadership, election, fuser, counters, spans } =
-            arguments;
+        let FollowerArguments {
+            newest,
+            log,
+            recording,
+            saved_term,
+            leadership,
+            election,
+            fuser,
+            clock,
+            counters,
+            spans,
+        } = arguments;
         let (filter, log) = (RoundFilter::new(saved_term, clock::now()), log.map(MapLog::new));
-        Self { newest, filter, log, recording, leadership, election, fuser, counters, spans }
+        Self { newest, filter, log, recording, leadership, election, fuser, clock, counters, spans }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
@@ -135,7 +149,7 @@ impl FollowerState {
         self.tell_election(accepted);
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
         if let Some(log) = &mut self.log {
-            log.append(&received);
+            log.append(&ReceivedMap { received_at: self.clock.date(received_at), map: Arc::clone(map) });
         }
         self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));

@@ -33,6 +33,7 @@ use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::observe::recorder::{LogItem, LogSender};
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::{RoundReports, Spans};
@@ -48,6 +49,8 @@ pub struct FuserArguments {
     pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
     /// Where the aggregator's inputs are recorded.
     pub recording: LogSender,
+    /// The cell's time.
+    pub clock: CellClock,
     /// Where maps and verdicts are published.
     pub gateway: ActorSlot<GatewayMessage>,
     /// Is told what rounds say about vehicles.
@@ -67,6 +70,9 @@ pub struct FuserState {
     aggregator: Aggregator,
     report_queue: LatestReportQueue,
     recording: LogSender,
+    clock: CellClock,
+    /// The cell's time as the aggregator knows it.
+    cell_offset_us: i64,
     gateway: ActorSlot<GatewayMessage>,
     keeper: ActorSlot<ReputationKeeperMessage>,
     counters: Arc<Counters>,
@@ -102,6 +108,7 @@ impl Actor for Fuser {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
+        state.follow_clock();
         match message {
             FuserMessage::TakeReports => state.take_reports(),
             FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
@@ -123,6 +130,11 @@ impl Actor for Fuser {
             }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
+            FuserMessage::Timeliness { reply } => {
+                if reply.send(state.aggregator.timeliness(clock::now())).is_err() {
+                    tracing::debug!("caller did not wait for the timeliness of reports");
+                }
+            }
         }
         state.count_losses();
         state.set_alarm(&myself);
@@ -132,12 +144,14 @@ impl Actor for Fuser {
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
-        let FuserArguments { aggregator, report_queue, newest, recording, gateway, keeper, counters, spans } =
+        let FuserArguments { aggregator, report_queue, newest, recording, clock, gateway, keeper, counters, spans } =
             arguments;
         Self {
             aggregator,
             report_queue,
             recording,
+            clock,
+            cell_offset_us: 0,
             gateway,
             keeper,
             counters,
@@ -147,6 +161,14 @@ impl FuserState {
             losses: [0; 4],
             spans,
             reports: RoundReports::default(),
+        }
+    }
+
+    /// Tells the aggregator when the cell's time has moved.
+    fn follow_clock(&mut self) {
+        let offset_us = self.clock.reading().offset_us;
+        if std::mem::replace(&mut self.cell_offset_us, offset_us) != offset_us {
+            self.command(Command::SetCellOffset { offset_us });
         }
     }
 

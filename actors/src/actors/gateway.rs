@@ -29,6 +29,7 @@ use uuid::Uuid;
 pub use ecod::wire::ReportKind;
 
 use crate::messages::gateway::GatewayMessage;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::connection::{LastWill, Retention, offline_payload};
@@ -51,6 +52,8 @@ pub struct GatewayArguments {
     pub mqtt: MqttConfig,
     /// Certificates and signatures.
     pub security: Security,
+    /// The cell's time.
+    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// Callback for every message.
@@ -168,7 +171,7 @@ async fn links_first() {
 
 impl GatewayState {
     fn new(arguments: GatewayArguments) -> Self {
-        let GatewayArguments { cell, role, status, mqtt, security, counters, subscriber, seed } = arguments;
+        let GatewayArguments { cell, role, status, mqtt, security, clock, counters, subscriber, seed } = arguments;
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
         let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
@@ -177,7 +180,7 @@ impl GatewayState {
         let will = LastWill { topic: status_topic.clone(), payload: seal(offline_payload(&status, encoding)) };
         let status_payload = seal(encode(&status, encoding));
         let signing = security.signing.clone();
-        let inbox = Inbox::new(&status, topics.clone(), &mqtt, signing, Arc::clone(&counters), subscriber);
+        let inbox = Inbox::new(&status, topics.clone(), &mqtt, signing, clock, Arc::clone(&counters), subscriber);
         // One client id for each run: a broker ends the old connection before it accepts the new one, so that the last
         // will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());

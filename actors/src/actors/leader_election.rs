@@ -34,6 +34,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::Member;
@@ -67,6 +68,8 @@ pub struct LeaderElectionArguments {
     pub parts: Parts,
     /// Gets the leadership whenever it changes. A change of the highest known term alone wakes nobody.
     pub leadership: watch::Sender<Leadership>,
+    /// Shows the cell's time.
+    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }

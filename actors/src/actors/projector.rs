@@ -11,6 +11,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::aggregator::Algorithms;
+use ecod::leadership::cell_time::ClockReading;
 use ecod::model::detection::Detection;
 use ecod::model::time::Timestamp;
 use ecod::perception::pose_history::PoseHistory;
@@ -22,6 +23,7 @@ use crate::camera::perception::Perception;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::projector::ProjectorMessage;
+use crate::platform::cell_clock::CellClock;
 use crate::telemetry::counters::{Counters, Event};
 
 /// Arguments of a projector's start.
@@ -32,6 +34,8 @@ pub struct ProjectorArguments {
     pub poses: Option<SocketAddr>,
     /// Algorithms to report for.
     pub algorithms: Algorithms,
+    /// Dates the reports.
+    pub clock: CellClock,
     /// Publisher of the reports.
     pub gateway: ActorSlot<GatewayMessage>,
     /// Counters of the node.
@@ -48,6 +52,7 @@ pub struct ProjectorState {
     /// Recent poses of a moving vehicle.
     poses: Option<PoseHistory>,
     algorithms: Algorithms,
+    clock: CellClock,
     gateway: ActorSlot<GatewayMessage>,
     counters: Arc<Counters>,
     /// Ends with the actor.
@@ -64,13 +69,13 @@ impl Actor for Projector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let ProjectorArguments { perception, poses, algorithms, gateway, counters } = arguments;
+        let ProjectorArguments { perception, poses, algorithms, clock, gateway, counters } = arguments;
         let mut feed = JoinSet::new();
         if let Some(address) = poses {
             feed.spawn(pose_feed::listen(address, myself, Arc::clone(&counters)));
         }
         let history = poses.map(|_| PoseHistory::default());
-        Ok(ProjectorState { perception, poses: history, algorithms, gateway, counters, _feed: feed })
+        Ok(ProjectorState { perception, poses: history, algorithms, clock, gateway, counters, _feed: feed })
     }
 
     async fn handle(
@@ -99,8 +104,10 @@ impl ProjectorState {
         }
         let found = detections.len();
         let span = tracing::info_span!("project");
-        let report = span.in_scope(|| self.perception.report(detections, captured_at));
+        let mut report = span.in_scope(|| self.perception.report(detections, captured_at));
         drop(span);
+        let ClockReading { offset_us, error_us } = self.clock.reading();
+        (report.captured_at_us, report.clock_error_us) = (captured_at.shifted(offset_us), error_us);
         self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
         if self.algorithms.vote() {
             self.publish(ReportKind::VoteDetections, votes(&report));
@@ -118,6 +125,7 @@ impl ProjectorState {
 /// The report as VOTE needs it: objects at known locations only.
 fn votes(report: &ObjectReport) -> ObjectReport {
     let objects = report.objects.iter().filter(|object| object.landmark.is_some()).cloned().collect();
-    let ObjectReport { node, seq, captured_at_us, pose, .. } = report;
-    ObjectReport { pose: *pose, objects, ..ObjectReport::new(node.clone(), *seq, *captured_at_us) }
+    let ObjectReport { node, seq, captured_at_us, pose, clock_error_us, .. } = report;
+    let empty = ObjectReport::new(node.clone(), *seq, *captured_at_us);
+    ObjectReport { pose: *pose, objects, clock_error_us: *clock_error_us, ..empty }
 }

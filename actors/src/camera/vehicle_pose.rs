@@ -53,7 +53,7 @@ struct PoseFix {
 /// Maximum distance from the origin in metres, along each axis.
 const WORLD_M: f64 = 1e8;
 
-/// Reads a pose and its time from JSON:
+/// Reads a pose from JSON, and its time by the node's steady clock, than which the wall clock is `wall_offset_us` more:
 ///
 /// ```json
 /// {"x_m": 4.2, "y_m": -1.0, "heading_rad": 1.57, "captured_at_us": 1732154400000000}
@@ -61,13 +61,14 @@ const WORLD_M: f64 = 1e8;
 ///
 /// # Errors
 /// The problem as text.
-pub fn read_pose(datagram: &[u8], now: Timestamp) -> Result<(Timestamp, Pose), String> {
+pub fn read_pose(datagram: &[u8], now: Timestamp, wall_offset_us: i64) -> Result<(Timestamp, Pose), String> {
     let fix: PoseFix = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
     let within = |value: f64, most: f64| value.abs() <= most;
     if !within(fix.x_m, WORLD_M) || !within(fix.y_m, WORLD_M) || !within(fix.heading_rad, 1e3) {
         return Err(format!("{fix:?} is not in this world"));
     }
-    Ok((fix.captured_at_us.unwrap_or(now), Pose::new(fix.x_m, fix.y_m, fix.heading_rad)))
+    let captured_at = fix.captured_at_us.map(|wall| wall.shifted(wall_offset_us.saturating_neg()));
+    Ok((captured_at.unwrap_or(now), Pose::new(fix.x_m, fix.y_m, fix.heading_rad)))
 }
 
 #[cfg(test)]
@@ -78,9 +79,9 @@ mod tests {
     fn a_pose_has_its_own_time_or_that_of_its_receipt() {
         let now = Timestamp(7);
         let told =
-            read_pose(br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#, now).unwrap();
-        assert_eq!(told, (Timestamp(5), Pose::new(1.0, -2.5, 3.1)));
-        assert_eq!(read_pose(br#"{"x_m":1,"y_m":2,"heading_rad":0}"#, now).unwrap().0, now);
+            read_pose(br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#, now, 2).unwrap();
+        assert_eq!(told, (Timestamp(3), Pose::new(1.0, -2.5, 3.1)));
+        assert_eq!(read_pose(br#"{"x_m":1,"y_m":2,"heading_rad":0}"#, now, 2).unwrap().0, now);
     }
 
     #[test]
@@ -91,7 +92,7 @@ mod tests {
             (b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":0,\"captured_at_us\":-1}", "invalid value"),
             (b"\xff\xfe", "line 1"),
         ] {
-            let error = read_pose(datagram, Timestamp(0)).unwrap_err();
+            let error = read_pose(datagram, Timestamp(0), 0).unwrap_err();
             assert!(error.contains(reason), "{error}");
         }
     }

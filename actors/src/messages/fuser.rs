@@ -3,12 +3,14 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use ecod::admission::timeliness::Timeliness;
 use ecod::aggregator::round::FirstRound;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::reputation::ReputationLedger;
 use ecod::wire::{GlobalMap, Reputation};
+use ractor::RpcReplyPort;
 
 /// What the fuser is asked to do.
 #[derive(Debug)]
@@ -46,5 +48,10 @@ pub enum FuserMessage {
     Resume {
         /// The reputations.
         reputations: BTreeMap<NodeName, Reputation>,
+    },
+    /// Query whether the reports of vehicles are usable by their time.
+    Timeliness {
+        /// Gets the share of the vehicles.
+        reply: RpcReplyPort<Timeliness>,
     },
 }

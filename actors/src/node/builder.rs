@@ -42,6 +42,7 @@ use crate::observe::dashboard::LiveState;
 #[cfg(feature = "camera")]
 use crate::observe::recorder::ImageRecorder;
 use crate::observe::recorder::LogSender;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
@@ -57,6 +58,7 @@ pub(super) struct NodeBuilder {
     name: NodeName,
     run: Uuid,
     started_at: Timestamp,
+    clock: CellClock,
     slots: ActorSlots,
     counters: Arc<Counters>,
     newest: Newest,
@@ -96,6 +98,7 @@ impl NodeBuilder {
             security,
             run: Uuid::now_v7(),
             started_at: clock::now(),
+            clock: CellClock::default(),
             slots: ActorSlots::default(),
             recording: LogSender::new(Arc::clone(&counters)),
             counters,
@@ -122,7 +125,7 @@ impl NodeBuilder {
     }
 
     fn spans(&self) -> Spans {
-        Spans::new(self.config.cell.clone(), self.name.clone())
+        Spans::new(self.config.cell.clone(), self.name.clone()).dated_by(self.clock.clone())
     }
 
     pub(super) fn newest(&self) -> Newest {
@@ -223,6 +226,7 @@ impl NodeBuilder {
                     perception: crate::node::camera::perception(&self.config).map_err(in_full)?,
                     poses: self.config.pose.listen,
                     algorithms: crate::node::camera::algorithms(&self.config),
+                    clock: self.clock.clone(),
                     gateway: self.slots.gateway.clone(),
                     counters: self.counters(),
                 };

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use ecod::admission::timeliness::Timeliness;
 use ecod::aggregator::FusionConfig;
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::{Readiness, round_timeout};
@@ -15,11 +16,13 @@ use tokio::sync::watch;
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
+use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::transport::broker::BrokerHealth;
-use crate::transport::mqtt::{BrokerAddress, DataPlane, LinkState};
+use crate::transport::mqtt::{BrokerAddress, DataPlane, LinkState, Security};
 
 /// What a node's readiness is judged from; reading never makes another part wait.
 #[derive(Debug, Clone)]
@@ -28,10 +31,16 @@ pub struct Vitals {
     pub newest: Newest,
     /// Who leads.
     pub leadership: watch::Receiver<Leadership>,
+    /// The cell's time.
+    pub clock: CellClock,
     /// Which brokers carry the data.
     pub plane: DataPlane,
     /// How old the newest round of a live aggregator may be; none where rounds come only with reports.
     pub patience: Option<Duration>,
+    /// The node's certificates, which are valid at certain times only.
+    pub security: Security,
+    /// Tells how reports are.
+    pub fuser: ActorSlot<FuserMessage>,
     /// Tells how links are.
     pub gateway: ActorSlot<GatewayMessage>,
     /// Tells whether the node's own broker serves.
@@ -45,6 +54,8 @@ pub struct Probe {
     pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
     /// Whether the node's own broker serves.
     pub broker_serves: bool,
+    /// Vehicles whose reports are usable by their time, and others.
+    pub timeliness: Timeliness,
 }
 
 /// Maximum age of the newest round of a live aggregator; none for VOTE's `paper` mode alone, which has a round whenever
@@ -57,16 +68,28 @@ pub fn patience(fusion: &FusionConfig) -> Option<Duration> {
 impl Vitals {
     /// Asks the parts how they are.
     pub async fn probe(&self) -> Probe {
-        let (health, links) = tokio::join!(
+        let (health, links, timeliness) = tokio::join!(
             self.broker.ask(|reply| BrokerMessage::Health { reply }, READINESS_STEPS),
             self.gateway.ask(|reply| GatewayMessage::Links { reply }, READINESS_STEPS),
+            self.fuser.ask(|reply| FuserMessage::Timeliness { reply }, READINESS_STEPS),
         );
-        Probe { broker_serves: matches!(health, Some(BrokerHealth::Serving(_))), links }
+        let broker_serves = matches!(health, Some(BrokerHealth::Serving(_)));
+        Probe { broker_serves, links, timeliness: timeliness.unwrap_or_default() }
     }
 
     /// Whether the node is ready now, the parts being as they answered.
     pub fn readiness(&self, probe: &Probe) -> Readiness {
         let leadership = self.leadership.borrow().clone();
+        if let Some(fault) = self.security.clock_fault() {
+            return Readiness::not(fault);
+        }
+        let Timeliness { timely, untimely } = probe.timeliness;
+        if leadership.is_leading() && !probe.timeliness.is_usable() {
+            let vehicles = timely + untimely;
+            return Readiness::not(format!(
+                "leading, but the times of {untimely} of {vehicles} vehicles' reports are unusable"
+            ));
+        }
         Readiness::judge(&leadership, self.last_round().as_ref(), self.broker_works(probe), self.patience, clock::now())
     }
 

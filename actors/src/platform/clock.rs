@@ -1,4 +1,4 @@
-//! The node's clock. It never goes backwards.
+//! The node's clocks: a steady one for everything that happens inside the node, and the machine's wall clock.
 
 use std::sync::OnceLock;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -6,18 +6,25 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use ecod::model::time::Timestamp;
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
-/// The present time in Unix microseconds.
+/// The present time of the steady clock in microseconds. It never steps.
 ///
-/// The wall clock is read once, at the first call. From then on time passes by the monotonic clock that includes
-/// suspension. A later step of the wall clock, such as by NTP's first synchronisation, takes effect at the next restart.
-/// Aggregators estimate each vehicle's offset, so that a constant error up to `max_clock_offset_s` does no harm.
+/// It starts as the wall clock of the first call. From then on time passes by the monotonic clock that includes suspension.
+/// All durations, timers and times of arrival are by this clock. What leaves the node is dated by
+/// [`CellClock`](super::cell_clock::CellClock).
 pub fn now() -> Timestamp {
     static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();
-    let (started, wall) = ANCHOR.get_or_init(|| {
-        let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        (since_boot(), Timestamp::default() + since_epoch)
-    });
+    let (started, wall) = ANCHOR.get_or_init(|| (since_boot(), wall()));
     *wall + since_boot().saturating_sub(*started)
+}
+
+/// The wall clock less the steady clock in microseconds. It changes when the wall clock steps.
+pub fn wall_offset_us() -> i64 {
+    wall().micros_from(now())
+}
+
+/// The wall clock in Unix microseconds, as right or wrong as the machine has it.
+pub fn wall() -> Timestamp {
+    Timestamp::default() + SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
 }
 
 fn since_boot() -> Duration {

@@ -25,11 +25,14 @@ use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, Verdicts};
 use tracing::{Level, Span, info_span, span_enabled};
 
+use crate::platform::cell_clock::CellClock;
+
 /// The spans of one node.
 #[derive(Debug, Clone)]
 pub struct Spans {
     cell: NodeName,
     node: NodeName,
+    clock: CellClock,
 }
 
 /// Reports that a round has taken so far: node and capture, and when they came.
@@ -48,7 +51,12 @@ pub struct RoundId<'a> {
 impl Spans {
     /// Spans of a node of a cell.
     pub fn new(cell: NodeName, node: NodeName) -> Self {
-        Self { cell, node }
+        Self { cell, node, clock: CellClock::default() }
+    }
+
+    /// The same for a node that dates its messages by this clock.
+    pub fn dated_by(self, clock: CellClock) -> Self {
+        Self { clock, ..self }
     }
 
     /// The way of a frame from its capture on; the root of its trace.
@@ -57,7 +65,7 @@ impl Spans {
             parent: None,
             "frame",
             node = %self.node,
-            ecod.id = %self.frame_name(&self.node, captured_at),
+            ecod.id = %self.frame_name(&self.node, self.clock.date(captured_at)),
             ecod.since_us = captured_at.micros(),
         )
     }
@@ -77,7 +85,7 @@ impl Spans {
         if !span_enabled!(Level::INFO) {
             return Span::none();
         }
-        let (mut frames, mut since) = (String::new(), round.fused_at);
+        let (mut frames, mut since) = (String::new(), self.clock.undate(round.fused_at));
         for ((node, captured_at), received_at) in &reports.0 {
             let frame = self.frame_name(node, *captured_at).to_string();
             drop(info_span!(
@@ -103,7 +111,8 @@ impl Spans {
             ecod.links = frames.trim_end(),
             ecod.since_us = since.micros(),
         );
-        drop(info_span!(parent: &span, "fuse", ecod.since_us = round.fused_at.micros()));
+        let fused_at = self.clock.undate(round.fused_at);
+        drop(info_span!(parent: &span, "fuse", ecod.since_us = fused_at.micros()));
         span
     }
 

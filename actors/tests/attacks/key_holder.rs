@@ -67,6 +67,7 @@ async fn largest_term(target: Target) -> anyhow::Result<()> {
             term: MAX_TERM,
             epoch: None,
             hears_you: true,
+            clock: None,
             body: Body::Status { over: None },
         };
         let payload = Bytes::from(message.encode(Encoding::Cbor));

@@ -67,6 +67,7 @@ impl Node {
             status: status.clone(),
             mqtt,
             security: Security::default(),
+            clock: Default::default(),
             counters: Arc::clone(&counters),
             subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
             seed: 7,

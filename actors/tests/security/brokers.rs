@@ -49,6 +49,7 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
         status: NodeStatus::starting(node("gauss"), Uuid::now_v7(), Role::Cav, "0.1.0"),
         mqtt: config.mqtt.clone(),
         security: config.security().unwrap(),
+        clock: Default::default(),
         counters: Arc::clone(&counters),
         subscriber: Arc::new(move |delivery| {
             if let Incoming::Link { broker, state } = delivery.message {

@@ -44,6 +44,7 @@ impl Voters {
             status,
             mqtt: MqttConfig::default(),
             security: Security::default(),
+            clock: Default::default(),
             counters: Arc::default(),
             subscriber: Arc::new(move |Delivery { message, .. }| {
                 if let Incoming::Reputations(reputations) = message {

@@ -47,6 +47,7 @@ impl ReportCollector {
             status,
             mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },
             security: Security::default(),
+            clock: Default::default(),
             counters: Arc::default(),
             subscriber: Arc::new(move |delivery| lock(&kept).take(delivery)),
             seed: 1,

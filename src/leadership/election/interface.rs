@@ -60,6 +60,8 @@ pub struct Health {
     pub fuser: bool,
     /// The gateway can publish and receive.
     pub gateway: bool,
+    /// Vehicles' reports are usable: not nearly all of them are rejected for their time.
+    pub reports: bool,
     /// Processor load of the machine, 0 to 100 %.
     pub load_percent: u8,
 }
@@ -67,7 +69,7 @@ pub struct Health {
 impl Health {
     /// All parts work.
     pub fn is_fit(&self) -> bool {
-        self.broker && self.fuser && self.gateway
+        self.broker && self.fuser && self.gateway && self.reports
     }
 }
 

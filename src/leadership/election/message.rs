@@ -4,6 +4,7 @@ use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::leadership::election::clock_stamps::ClockStamps;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::wire::{self, Encoding, Limits, RejectReason, Role};
@@ -62,6 +63,10 @@ pub struct ElectionMessage {
     /// Its content.
     #[n(7)]
     pub body: Body,
+    /// Stamps by which the nodes compare their clocks; absent from nodes of earlier versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(9)]
+    pub clock: Option<Box<ClockStamps>>,
 }
 
 /// A node as a candidate: its rank among possible leaders.
@@ -224,13 +229,16 @@ impl ElectionMessage {
             Body::Yield { last_round } => *last_round <= MAX_ROUND,
             Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready => true,
         };
-        body && self.term <= MAX_TERM && known(&self.epoch)
+        let clock = self.clock.as_ref().is_none_or(|clock| clock.is_plausible());
+        body && clock && self.term <= MAX_TERM && known(&self.epoch)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::leadership::election::AnsweredStamps;
+    use crate::model::time::Timestamp;
     use crate::wire::SCHEMA_VERSION;
 
     fn beat(term: u64, leader: &str) -> ElectionMessage {
@@ -244,6 +252,7 @@ mod tests {
             epoch: Some(Epoch::new(4, NodeName::new(leader).unwrap())),
             hears_you: true,
             body: Body::Beat { every_ms: 40, round: 88, followers: 31, after: None, successors: vec![] },
+            clock: None,
         }
     }
 
@@ -255,6 +264,10 @@ mod tests {
             *successors = vec![long.clone(), long.clone(), long.clone()];
             *after = Some(Epoch::new(3, long));
         }
+        let latest = Timestamp(wire::MAX_INTEGER);
+        let answers = Some(AnsweredStamps { sent_us: latest, received_us: latest });
+        message.clock =
+            Some(ClockStamps { sent_us: latest, answers, wall_us: Some(latest), cell_us: Some(latest) }.into());
         for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
             let bytes = message.encode(encoding);
             assert!(bytes.len() <= MAX_MESSAGE_BYTES, "{}", bytes.len());

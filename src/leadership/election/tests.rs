@@ -6,7 +6,7 @@ const NOW: Timestamp = Timestamp(1_000_000);
 
 fn euclid() -> Election {
     let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 7, NOW);
-    let health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
     election.handle(ElectionInput::Health { health }, NOW);
     election
 }
@@ -23,6 +23,7 @@ fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> Elec
         epoch: epoch.cloned(),
         hears_you: true,
         body,
+        clock: None,
     }
 }
 
@@ -95,7 +96,7 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
     let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
     let mut now = Timestamp(1_000_000);
     let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
-    let health = Health { broker: true, fuser: true, gateway: true, load_percent: 0 };
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
     election.handle(ElectionInput::Health { health }, now);
     let status = || Body::Status { over: None };
     for seq in 1.. {

@@ -74,7 +74,12 @@ impl Scene {
                     Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members: self.members.clone() }
                 }
                 Effect::AskParts => Input::PartsAnswered {
-                    sample: HealthSample { broker_serves: true, links: Some(BTreeMap::new()), fuser_runs: true },
+                    sample: HealthSample {
+                        broker_serves: true,
+                        links: Some(BTreeMap::new()),
+                        fuser_runs: true,
+                        rejects_reports: false,
+                    },
                 },
                 effect => {
                     self.effects.push(effect);
@@ -108,6 +113,7 @@ impl Scene {
             epoch: Some(epoch),
             hears_you: true,
             body,
+            clock: None,
         }
     }
 

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use crate::admission::live_stream::LiveStream;
 use crate::admission::minimum_delay::MinimumDelay;
 use crate::leadership::timers::{LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT};
 use crate::model::epoch::Epoch;
@@ -21,6 +22,8 @@ pub struct StalenessFilter {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct LeadersDelay {
     least: MinimumDelay,
+    /// A least delay that the rounds that seem to have waited agree on: the leader's clock may have been set.
+    candidate: Option<LiveStream>,
     /// Whether the least delay is that of rounds that did not wait.
     is_learnt: bool,
     /// Time for which rounds have arrived no faster than they were made.
@@ -32,7 +35,7 @@ struct LeadersDelay {
 impl LeadersDelay {
     fn new(is_learnt: bool, fused_at: Timestamp, received_at: Timestamp) -> Self {
         let least = MinimumDelay::new(received_at);
-        Self { least, is_learnt, live_for: Duration::ZERO, last: (fused_at, received_at) }
+        Self { least, candidate: None, is_learnt, live_for: Duration::ZERO, last: (fused_at, received_at) }
     }
 
     /// Takes a round; returns how long it waited, as far as is known.
@@ -43,9 +46,20 @@ impl LeadersDelay {
         self.is_learnt |= self.live_for >= LIVE_STREAM_TIME;
         let delay_us = received_at.micros_from(fused_at);
         self.least.observe(delay_us, received_at);
-        Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs())
+        let mut waited = Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs());
+        if waited <= MAX_ROUND_WAIT {
+            self.candidate = None;
+        } else if let Some(least_us) = LiveStream::observe(&mut self.candidate, fused_at, received_at, TOLERANCE_US) {
+            self.least = MinimumDelay::new(received_at);
+            self.least.observe(least_us, received_at);
+            waited = Duration::from_micros(delay_us.saturating_sub(least_us).unsigned_abs());
+        }
+        waited
     }
 }
+
+/// Change of delay within which the rounds of a leader whose clock was set agree.
+const TOLERANCE_US: i64 = 250_000;
 
 impl StalenessFilter {
     /// A filter of a node that starts: nothing can have waited for it before.
@@ -115,6 +129,18 @@ mod tests {
         assert_eq!(waiting, 0, "however slowly they come");
         let live: Vec<_> = (115..125).filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(9 + 100 * n))).collect();
         assert_eq!(live, Vec::from_iter(117..125));
+    }
+
+    #[test]
+    fn a_leader_whose_clock_was_set_is_believed_after_a_second() {
+        for (step_ms, most) in [(5_000, 0), (-5_000, 11), (-31_536_000_000_i64, 11)] {
+            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+            let refused = (0..100).filter(|n| {
+                let fused_at = ms(100 * n).shifted(if *n < 50 { 0 } else { 1000 * step_ms });
+                !filter.is_fresh(&epoch, fused_at, ms(100 * n + 1))
+            });
+            assert!(refused.count() <= most, "{step_ms} ms");
+        }
     }
 
     #[test]

@@ -145,7 +145,8 @@ fn what_others_write_is_read() {
     e.begin_array().unwrap().u8(1).unwrap().str("euclid").unwrap().u8(7).unwrap().u32(5).unwrap();
     e.begin_array().unwrap();
     object(&mut e).unwrap();
-    e.end().unwrap().null().unwrap().null().unwrap().null().unwrap().bool(true).unwrap().end().unwrap();
+    e.end().unwrap().null().unwrap().null().unwrap().null().unwrap().null().unwrap();
+    e.bool(true).unwrap().end().unwrap();
     let report: ObjectReport = decode(&bytes, &Limits::default()).unwrap();
     let expected =
         PerceivedObject { covariance_m2: Some([0.25, 0.0, 0.5]), ..PerceivedObject::new("car", 0.5, 1.5, -0.02) };

@@ -4,6 +4,7 @@ use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use ecod::leadership::cell_time::{CellTime, ClockEvent};
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
@@ -22,6 +23,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::gossip::{Member, MembershipEvent, is_of_this_machine};
@@ -29,6 +31,8 @@ use crate::transport::gossip::{Member, MembershipEvent, is_of_this_machine};
 /// The node's leadership, and where its effects go.
 pub struct ElectionDriver {
     machine: LeadershipNode,
+    cell_time: CellTime,
+    clock: CellClock,
     terms: TermWriter,
     members: watch::Receiver<Vec<Member>>,
     own_broker: watch::Receiver<Option<SocketAddr>>,
@@ -45,13 +49,24 @@ pub struct ElectionDriver {
 
 impl ElectionDriver {
     pub(super) fn new(arguments: LeaderElectionArguments, myself: ActorRef<LeaderElectionMessage>) -> Self {
-        let LeaderElectionArguments { settings, term_file, mut own_broker, members, parts, leadership, counters } =
-            arguments;
+        let LeaderElectionArguments {
+            settings,
+            term_file,
+            mut own_broker,
+            members,
+            parts,
+            leadership,
+            clock,
+            counters,
+        } = arguments;
         let saved_term = saved_term(term_file.as_ref());
         own_broker.mark_changed();
+        let cell_time = CellTime::new(settings.election.role);
         let machine = LeadershipNode::new(settings, saved_term, &leadership.borrow(), clock::now());
         Self {
             machine,
+            cell_time,
+            clock,
             terms: TermWriter::new(term_file),
             members,
             own_broker,
@@ -72,7 +87,12 @@ impl ElectionDriver {
             MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
             MembershipEvent::Down { name } => Input::MemberDown { name },
             MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
-                Ok(message) => Input::Receive { from, rights, message },
+                Ok(message) => {
+                    if message.from == from {
+                        self.cell_time.receive(&message, clock::now());
+                    }
+                    Input::Receive { from, rights, message }
+                }
                 Err(reason) => {
                     self.counters.reject(reason, from.as_str());
                     return tracing::debug!(%from, %reason, "election message dropped");
@@ -99,6 +119,8 @@ impl ElectionDriver {
                 inputs.extend(self.carry_out(effect).await);
             }
         }
+        self.cell_time.follow(&self.leadership.borrow(), clock::now());
+        self.clock.show(self.cell_time.reading());
         self.set_timer();
     }
 
@@ -112,7 +134,8 @@ impl ElectionDriver {
     async fn carry_out(&mut self, effect: Effect) -> Option<Input> {
         match effect {
             Effect::PersistTerm { term } => self.terms.save(term),
-            Effect::Send { to, message } => {
+            Effect::Send { to, mut message } => {
+                message.clock = Some(Box::new(self.cell_time.stamps(&to, clock::now())));
                 let payload = message.encode(Encoding::Cbor).into();
                 self.parts.membership.send(MembershipMessage::Send { to, payload });
             }
@@ -140,6 +163,8 @@ impl ElectionDriver {
                 self.parts.keeper.send(ReputationKeeperMessage::SendSnapshot { to });
             }
             Effect::Look => {
+                let events = self.cell_time.look(clock::wall_offset_us(), &self.leadership.borrow(), clock::now());
+                events.into_iter().for_each(log_clock);
                 return Some(Input::Looked {
                     rounds_due: self.counters.events(Event::RoundDue),
                     load_percent: probe::load_percent().unwrap_or(0),
@@ -201,11 +226,19 @@ fn as_seen(member: &Member) -> node::Member {
     }
 }
 
+fn log_clock(event: ClockEvent) {
+    let seconds = |micros: i64| micros as f64 / 1e6;
+    match event {
+        ClockEvent::WallStepped(step_us) => tracing::info!(step_s = seconds(step_us), "this machine's clock was set"),
+        ClockEvent::CellJumped(jump_us) => tracing::info!(jump_s = seconds(jump_us), "the cell's time jumps"),
+    };
+}
+
 fn log(notice: Notice) {
     match notice {
         Notice::Fit => tracing::info!("fit to lead"),
-        Notice::Unfit { health: Health { broker, fuser, gateway, .. } } => {
-            tracing::warn!(broker, fuser, gateway, "not fit to lead");
+        Notice::Unfit { health: Health { broker, fuser, gateway, reports, .. } } => {
+            tracing::warn!(broker, fuser, gateway, reports, "not fit to lead");
         }
         Notice::OutOfReach { members } => tracing::warn!(
             ?members,

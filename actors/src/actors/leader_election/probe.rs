@@ -7,21 +7,24 @@ use ractor::{ActorRef, ActorStatus};
 
 use super::Parts;
 use crate::messages::broker::BrokerMessage;
+use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::transport::broker::BrokerHealth;
 
 /// Asks broker, gateway and fuser, and tells the election when they have answered.
 pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
-    let (broker, gateway) = (parts.broker.clone(), parts.gateway.clone());
+    let (broker, gateway, fuser) = (parts.broker.clone(), parts.gateway.clone(), parts.fuser.clone());
     let fuser_runs = parts.fuser.get().is_some_and(|fuser| fuser.get_status() == ActorStatus::Running);
     tokio::spawn(async move {
-        let (health, links) = tokio::join!(
+        let (health, links, timeliness) = tokio::join!(
             broker.ask(|reply| BrokerMessage::Health { reply }, ANSWER_STEPS),
             gateway.ask(|reply| GatewayMessage::Links { reply }, ANSWER_STEPS),
+            fuser.ask(|reply| FuserMessage::Timeliness { reply }, ANSWER_STEPS),
         );
+        let rejects_reports = timeliness.is_some_and(|timeliness| !timeliness.is_usable());
         let broker_serves = matches!(health, Some(BrokerHealth::Serving(_)));
-        let sample = HealthSample { broker_serves, links, fuser_runs };
+        let sample = HealthSample { broker_serves, links, fuser_runs, rejects_reports };
         let input = Input::PartsAnswered { sample };
         if election.cast(LeaderElectionMessage::Note { input }).is_err() {
             tracing::debug!("the election ended before its parts answered");

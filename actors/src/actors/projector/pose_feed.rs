@@ -39,7 +39,8 @@ async fn receive(address: SocketAddr, projector: &ActorRef<ProjectorMessage>, co
     let mut is_logged = false;
     loop {
         let length = socket.recv(&mut datagram).await?;
-        match read_pose(datagram.get(..length).unwrap_or_default(), clock::now()) {
+        let datagram = datagram.get(..length).unwrap_or_default();
+        match read_pose(datagram, clock::now(), clock::wall_offset_us()) {
             Ok((at, pose)) => {
                 if projector.cast(ProjectorMessage::TakePose { at, pose }).is_err() {
                     return Ok(());

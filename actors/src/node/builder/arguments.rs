@@ -66,6 +66,7 @@ impl NodeBuilder {
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
             security: self.security.clone(),
+            clock: self.clock.clone(),
             counters: self.counters(),
             subscriber: self.subscriber(),
             seed: self.run.as_u64_pair().1,
@@ -178,6 +179,7 @@ impl NodeBuilder {
             leadership: self.leadership(),
             election: self.slots.election.clone(),
             fuser: self.slots.fuser.clone(),
+            clock: self.clock.clone(),
             counters: self.counters(),
             spans: self.spans(),
         }
@@ -213,6 +215,7 @@ impl NodeBuilder {
             recording: self.recording.clone(),
             report_queue: self.report_queue.clone(),
             newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
+            clock: self.clock.clone(),
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
             counters: self.counters(),
@@ -235,6 +238,7 @@ impl NodeBuilder {
             members: self.members(),
             parts: Parts { membership, gateway, fuser, keeper, broker },
             leadership: self.leadership.clone(),
+            clock: self.clock.clone(),
             counters: self.counters(),
         }
     }
@@ -271,8 +275,11 @@ impl NodeBuilder {
         Vitals {
             newest: self.newest.clone(),
             leadership: self.leadership(),
+            clock: self.clock.clone(),
             plane: self.config.data_plane(),
             patience: patience(&self.config.fusion),
+            security: self.security.clone(),
+            fuser: self.slots.fuser.clone(),
             gateway: self.slots.gateway.clone(),
             broker: self.slots.broker.clone(),
         }

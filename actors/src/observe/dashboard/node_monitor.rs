@@ -205,8 +205,11 @@ impl NodeMonitor {
     fn take_map(&self) {
         let Some(newest) = self.sources.vitals.newest.map.borrow().clone() else { return };
         let epoch = Epoch::new(newest.map.epoch, newest.map.aggregator.clone());
-        self.map_latency.observe(newest.map.oldest_capture_us, newest.map.fused_at_us, newest.received_at);
-        self.observed().history.add_round(&epoch, newest.map.oldest_capture_us, newest.received_at);
+        let clock = &self.sources.vitals.clock;
+        let oldest_capture = newest.map.oldest_capture_us;
+        self.map_latency.observe(oldest_capture, newest.map.fused_at_us, clock.date(newest.received_at));
+        let captured_at = oldest_capture.map(|date| clock.undate(date));
+        self.observed().history.add_round(&epoch, captured_at, newest.received_at);
     }
 
     /// In a cell without maps, verdicts count as the round.

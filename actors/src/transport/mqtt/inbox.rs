@@ -17,6 +17,7 @@ use uuid::Uuid;
 
 use super::config::MqttConfig;
 use super::security::SigningKey;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, Event, ShedReason};
@@ -90,6 +91,7 @@ pub(crate) struct Inbox {
     topics: Topics,
     limits: Limits,
     signing: Option<SigningKey>,
+    clock: CellClock,
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
     /// Deliveries that receivers may still hold.
@@ -120,6 +122,7 @@ impl Inbox {
         topics: Topics,
         config: &MqttConfig,
         signing: Option<SigningKey>,
+        clock: CellClock,
         counters: Arc<Counters>,
         subscriber: Subscriber,
     ) -> Self {
@@ -130,6 +133,7 @@ impl Inbox {
             topics,
             limits: config.limits(),
             signing,
+            clock,
             counters,
             subscriber: RwLock::new(subscriber),
             capacity: Arc::new(Semaphore::new(config.inbox)),
@@ -209,7 +213,7 @@ impl Inbox {
                 if map.aggregator == self.node {
                     return Ok(self.echo());
                 }
-                check_fused_at(map.fused_at_us, received_at)?;
+                self.check_date(map.fused_at_us, received_at)?;
                 Incoming::Map(Arc::new(map))
             }
             Topic::GlobalVerdicts => {
@@ -217,7 +221,7 @@ impl Inbox {
                 if verdicts.aggregator == self.node {
                     return Ok(self.echo());
                 }
-                check_fused_at(verdicts.fused_at_us, received_at)?;
+                self.check_date(verdicts.fused_at_us, received_at)?;
                 Incoming::Verdicts(Arc::new(verdicts))
             }
             Topic::Reputations if payload.is_empty() => return Ok(PacketOutcome::Done),
@@ -230,6 +234,11 @@ impl Inbox {
             }
         };
         Ok(self.deliver(message, received_at))
+    }
+
+    /// Checks that a round is not from the far future, as far as this node knows the time.
+    fn check_date(&self, fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
+        self.clock.date_if_set(received_at).map_or(Ok(()), |date| check_fused_at(fused_at, date))
     }
 
     fn read_report(
@@ -324,7 +333,7 @@ mod tests {
         let own = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
         let config = MqttConfig { inbox: capacity, max_report_hz, ..MqttConfig::default() };
         let topics = Topics::new(&NodeName::from_static("lot"));
-        Inbox::new(&own, topics, &config, None, Arc::clone(counters), Arc::new(receiver))
+        Inbox::new(&own, topics, &config, None, CellClock::default(), Arc::clone(counters), Arc::new(receiver))
     }
 
     fn broker() -> BrokerAddress {

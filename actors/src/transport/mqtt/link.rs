@@ -80,8 +80,16 @@ impl Link {
     pub(crate) fn spawn(id: LinkId, broker: BrokerAddress, setup: Arc<LinkSetup>, report: LinkSink) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
         let (hearing, at) = (Arc::<Hearing>::default(), broker.clone());
-        let task =
-            LinkTask { id, broker: at, setup, report, hearing, reported_refusal: None, has_reported_oversized: false };
+        let task = LinkTask {
+            id,
+            broker: at,
+            setup,
+            report,
+            hearing,
+            reported_refusal: None,
+            has_reported_oversized: false,
+            has_reported_clock: false,
+        };
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
         let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
@@ -137,6 +145,8 @@ struct LinkTask {
     /// The refusal that was logged last.
     reported_refusal: Option<String>,
     has_reported_oversized: bool,
+    /// Whether the wrong clock of this machine was told.
+    has_reported_clock: bool,
 }
 
 impl LinkTask {
@@ -156,6 +166,13 @@ impl LinkTask {
                 _ => LinkState::Down,
             };
             tracing::debug!(broker = %self.broker, %error, "link lost");
+            match self.setup.security.clock_fault() {
+                Some(fault) if !std::mem::replace(&mut self.has_reported_clock, true) => {
+                    tracing::warn!(broker = %self.broker, "{fault}; the node tries on, and goes on by itself then");
+                }
+                Some(_) => {}
+                None => self.has_reported_clock = false,
+            }
             if let Some(reason) = error.rejection() {
                 self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }

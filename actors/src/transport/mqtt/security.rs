@@ -3,11 +3,14 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use chrono::DateTime;
 use ecod::leadership::BrokerAddress;
 use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ring::hmac;
 
 use super::config::MqttConfig;
+use crate::platform::clock;
 use crate::transport::gossip::{KeyError, MembershipConfig, payload_key};
 use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker};
 
@@ -73,6 +76,24 @@ impl Security {
         }
     }
 
+    /// The reason for which this machine's clock makes every connection by certificate fail, and the remedy. Such
+    /// connections are tried on and on, and succeed once the clock is set.
+    pub fn clock_fault(&self) -> Option<String> {
+        let credentials = self.credentials.as_ref()?.current();
+        let (wall, begins) = (clock::wall(), credentials.identity.begins());
+        let date = |time: Timestamp| {
+            let date = i64::try_from(time.micros()).ok().and_then(DateTime::from_timestamp_micros);
+            date.map_or_else(|| time.to_string(), |date| date.format("%Y-%m-%dT%H:%MZ").to_string())
+        };
+        (wall < begins).then(|| {
+            let (wall, begins) = (date(wall), date(begins));
+            format!(
+                "this machine's clock says {wall}, and the node's certificate is valid from {begins} on: set the clock, \
+                 such as by `timedatectl set-ntp true`"
+            )
+        })
+    }
+
     /// The payload as sent on a topic: in a signed envelope where the cell signs.
     pub fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
         match &self.signing {
@@ -135,10 +156,31 @@ fn signed(topic: &[u8], payload: &[u8]) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use ecod::model::names::NodeName;
+    use ecod::wire::Role;
 
     use super::*;
     use crate::transport::gossip::MembershipConfig;
+    use crate::transport::pki::Authority;
+
+    #[test]
+    fn a_clock_before_the_certificate_is_told_with_its_remedy() {
+        let (name, cell) = (NodeName::from_static("edge"), NodeName::from_static("lot"));
+        for (issued_after, is_wrong) in [(Duration::ZERO, false), (Duration::from_secs(30 * 86_400), true)] {
+            let directory = tempfile::tempdir().unwrap();
+            let issued_at = clock::now() + issued_after;
+            let mut authority = Authority::init(directory.path(), &cell, issued_at).unwrap();
+            authority.issue(&name, Role::Edge, Duration::from_secs(3600), issued_at).unwrap();
+            let (certificate, key) = authority.files_of(&name);
+            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+            let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
+            let security = Security::load(Some((&tls, &name)), &mqtt, (&membership, &cell)).unwrap();
+            let fault = security.clock_fault();
+            assert_eq!(fault.as_ref().is_some_and(|fault| fault.contains("set the clock")), is_wrong, "{fault:?}");
+        }
+    }
 
     fn key(text: &str, cell: &'static str) -> SigningKey {
         let membership =

@@ -17,6 +17,7 @@ use super::{BROKER_NAME, OBSERVER_MARK, RIGHTS_SCHEME};
 pub struct CertificateSubject {
     name: NodeName,
     may_serve: bool,
+    begins: Timestamp,
     rights: Rights,
     expires: Timestamp,
 }
@@ -57,8 +58,10 @@ impl CertificateSubject {
             Some(rights) => parse_rights(rights).ok_or(InvalidCertificate::Rights)?,
             None => Rights::default(),
         };
-        let expires = u64::try_from(parsed.validity().not_after.timestamp()).unwrap_or(0);
-        Ok(Self { name, may_serve, rights, expires: Timestamp(0) + Duration::from_secs(expires) })
+        let time = |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
+        let validity = parsed.validity();
+        let (begins, expires) = (time(validity.not_before.timestamp()), time(validity.not_after.timestamp()));
+        Ok(Self { name, may_serve, rights, begins, expires })
     }
 
     /// The node's name.
@@ -69,6 +72,11 @@ impl CertificateSubject {
     /// Whether the node may serve a broker, and so lead.
     pub fn may_serve(&self) -> bool {
         self.may_serve
+    }
+
+    /// Beginning of the certificate's validity.
+    pub fn begins(&self) -> Timestamp {
+        self.begins
     }
 
     /// Highest role and priority of the node in the election. A certificate of a version that wrote none allows all, if

@@ -1,0 +1,183 @@
+//! Cells of real processes whose wall clocks are wrong, step, or start in 1970, by libfaketime.
+//!
+//! `make clocks` runs all trials and prints a table; every run of the tests has a reduced form.
+#![cfg(feature = "camera")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
+
+mod cell;
+mod feeder;
+mod record;
+
+use std::time::Duration;
+
+use cell::{Cell, Fake};
+
+/// Nodes that see the landmark, and the client without a node.
+const VEHICLES: [&str; 4] = ["euclid", "gauss", "noether", "feeder"];
+
+/// Longest time without a vehicle's reports that its own wrong clock may cost.
+const OWN_LOSS: Duration = Duration::from_millis(2500);
+
+/// Longest time without a report of others: a handover on a busy machine, but no clock.
+const OTHERS_LOSS: Duration = Duration::from_millis(1500);
+
+/// One node's clock in one trial.
+struct Trial {
+    name: &'static str,
+    /// The node, or the client `feeder`.
+    whose: &'static str,
+    /// Its clock when it starts.
+    start: Fake,
+    /// Its clock later, one step after another.
+    steps: &'static [Fake],
+}
+
+/// Time between two steps, and from the last one to the end.
+const STEP_TIME: Duration = Duration::from_secs(8);
+
+static TRIALS: [Trial; 12] = [
+    Trial { name: "vehicle 5 s ahead", whose: "euclid", start: Fake::Seconds(5), steps: &[] },
+    Trial { name: "vehicle 5 s behind", whose: "noether", start: Fake::Seconds(-5), steps: &[] },
+    Trial { name: "vehicle in 1970, then set", whose: "noether", start: Fake::Year1970, steps: &[Fake::Seconds(0)] },
+    Trial { name: "vehicle steps 3 s back", whose: "euclid", start: Fake::Seconds(0), steps: &[Fake::Seconds(-3)] },
+    Trial {
+        name: "vehicle steps 5 s ahead and back",
+        whose: "noether",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(5), Fake::Seconds(0)],
+    },
+    Trial {
+        name: "client steps 3 s back, then ahead",
+        whose: "feeder",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(-3), Fake::Seconds(0)],
+    },
+    Trial { name: "client a year behind", whose: "feeder", start: Fake::Seconds(-31_536_000), steps: &[] },
+    Trial { name: "leader 5 s ahead", whose: "edge", start: Fake::Seconds(5), steps: &[] },
+    Trial { name: "leader a year behind", whose: "edge", start: Fake::Seconds(-31_536_000), steps: &[] },
+    Trial { name: "leader in 1970, then set", whose: "edge", start: Fake::Year1970, steps: &[Fake::Seconds(0)] },
+    Trial {
+        name: "leader steps 5 s ahead, 5 s back",
+        whose: "edge",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(5), Fake::Seconds(-5)],
+    },
+    Trial {
+        name: "leader steps to 1970 and back",
+        whose: "edge",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Year1970, Fake::Seconds(0)],
+    },
+];
+
+/// The edge starts last: whatever its clock says, it takes over from a working leader.
+fn run(trial: &Trial) -> Outcome {
+    let mut cell = Cell::new();
+    let start =
+        |cell: &mut Cell, name: &str| cell.start(name, if name == trial.whose { trial.start } else { Fake::Off });
+    for name in ["euclid", "gauss", "noether"] {
+        start(&mut cell, name);
+    }
+    cell.feed(if trial.whose == "feeder" { trial.start } else { Fake::Off });
+    cell.until("a vehicle leads", |record| record.source().is_some());
+    // A vehicle that is to be used at once is used when others are.
+    let settled = cell.now() + OWN_LOSS + Duration::from_secs(1);
+    cell.until("all run", |record| record.last_at().is_some_and(|at| at > settled));
+    start(&mut cell, "edge");
+    cell.until("the edge leads", |record| record.source() == Some("edge"));
+    let mut until = cell.now() + STEP_TIME;
+    for step in trial.steps {
+        cell.until("time passes", |record| record.last_at().is_some_and(|at| at > until));
+        cell.set(trial.whose, *step);
+        until = until + STEP_TIME;
+    }
+    cell.until("time passes", |record| record.last_at().is_some_and(|at| at > until));
+    let readiness = cell.readiness("edge");
+    let record = cell.record();
+    let losses = VEHICLES.map(|name| record.longest_without(name, settled));
+    Outcome {
+        maps: record.count(settled, |_| true),
+        full: record.count(settled, |map| VEHICLES.iter().all(|name| map.has(name))),
+        losses,
+        readiness,
+        dated: record.farthest_date(settled),
+    }
+}
+
+struct Outcome {
+    maps: usize,
+    /// Maps with all vehicles.
+    full: usize,
+    /// Longest time without each.
+    losses: [Duration; VEHICLES.len()],
+    readiness: String,
+    /// Largest difference between a map's date and the true time.
+    dated: Duration,
+}
+
+impl Outcome {
+    fn print(&self, trial: &Trial) {
+        let Self { maps, full, losses, readiness, dated } = self;
+        let losses: Vec<_> =
+            VEHICLES.iter().zip(losses).map(|(name, loss)| format!("{name} {} ms", loss.as_millis())).collect();
+        println!(
+            "{:<34} {full:>4} of {maps:>4} maps have all; longest without {}; dates wrong by {:.3} s at most; edge: {readiness}",
+            trial.name,
+            losses.join(", "),
+            dated.as_secs_f64()
+        );
+    }
+
+    fn check(&self, trial: &Trial) {
+        for (name, loss) in VEHICLES.iter().zip(self.losses) {
+            let may = if [*name, "edge"].contains(&trial.whose) { OWN_LOSS } else { OTHERS_LOSS };
+            assert!(loss <= may, "{}: {loss:?} without {name}", trial.name);
+        }
+    }
+}
+
+fn passes(trial: &Trial) {
+    let outcome = run(trial);
+    outcome.print(trial);
+    outcome.check(trial);
+}
+
+#[test]
+fn a_vehicle_from_1970_and_a_leader_that_steps_take_part() {
+    for trial in TRIALS
+        .iter()
+        .filter(|trial| ["vehicle in 1970, then set", "leader steps 5 s ahead, 5 s back"].contains(&trial.name))
+    {
+        passes(trial);
+    }
+}
+
+/// Nobody believes its certificate, nor does it believe others': it says so, and takes part as soon as its clock is set.
+#[test]
+fn a_vehicle_with_a_certificate_waits_for_its_clock_and_says_so() {
+    let mut cell = Cell::with_certificates();
+    for name in ["euclid", "gauss"] {
+        cell.start(name, Fake::Off);
+    }
+    cell.until("a vehicle leads", |record| record.source().is_some());
+    cell.start("noether", Fake::Year1970);
+    cell.until_ready("noether", "this machine's clock says 1970-");
+    cell.set("noether", Fake::Seconds(0));
+    let set_at = cell.now();
+    cell.until("it takes part", |record| record.count(set_at, |map| map.has("noether")) > 0);
+    println!("a vehicle with a certificate took part {:?} after its clock was set", cell.now().since(set_at));
+    cell.until_ready("noether", "following");
+}
+
+#[test]
+#[ignore = "takes minutes: make clocks"]
+fn all() {
+    let only = std::env::var("TRIAL").unwrap_or_default();
+    let tried = |trial: &'static Trial| {
+        let outcome = run(trial);
+        outcome.print(trial);
+        (trial, outcome)
+    };
+    let outcomes: Vec<_> = TRIALS.iter().filter(|trial| trial.name.contains(&only)).map(tried).collect();
+    outcomes.iter().for_each(|(trial, outcome)| outcome.check(trial));
+}

@@ -1,0 +1,206 @@
+//! The cell's time: one time scale for all stamps on the wire, whatever the nodes' wall clocks say.
+//!
+//! A node's *steady clock* never steps; it times everything inside the node. Its *wall clock* may be wrong and may step.
+//! Nodes compare steady clocks by stamps in the election's messages ([`ClockStamps`], [`OffsetFilter`]). The leader keeps
+//! the cell's time as an offset from its steady clock, and followers take it over.
+//!
+//! - The leader goes by the median of the candidates' wall clocks. Of two that differ, it keeps to the one nearer to the
+//!   cell's time so far. So one node alone moves it in cells of one candidate only.
+//! - A wall clock before [`EARLIEST`] was never set and does not count.
+//! - A new leader goes on from the old one's time. Small errors are slewed away; larger ones make it jump.
+//! - A follower's stamps never depend on its own wall clock, so a step of that costs nothing.
+//!
+//! Call [`CellTime::stamps`] for every message sent, [`CellTime::receive`] and then [`CellTime::follow`] for every one
+//! received, and [`CellTime::look`] from time to time. [`CellTime::reading`] has the outcome.
+
+mod offset_filter;
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+pub use offset_filter::OffsetFilter;
+
+use crate::leadership::election::{AnsweredStamps, Candidacy, ClockStamps, ElectionMessage};
+use crate::leadership::timers::{CLOCK_MEMORY, MAX_CLOCK_SLEW, MIN_CLOCK_JUMP};
+use crate::leadership::view::{Leadership, Position};
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+use crate::wire::Role;
+use offset_filter::{Exchange, Offset};
+
+/// A wall clock before this time, the beginning of 2025, was never set.
+pub const EARLIEST: Timestamp = Timestamp(1_735_689_600_000_000);
+
+/// The cell's time as one node knows it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ClockReading {
+    /// The cell's time less the node's steady clock in microseconds.
+    pub offset_us: i64,
+    /// Largest error of it; none while the node goes by its own wall clock.
+    pub error_us: Option<u32>,
+}
+
+/// Event worth a line in the log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ClockEvent {
+    /// The node's wall clock stepped by so many microseconds.
+    WallStepped(i64),
+    /// The leader let the cell's time jump by so many microseconds.
+    CellJumped(i64),
+}
+
+/// One node's knowledge of all clocks.
+#[derive(Debug, Clone)]
+pub struct CellTime {
+    /// Whether the node's own wall clock counts.
+    is_candidate: bool,
+    /// The node's wall clock less its steady clock; none before the first look.
+    wall_offset_us: Option<i64>,
+    peers: BTreeMap<NodeName, PeerClock>,
+    reading: Option<ClockReading>,
+    looked_at: Option<Timestamp>,
+}
+
+/// The clock of another node.
+#[derive(Debug, Clone)]
+struct PeerClock {
+    run: u64,
+    /// False for a node of an earlier version.
+    has_stamps: bool,
+    last: AnsweredStamps,
+    filter: OffsetFilter,
+    /// Its wall clock less its steady clock, if it may lead and its clock was set.
+    wall_offset_us: Option<i64>,
+    /// The cell's time less its steady clock, as it knows it.
+    cell_offset_us: Option<i64>,
+}
+
+impl CellTime {
+    /// Knows nothing but that the node may lead, or not.
+    pub fn new(role: Role) -> Self {
+        Self {
+            is_candidate: role != Role::Cav,
+            wall_offset_us: None,
+            peers: BTreeMap::new(),
+            reading: None,
+            looked_at: None,
+        }
+    }
+
+    /// The cell's time, or the node's own wall clock while that is not known.
+    pub fn reading(&self) -> ClockReading {
+        let own = ClockReading { offset_us: self.wall_offset_us.unwrap_or_default(), error_us: None };
+        self.reading.unwrap_or(own)
+    }
+
+    /// Stamps for a message to a node, sent `now` by the steady clock.
+    pub fn stamps(&self, to: &NodeName, now: Timestamp) -> ClockStamps {
+        let lately = |peer: &&PeerClock| peer.has_stamps && now.since(peer.last.received_us) < CLOCK_MEMORY;
+        let wall = self.wall_offset_us.map(|offset| now.shifted(offset));
+        ClockStamps {
+            sent_us: now,
+            answers: self.peers.get(to).filter(lately).map(|peer| peer.last),
+            wall_us: wall.filter(|wall| *wall >= EARLIEST),
+            cell_us: self.reading.map(|reading| now.shifted(reading.offset_us)),
+        }
+    }
+
+    /// Takes the stamps of a message that arrived `now`. The transport must prove the sender.
+    pub fn receive(&mut self, message: &ElectionMessage, now: Timestamp) {
+        let stamps = message.clock.as_deref().copied().unwrap_or(ClockStamps {
+            sent_us: now,
+            answers: None,
+            wall_us: None,
+            cell_us: None,
+        });
+        let Candidacy { role, .. } = message.candidacy;
+        let wall = stamps.wall_us.filter(|wall| role != Role::Cav && *wall >= EARLIEST);
+        let last = AnsweredStamps { sent_us: stamps.sent_us, received_us: now };
+        let new = || PeerClock {
+            run: message.run,
+            has_stamps: message.clock.is_some(),
+            last,
+            filter: OffsetFilter::default(),
+            wall_offset_us: None,
+            cell_offset_us: None,
+        };
+        let peer = self.peers.entry(message.from.clone()).or_insert_with(new);
+        if peer.run != message.run {
+            *peer = new();
+        }
+        let offset = |time: Timestamp| time.micros_from(stamps.sent_us);
+        peer.last = last;
+        peer.wall_offset_us = wall.map(offset);
+        peer.cell_offset_us = stamps.cell_us.map(offset);
+        if let Some(AnsweredStamps { sent_us, received_us }) = stamps.answers {
+            peer.filter.observe(Exchange { t1: sent_us, t2: received_us, t3: stamps.sent_us, t4: now });
+        }
+    }
+
+    /// Takes over the time of the leader that this node follows, after each message and each change of leader.
+    pub fn follow(&mut self, leadership: &Leadership, now: Timestamp) {
+        let leader = leadership.leader().filter(|_| leadership.position == Position::Following);
+        let Some(leader) = leader.and_then(|leader| self.peers.get(leader)) else { return };
+        if !leader.has_stamps {
+            self.reading = None;
+        } else if let (Some(cell_offset), Some(offset)) = (leader.cell_offset_us, leader.filter.best(now)) {
+            let Offset { offset_us, error_us } = offset;
+            let offset_us = cell_offset.saturating_add(offset_us);
+            self.reading = Some(ClockReading { offset_us, error_us: Some(error_us) });
+        }
+    }
+
+    /// Looks at the wall clock, `wall_offset_us` ahead of the steady one. A leader adjusts the cell's time.
+    pub fn look(&mut self, wall_offset_us: i64, leadership: &Leadership, now: Timestamp) -> Vec<ClockEvent> {
+        let mut events = Vec::new();
+        if let Some(before) = self.wall_offset_us.replace(wall_offset_us) {
+            let step = wall_offset_us.saturating_sub(before);
+            events.extend((step.saturating_abs() >= MIN_WALL_STEP_US).then_some(ClockEvent::WallStepped(step)));
+        }
+        let elapsed = self.looked_at.replace(now).map_or(Duration::ZERO, |before| now.since(before));
+        self.peers.retain(|_, peer| now.since(peer.last.received_us) < CLOCK_MEMORY);
+        if leadership.is_leading() {
+            events.extend(self.lead(elapsed, now));
+        }
+        events
+    }
+
+    /// Moves the cell's time towards the candidates' clocks; returns its jump, if any.
+    fn lead(&mut self, elapsed: Duration, now: Timestamp) -> Option<ClockEvent> {
+        let before = self.reading.map(|reading| reading.offset_us);
+        let start = before.or(self.wall_offset_us)?;
+        let mut walls = self.walls(now);
+        walls.sort_unstable();
+        let middle = walls.len().checked_sub(1).map(|last| (walls.get(last / 2), walls.get(last.div_ceil(2))));
+        let target = match middle {
+            Some((Some(low), Some(high))) => start.clamp(*low, *high),
+            _ => start,
+        };
+        let error = target.saturating_sub(start);
+        let is_jump = before.is_none() || error.saturating_abs() >= micros(MIN_CLOCK_JUMP);
+        let most = micros(elapsed) * MAX_CLOCK_SLEW / 1_000_000;
+        let offset_us = if is_jump { target } else { start.saturating_add(error.clamp(-most, most)) };
+        self.reading = Some(ClockReading { offset_us, error_us: Some(0) });
+        (is_jump && error != 0).then_some(ClockEvent::CellJumped(error))
+    }
+
+    /// The wall clocks of all candidates that were set, as offsets from this node's steady clock.
+    fn walls(&self, now: Timestamp) -> Vec<i64> {
+        let is_set = |offset: &i64| self.is_candidate && now.shifted(*offset) >= EARLIEST;
+        let others = self.peers.values().filter_map(|peer| {
+            let Offset { offset_us, .. } = peer.filter.best(now)?;
+            Some(peer.wall_offset_us?.saturating_add(offset_us))
+        });
+        self.wall_offset_us.filter(is_set).into_iter().chain(others).collect()
+    }
+}
+
+/// Step of a wall clock that is logged; less is noise of reading two clocks.
+const MIN_WALL_STEP_US: i64 = 5_000;
+
+fn micros(duration: Duration) -> i64 {
+    i64::try_from(duration.as_micros()).unwrap_or(i64::MAX)
+}
+
+#[cfg(test)]
+mod tests;

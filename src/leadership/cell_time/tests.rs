@@ -1,0 +1,216 @@
+use super::*;
+use crate::leadership::election::Body;
+use crate::model::epoch::Epoch;
+use crate::wire::{MAX_INTEGER, SCHEMA_VERSION};
+
+/// A true time, to which the simulated clocks are compared.
+const NOON: Timestamp = Timestamp(1_795_000_000_000_000);
+const SECOND_US: i64 = 1_000_000;
+/// From the true time back to 1970.
+const TO_1970_US: i64 = -1_794_000_000_000_000;
+
+/// Nodes that exchange messages with the leader as they do when nothing happens: idle beats and the answers to them.
+struct Cell {
+    now: Timestamp,
+    nodes: Vec<Node>,
+    leader: usize,
+    /// State of a generator of transit times.
+    random: u64,
+}
+
+struct Node {
+    name: NodeName,
+    role: Role,
+    time: CellTime,
+    /// Its steady clock less the true time, and its wall clock less the true time.
+    steady_us: i64,
+    wall_us: i64,
+    events: Vec<ClockEvent>,
+}
+
+impl Cell {
+    fn new(nodes: &[(Role, i64, i64)]) -> Self {
+        let node = |(index, (role, steady_us, wall_us)): (usize, &(Role, i64, i64))| Node {
+            name: NodeName::new(format!("n{index}")).unwrap(),
+            role: *role,
+            time: CellTime::new(*role),
+            steady_us: *steady_us,
+            wall_us: *wall_us,
+            events: Vec::new(),
+        };
+        Self { now: NOON, nodes: nodes.iter().enumerate().map(node).collect(), leader: 0, random: 1 }
+    }
+
+    fn leadership(&self, index: usize) -> Leadership {
+        let epoch = Some(Epoch::new(7, self.nodes[self.leader].name.clone()));
+        let position = if index == self.leader { Position::Leading } else { Position::Following };
+        Leadership { position, epoch, standby: None, term: 7 }
+    }
+
+    /// A transit of 1 to 4 ms, and seldom 300.
+    fn transit(&mut self) -> Duration {
+        self.random = self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        let draw = self.random >> 33;
+        if draw.is_multiple_of(7) { Duration::from_millis(300) } else { Duration::from_micros(1000 + draw % 3000) }
+    }
+
+    fn pass(&mut self, from: usize, to: usize) {
+        let transit = self.transit();
+        let sender = &self.nodes[from];
+        let sender_now = self.now.shifted(sender.steady_us);
+        let message = ElectionMessage {
+            schema: SCHEMA_VERSION,
+            from: sender.name.clone(),
+            run: 1,
+            seq: 1,
+            candidacy: Candidacy { role: sender.role, priority: 0, load: 0, fit: true },
+            term: 7,
+            epoch: None,
+            hears_you: true,
+            body: Body::Status { over: None },
+            clock: Some(Box::new(sender.time.stamps(&self.nodes[to].name, sender_now))),
+        };
+        self.now = self.now + transit;
+        let (leadership, now) = (self.leadership(to), self.now);
+        let receiver = &mut self.nodes[to];
+        receiver.time.receive(&message, now.shifted(receiver.steady_us));
+        receiver.time.follow(&leadership, now.shifted(receiver.steady_us));
+    }
+
+    fn look(&mut self) {
+        for index in 0..self.nodes.len() {
+            let (leadership, now) = (self.leadership(index), self.now);
+            let node = &mut self.nodes[index];
+            let events = node.time.look(node.wall_us - node.steady_us, &leadership, now.shifted(node.steady_us));
+            node.events.extend(events);
+        }
+    }
+
+    fn run(&mut self, seconds: u32) {
+        for _ in 0..seconds {
+            let leader = self.leader;
+            for index in (0..self.nodes.len()).filter(|index| *index != leader) {
+                self.pass(leader, index);
+                self.pass(index, leader);
+                self.pass(leader, index);
+            }
+            self.look();
+            self.now = self.now + Duration::from_secs(1);
+        }
+    }
+
+    /// The cell's time less the true time, as each node knows it.
+    fn errors(&self) -> Vec<i64> {
+        self.nodes.iter().map(|node| node.steady_us + node.time.reading().offset_us).collect()
+    }
+
+    #[track_caller]
+    fn all_know(&self, expected_us: i64, tolerance_us: u64) {
+        for (error, node) in self.errors().into_iter().zip(&self.nodes) {
+            assert!(error.abs_diff(expected_us) <= tolerance_us, "{}: {error} µs", node.name);
+            assert!(node.time.reading().error_us.is_some_and(|error| error < 20_000), "{}", node.name);
+        }
+    }
+}
+
+#[test]
+fn all_agree_on_the_median_of_the_candidates_whatever_their_steady_clocks_say() {
+    let year = 31_536_000 * SECOND_US;
+    let mut cell = Cell::new(&[
+        (Role::Edge, TO_1970_US, TO_1970_US),
+        (Role::Auto, -year, 3_000),
+        (Role::Auto, 5 * SECOND_US, 0),
+        (Role::Auto, 0, 9 * SECOND_US),
+        (Role::Cav, TO_1970_US, TO_1970_US),
+        (Role::Cav, 0, -year),
+    ]);
+    // It starts by the leader's own clock, and nobody has been heard yet.
+    cell.run(4);
+    cell.all_know(3_000, 5_000);
+}
+
+#[test]
+fn a_step_of_any_vehicle_moves_nothing_and_is_told_once() {
+    let mut cell = Cell::new(&[(Role::Edge, 0, 0), (Role::Auto, 0, 0), (Role::Cav, 0, 0)]);
+    cell.run(3);
+    for index in 1..3 {
+        cell.nodes[index].wall_us = -3 * SECOND_US;
+        cell.run(3);
+        cell.all_know(0, 5_000);
+        assert_eq!(cell.nodes[index].events, [ClockEvent::WallStepped(-3 * SECOND_US)]);
+    }
+    assert_eq!(cell.nodes[0].events, []);
+}
+
+#[test]
+fn a_leader_that_steps_moves_the_cells_time_only_where_nobody_else_could_lead() {
+    for (others, expected) in [(2, 0), (1, 0), (0, 5 * SECOND_US)] {
+        let mut nodes = vec![(Role::Edge, 0, 0), (Role::Cav, 0, 0)];
+        nodes.extend(vec![(Role::Auto, 0, 0); others]);
+        let mut cell = Cell::new(&nodes);
+        cell.run(2);
+        cell.nodes[0].wall_us = 5 * SECOND_US;
+        cell.run(3);
+        cell.all_know(expected, 5_000);
+        cell.nodes[0].wall_us = TO_1970_US;
+        cell.run(3);
+        cell.all_know(expected, 5_000);
+    }
+}
+
+#[test]
+fn a_leader_from_1970_is_followed_and_set_right_when_its_clock_is() {
+    let mut cell = Cell::new(&[(Role::Edge, TO_1970_US, TO_1970_US), (Role::Cav, 0, 0)]);
+    cell.run(2);
+    cell.all_know(TO_1970_US, 5_000);
+    cell.nodes[0].wall_us = 0;
+    cell.run(2);
+    cell.all_know(0, 5_000);
+    assert!(cell.nodes[0].events.contains(&ClockEvent::CellJumped(-TO_1970_US)));
+}
+
+#[test]
+fn a_new_leader_goes_on_from_the_old_ones_time_and_moves_slowly() {
+    let ahead = 400_000;
+    let mut cell = Cell::new(&[(Role::Edge, 0, ahead), (Role::Auto, 9 * SECOND_US, 0), (Role::Cav, 0, 0)]);
+    cell.run(5);
+    cell.all_know(ahead, 5_000);
+    (cell.leader, cell.nodes[0].wall_us) = (1, 0);
+    cell.run(2);
+    cell.all_know(ahead, 30_000);
+    cell.run(120);
+    cell.all_know(0, 5_000);
+    assert!(cell.nodes[1].events.is_empty());
+}
+
+#[test]
+fn stamps_of_a_liar_are_survived() {
+    let mut cell = Cell::new(&[(Role::Edge, 0, 0), (Role::Auto, 0, 0), (Role::Auto, 0, 0)]);
+    cell.run(2);
+    let extremes = [Timestamp(0), Timestamp(MAX_INTEGER)];
+    for sent_us in extremes {
+        for received_us in extremes {
+            for other in extremes {
+                let answers = Some(AnsweredStamps { sent_us: other, received_us });
+                let clock = ClockStamps { sent_us, answers, wall_us: Some(other), cell_us: Some(received_us) };
+                let message = ElectionMessage {
+                    schema: SCHEMA_VERSION,
+                    from: cell.nodes[1].name.clone(),
+                    run: 1,
+                    seq: 1,
+                    candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+                    term: 7,
+                    epoch: None,
+                    hears_you: true,
+                    body: Body::Status { over: None },
+                    clock: Some(Box::new(clock)),
+                };
+                let now = cell.now;
+                cell.nodes[0].time.receive(&message, now);
+                cell.look();
+            }
+        }
+    }
+    let others = [cell.errors()[0], cell.errors()[2]];
+    assert!(others.iter().all(|error| error.abs() < 5_000), "{others:?}");
+}

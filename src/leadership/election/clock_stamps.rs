@@ -1,0 +1,48 @@
+//! Stamps that election messages carry, for [`crate::leadership::cell_time`].
+
+use minicbor::{Decode, Encode};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::model::time::Timestamp;
+use crate::wire::MAX_INTEGER;
+
+/// Stamps of one message, for the comparison of two clocks (RFC 5905, section 8).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct ClockStamps {
+    /// Time of sending, by the sender's steady clock.
+    #[n(0)]
+    pub sent_us: Timestamp,
+    /// The addressee's last message, if the sender has got one lately.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(1)]
+    pub answers: Option<AnsweredStamps>,
+    /// Time of sending, by the sender's wall clock; absent if that was never set.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(2)]
+    pub wall_us: Option<Timestamp>,
+    /// Time of sending in the cell's time, as far as the sender knows it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(3)]
+    pub cell_us: Option<Timestamp>,
+}
+
+/// Stamps of an earlier message in the other direction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct AnsweredStamps {
+    /// Time of its sending, by its sender's steady clock.
+    #[n(0)]
+    pub sent_us: Timestamp,
+    /// Time of its receipt, by its receiver's steady clock.
+    #[n(1)]
+    pub received_us: Timestamp,
+}
+
+impl ClockStamps {
+    /// Whether all stamps are integers that a node sends.
+    pub(super) fn is_plausible(&self) -> bool {
+        let answered = self.answers.map(|answered| [answered.sent_us, answered.received_us]);
+        let stamps = [Some(self.sent_us), self.wall_us, self.cell_us].into_iter().flatten();
+        stamps.chain(answered.into_iter().flatten()).all(|stamp| stamp.micros() <= MAX_INTEGER)
+    }
+}
