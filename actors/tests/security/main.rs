@@ -12,4 +12,5 @@ mod identity;
 mod packets;
 mod payloads;
 mod resources;
+mod stolen_leader;
 mod topics;
