@@ -50,6 +50,8 @@ pub(crate) struct Cell {
     nodes: BTreeMap<String, Running>,
     feeder: Option<(Feeder, Arc<AtomicI64>)>,
     authority: Option<Authority>,
+    /// The maps that a node with the right clock took.
+    record: Record,
     brokers: BTreeMap<&'static str, SocketAddr>,
 }
 
@@ -69,7 +71,15 @@ impl Cell {
         std::fs::write(directory.path().join("detections.jsonl"), car).unwrap();
         let brokers = ["edge", "euclid", "gauss"].map(|name| (name, free_tcp())).into();
         let gossip = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-        Self { directory, gossip, nodes: BTreeMap::new(), feeder: None, authority: None, brokers }
+        Self {
+            directory,
+            gossip,
+            nodes: BTreeMap::new(),
+            feeder: None,
+            authority: None,
+            record: Record::default(),
+            brokers,
+        }
     }
 
     /// A cell whose nodes have certificates.
@@ -169,13 +179,15 @@ impl Cell {
     }
 
     /// The maps that a node with the right clock took.
-    pub(crate) fn record(&self) -> Record {
-        Record::read(&self.path("gauss.maps"))
+    pub(crate) fn record(&mut self) -> &Record {
+        let log = self.path("gauss.maps");
+        self.record.read(&log);
+        &self.record
     }
 
     pub(crate) fn until(&mut self, what: &str, holds: impl Fn(&Record) -> bool) {
         let deadline = Instant::now() + PATIENCE;
-        while !holds(&self.record()) {
+        while !holds(self.record()) {
             assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
             for (name, node) in &mut self.nodes {
                 assert_eq!(node.child.try_wait().unwrap(), None, "{name} ended");

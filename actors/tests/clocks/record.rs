@@ -6,9 +6,13 @@ use std::time::Duration;
 use ecod::model::time::Timestamp;
 use ecod_actors::messages::newest::ReceivedMap;
 
-/// Maps in the order of their arrival.
+use crate::cell::true_time;
+
+/// Maps in the order of their arrival, with the true time at which they were found in the log: its own times are the
+/// cell's, which may jump.
+#[derive(Default)]
 pub(crate) struct Record {
-    maps: Vec<ReceivedMap>,
+    maps: Vec<(Timestamp, ReceivedMap)>,
 }
 
 /// A map of the record.
@@ -23,43 +27,43 @@ impl Entry<'_> {
 }
 
 impl Record {
-    pub(crate) fn read(path: &Path) -> Self {
+    /// Takes the lines that are new; the last one may be half written.
+    pub(crate) fn read(&mut self, path: &Path) {
         let text = std::fs::read_to_string(path).unwrap_or_default();
-        // The last line may be half written.
-        Self { maps: text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect() }
+        let new = text.lines().skip(self.maps.len()).map_while(|line| serde_json::from_str(line).ok());
+        self.maps.extend(new.map(|received| (true_time(), received)));
     }
 
     /// Whose map was taken last.
     pub(crate) fn source(&self) -> Option<&str> {
-        self.maps.last().map(|received| received.map.aggregator.as_str())
+        self.maps.last().map(|(_, received)| received.map.aggregator.as_str())
     }
 
     /// Arrival of the last map.
     pub(crate) fn last_at(&self) -> Option<Timestamp> {
-        self.maps.last().map(|received| received.received_at)
+        self.maps.last().map(|(at, _)| *at)
     }
 
     pub(crate) fn count(&self, since: Timestamp, is_counted: impl Fn(&Entry<'_>) -> bool) -> usize {
-        self.since(since).filter(|received| is_counted(&Entry(received))).count()
+        self.since(since).filter(|(_, received)| is_counted(&Entry(received))).count()
     }
 
     /// Longest time in which no map with a vehicle's detection came.
     pub(crate) fn longest_without(&self, vehicle: &str, since: Timestamp) -> Duration {
-        let with =
-            self.since(since).filter(|received| Entry(received).has(vehicle)).map(|received| received.received_at);
+        let with = self.since(since).filter(|(_, received)| Entry(received).has(vehicle)).map(|(at, _)| *at);
         let mut times = vec![since];
         times.extend(with);
         times.extend(self.last_at());
         times.windows(2).map(|pair| pair[1].since(pair[0])).max().unwrap_or_default()
     }
 
-    /// Largest difference between a map's time of fusion and its arrival.
+    /// Largest difference between a map's time of fusion and the true time of its arrival.
     pub(crate) fn farthest_date(&self, since: Timestamp) -> Duration {
-        let difference = |received: &ReceivedMap| received.received_at.micros_from(received.map.fused_at_us);
-        Duration::from_micros(self.since(since).map(|received| difference(received).unsigned_abs()).max().unwrap_or(0))
+        let difference = |(at, received): &(Timestamp, ReceivedMap)| at.micros_from(received.map.fused_at_us);
+        Duration::from_micros(self.since(since).map(|entry| difference(entry).unsigned_abs()).max().unwrap_or(0))
     }
 
-    fn since(&self, since: Timestamp) -> impl Iterator<Item = &ReceivedMap> {
-        self.maps.iter().filter(move |received| received.received_at >= since)
+    fn since(&self, since: Timestamp) -> impl Iterator<Item = &(Timestamp, ReceivedMap)> {
+        self.maps.iter().filter(move |(at, _)| *at >= since)
     }
 }
