@@ -5,7 +5,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::reputation::Evidence;
@@ -13,6 +12,7 @@ use ecod::wire::{Encoding, LedgerEntry, LedgerShare, RejectReason, Reputation, R
 use ecod_actors::messages::reputation_keeper::ReputationKeeperMessage;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::pki::{Credentials, EvidenceSigner, TlsConfig};
 use tokio::time::{Instant, sleep};
@@ -74,6 +74,50 @@ fn inverted(epoch: u64, aggregator: &str) -> LedgerShare {
     }
 }
 
+/// Has a leader count forty votes of each vehicle; returns its term.
+fn record(leader: &NodeHandle, vehicles: [(&str, bool); 2]) -> u64 {
+    let epoch = leader.leadership().borrow().epoch.clone().unwrap();
+    let votes = |(node, correct)| {
+        let evidence = Evidence { node: name(node), label: "cup".into(), correct };
+        std::iter::repeat_n(evidence, 40)
+    };
+    let evidence = vehicles.into_iter().flat_map(votes).collect();
+    let round = 50 + leader.newest_reputations().borrow().as_ref().map_or(0, |newest| newest.message.round);
+    let record = ReputationKeeperMessage::Record { epoch: epoch.clone(), round, evidence, reputations: None };
+    assert!(leader.slots().keeper.send(record));
+    epoch.term
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_false_leader_counted_is_gone_when_it_is_revoked() {
+    let (mut pki, state) = (Pki::new(), tempfile::tempdir().unwrap());
+    let [edge_files, gauss_files] =
+        [("edge", Role::Edge), ("gauss", Role::Auto)].map(|(node, role)| pki.issue(node, role, DAY));
+    let gauss = node::start(config("gauss", Role::Auto, &gauss_files, state.path())).await.unwrap();
+    until("a false leader", || gauss.leadership().borrow().is_leading()).await;
+    record(&gauss, [("honest", false), ("liar", true)]);
+    let mut better = config("edge", Role::Edge, &edge_files, state.path());
+    better.membership.seeds = vec![gauss.gossip_address().unwrap().to_string()];
+    let edge = node::start(better).await.unwrap();
+    let leads = || edge.leadership().borrow().is_leading();
+    until("the lead handed over", || leads() && reputations(&edge).contains_key(&name("liar"))).await;
+    record(&edge, [("honest", true), ("other", true)]);
+    until("both leaders' evidence", || reputations(&edge).len() == 3).await;
+    let before = reputations(&edge);
+    assert!(before[&name("liar")].score > 0.8 && before[&name("honest")].incorrect == 40, "{before:?}");
+
+    pki.authority.revoke(&name("gauss"), clock::now()).unwrap();
+    until("evidence gone", || !reputations(&edge).contains_key(&name("liar"))).await;
+    let after = reputations(&edge);
+    assert_eq!((after[&name("honest")].correct, after[&name("honest")].incorrect), (40, 0));
+    let saved = state.path().join("lot.edge.reputations.json");
+    let lane = "\"aggregator\":\"gauss\"";
+    until("gone from the disk", || !std::fs::read_to_string(&saved).unwrap().contains(lane)).await;
+    for node in [gauss, edge] {
+        node.stop().await;
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_candidate_that_does_not_lead_changes_no_reputation_by_forged_evidence() {
     let (mut pki, state) = (Pki::new(), tempfile::tempdir().unwrap());
@@ -87,15 +131,7 @@ async fn a_candidate_that_does_not_lead_changes_no_reputation_by_forged_evidence
     until("a leader and a candidate", || edge.leadership().borrow().is_leading() && edge.members().borrow().len() == 1)
         .await;
 
-    let term = edge.leadership().borrow().epoch.as_ref().unwrap().term;
-    let evidence = [("honest", true), ("liar", false)].map(|(node, correct)| {
-        let label = "cup".into();
-        std::iter::repeat_n(Evidence { node: name(node), label, correct }, 40)
-    });
-    let (epoch, evidence) = (Epoch::new(term, name("edge")), evidence.into_iter().flatten().collect());
-    let round = 50 + edge.newest_reputations().borrow().as_ref().map_or(0, |newest| newest.message.round);
-    let record = ReputationKeeperMessage::Record { epoch, round, evidence, reputations: None };
-    assert!(edge.slots().keeper.send(record));
+    let term = record(&edge, [("honest", true), ("liar", false)]);
     until("reputations", || reputations(&edge).len() == 2).await;
     let honest = reputations(&edge);
     assert!(honest[&name("honest")].score > 0.8 && honest[&name("liar")].score < 0.35, "{honest:?}");
