@@ -60,10 +60,10 @@ pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
 pub use clock_stamps::{AnsweredStamps, ClockStamps};
 pub use interface::{ElectionEffect, ElectionInput, Health};
-use message::MAX_ROUND_STEP;
 pub use message::{
     Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP,
 };
+use message::{MAX_FIRST_TERM, MAX_ROUND_STEP};
 
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -274,7 +274,8 @@ impl Election {
 
     /// Whether a term is near enough to the known ones to be one of this cell.
     fn is_plausible(&self, term: u64) -> bool {
-        term <= MAX_TERM.min(self.terms.seen + MAX_TERM_STEP)
+        let limit = if self.terms.seen == 0 { MAX_FIRST_TERM } else { self.terms.seen + MAX_TERM_STEP };
+        term <= MAX_TERM.min(limit)
     }
 
     fn learn_term(&mut self, term: u64) {

@@ -19,6 +19,9 @@ pub const MAX_TERM: u64 = (1 << 53) - 1;
 /// never gets so far ahead of a node. A forged term near [`MAX_TERM`] would end elections for good.
 pub const MAX_TERM_STEP: u64 = 1 << 20;
 
+/// Largest term that a node without any takes from another: it may join a cell that has led for long.
+pub(super) const MAX_FIRST_TERM: u64 = 1 << 40;
+
 /// Largest step by which one message raises the known number of the last round: more rounds than a cell publishes in
 /// years. A node that has just started believes any number up to [`MAX_ROUND`].
 pub(super) const MAX_ROUND_STEP: u64 = 1 << 32;

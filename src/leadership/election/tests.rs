@@ -1,11 +1,16 @@
-use super::message::MAX_ROUND_STEP;
+use super::message::{MAX_FIRST_TERM, MAX_ROUND_STEP};
 use super::*;
 use crate::wire::Role;
 
 const NOW: Timestamp = Timestamp(1_000_000);
 
 fn euclid() -> Election {
-    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 7, NOW);
+    euclid_after(7)
+}
+
+/// A fit node that finds this term on its disk.
+fn euclid_after(saved_term: u64) -> Election {
+    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), saved_term, NOW);
     let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
     election.handle(ElectionInput::Health { health }, NOW);
     election
@@ -68,6 +73,16 @@ fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
     assert_eq!(hear(2, MAX_TERM), (cell, true));
     assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), (cell, true));
     assert_eq!(hear(4, cell + 1), (cell + 1, false));
+}
+
+#[test]
+fn a_node_without_a_term_joins_a_cell_of_any_age() {
+    let mut election = euclid_after(0);
+    let old = 1_800_000_000;
+    assert!(!is_counted(&election.handle(of_edge(1, old, Body::Status { over: None }), NOW)));
+    assert!(is_counted(&election.handle(of_edge(2, MAX_FIRST_TERM, Body::Status { over: None }), NOW)));
+    assert_eq!(election.term(), old);
+    assert!(is_counted(&euclid_after(0).handle(of_edge(1, MAX_FIRST_TERM + 1, Body::Status { over: None }), NOW)));
 }
 
 /// First round of euclid's own leadership after the leader's beats with these rounds, and the beats that were counted.
