@@ -93,13 +93,19 @@ impl World {
         }
     }
 
-    /// Whether a node knows what it was told of terms that its election knows.
+    /// Whether a node knows what it was told of terms that its election knows. Of the present leadership only its leader
+    /// tells.
     fn judge_merge(&self, to: usize, share: &LedgerShare) {
         let node = &self.nodes[to];
         let mut told = ReputationLedger::default();
-        let is_known = |term: u64| node.leadership.knows_term(term);
-        told.merge_entries(share.entries.iter().filter(|entry| is_known(entry.epoch)).cloned(), None);
-        told.merge_marks(share.marks.iter().filter(|mark| is_known(mark.epoch)).cloned(), None);
+        let counts = |term: u64, aggregator: &NodeName| {
+            let lane = Epoch::new(term, aggregator.clone());
+            let is_told_by_another = node.leadership.present_epoch() == Some(&lane) && share.node != lane.leader;
+            node.leadership.knows_term(term) && !is_told_by_another
+        };
+        let entries = share.entries.iter().filter(|entry| counts(entry.epoch, &entry.aggregator));
+        told.merge_entries(entries.cloned(), None);
+        told.merge_marks(share.marks.iter().filter(|mark| counts(mark.epoch, &mark.aggregator)).cloned(), None);
         let lacks = told.beyond(&node.ledger);
         assert!(lacks.0.is_empty() && lacks.1.is_empty(), "{} was told {lacks:?} and does not know it", node.name);
     }
