@@ -114,7 +114,7 @@ impl Actor for ReputationKeeper {
         store::restore(&state.arguments, state.signer.as_mut());
         myself.send_interval(state.arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
         if state.signer.is_some() {
-            // Those that were revoked while the actor did not run.
+            // Certificates may have been revoked while the actor did not run.
             state.drop_revoked();
             myself.send_interval(REVOCATION_CHECK_PERIOD, || ReputationKeeperMessage::CheckCertificates);
         }
@@ -146,7 +146,7 @@ impl Actor for ReputationKeeper {
             ReputationKeeperMessage::Tick => state.tick().await,
             ReputationKeeperMessage::CheckCertificates => {
                 if state.signer.as_mut().is_some_and(EvidenceSigner::reload) && state.drop_revoked() {
-                    // Receivers drop what comes in the same round again.
+                    // Receivers drop reputations that repeat a round.
                     state.last_round += 1;
                     state.settle().await;
                 }
