@@ -5,8 +5,8 @@
 //! - A node that has led sends a leader all it knows when it first hears it. Every other candidate listens for longer than
 //!   leaders take to share all they know, and then sends what nobody has shared, each at a time of its own. So evidence of
 //!   leaders that are gone is kept, too, when a split heals.
-//! - Evidence is accepted from candidates, of terms that the election knows, and by plausible steps. The leader's present
-//!   lane is accepted from the leader alone.
+//! - Evidence is accepted from candidates, of terms that the election knows, and by plausible steps. The leader's
+//!   present lane is accepted from the leader alone.
 //!
 //! # Signed evidence
 //!
@@ -15,7 +15,8 @@
 //! this node follows, or followed a moment ago, or from another candidate than the lane's aggregator. Candidates
 //! accept nothing else themselves, so a lane that a candidate has invented for itself gets no further.
 //!
-//! Nothing is sent here: methods return the shares to publish. The caller signs those of the node's own lanes. Time is counted in ticks of the publication period.
+//! Nothing is sent here: methods return the shares to publish. The caller signs those of the node's own lanes. Time is
+//! counted in ticks of the publication period.
 
 mod growth;
 

@@ -1,7 +1,7 @@
 //! Signed evidence: the shares that aggregators have signed, kept beside the counts that come from them.
 //!
-//! A node that passes a lane on sends the signed shares of its aggregator. When the certificate of an aggregator is revoked, its
-//! statements go, and the counts with them.
+//! A node that passes a lane on sends the signed shares of its aggregator. When the certificate of an aggregator is
+//! revoked, its statements go, and the counts with them.
 
 use std::sync::Arc;
 

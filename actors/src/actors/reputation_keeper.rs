@@ -6,12 +6,11 @@
 //! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
 //! ```
 //!
-//! With certificates, what this node counts is signed here, and what others counted is verified here. When a certificate
-//! is revoked, the counts that it signed go within a second, from what is published and from the fuser.
+//! With certificates, this actor signs the counts of its node, and verifies those of others. When a certificate is revoked,
+//! the counts that it signed are dropped within a second, from the published reputations and from the fuser.
 //!
-//! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. What is
-//! published was saved before. What an actor knew outlives it in its [`ReputationStore`]; what a node knew outlives it in its state
-//! directory.
+//! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. Reputations are
+//! saved before they are published. The [`ReputationStore`] outlives the actor, and the state directory the node.
 
 mod config;
 mod store;
