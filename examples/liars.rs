@@ -1,4 +1,4 @@
-//! What liars achieve: ⌊(n−1)/2⌋ of n vehicles lie, in four ways, by rejoining under new names, and by forged evidence.
+//! Effect of liars on verdicts: ⌊(n−1)/2⌋ of n vehicles lie, in four ways, by rejoining under new names, and by forged evidence.
 //!
 //! `cargo run --release --example liars -- [--svg FILE] [--table FILE] [--write-table FILE] [--seeds N]`
 //!

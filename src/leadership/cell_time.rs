@@ -36,7 +36,7 @@ pub const EARLIEST: Timestamp = Timestamp(1_735_689_600_000_000);
 pub struct ClockReading {
     /// The cell's time less the node's steady clock in microseconds.
     pub offset_us: i64,
-    /// Largest error of it; none while the node goes by its own wall clock.
+    /// Largest error of the offset in microseconds; none while the node goes by its own wall clock.
     pub error_us: Option<u32>,
 }
 
@@ -76,7 +76,7 @@ struct PeerClock {
 }
 
 impl CellTime {
-    /// Knows nothing but that the node may lead, or not.
+    /// A state that knows of no clock. The node's own wall clock counts only if its role may lead.
     pub fn new(role: Role) -> Self {
         Self {
             is_candidate: role != Role::Cav,

@@ -35,7 +35,7 @@ pub struct HealthSample {
     pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
     /// Whether the fuser runs.
     pub fuser_runs: bool,
-    /// Whether it rejects nearly all vehicles' reports for their time.
+    /// Whether the fuser rejects nearly all vehicles' reports for their time.
     pub rejects_reports: bool,
 }
 
@@ -117,9 +117,9 @@ impl HealthMonitor {
         self.load_percent = load_percent;
     }
 
-    /// The parts as the election wants to know them. A node that uses an external broker, its own, or both, needs one
-    /// of them. A stalled link is none, nor are reports usable that the fuser rejects, but in a leader with `no_other` to
-    /// lead, which would only make way for nobody.
+    /// Health of the parts, for the election. A node that uses an external broker, its own, or both, needs one of them.
+    /// A stalled link does not count as a link, and rejected reports do not count as usable. Both are overlooked in a
+    /// leader with `no_other` to lead: it would make way for nobody.
     pub fn health(&self, plane: &DataPlane, brokers: &Brokers, no_other: bool, round_period: Duration) -> Health {
         let external = self.is_up(plane.external.as_ref(), no_other);
         let embedded = plane.embedded && self.sample.broker_serves;

@@ -5,18 +5,18 @@
 //! - A node that has led sends a leader all it knows when it first hears it. Every other candidate listens for longer than
 //!   leaders take to share all they know, and then sends what nobody has shared, each at a time of its own. So evidence of
 //!   leaders that are gone is kept, too, when a split heals.
-//! - Evidence is accepted of candidates, of terms that the election knows, and by plausible steps. The leader's present
-//!   lane is accepted of the leader alone.
+//! - Evidence is accepted from candidates, of terms that the election knows, and by plausible steps. The leader's
+//!   present lane is accepted from the leader alone.
 //!
 //! # Signed evidence
 //!
-//! In a cell with certificates every share is of one lane and signed by the lane's aggregator. Whoever passes it on
-//! passes on the same bytes. A signature proves who counted, not that it led. So a lane must come from the leader that
+//! In a cell with certificates every share is of one lane and signed by the lane's aggregator. Other nodes pass on the
+//! same bytes. A signature proves who counted, not that it led. So a lane must come from the leader that
 //! this node follows, or followed a moment ago, or from another candidate than the lane's aggregator. Candidates
 //! accept nothing else themselves, so a lane that a candidate has invented for itself gets no further.
 //!
-//! Nothing is sent here: methods return the shares to publish, to be signed where they are of the node's own lanes and
-//! are not yet. Time is counted in ticks of the publication period.
+//! Nothing is sent here: methods return the shares to publish. The caller signs those of the node's own lanes. Time is
+//! counted in ticks of the publication period.
 
 mod growth;
 
@@ -76,7 +76,7 @@ pub struct Merged {
 }
 
 impl LedgerResync {
-    /// The same in a cell with certificates. [`Self::merge`] is then given shares whose signature was verified.
+    /// As [`Self::new`], for a cell with certificates. The caller of [`Self::merge`] must verify signatures first.
     pub fn signed(name: NodeName, ticks_per_snapshot: u32) -> Self {
         Self { is_signed: true, ..Self::new(name, ticks_per_snapshot) }
     }
@@ -157,7 +157,7 @@ impl LedgerResync {
         let is_over = !self.is_signed && share.reset_at_us.unwrap_or_default() < ledger.reset_at();
         let (mut taken, refused) =
             if is_over { (share.clone(), Vec::new()) } else { self.judge(share, ledger, leadership, now) };
-        // What was signed together is taken together.
+        // A signed share is taken whole or not at all: it is passed on as it is.
         let is_whole = taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
         if is_over || (self.is_signed && !is_whole) {
             (taken.entries, taken.marks) = (Vec::new(), Vec::new());
@@ -189,7 +189,7 @@ impl LedgerResync {
         let mut refused = BTreeSet::new();
         let mut is_usable = |lane: Epoch, is_plausible: bool, is_news: &dyn Fn() -> bool| {
             if self.leads.as_ref() == Some(&lane) {
-                // Nobody knows better what it counts now.
+                // Only this node knows what it counts now.
                 return false;
             }
             let reason = if !leadership.knows_term(lane.term) {
@@ -220,7 +220,7 @@ impl LedgerResync {
         (taken, refused.into_iter().collect())
     }
 
-    /// Whether this node counted what is known of a lane, and signs it.
+    /// Whether this node counted all that is known of a lane, and so signs it.
     fn has_counted(&self, lane: &Epoch, ledger: &ReputationLedger) -> bool {
         lane.leader == self.name && ledger.has_lane(lane) && !ledger.is_stated(lane)
     }

@@ -341,8 +341,8 @@ impl LeadershipNode {
         self.set_health(Health { broker: health.broker && is_reached, ..health }, now);
     }
 
-    /// Whether this node is logged in where a node would lead: a lead that is handed to a broker that nobody is admitted
-    /// to silences the cell. The challenger says again that it is ready.
+    /// Whether this node is logged in at the broker with which the challenger would lead. If that broker admits nobody,
+    /// handing over would silence the cell. The challenger repeats that it is ready.
     fn is_served_by(&self, challenger: &NodeName) -> bool {
         self.links.plane().external.is_some()
             || self.members.broker_of(challenger).is_some_and(|broker| self.monitor.is_logged_in(&broker))

@@ -12,7 +12,7 @@ use crate::model::time::Timestamp;
 /// Readiness of a node, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Readiness {
-    /// Whether it does.
+    /// Whether the node is ready.
     pub ready: bool,
     /// The reason in words.
     pub reason: String,

@@ -46,7 +46,7 @@ impl Rights {
         if rank(role) <= rank(self.role) { role } else { self.role }
     }
 
-    /// The message as far as its sender may say it; `None` for a claim that only a possible leader may make.
+    /// The message with role and priority lowered to these rights. `None` if only a node that may lead may send it.
     pub(crate) fn limit(self, mut message: ElectionMessage) -> Option<ElectionMessage> {
         let claims = matches!(
             message.body,

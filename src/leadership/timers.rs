@@ -41,6 +41,7 @@
 //! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from a far future would be the last |
 //! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
 //! | [`MIN_CLOCK_JUMP`] | 1 s | [`MAX_ROUND_AGE`] | a report's age tells by which time, before or after a jump, it is stamped |
+//! | [`MAX_CLOCK_SLEW`] | 0.5 % | above the drift of two clocks, 0.01 % | the cell's time catches up with the median |
 
 use std::time::Duration;
 
@@ -134,7 +135,8 @@ pub const MIN_CLOCK_JUMP: Duration = MAX_ROUND_AGE;
 
 /// Rate at which the leader slews the cell's time, in parts per million.
 pub const MAX_CLOCK_SLEW: i64 = 5_000;
-/// Time after the end of a leadership in which evidence that its leader sends is still accepted of it.
+
+/// Time after the end of a leadership in which evidence that its leader sends is still accepted.
 pub const LAST_WORD_TIME: Duration = Duration::from_secs(5);
 
 /// Maximum time by which the clock of the node that forgot all evidence may be ahead of this node's.

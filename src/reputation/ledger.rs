@@ -29,7 +29,7 @@ pub struct ReputationLedger {
     pub(super) lanes: BTreeMap<Epoch, BTreeMap<NodeName, Record>>,
     /// Number of counts and marks in all lanes.
     pub(super) entries: usize,
-    /// What aggregators signed, by lane. It is not serialised with the counts.
+    /// Signed shares of aggregators, by lane. They are not serialised with the counts.
     pub(super) statements: BTreeMap<Epoch, Statements>,
     /// Time of the last reset, in cells without certificates; 0 if there was none.
     pub(super) reset_at: Timestamp,

@@ -1,7 +1,7 @@
 //! Signed evidence: the shares that aggregators have signed, kept beside the counts that come from them.
 //!
-//! Whoever passes a lane on, passes on what its aggregator signed. When the certificate of an aggregator is revoked, its
-//! statements go, and the counts with them.
+//! A node that passes a lane on sends the signed shares of its aggregator. When the certificate of an aggregator is
+//! revoked, its statements go, and the counts with them.
 
 use std::sync::Arc;
 
@@ -33,7 +33,7 @@ impl Statements {
         }
     }
 
-    /// Keeps the statements that later ones leave something of.
+    /// Drops the statements to which later ones leave nothing to add.
     fn clear(&mut self, lane_size: usize) {
         let mut later = ReputationLedger::default();
         let mut room = MAX_COPIES * (lane_size + MAX_SHARE_ENTRIES);

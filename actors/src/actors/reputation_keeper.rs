@@ -6,12 +6,11 @@
 //! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
 //! ```
 //!
-//! With certificates, what this node counts is signed here, and what others counted is verified here. When a certificate
-//! is revoked, the counts that it signed go within a second, from what is published and from the fuser.
+//! With certificates, this actor signs the counts of its node, and verifies those of others. When a certificate is revoked,
+//! the counts that it signed are dropped within a second, from the published reputations and from the fuser.
 //!
-//! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. What is
-//! published was saved before. What an actor knew outlives it in its [`ReputationStore`]; what a node knew outlives it in its state
-//! directory.
+//! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. Reputations are
+//! saved before they are published. The [`ReputationStore`] outlives the actor, and the state directory the node.
 
 mod config;
 mod store;
@@ -114,7 +113,7 @@ impl Actor for ReputationKeeper {
         store::restore(&state.arguments, state.signer.as_mut());
         myself.send_interval(state.arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
         if state.signer.is_some() {
-            // Those that were revoked while the actor did not run.
+            // Certificates may have been revoked while the actor did not run.
             state.drop_revoked();
             myself.send_interval(REVOCATION_CHECK_PERIOD, || ReputationKeeperMessage::CheckCertificates);
         }
@@ -146,7 +145,7 @@ impl Actor for ReputationKeeper {
             ReputationKeeperMessage::Tick => state.tick().await,
             ReputationKeeperMessage::CheckCertificates => {
                 if state.signer.as_mut().is_some_and(EvidenceSigner::reload) && state.drop_revoked() {
-                    // Receivers drop what comes in the same round again.
+                    // Receivers drop reputations that repeat a round.
                     state.last_round += 1;
                     state.settle().await;
                 }

@@ -9,7 +9,7 @@ use rustix::time::{ClockId, Timespec, clock_gettime};
 /// The present time of the steady clock in microseconds. It never steps.
 ///
 /// It starts as the wall clock of the first call. From then on time passes by the monotonic clock that includes suspension.
-/// All durations, timers and times of arrival are by this clock. What leaves the node is dated by
+/// All durations, timers and times of arrival are by this clock. Messages that leave the node are dated by
 /// [`CellClock`](super::cell_clock::CellClock).
 pub fn now() -> Timestamp {
     static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();

@@ -65,7 +65,7 @@ struct Node {
     process: Process,
 }
 
-/// What an attacker knows and holds. A row uses what its means allow.
+/// Knowledge and secrets of an attacker. A row uses what its means allow.
 #[derive(Clone)]
 pub(crate) struct Target {
     /// The edge's broker.
@@ -137,7 +137,7 @@ impl Cell {
         }
     }
 
-    /// What an attacker needs.
+    /// Knowledge and secrets for an attacker.
     pub(crate) fn target(&self) -> anyhow::Result<Target> {
         let client = |files: &TlsConfig, name| -> anyhow::Result<_> {
             Ok(Arc::clone(&Credentials::load(files, &NodeName::from_static(name))?.current().client))
@@ -207,7 +207,7 @@ impl Cell {
     }
 }
 
-/// What is needed of a line of a map log.
+/// The part of a map log's line that is needed here.
 #[derive(Deserialize)]
 struct Line {
     received_at_us: Timestamp,

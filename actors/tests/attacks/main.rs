@@ -7,7 +7,8 @@
 //! ```
 //!
 //! Each kind of attacker has a file with its rows. `ROWS=a,b` runs those whose names contain `a` or `b`;
-//! `ATTACK=quick` runs only those for every change, `PROGRAM=file` attacks another build. A row that missed its bar while the machine stood still is repeated.
+//! `ATTACK=quick` runs only those for every change, `PROGRAM=file` attacks another build. A row that missed its bar
+//! while the machine stood still is repeated.
 
 mod candidate;
 mod cell;

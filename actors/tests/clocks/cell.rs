@@ -22,7 +22,7 @@ use crate::record::Record;
 /// How long anything may take.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What a wall clock says.
+/// Setting of a wall clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Fake {
     /// The truth, without libfaketime.
@@ -205,7 +205,7 @@ impl Cell {
         }
     }
 
-    /// What a node's page says of its readiness; nothing while there is no page.
+    /// A node's readiness in its own words; nothing while there is no page.
     pub(crate) fn readiness(&self, name: &str) -> String {
         let page = self.nodes[name].page;
         let Ok(mut stream) = TcpStream::connect(page) else { return String::new() };

@@ -34,7 +34,7 @@ impl Record {
         self.maps.extend(new.map(|received| (true_time(), received)));
     }
 
-    /// Whose map was taken last.
+    /// Leader whose map was taken last.
     pub(crate) fn source(&self) -> Option<&str> {
         self.maps.last().map(|(_, received)| received.map.aggregator.as_str())
     }

@@ -1,4 +1,4 @@
-//! Memberships that prove certificates, on real sockets: who has the cell's key alone, or is revoked, is no member.
+//! Memberships that prove certificates, on real sockets: a holder of the key alone, or a revoked node, is no member.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex};

@@ -1,4 +1,4 @@
-//! What is known of one vehicle's clock, and the admission of its reports by that.
+//! One vehicle's clock as far as it is known, and admission of the vehicle's reports by it.
 
 use std::collections::VecDeque;
 
@@ -8,6 +8,7 @@ use crate::admission::report_window::Admitted;
 use crate::model::time::Timestamp;
 use crate::wire::{ObjectReport, RejectReason};
 
+/// Clock and latest reports of one vehicle.
 #[derive(Debug, Clone)]
 pub(super) struct VehicleClock {
     pub(super) base: TimeBase,
@@ -110,7 +111,7 @@ impl VehicleClock {
         }
     }
 
-    /// Forgets the clock: the next stamps are on another one.
+    /// Forgets the clock, because the next stamps are by another one.
     fn start_over(&mut self, base: TimeBase, now: Timestamp) {
         *self = Self { base, last_received: self.last_received, ..Self::new(now) };
     }
@@ -214,7 +215,7 @@ impl VehicleClock {
         Ok(())
     }
 
-    /// Whether a delay is one of the clock that is known.
+    /// Whether a delay fits the clock that is known.
     fn is_known(&self, delay: i64, bounds: Bounds) -> bool {
         let least = self.delay.least();
         least != i64::MAX && (-bounds.slack()..=bounds.max_age).contains(&delay.saturating_sub(least))

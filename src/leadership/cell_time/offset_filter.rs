@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::model::time::Timestamp;
 
-/// The latest exchanges with one node, of which the one with the least delay counts.
+/// The latest exchanges with one node. The one with the least error counts.
 #[derive(Debug, Clone, Default)]
 pub struct OffsetFilter(VecDeque<Sample>);
 
@@ -22,7 +22,7 @@ pub(super) struct Exchange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Offset {
     pub(super) offset_us: i64,
-    /// Largest error: half the delay, and the drift since.
+    /// Largest error in microseconds: half the delay, and the drift since.
     pub(super) error_us: u32,
 }
 

@@ -39,7 +39,8 @@ pub(super) struct Following {
     round_interval: Option<Duration>,
     /// Time at which this node heard the leader.
     pub(super) direct_at: Timestamp,
-    /// Whether a beat of it was heard. Others' word of the leadership, and its rounds, may overtake what it sent before.
+    /// Whether a beat of this leadership was heard. Rounds, and the word of other nodes, may overtake messages that the
+    /// leader sent before it led.
     pub(super) has_beaten: bool,
     /// Time at which the leader said that it hears this node.
     pub(super) bidirectional_at: Timestamp,

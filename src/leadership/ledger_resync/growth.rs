@@ -14,13 +14,13 @@ pub const MAX_FIRST_VOTES: u64 = 100_000_000;
 /// Maximum number of votes of a vehicle for one label in a second, from then on: 1024 objects in ten reports.
 const MAX_VOTES_PER_S: u64 = 10_240;
 
-/// Votes by which a count may be ahead of that.
+/// Votes by which a count may be ahead of [`MAX_VOTES_PER_S`].
 const ALLOWANCE: u64 = 1024;
 
 /// Votes from one mark to the next.
 const MARK_VOTES: u64 = 32;
 
-/// Number of votes of each count when this node first heard of it, and when that was.
+/// Number of votes of each count when this node first heard of it, with the time.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct GrowthLimit {
     /// Marks have no label.

@@ -128,7 +128,7 @@ fn the_counts_of_a_leadership_that_is_known_do_not_leap() {
     let first = slander(8, "leader", MAX_FIRST_VOTES + 1);
     assert!(!euclid.merge(&share("leader", Some(8), vec![first]), 2000).unwrap().is_news);
     assert_eq!(euclid.incorrect("gauss"), 3);
-    // What was lost meanwhile.
+    // Shares that were lost meanwhile.
     euclid.merge(&share("other", None, vec![slander(7, "edge", 900)]), 3000).unwrap();
     assert_eq!(euclid.incorrect("gauss"), 900);
 }

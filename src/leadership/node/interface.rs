@@ -244,7 +244,7 @@ pub enum Notice {
         role: Role,
         /// The priority that it declared.
         priority: u8,
-        /// What its certificate allows.
+        /// Its rights by its certificate.
         rights: Rights,
     },
     /// A message in another node's name was dropped.

@@ -22,7 +22,7 @@ pub struct StalenessFilter {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct LeadersDelay {
     least: MinimumDelay,
-    /// A least delay that the rounds that seem to have waited agree on: the leader's clock may have been set.
+    /// Delay on which rounds that seem to have waited agree: the leader's clock may have been set.
     candidate: Option<LiveStream>,
     /// Whether the least delay is that of rounds that did not wait.
     is_learnt: bool,

@@ -92,7 +92,7 @@ pub(super) struct Saved {
     schema: u32,
     cell: NodeName,
     node: NodeName,
-    /// Counts; where evidence is signed, those of the node's own.
+    /// All counts; where evidence is signed, only those that this node counted itself.
     entries: Vec<LedgerEntry>,
     #[serde(default)]
     marks: Vec<LedgerMark>,
@@ -100,7 +100,7 @@ pub(super) struct Saved {
     /// Whether the counts of others are in `statements`.
     #[serde(default)]
     signed: bool,
-    /// What other aggregators signed.
+    /// Shares that other aggregators signed.
     #[serde(default)]
     statements: Vec<LedgerShare>,
     #[serde(default)]

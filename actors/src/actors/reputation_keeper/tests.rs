@@ -37,7 +37,7 @@ fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> Delivery<
     Delivery::local(Arc::new(share), Timestamp(0))
 }
 
-/// What the keeper of `euclid` is given, which follows `edge` in term 7.
+/// Arguments of the keeper of `euclid`, which follows `edge` in term 7.
 fn arguments(gateway: &ActorSlot<GatewayMessage>, counters: &Arc<Counters>) -> ReputationKeeperArguments {
     let roles = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)];
     let members = roles.map(|(node, role)| member(node, role)).to_vec();

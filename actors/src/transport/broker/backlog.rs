@@ -31,7 +31,7 @@ struct Holding {
     principal: Option<Arc<str>>,
     unread: usize,
     unfinished: usize,
-    /// Since when there are any.
+    /// Time since which bytes are held.
     since: Option<Timestamp>,
     /// Dropped to cut the connection.
     cut: Option<oneshot::Sender<()>>,
@@ -53,7 +53,7 @@ pub(super) struct BacklogSlot {
 }
 
 impl Backlog {
-    /// Room for packets of this size.
+    /// A backlog that has room for packets of this size.
     pub(super) fn new(max_packet_bytes: usize) -> Self {
         Self {
             table: Arc::default(),

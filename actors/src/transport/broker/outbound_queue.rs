@@ -17,7 +17,7 @@ pub(super) struct OutboundQueue {
 struct QueuedPacket {
     /// Bytes in the queue.
     bytes: usize,
-    /// Whether nothing is lost but a message without a guarantee, of which nothing was sent yet.
+    /// Whether the packet is a message of QoS 0 of which no byte was sent yet.
     is_droppable: bool,
 }
 

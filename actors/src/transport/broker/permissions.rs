@@ -144,7 +144,7 @@ impl Handler for Permissions {
                 self.policy.counters.count(Event::ClientDenied);
                 HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
             }
-            // Messages are passed on without acknowledgement: one that does not come would hold them in memory.
+            // QoS 0: an acknowledgement that never comes would hold messages in memory.
             Parameter::ClientSubscribeCheckAcl(..) => {
                 HookResult::SubscribeAclResult(SubscribeAclResult::new_success(QoS::AtMostOnce, None))
             }

@@ -62,7 +62,7 @@ impl RelayLimits {
         tokio::select! {
             ended = &mut down => match ended {
                 Err(error) if error.kind() == io::ErrorKind::TimedOut => {
-                    // The rest of its queue.
+                    // The rest of its queue is dropped.
                     self.counters.shed(ShedReason::ReaderSlow, principal.source());
                     Err(ClientRejection::Stalled)
                 }
@@ -102,7 +102,7 @@ impl RelayLimits {
                 unfinished = 0;
             }
             if packets > 0 {
-                // The packet before has ended.
+                // A new packet has begun, so the one before has ended.
                 slot.set_unfinished(0, clock::now());
             }
             slot.set_unfinished(unfinished, clock::now());

@@ -50,7 +50,7 @@ impl RetainStorage for RetainedMessages {
         mut message: Retain,
         _listener_expiry: Option<Duration>,
     ) -> rmqtt::Result<()> {
-        // Its own bytes: those that came are part of a larger buffer, and count as in flight.
+        // A copy: the received bytes are part of a larger buffer, and count as in flight.
         message.publish.payload = Bytes::copy_from_slice(&message.publish.payload);
         let properties = message.publish.properties.as_ref();
         let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));

@@ -50,7 +50,7 @@ pub(crate) struct Attestation {
 /// Hash of all that one side signs.
 pub(crate) type Transcript = [u8; 32];
 
-/// Side of a handshake; its label in what it signs, so that no signature can be given back to its maker.
+/// Side of a handshake. Its label is in the signed text, so that no signature can be returned to its maker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Side {
     Prover,
@@ -232,7 +232,7 @@ impl Side {
 }
 
 impl SignedMessage<'_> {
-    /// Hash of the message with all that it must not be separated from, each part with its length.
+    /// Hash of the message and of everything that it is bound to, each part with its length.
     fn transcript(&self, attestation: &Attestation) -> Transcript {
         let Attestation { ephemeral, nonce, certificate, signature: _ } = attestation;
         let mut hash = digest::Context::new(&digest::SHA256);

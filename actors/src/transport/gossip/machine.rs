@@ -2,9 +2,9 @@
 //!
 //! # Call order
 //!
-//! [`GossipMachine::new`], then [`GossipMachine::receive`] for every datagram, [`GossipMachine::tick`] at [`GossipMachine::next_deadline`], and
-//! the commands at any time. After each, [`GossipMachine::poll`] until nothing is left. A caller that was stalled hands in
-//! all datagrams that wait before it ticks; the time of the stall does not count.
+//! [`GossipMachine::new`], then [`GossipMachine::receive`] for every datagram, [`GossipMachine::tick`] at
+//! [`GossipMachine::next_deadline`], and the commands at any time. After each, [`GossipMachine::poll`] until nothing is
+//! left. A caller that was stalled hands in all datagrams that wait before it ticks; the time of the stall does not count.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;

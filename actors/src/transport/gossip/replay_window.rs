@@ -2,8 +2,8 @@
 
 use super::counters::FrameEvent;
 
-/// Largest step by which one frame moves a window. The counter is that of all frames of a sender, so a node that was
-/// out of reach may find it far ahead, but a forged one near the end would mute the sender.
+/// Largest step by which one frame moves a window. The counter is that of all frames of a sender, so it may be far ahead
+/// for a node that was out of reach. A forged counter near the end would mute the sender.
 const MAX_JUMP: u64 = 1 << 20;
 
 /// Accepts every frame counter once, none that is 128 or more behind the highest, and none far ahead of it.

@@ -130,8 +130,8 @@ impl Swim {
         result.map_err(|_| FrameEvent::Malformed)
     }
 
-    /// A message without what it says of nodes that this one has not met, of lives that a node has not claimed itself, and
-    /// without doubts about nodes that this one hears.
+    /// A message without hearsay: news of nodes that this one has not met, lives that a node has not claimed itself, and
+    /// doubts about nodes that this one hears.
     fn without_hearsay(
         &mut self,
         from: &NodeId,

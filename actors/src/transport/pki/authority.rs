@@ -137,8 +137,9 @@ impl Authority {
         Ok(Self { directory: directory.into(), register })
     }
 
-    /// Makes a key and a certificate for a node, `nodes/<node>.key` and `nodes/<node>.pem`, in place of earlier ones,
-    /// which stay valid until they expire or are revoked. The node can declare no more than `rights` in the election.
+    /// Makes a key and a certificate for a node: `nodes/<node>.key` and `nodes/<node>.pem`. Earlier ones are
+    /// overwritten, and stay valid until they expire or are revoked. In the election the node can declare no more than
+    /// `rights`.
     ///
     /// # Errors
     /// [`AuthorityError`] when the name cannot have one or a file cannot be written.

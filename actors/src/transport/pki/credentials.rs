@@ -95,7 +95,7 @@ pub enum CredentialsError {
         role: &'static str,
         /// The configured priority.
         priority: u8,
-        /// What the certificate allows.
+        /// Highest role and priority by the certificate.
         allowed: String,
     },
     /// Key, certificate, CA and list do not belong together.

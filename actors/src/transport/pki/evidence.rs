@@ -35,7 +35,7 @@ struct Signatory {
     public_key: Vec<u8>,
 }
 
-/// The reason why evidence is not taken for its aggregator's.
+/// The reason why evidence does not count as its aggregator's.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum EvidenceError {
     /// No signature.
@@ -134,8 +134,8 @@ impl EvidenceSigner {
     }
 }
 
-/// The holder of a certificate, if the cell's CA issued it and has not revoked it. Whether it is valid today is judged
-/// elsewhere.
+/// The holder of a certificate, if the cell's CA issued it and has not revoked it. The caller checks that it has not
+/// expired.
 fn signatory(certificate: &str, loaded: &LoadedCredentials) -> Option<Signatory> {
     let certificate = CertificateDer::from(BASE64.decode(certificate).ok()?);
     let subject = CertificateSubject::of(&certificate).ok()?;
