@@ -20,9 +20,10 @@ use std::time::Duration;
 
 pub use offset_filter::OffsetFilter;
 
-use crate::leadership::election::{AnsweredStamps, Candidacy, ClockStamps, ElectionMessage};
+use crate::leadership::election::{AnsweredStamps, ClockStamps, ElectionMessage};
+use crate::leadership::rights::Rights;
 use crate::leadership::timers::{CLOCK_MEMORY, MAX_CLOCK_SLEW, MIN_CLOCK_JUMP};
-use crate::leadership::view::{Leadership, Position};
+use crate::leadership::view::Leadership;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::Role;
@@ -105,15 +106,16 @@ impl CellTime {
         }
     }
 
-    /// Takes the stamps of a message that arrived `now`. The transport must prove the sender.
-    pub fn receive(&mut self, message: &ElectionMessage, now: Timestamp) {
+    /// Takes the stamps of a message that arrived `now`. The transport must prove the sender and its rights: only wall
+    /// clocks of possible leaders count.
+    pub fn receive(&mut self, message: &ElectionMessage, rights: Rights, now: Timestamp) {
         let stamps = message.clock.as_deref().copied().unwrap_or(ClockStamps {
             sent_us: now,
             answers: None,
             wall_us: None,
             cell_us: None,
         });
-        let Candidacy { role, .. } = message.candidacy;
+        let role = rights.limit_role(message.candidacy.role);
         let wall = stamps.wall_us.filter(|wall| role != Role::Cav && *wall >= EARLIEST);
         let last = AnsweredStamps { sent_us: stamps.sent_us, received_us: now };
         let new = || PeerClock {
@@ -139,7 +141,7 @@ impl CellTime {
 
     /// Takes over the time of the leader that this node follows, after each message and each change of leader.
     pub fn follow(&mut self, leadership: &Leadership, now: Timestamp) {
-        let leader = leadership.leader().filter(|_| leadership.position == Position::Following);
+        let leader = leadership.leader().filter(|_| !leadership.is_leading());
         let Some(leader) = leader.and_then(|leader| self.peers.get(leader)) else { return };
         if !leader.has_stamps {
             self.reading = None;

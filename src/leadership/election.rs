@@ -65,10 +65,11 @@ pub use message::{
 };
 use message::{MAX_FIRST_TERM, MAX_ROUND_STEP};
 
+use crate::leadership::timers::TERM_WINDOW;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
-use crate::wire::SCHEMA_VERSION;
+use crate::wire::{Role, SCHEMA_VERSION};
 use leading::Leading;
 use liveness::Following;
 use peers::Peers;
@@ -113,6 +114,8 @@ struct Terms {
     found: u64,
     /// Term handed to the disk.
     persisted: u64,
+    /// Highest known term at the beginning of the present [`TERM_WINDOW`], and when that was.
+    window: (u64, Timestamp),
 }
 
 impl Election {
@@ -127,7 +130,12 @@ impl Election {
             run: now.micros(),
             seq: 0,
             clock,
-            terms: Terms { seen: persisted.saturating_sub(1), found: persisted, persisted },
+            terms: Terms {
+                seen: persisted.saturating_sub(1),
+                found: persisted,
+                persisted,
+                window: (persisted.saturating_sub(1), now),
+            },
             epoch: None,
             over: None,
             round: 0,
@@ -242,12 +250,18 @@ impl Election {
         }
     }
 
-    fn receive(&mut self, message: ElectionMessage, now: Timestamp) {
+    fn receive(&mut self, mut message: ElectionMessage, now: Timestamp) {
         if message.from == self.id {
             return;
         }
-        if !self.is_plausible(message.term) {
-            return self.effects.push(ElectionEffect::CountImplausible { from: message.from });
+        let limit = self.term_limit(message.candidacy.role, now);
+        if message.term > limit {
+            self.effects.push(ElectionEffect::CountImplausible { from: message.from.clone() });
+            // A node that was told a wrong term is heard all the same.
+            if message.highest_epoch() > limit {
+                return;
+            }
+            message.term = self.terms.seen;
         }
         if !self.peers.note(&message, now) {
             return;
@@ -272,16 +286,18 @@ impl Election {
         }
     }
 
-    /// Whether a term is near enough to the known ones to be one of this cell.
-    fn is_plausible(&self, term: u64) -> bool {
-        let limit = if self.terms.seen == 0 { MAX_FIRST_TERM } else { self.terms.seen + MAX_TERM_STEP };
-        term <= MAX_TERM.min(limit)
+    /// Highest term that a node of this role may state now. A node without any term believes possible leaders.
+    fn term_limit(&mut self, role: Role, now: Timestamp) -> u64 {
+        let Terms { seen, window: (before, since), .. } = &mut self.terms;
+        if *before == 0 || now.since(*since) >= TERM_WINDOW {
+            (*before, *since) = (*seen, now);
+        }
+        let limit = if *before == 0 && role != Role::Cav { MAX_FIRST_TERM } else { *before + MAX_TERM_STEP };
+        limit.min(MAX_TERM)
     }
 
     fn learn_term(&mut self, term: u64) {
-        if self.is_plausible(term) {
-            self.terms.seen = self.terms.seen.max(term);
-        }
+        self.terms.seen = self.terms.seen.max(term);
     }
 
     /// Notes the last round of a leadership as a node states it.

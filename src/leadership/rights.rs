@@ -50,7 +50,12 @@ impl Rights {
     pub(crate) fn limit(self, mut message: ElectionMessage) -> Option<ElectionMessage> {
         let claims = matches!(
             message.body,
-            Body::Beat { .. } | Body::Ready | Body::Yield { .. } | Body::Offer | Body::Resign { .. }
+            Body::Beat { .. }
+                | Body::LeaderEvidence { .. }
+                | Body::Ready
+                | Body::Yield { .. }
+                | Body::Offer
+                | Body::Resign { .. }
         );
         let Candidacy { role, priority, .. } = message.candidacy;
         message.candidacy.role = self.limit_role(role);

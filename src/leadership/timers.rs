@@ -36,6 +36,8 @@
 //! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is understood after its node was given up |
 //! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a membership that restarts costs no leader |
 //! | [`DISK_TIMEOUT`] | 1 s | below `handover` | a hung disk delays a handover and does not end it |
+//! | [`RENEWAL_PAUSE`] | 10 s | above `response_timeout` | a follower that refuses each epoch does not wear out terms and lanes |
+//! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, whoever states them |
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
 //! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from a far future would be the last |
@@ -123,6 +125,12 @@ pub const REDISCOVERY_TIME: Duration = Duration::from_secs(2);
 
 /// Time for which a node waits for its disk: for its term before it leads, for reputations before it publishes them.
 pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Least time between two renewals of a leadership that followers refuse.
+pub const RENEWAL_PAUSE: Duration = Duration::from_secs(10);
+
+/// Time in which the known term rises by [`MAX_TERM_STEP`](crate::leadership::election::MAX_TERM_STEP) at most.
+pub const TERM_WINDOW: Duration = Duration::from_secs(3600);
 
 /// Least time between two transfers of all evidence to new leaders: leaders may seem to come and go fast.
 pub const FULL_RESYNC_PAUSE: Duration = Duration::from_secs(5);
@@ -270,6 +278,7 @@ mod tests {
             (config.response_timeout(), REDISCOVERY_TIME, "a restarted membership costs no leader"),
             (DISK_TIMEOUT, config.handover(), "a hung disk ends no handover"),
             (config.handover(), LAST_WORD_TIME, "the last evidence counts after a handover"),
+            (config.response_timeout(), RENEWAL_PAUSE, "a renewal is heard by all before the next"),
             (FULL_RESYNC_PAUSE, Duration::from_secs(10), "a new leader is told before the next snapshot"),
         ] {
             assert!(smaller < larger, "{why}: {smaller:?} is not below {larger:?}");

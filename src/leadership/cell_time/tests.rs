@@ -1,5 +1,6 @@
 use super::*;
-use crate::leadership::election::Body;
+use crate::leadership::election::{Body, Candidacy};
+use crate::leadership::view::Position;
 use crate::model::epoch::Epoch;
 use crate::wire::{MAX_INTEGER, SCHEMA_VERSION};
 
@@ -43,7 +44,11 @@ impl Cell {
 
     fn leadership(&self, index: usize) -> Leadership {
         let epoch = Some(Epoch::new(7, self.nodes[self.leader].name.clone()));
-        let position = if index == self.leader { Position::Leading } else { Position::Following };
+        let position = match index {
+            _ if index == self.leader => Position::Leading,
+            _ if index == (self.leader + 1) % self.nodes.len() => Position::StandingBy,
+            _ => Position::Following,
+        };
         Leadership { position, epoch, standby: None, term: 7 }
     }
 
@@ -73,7 +78,7 @@ impl Cell {
         self.now = self.now + transit;
         let (leadership, now) = (self.leadership(to), self.now);
         let receiver = &mut self.nodes[to];
-        receiver.time.receive(&message, now.shifted(receiver.steady_us));
+        receiver.time.receive(&message, Rights::default(), now.shifted(receiver.steady_us));
         receiver.time.follow(&leadership, now.shifted(receiver.steady_us));
     }
 
@@ -206,7 +211,7 @@ fn stamps_of_a_liar_are_survived() {
                     clock: Some(Box::new(clock)),
                 };
                 let now = cell.now;
-                cell.nodes[0].time.receive(&message, now);
+                cell.nodes[0].time.receive(&message, Rights::default(), now);
                 cell.look();
             }
         }

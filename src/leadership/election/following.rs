@@ -172,7 +172,13 @@ impl Election {
             State::Leading(leading) if message.hears_you => {
                 let own = leading.epoch.clone();
                 match &message.epoch {
-                    Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
+                    // The word of a node that never leads ends no leadership.
+                    Some(other)
+                        if *other > own
+                            && other.leader != message.from
+                            && other.leader != self.id
+                            && message.candidacy.role != Role::Cav =>
+                    {
                         let other = other.clone();
                         self.stop_leading(&other.leader);
                         self.adopt(other, now, now);
@@ -192,11 +198,10 @@ impl Election {
         {
             self.renew_later(now);
         }
-        let Some(peer) = self.peers.get(from) else { return };
         // Of two that began to lead at the same time, one ends at once, and may have followers that hear it next in a while.
-        let follows_what_is_over =
-            peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.id && Some(epoch) != self.current_epoch());
-        if peer.told && !follows_what_is_over {
+        let current = self.current_epoch().cloned();
+        let is_corrected = self.peers.correct(from, &self.id, current.as_ref());
+        if !is_corrected && self.peers.get(from).is_none_or(|peer| peer.told) {
             return;
         }
         if self.is_leading() {

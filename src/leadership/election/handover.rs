@@ -10,6 +10,7 @@ use crate::leadership::election::{Election, State};
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
+use crate::wire::Role;
 
 /// A handover as the old leader sees it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -71,7 +72,9 @@ impl Election {
     }
 
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
-        self.learn_term(epoch.term);
+        if epoch.term <= self.term_limit(Role::Auto, now) {
+            self.learn_term(epoch.term);
+        }
         self.learn_round(&epoch.leader, round);
         let least = self.config.beat();
         match &mut self.state {

@@ -5,6 +5,7 @@ use std::time::Duration;
 use crate::leadership::election::handover::Handover;
 use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
 use crate::leadership::election::{Election, State};
+use crate::leadership::timers::RENEWAL_PAUSE;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -71,7 +72,9 @@ impl Election {
     pub(super) fn renew_later(&mut self, now: Timestamp) {
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
-            leading.renew_at.get_or_insert(at);
+            let is_renewed = leading.after.as_ref().is_some_and(|after| after.leader == self.id);
+            let earliest = if is_renewed { leading.since + RENEWAL_PAUSE } else { at };
+            leading.renew_at.get_or_insert(at.max(earliest));
         }
     }
 

@@ -15,8 +15,8 @@ pub const MAX_SUCCESSORS: usize = 3;
 /// Largest term taken from the wire: the largest integer that every JSON reader keeps exactly.
 pub const MAX_TERM: u64 = (1 << 53) - 1;
 
-/// Largest step by which one message raises the highest known term. A cell uses one term per change of leader, so it
-/// never gets so far ahead of a node. A forged term near [`MAX_TERM`] would end elections for good.
+/// Largest rise of the known term in [`TERM_WINDOW`](crate::leadership::timers::TERM_WINDOW). A cell uses one term per
+/// change of leader, so it never gets so far ahead of a node. A forged term near [`MAX_TERM`] would end elections for good.
 pub const MAX_TERM_STEP: u64 = 1 << 20;
 
 /// Largest term that a node without any takes from another: it may join a cell that has led for long.
@@ -212,6 +212,17 @@ impl ElectionMessage {
         let limits = Limits { payload_bytes: MAX_MESSAGE_BYTES, ..Limits::default() };
         let message: Self = wire::decode(bytes, &limits)?;
         if message.is_plausible() { Ok(message) } else { Err(RejectReason::Malformed) }
+    }
+
+    /// The highest term of an epoch in the message.
+    pub(super) fn highest_epoch(&self) -> u64 {
+        let of_body = match &self.body {
+            Body::Status { over } => over.as_ref(),
+            Body::Beat { after, .. } => after.as_ref(),
+            Body::Resign { epoch, .. } => Some(epoch),
+            Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready | Body::Yield { .. } => None,
+        };
+        of_body.into_iter().chain(&self.epoch).map(|epoch| epoch.term).max().unwrap_or(0)
     }
 
     fn is_plausible(&self) -> bool {

@@ -32,6 +32,8 @@ pub(super) struct Peer {
     pub(super) epoch: Option<Epoch>,
     /// Whether our last message to it said that we hear it.
     pub(super) told: bool,
+    /// Leadership of this node that the peer was last told to be over.
+    corrected: Option<Epoch>,
     run: u64,
     seq: u64,
     heard_at: Option<Timestamp>,
@@ -84,6 +86,18 @@ impl Peers {
         if let Some(peer) = self.table.get_mut(name) {
             peer.told = hears;
         }
+    }
+
+    /// Whether a peer follows a leadership of `leader` that is over, and has not been told so: each is told of once, as its
+    /// answer is answered too.
+    pub(super) fn correct(&mut self, name: &NodeName, leader: &NodeName, current: Option<&Epoch>) -> bool {
+        let Some(peer) = self.table.get_mut(name) else { return false };
+        let over = peer.epoch.clone().filter(|epoch| epoch.leader == *leader && Some(epoch) != current);
+        let is_news = over.is_some() && over != peer.corrected;
+        if is_news {
+            peer.corrected = over;
+        }
+        is_news
     }
 
     /// Notes what every message says about its sender; false for one that is repeated or overtaken.

@@ -143,3 +143,39 @@ fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
     election.handle(received(&gauss, 1, Some(&before), Body::Status { over: None }), now);
     assert_eq!(election.leader(), Some(&gauss));
 }
+
+/// A vehicle's certificate lets nobody lead; its word about others ends no leadership either.
+#[test]
+fn the_word_of_a_node_that_never_leads_ends_no_leadership() {
+    let mut election = euclid();
+    let mut now = NOW;
+    let hopper = NodeName::from_static("hopper");
+    let of_hopper = |seq, epoch: Option<&Epoch>| {
+        let message = message(&hopper, seq, epoch, Body::Status { over: None });
+        let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
+        ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }
+    };
+    for seq in 1.. {
+        election.handle(of_hopper(seq, None), now);
+        now = election.next_deadline();
+        election.tick(now);
+        if election.is_leading() {
+            break;
+        }
+    }
+    let ghost = Epoch::new(election.term() + 1, NodeName::from_static("ghost"));
+    election.handle(of_hopper(1000, Some(&ghost)), now);
+    assert!(election.is_leading());
+}
+
+#[test]
+fn a_term_rises_by_a_bounded_step_in_an_hour_however_many_messages_state_more() {
+    let mut election = euclid();
+    let status = || Body::Status { over: None };
+    for seq in 1..100 {
+        election.handle(of_edge(seq, 8 + seq * (MAX_TERM_STEP / 2), status()), NOW);
+    }
+    assert!(election.term() <= 8 + MAX_TERM_STEP, "{}", election.term());
+    let beat = election.handle(of_edge(100, MAX_TERM, beat(88)), NOW);
+    assert!(is_counted(&beat) && election.leader() == Some(&NodeName::from_static("edge")), "heard all the same");
+}

@@ -89,7 +89,7 @@ impl ElectionDriver {
             MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
                 Ok(message) => {
                     if message.from == from {
-                        self.cell_time.receive(&message, clock::now());
+                        self.cell_time.receive(&message, rights, clock::now());
                     }
                     Input::Receive { from, rights, message }
                 }

@@ -88,7 +88,6 @@ impl EvidenceSigner {
     /// # Errors
     /// [`EvidenceError`] unless the share's aggregator signed it, with a valid certificate of a node that may lead.
     pub fn verify(&mut self, share: &LedgerShare) -> Result<(), EvidenceError> {
-        self.reload();
         let signatory = self.signatory(share)?;
         // Before the certificate begins, this machine's clock is wrong.
         let since_epoch = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();

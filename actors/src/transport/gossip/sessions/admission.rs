@@ -201,6 +201,9 @@ impl Sessions {
         introduction: &Introduction,
         arrival: &Arrival<'_>,
     ) -> Result<Admission, FrameEvent> {
+        if !self.verifications.allow_host(arrival.from, arrival.now) {
+            return Err(FrameEvent::Throttled);
+        }
         let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
         let name = &introduction.id.name;
         let head_bytes = head.bytes(self.key.tag());

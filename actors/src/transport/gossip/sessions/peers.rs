@@ -96,18 +96,26 @@ impl PeerTable {
     /// Adds a session, if there is room: the longest idle one gives way when it is idle for long enough.
     pub(super) fn insert(&mut self, session: SessionId, peer: PeerSession) -> Result<(), FrameEvent> {
         let holder = |peer: &PeerSession| peer.proven.as_ref().map(|proven| proven.holder.clone());
-        if let Some(own) = holder(&peer)
-            && self.peers.values().filter(|peer| holder(peer).as_ref() == Some(&own)).count() >= MAX_SESSIONS_EACH
-        {
-            return Err(FrameEvent::TooManyPeers);
+        if let Some(own) = holder(&peer) {
+            let is_own = |peer: &PeerSession| holder(peer).as_ref() == Some(&own);
+            if self.peers.values().filter(|peer| is_own(peer)).count() >= MAX_SESSIONS_EACH {
+                self.make_room(peer.heard, is_own)?;
+            }
         }
         if self.peers.len() >= self.max_peers {
-            let longest_idle = self.peers.iter().min_by_key(|(_, peer)| peer.heard);
-            let may_go = longest_idle.filter(|(_, idle)| peer.heard.since(idle.heard) >= SESSION_IDLE_TIMEOUT);
-            let session = may_go.map(|(session, _)| *session).ok_or(FrameEvent::TooManyPeers)?;
-            self.remove(&session);
+            self.make_room(peer.heard, |_| true)?;
         }
         self.peers.insert(session, peer);
+        Ok(())
+    }
+
+    /// Removes the longest idle of some sessions, when it is idle for long enough.
+    fn make_room(&mut self, now: Timestamp, may_go: impl Fn(&PeerSession) -> bool) -> Result<(), FrameEvent> {
+        let some = self.peers.iter().filter(|(_, peer)| may_go(peer));
+        let longest_idle = some.min_by_key(|(_, peer)| peer.heard);
+        let idle = longest_idle.filter(|(_, idle)| now.since(idle.heard) >= SESSION_IDLE_TIMEOUT);
+        let session = idle.map(|(session, _)| *session).ok_or(FrameEvent::TooManyPeers)?;
+        self.remove(&session);
         Ok(())
     }
 
