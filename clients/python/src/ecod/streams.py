@@ -25,7 +25,7 @@ class Stream(Generic[M]):
         self.number = 0
         self.told: set[str] = set()
         self._newest: dict[str, tuple[int, M]] = {}
-        self._last = (-1, -1)
+        self._last = (-1, "", -1)
         self._last_at = 0.0
 
     def take(self, node: str, payload: bytes, changed: threading.Condition) -> None:
@@ -34,7 +34,7 @@ class Stream(Generic[M]):
         if message is not None and node and message.node != node:
             raise Rejected("node_mismatch", f"a status of {message.node!r}")
         if message is not None and not node:
-            self._check_order((message.epoch, message.round))
+            self._check_order((message.epoch, message.aggregator or "", message.round))
         with changed:
             self._newest.pop(node, None)
             # An empty payload withdraws a status.
@@ -49,9 +49,11 @@ class Stream(Generic[M]):
         """The earliest of the newest payloads that came after the numbered one."""
         return min((entry for entry in self._newest.values() if entry[0] > number), key=lambda entry: entry[0], default=None)
 
-    def _check_order(self, this: tuple[int, int]) -> None:
+    def _check_order(self, this: tuple[int, str, int]) -> None:
+        """Rejects what is not later by epoch, aggregator and round, in this order."""
         now = time.monotonic()
         if this <= self._last and now - self._last_at < FORGET_S:
-            reason = "superseded" if this[0] < self._last[0] else "repeated"
-            raise Rejected(reason, f"epoch {this[0]} round {this[1]} after epoch {self._last[0]} round {self._last[1]}")
+            reason = "superseded" if this[:2] < self._last[:2] else "repeated"
+            (epoch, _, round), (last_epoch, _, last_round) = this, self._last
+            raise Rejected(reason, f"epoch {epoch} round {round} after epoch {last_epoch} round {last_round}")
         self._last, self._last_at = this, now
