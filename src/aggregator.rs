@@ -230,10 +230,11 @@ impl Aggregator {
         round
     }
 
-    /// The share of the vehicles heard lately whose reports are usable by their time.
+    /// The share of the vehicles heard lately whose reports are usable by their time. A vehicle that sends reports of both
+    /// kinds counts once.
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
         let [detections, votes] = self.windows.each_ref().map(|window| window.timeliness(now));
-        Timeliness { timely: detections.timely + votes.timely, untimely: detections.untimely + votes.untimely }
+        Timeliness { timely: detections.timely.max(votes.timely), untimely: detections.untimely.max(votes.untimely) }
     }
 
     /// VOTE's trust in each vehicle, from the evidence of this aggregator.

@@ -16,9 +16,10 @@ enum Step {
     Wait { ms: u16 },
 }
 
-fuzz_target!(|input: (bool, Vec<Step>)| {
-    let (proves, steps) = input;
-    let mut listener = Listener::meet(proves);
+fuzz_target!(|input: (u8, Vec<Step>)| {
+    let (cell, steps) = input;
+    let proves = cell & 1 == 1;
+    let mut listener = if cell & 2 == 2 { Listener::alone(proves) } else { Listener::meet(proves) };
     for step in steps {
         match step {
             Step::Datagram(frame) => listener.hear(&frame),

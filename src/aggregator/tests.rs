@@ -196,3 +196,17 @@ fn what_is_said_to_a_new_leader_is_its_evidence() {
     let after = settled(&mut standby, &["euclid", "gauss"], (5000, 6000));
     assert_eq!(after.values().copied().collect::<Vec<_>>(), [1, 1], "{after:?}");
 }
+
+#[test]
+fn a_vehicle_that_is_rejected_for_its_time_deposes_nobody_by_sending_both_kinds() {
+    let mut cell = leader(FusionConfig::default());
+    let mut last = Timeliness::default();
+    for n in 0..100 {
+        for kind in [Detections, VoteDetections] {
+            // A clock that nobody can follow.
+            let _rejected = cell.report(kind, &report("bad", "cup", n * 10_000), at(n * 100 + 2));
+        }
+        last = cell.timeliness(at(n * 100 + 2));
+    }
+    assert_eq!((last, last.is_usable()), (Timeliness { timely: 0, untimely: 1 }, true));
+}

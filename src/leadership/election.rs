@@ -310,9 +310,9 @@ impl Election {
         }
     }
 
-    /// Number of the first round of a leadership.
+    /// Number of the first round of a leadership. Rounds begin anew long before receivers take no more.
     fn next_round(&self) -> u64 {
-        if self.round < MAX_ROUND { self.round + 1 } else { 1 }
+        if self.round < MAX_ROUND / 2 { self.round + 1 } else { 1 }
     }
 
     fn peer_alive(&mut self, peer: &NodeName, now: Timestamp) {

@@ -241,7 +241,7 @@ impl GatewayState {
         let reports = REPORTS.map(|level| self.topics.filter(level));
         for link in self.links.values().filter(|link| !self.takes_reports_of(&link.broker)) {
             let told = link.client.as_ref().map(|client| match wanted {
-                true => client.subscribe(&self.filters(&link.broker)),
+                true => client.subscribe(&reports),
                 false => client.unsubscribe(&reports),
             });
             tracing::debug!(broker = %link.broker, wanted, ?told, "subscription to reports changed");

@@ -3,7 +3,9 @@
 mod arguments;
 
 use std::fs::File;
+use std::io;
 use std::net::SocketAddr;
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -80,6 +82,18 @@ pub(super) struct NodeBuilder {
 /// How long a part may take to stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// Locks the node's state. A directory that cannot be written is reported when something is saved.
+fn lock_state(directory: &Path, cell: &NodeName, name: &NodeName) -> Option<File> {
+    let lock = StateFile::lock(directory, cell, name);
+    if lock.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
+        tracing::warn!(
+            directory = %directory.display(),
+            "another process uses the state of this node, and each overwrites the other's: stop one of them"
+        );
+    }
+    lock.ok()
+}
+
 /// How often, and how far apart, a broker or membership started anew tries to get its address back.
 const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
@@ -91,8 +105,7 @@ impl NodeBuilder {
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
         Self {
-            // A directory that cannot be written is reported when something is saved.
-            _state_lock: directory.and_then(|directory| StateFile::lock(directory, &config.cell, &name).ok()),
+            _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
             config,
             security,

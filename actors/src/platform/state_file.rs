@@ -136,7 +136,12 @@ fn checksum(state: &[u8]) -> String {
 /// When the directory or disk refuses it; the file before is then still there.
 pub(crate) fn replace_file(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     let temporary = path.with_extension("tmp");
-    let mut file = OpenOptions::new().write(true).create(true).truncate(true).mode(mode).open(&temporary)?;
+    // One that was left over keeps its own permissions.
+    match fs::remove_file(&temporary) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&temporary)?;
     file.write_all(bytes)?;
     file.sync_all()?;
     fs::rename(&temporary, path)?;
@@ -214,5 +219,17 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         fs::write(directory.path().join("occupied"), b"").unwrap();
         assert!(file(&directory.path().join("occupied")).save(&[1]).is_err());
+    }
+
+    #[test]
+    fn a_left_over_file_lends_no_permissions_to_a_secret() {
+        use std::os::unix::fs::PermissionsExt;
+
+        let directory = tempfile::tempdir().unwrap();
+        let (key, left_over) = (directory.path().join("edge.key"), directory.path().join("edge.tmp"));
+        fs::write(&left_over, "half a certificate").unwrap();
+        fs::set_permissions(&left_over, PermissionsExt::from_mode(0o644)).unwrap();
+        replace_file(&key, b"secret", 0o600).unwrap();
+        assert_eq!(fs::metadata(&key).unwrap().permissions().mode() & 0o777, 0o600);
     }
 }

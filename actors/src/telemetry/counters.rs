@@ -176,7 +176,11 @@ impl Counters {
     /// Counts a message that was shed under overload; the first of each source is also a warning.
     pub fn shed(&self, reason: ShedReason, source: &str) {
         if self.shed.count(reason, source) {
-            tracing::warn!(source, reason = reason.as_str(), "more comes in than is taken, the rest is left out");
+            let meaning = match reason {
+                ShedReason::ReaderSlow => "a client reads too slowly, it misses the oldest messages",
+                _ => "more comes in than is taken, the rest is left out",
+            };
+            tracing::warn!(source, reason = reason.as_str(), "{meaning}");
         }
     }
 

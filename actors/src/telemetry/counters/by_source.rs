@@ -50,7 +50,7 @@ pub type Shed = SourceCount<ShedReason>;
 
 /// Counts by reason and source.
 #[derive(Debug)]
-pub(super) struct CountsBySource<R>(Mutex<BTreeMap<(R, String), u64>>);
+pub(super) struct CountsBySource<R>(Mutex<BTreeMap<R, BTreeMap<String, u64>>>);
 
 impl<R> Default for CountsBySource<R> {
     fn default() -> Self {
@@ -58,7 +58,7 @@ impl<R> Default for CountsBySource<R> {
     }
 }
 
-/// Maximum pairs of reason and source with a count of their own; further sources share [`OTHERS`].
+/// Maximum sources of each reason with a count of their own; further sources share [`OTHERS`].
 const MAX_TRACKED_SOURCES: usize = 64;
 
 /// Source name under which further sources are counted together.
@@ -68,27 +68,25 @@ impl<R: Copy + Ord> CountsBySource<R> {
     /// Counts one message; true for the first of a source.
     pub(super) fn count(&self, reason: R, source: &str) -> bool {
         let mut counts = self.counts();
-        let key = (reason, source.to_owned());
-        if let Some(times) = counts.get_mut(&key) {
+        let sources = counts.entry(reason).or_default();
+        if let Some(times) = sources.get_mut(source) {
             *times += 1;
             return false;
         }
-        let has_room = counts.len() < MAX_TRACKED_SOURCES;
-        let key = if has_room { key } else { (reason, OTHERS.to_owned()) };
-        *counts.entry(key).or_default() += 1;
+        let has_room = sources.len() < MAX_TRACKED_SOURCES;
+        *sources.entry(if has_room { source } else { OTHERS }.to_owned()).or_default() += 1;
         has_room
     }
 
     pub(super) fn snapshot(&self) -> Vec<SourceCount<R>> {
-        let count = |((reason, source), times): (&(R, String), &u64)| SourceCount {
-            reason: *reason,
-            source: source.clone(),
-            times: *times,
-        };
-        self.counts().iter().map(count).collect()
+        let mut all = Vec::new();
+        for (&reason, sources) in self.counts().iter() {
+            all.extend(sources.iter().map(|(source, &times)| SourceCount { reason, source: source.clone(), times }));
+        }
+        all
     }
 
-    fn counts(&self) -> MutexGuard<'_, BTreeMap<(R, String), u64>> {
+    fn counts(&self) -> MutexGuard<'_, BTreeMap<R, BTreeMap<String, u64>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -100,13 +98,16 @@ mod tests {
     #[test]
     fn sources_are_told_apart_until_there_are_too_many() {
         let shed = CountsBySource::default();
+        assert!(shed.count(ShedReason::ReaderSlow, "gauss"));
         for source in 0..2 * MAX_TRACKED_SOURCES {
             for time in 0..2 {
                 let is_first = shed.count(ShedReason::ReportThrottled, &format!("v{source:03}"));
                 assert_eq!(is_first, time == 0 && source < MAX_TRACKED_SOURCES, "source {source}");
             }
         }
-        let snapshot = shed.snapshot();
+        assert!(shed.count(ShedReason::LedgerThrottled, "gauss"), "each reason has room of its own");
+        let mut snapshot = shed.snapshot();
+        snapshot.retain(|count| count.reason == ShedReason::ReportThrottled);
         assert_eq!(snapshot.len(), MAX_TRACKED_SOURCES + 1);
         assert_eq!(snapshot.iter().map(|count| count.times).sum::<u64>(), 4 * MAX_TRACKED_SOURCES as u64);
         let others = snapshot.iter().find(|count| count.source == OTHERS).unwrap();

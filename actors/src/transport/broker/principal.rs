@@ -1,10 +1,10 @@
 //! The principal behind each connection, and the quotas of principals.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
-use rmqtt::types::ClientId;
+use rmqtt::types::{ClientId, TopicFilter};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::permissions::LeaderCheck;
@@ -83,7 +83,7 @@ pub(super) struct PrincipalRegistry(Arc<RwLock<HashMap<SocketAddr, Registered>>>
 #[derive(Debug)]
 struct Registered {
     principal: Principal,
-    subscriptions: usize,
+    subscriptions: HashSet<TopicFilter>,
 }
 
 /// Entry of one connection in the registry; removed when dropped.
@@ -94,7 +94,7 @@ pub(super) struct Registration {
 
 impl PrincipalRegistry {
     pub(super) fn register(&self, address: SocketAddr, principal: Principal) -> Registration {
-        self.connections_mut().insert(address, Registered { principal, subscriptions: 0 });
+        self.connections_mut().insert(address, Registered { principal, subscriptions: HashSet::new() });
         Registration { principals: self.clone(), address }
     }
 
@@ -112,19 +112,14 @@ impl PrincipalRegistry {
         Some(Arc::clone(&self.connections().get(&address?)?.principal.source))
     }
 
-    /// Counts a subscription of a connection.
-    pub(super) fn add_subscription(&self, address: Option<SocketAddr>) {
+    /// Notes that a connection has begun or ended a subscription. One that is made again counts once.
+    pub(super) fn note_subscription(&self, address: Option<SocketAddr>, filter: &TopicFilter, is_begun: bool) {
         let mut connections = self.connections_mut();
-        if let Some(connection) = address.and_then(|address| connections.get_mut(&address)) {
-            connection.subscriptions += 1;
-        }
-    }
-
-    /// Counts the end of a subscription.
-    pub(super) fn remove_subscription(&self, address: Option<SocketAddr>) {
-        let mut connections = self.connections_mut();
-        if let Some(connection) = address.and_then(|address| connections.get_mut(&address)) {
-            connection.subscriptions = connection.subscriptions.saturating_sub(1);
+        let Some(connection) = address.and_then(|address| connections.get_mut(&address)) else { return };
+        if !is_begun {
+            connection.subscriptions.remove(filter);
+        } else if !connection.subscriptions.contains(filter) {
+            connection.subscriptions.insert(filter.clone());
         }
     }
 
@@ -134,7 +129,7 @@ impl PrincipalRegistry {
         let key_of = |registered: &Registered| registered.principal.quota_key.clone();
         let Some(key) = address.and_then(|address| connections.get(&address).and_then(key_of)) else { return 0 };
         let own = connections.values().filter(|other| other.principal.quota_key.as_ref() == Some(&key));
-        own.map(|connection| connection.subscriptions).sum()
+        own.map(|connection| connection.subscriptions.len()).sum()
     }
 
     fn connections(&self) -> RwLockReadGuard<'_, HashMap<SocketAddr, Registered>> {

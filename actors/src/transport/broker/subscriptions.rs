@@ -51,8 +51,12 @@ impl Handler for SharedQuota {
     async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
         let SubscriptionQuota { rate, principals, counters } = &*self.0;
         match parameter {
-            Parameter::SessionSubscribed(session, _) => principals.add_subscription(session.id.remote_addr),
-            Parameter::SessionUnsubscribed(session, _) => principals.remove_subscription(session.id.remote_addr),
+            Parameter::SessionSubscribed(session, subscribe) => {
+                principals.note_subscription(session.id.remote_addr, &subscribe.topic_filter, true)
+            }
+            Parameter::SessionUnsubscribed(session, unsubscribe) => {
+                principals.note_subscription(session.id.remote_addr, &unsubscribe.topic_filter, false)
+            }
             Parameter::ClientSubscribeCheckAcl(session, _) => {
                 let address = session.id.remote_addr;
                 let source = principals.quota_key(address, &session.id.client_id);

@@ -28,7 +28,7 @@ static IDENTITIES: LazyLock<[Identity; 2]> = LazyLock::new(|| {
     [OWN, PEER].map(|name| authority.identity(name, Role::Auto))
 });
 
-/// A node that has met a peer, whose frames can then say anything.
+/// A node that hears a peer, whose frames can say anything.
 pub struct Listener {
     own: GossipMachine,
     key: CellKey,
@@ -42,17 +42,14 @@ pub struct Listener {
 impl Listener {
     /// A node and its peer, after their handshake, in a cell with certificates or without.
     pub fn meet(proves: bool) -> Self {
-        let mut now = Timestamp(1_700_000_000_000_000);
-        let nodes = [(OWN, [2; 16]), (PEER, [1; 16])];
-        let identities = if proves { IDENTITIES.clone().map(Some) } else { [None, None] };
-        let [own_identity, peer_identity] = identities;
-        let mut own = machine(OWN, [2; 16], own_identity, now);
-        let mut peer = machine(PEER, [1; 16], peer_identity, now);
+        let mut listener = Self::alone(proves);
+        let mut peer = machine(PEER, 1, proves, listener.now);
+        let Self { own, now, .. } = &mut listener;
         let mut under_way = VecDeque::new();
         for _ in 0..100 {
-            for (index, machine) in [&mut own, &mut peer].into_iter().enumerate() {
-                if machine.next_deadline().is_some_and(|deadline| deadline <= now) {
-                    machine.tick(now);
+            for (index, machine) in [&mut *own, &mut peer].into_iter().enumerate() {
+                if machine.next_deadline().is_some_and(|deadline| deadline <= *now) {
+                    machine.tick(*now);
                 }
                 while let Some(output) = machine.poll() {
                     match output {
@@ -63,17 +60,25 @@ impl Listener {
                     }
                 }
             }
-            now = now + Duration::from_millis(10);
+            *now = *now + Duration::from_millis(10);
             for (from, frame) in under_way.drain(..) {
-                let to = if from == 0 { &mut peer } else { &mut own };
-                to.receive(&frame, address(from), now);
+                let to = if from == 0 { &mut peer } else { &mut *own };
+                to.receive(&frame, address(from), *now);
             }
             if !own.members().is_empty() && !peer.members().is_empty() {
                 break;
             }
         }
         assert!(!own.members().is_empty(), "the nodes have met");
-        let sessions = nodes.map(|(node, nonce)| if proves { session_of(&name(node), &nonce) } else { nonce });
+        listener
+    }
+
+    /// A node that has met nobody yet.
+    pub fn alone(proves: bool) -> Self {
+        let now = Timestamp(1_700_000_000_000_000);
+        let own = machine(OWN, 2, proves, now);
+        let sessions = [(OWN, [2; 16]), (PEER, [1; 16])]
+            .map(|(node, nonce)| if proves { session_of(&name(node), &nonce) } else { nonce });
         let version = if proves { Version::Certificate } else { Version::Key };
         Self { own, key: key(), version, sessions, now, forged: 1 << 16 }
     }
@@ -126,7 +131,8 @@ fn key() -> CellKey {
     CellKey::new(KEY, &name("lot-1"))
 }
 
-fn machine(node: &'static str, session: SessionId, identity: Option<Identity>, now: Timestamp) -> GossipMachine {
+fn machine(node: &'static str, nonce: u8, proves: bool, now: Timestamp) -> GossipMachine {
+    let identity = proves.then(|| IDENTITIES[usize::from(node == PEER)].clone());
     let own = NodeId {
         name: name(node),
         run: now.micros(),
@@ -135,7 +141,15 @@ fn machine(node: &'static str, session: SessionId, identity: Option<Identity>, n
         gossip: SocketAddr::from((Ipv4Addr::UNSPECIFIED, 17_884)),
         broker: None,
     };
-    let setup = GossipSetup { own, key: key(), session, identity, secret: [7; 32], seed: 3, counters: Arc::default() };
+    let setup = GossipSetup {
+        own,
+        key: key(),
+        session: [nonce; 16],
+        identity,
+        secret: [7; 32],
+        seed: 3,
+        counters: Arc::default(),
+    };
     GossipMachine::new(setup, &MembershipConfig::default(), now)
 }
 

@@ -141,17 +141,16 @@ impl Swim {
         let Some((count, mut rest)) = updates.split_first_chunk::<2>() else { return Ok(body.to_vec()) };
         self.note_met(from);
         let mut kept = body.get(..body.len() - updates.len()).unwrap_or_default().to_vec();
-        let (mut codec, lives) = (PostcardCodec, self.lives.iter().flatten().collect::<BTreeMap<_, _>>());
-        let mut updates = Vec::new();
+        let (mut codec, mut kept_updates) = (PostcardCodec, Vec::new());
         for _ in 0..u16::from_be_bytes(*count) {
             let update: foca::Member<NodeId> = codec.decode_member(&mut rest)?;
             let id = update.id();
-            match lives.get(&id.name) {
-                _ if id.name == self.foca.identity().name => updates.push(update),
-                Some(life) if id.life <= **life => {
+            match self.lives.as_ref().and_then(|lives| lives.get(&id.name)) {
+                _ if id.name == self.foca.identity().name => kept_updates.push(update),
+                Some(life) if id.life <= *life => {
                     let is_doubt = update.state() != State::Alive && id.name != from.name;
                     if !is_doubt || !is_heard(&id.name) {
-                        updates.push(update);
+                        kept_updates.push(update);
                     }
                 }
                 Some(_) => {}
@@ -159,8 +158,8 @@ impl Swim {
                 None => {}
             }
         }
-        kept.extend(u16::try_from(updates.len()).unwrap_or(u16::MAX).to_be_bytes());
-        updates.iter().try_for_each(|update| codec.encode_member(update, &mut kept))?;
+        kept.extend(u16::try_from(kept_updates.len()).unwrap_or(u16::MAX).to_be_bytes());
+        kept_updates.iter().try_for_each(|update| codec.encode_member(update, &mut kept))?;
         kept.extend_from_slice(rest);
         Ok(kept)
     }
