@@ -102,7 +102,7 @@ def test_a_slow_reader_gets_the_newest_map_and_keeps_nothing_else(cell: ecod.Cel
     slow, quick = listen(cell, publisher), cell.maps(timeout=20)
     for round in range(1, 201):
         publisher.say("global_detections", map_of(1, round))
-    wait_for(lambda: cell._maps._last == (1, 200))
+    wait_for(lambda: cell._maps._last == (1, "edge", 200))
     assert [next(reader).round for reader in (slow, quick)] == [200, 200], "each reader has its own place"
     assert len(cell._maps._newest) == 1
     with pytest.raises(ecod.Silent, match="nothing on ecod/v1/lot-.*/global_detections from 127.0.0.1:.* does a node lead the cell"):

@@ -122,6 +122,8 @@ class ObjectReport:
     pose: Optional[Pose] = None
     seen: Optional[Annotated[list[Label], _at_most(1024)]] = None
     view: Optional[FieldOfView] = None
+    # How wrong the stamp may be, of a node that knows the cell's time. Programs leave it out.
+    clock_error_us: Optional[Count] = None
 
 
 @dataclass(frozen=True)
