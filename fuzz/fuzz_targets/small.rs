@@ -22,7 +22,7 @@ fuzz_target!(|input: &[u8]| {
     let text = std::str::from_utf8(bytes).unwrap_or_default();
     match kind % 5 {
         0 => {
-            if let Ok((_, pose)) = read_pose(bytes, Timestamp(0)) {
+            if let Ok((_, pose)) = read_pose(bytes, Timestamp(0), 0) {
                 assert!(pose.position.x.is_finite() && pose.position.y.is_finite() && pose.heading_rad.is_finite());
             }
         }
