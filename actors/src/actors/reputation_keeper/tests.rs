@@ -16,7 +16,14 @@ fn name(name: &str) -> NodeName {
 }
 
 fn member(node: &str, role: Role) -> Member {
-    Member { name: name(node), run: 1, gossip: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)), broker: None, role }
+    Member {
+        name: name(node),
+        run: 1,
+        gossip: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)),
+        broker: None,
+        role,
+        certificate: None,
+    }
 }
 
 fn counted(epoch: u64, aggregator: &str) -> LedgerEntry {
