@@ -206,6 +206,10 @@ impl World {
             }
         }
         let Some(later) = of_this_run().find(|accepted| accepted.epoch > map.epoch) else { return };
+        // Nobody can have forged what it published itself.
+        if later.epoch.leader == node.name {
+            fail("it led itself in a later term");
+        }
         let is_elected = node.leadership.present_epoch() == Some(&map.epoch);
         let is_alone =
             node.leadership.leader().is_none() && u128::from(self.now - later.at) >= EPOCH_MEMORY.as_micros() - 1000;

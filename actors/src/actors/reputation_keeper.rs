@@ -96,7 +96,6 @@ pub struct ReputationKeeperState {
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
     disk_failed: bool,
-    cannot_sign: bool,
 }
 
 impl Actor for ReputationKeeper {
@@ -176,7 +175,6 @@ impl ReputationKeeperState {
             unadopted: false,
             writing: None,
             disk_failed: false,
-            cannot_sign: false,
         }
     }
 
@@ -297,8 +295,6 @@ impl ReputationKeeperState {
             };
             if let Some(share) = share {
                 self.arguments.gateway.send(GatewayMessage::PublishShare { share });
-            } else if !std::mem::replace(&mut self.cannot_sign, true) {
-                tracing::warn!("evidence not shared: `tls.key` is not an ECDSA P-256 key, as `ecod-node pki` makes it");
             }
         }
     }
