@@ -42,7 +42,7 @@ use crate::messages::newest::Received;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
-use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::Delivery;
 use crate::transport::pki::{Credentials, EvidenceSigner};
@@ -210,13 +210,20 @@ impl ReputationKeeperState {
     fn merge(&mut self, delivery: &Delivery<Arc<LedgerShare>>) {
         let share = &delivery.message;
         let candidates = self.candidates();
+        let leadership = self.arguments.leadership.borrow().clone();
+        let broker = delivery.broker.as_ref();
+        let way = self.resync.check_way(broker, share, &self.arguments.reputations.open().ledger, &leadership);
+        if let Err(reason) = way {
+            let broker = broker.map_or(OTHERS, NodeName::as_str);
+            tracing::debug!(node = %share.node, broker, "evidence over this broker not used");
+            return reason.map_or((), |reason| self.arguments.counters.reject(reason, broker));
+        }
         if let Some(signer) = self.signer.as_mut().filter(|_| !share.is_empty())
             && let Err(error) = signer.verify(share)
         {
             tracing::debug!(node = %share.node, %error, "evidence not used");
             return self.arguments.counters.reject(RejectReason::BadSignature, share.node.as_str());
         }
-        let leadership = self.arguments.leadership.borrow().clone();
         let mut store = self.arguments.reputations.open();
         let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, delivery.received_at);
         drop(store);

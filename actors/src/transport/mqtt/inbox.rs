@@ -69,6 +69,8 @@ pub struct Delivery<T = Incoming> {
     pub received_at: Timestamp,
     /// What proves the aggregator of a round; of other messages nothing is asked.
     pub origin: Origin,
+    /// The node whose certificate the broker has proven; `None` without certificates, and for messages of this node.
+    pub broker: Option<NodeName>,
     _place: Option<OwnedSemaphorePermit>,
 }
 
@@ -83,13 +85,13 @@ pub(crate) struct Via<'a> {
 impl<T> Delivery<T> {
     /// A message of this node itself. It occupies no place: the node's own pace bounds it.
     pub(crate) fn local(message: T, at: Timestamp) -> Self {
-        Self { message, received_at: at, origin: Origin::Proven, _place: None }
+        Self { message, received_at: at, origin: Origin::Proven, broker: None, _place: None }
     }
 
     /// The same delivery of a part of its message: all else stays.
     pub(crate) fn map<U>(self, part: impl FnOnce(T) -> U) -> Delivery<U> {
-        let Self { message, received_at, origin, _place } = self;
-        Delivery { message: part(message), received_at, origin, _place }
+        let Self { message, received_at, origin, broker, _place } = self;
+        Delivery { message: part(message), received_at, origin, broker, _place }
     }
 }
 
@@ -175,9 +177,10 @@ impl Inbox {
     }
 
     /// Delivers a message of a broker. Dropped and counted when receivers are too far behind.
-    fn deliver(&self, message: Incoming, origin: Origin, received_at: Timestamp) -> PacketOutcome {
+    fn deliver(&self, via: Via<'_>, message: Incoming, origin: Origin, received_at: Timestamp) -> PacketOutcome {
+        let broker = via.node.cloned();
         match Arc::clone(&self.capacity).try_acquire_owned() {
-            Ok(place) => self.hand_over(Delivery { message, received_at, origin, _place: Some(place) }),
+            Ok(place) => self.hand_over(Delivery { message, received_at, origin, broker, _place: Some(place) }),
             Err(_) => self.counters.count(Event::InboxFull),
         }
         PacketOutcome::Done
@@ -203,9 +206,11 @@ impl Inbox {
         };
         let origin = |aggregator| self.origin(via, aggregator, topic, payload).ok_or(RejectReason::BadSignature);
         let (message, origin) = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
-            Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload, received_at),
+            Topic::Detections(node) => {
+                return self.read_report(via, ReportKind::Detections, &node, payload, received_at);
+            }
             Topic::VoteDetections(node) => {
-                return self.read_report(ReportKind::VoteDetections, &node, payload, received_at);
+                return self.read_report(via, ReportKind::VoteDetections, &node, payload, received_at);
             }
             Topic::Nodes(node) => return self.read_status(via, &node, payload, received_at),
             Topic::Ledger(node) if node == self.node => return Ok(self.echo()),
@@ -243,7 +248,7 @@ impl Inbox {
                 (Incoming::Reputations(Arc::new(reputations)), origin)
             }
         };
-        Ok(self.deliver(message, origin, received_at))
+        Ok(self.deliver(via, message, origin, received_at))
     }
 
     /// What proves the aggregator of a round; `None` if the broker is not to be believed.
@@ -258,6 +263,7 @@ impl Inbox {
 
     fn read_report(
         &self,
+        via: Via<'_>,
         kind: ReportKind,
         node: &NodeName,
         payload: &[u8],
@@ -271,7 +277,7 @@ impl Inbox {
             return Ok(PacketOutcome::Done);
         }
         let report = Arc::new(decode_report(payload, node, &self.limits)?);
-        Ok(self.deliver(Incoming::Report { kind, report }, Origin::Claimed, received_at))
+        Ok(self.deliver(via, Incoming::Report { kind, report }, Origin::Claimed, received_at))
     }
 
     fn read_status(
@@ -291,6 +297,7 @@ impl Inbox {
         if status.node != self.node {
             let status = Arc::new(status);
             return Ok(self.deliver(
+                via,
                 Incoming::Status { status, via: via.address.clone() },
                 Origin::Claimed,
                 received_at,
