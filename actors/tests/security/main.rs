@@ -14,5 +14,6 @@ mod nodes;
 mod packets;
 mod payloads;
 mod resources;
+mod shares;
 mod stolen_leader;
 mod topics;
