@@ -12,7 +12,7 @@ use ecod::leadership::election::{Election, ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
-use ecod::leadership::round_filter::RoundFilter;
+use ecod::leadership::round_filter::{Origin, RoundFilter};
 use ecod::leadership::timers::EPOCH_MEMORY;
 use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
@@ -266,7 +266,7 @@ impl Cell {
             objects: Vec::new(),
             pose_corrections: Default::default(),
         };
-        let accepted = node.filter.accept_map(&map, node.clock, &node.leadership);
+        let accepted = node.filter.accept_map(&map, Origin::Claimed, node.clock, &node.leadership);
         if node.machine.is_none() || accepted.is_err() {
             return;
         }

@@ -273,6 +273,7 @@ mod tests {
                 gossip: "127.0.0.1:1".parse().unwrap(),
                 broker: None,
                 role: Role::Auto,
+                certificate: None,
             }],
             map: Some(ReceivedMap { received_at: Timestamp(7_000_000), map: Arc::new(map) }),
             verdicts: None,

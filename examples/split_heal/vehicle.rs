@@ -12,7 +12,7 @@ use ecod::leadership::health::HealthSample;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::links::{DataPlane, LinkState};
 use ecod::leadership::node::{Effect, Input, LeadershipNode, Member, NodeSettings};
-use ecod::leadership::round_filter::RoundFilter;
+use ecod::leadership::round_filter::{Origin, RoundFilter};
 use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
@@ -178,7 +178,7 @@ impl Vehicle {
 
     /// Takes a map that its filter accepts.
     fn accept(&mut self, map: GlobalMap, now: Timestamp) {
-        let Ok(accepted) = self.filter.accept_map(&map, now, &self.leadership) else { return };
+        let Ok(accepted) = self.filter.accept_map(&map, Origin::Claimed, now, &self.leadership) else { return };
         self.map = Some(map);
         self.handle(Input::RoundAccepted { epoch: accepted.epoch, round: accepted.round }, now);
     }

@@ -133,6 +133,30 @@ impl LedgerResync {
         self.shares(ledger, &changed, &reached)
     }
 
+    /// Checks the way on which a share came. `broker` is the node whose certificate the broker has proven, if any.
+    ///
+    /// A broker can let anybody publish in any name. So evidence that its sender has not signed itself is taken over the
+    /// sender's broker, this node's, and that of a leader that is followed or was a moment ago.
+    ///
+    /// # Errors
+    /// The share is not to be used. [`RejectReason::Unattested`] if it has news, `None` if all of it is known.
+    pub fn check_way(
+        &self,
+        broker: Option<&NodeName>,
+        share: &LedgerShare,
+        ledger: &ReputationLedger,
+        leadership: &Leadership,
+    ) -> Result<(), Option<RejectReason>> {
+        let Some(broker) = broker.filter(|broker| ![&share.node, &self.name].contains(broker)) else { return Ok(()) };
+        let is_of_leader = leadership.leader() == Some(broker) || self.followed.contains_key(broker);
+        if is_of_leader || share.is_empty() || share.lane().is_some_and(|lane| lane.leader == share.node) {
+            return Ok(());
+        }
+        let is_news = share.entries.iter().any(|entry| ledger.lacks_entry(entry))
+            || share.marks.iter().any(|mark| ledger.lacks_mark(mark));
+        Err(is_news.then_some(RejectReason::Unattested))
+    }
+
     /// Takes in another candidate's share. `candidates` are the other nodes that may lead.
     ///
     /// # Errors

@@ -341,11 +341,14 @@ impl LeadershipNode {
         self.set_health(Health { broker: health.broker && is_reached, ..health }, now);
     }
 
-    /// Whether this node is logged in at the broker with which the challenger would lead. If that broker admits nobody,
-    /// handing over would silence the cell. The challenger repeats that it is ready.
+    /// Whether this node is logged in at a broker with which the challenger would lead: its own, or an external one. If
+    /// none admits anybody, handing over would silence the cell. The challenger repeats that it is ready.
     fn is_served_by(&self, challenger: &NodeName) -> bool {
-        self.links.plane().external.is_some()
-            || self.members.broker_of(challenger).is_some_and(|broker| self.monitor.is_logged_in(&broker))
+        let plane = self.links.plane();
+        let is_at = |broker: &BrokerAddress| self.monitor.is_logged_in(broker);
+        !plane.embedded
+            || plane.external.as_ref().is_some_and(is_at)
+            || self.members.broker_of(challenger).as_ref().is_some_and(is_at)
     }
 
     /// Whether the members reach the broker that this node would lead with; the first time that they do not is logged.

@@ -7,21 +7,25 @@
 //! - [`PublisherFilter`] is the rule of a node's own broker: who may publish for all.
 //! - [`Leadership::knows_term`] is the rule for evidence, and for maps that a new leader goes on from.
 //!
-//! A round passes three checks in this order: its epoch and number do not go back ([`EpochGate`]), its leader is the
-//! elected one or may have succeeded it ([`SuccessionFilter`]), and it did not wait in a queue ([`StalenessFilter`]).
+//! A round passes four checks in this order: its [`Origin`] is good enough, its epoch and number do not go back
+//! ([`EpochGate`]), its leader is the elected one or may have succeeded it ([`SuccessionFilter`]), and it did not wait in a
+//! queue ([`StalenessFilter`]).
 //!
 //! # Invariants
 //!
 //! 1. An accepted round is never accepted again, and never followed by an earlier one of its leadership.
 //! 2. A leader that the election names is refused for [`crate::leadership::timers::SUCCESSOR_CREDIT`] at most.
-//! 3. A round older than [`crate::leadership::timers::MAX_ROUND_AGE`] is refused once its leader's delay is known.
+//! 3. Once a round of a leadership was proven, none that is only claimed is accepted as of that leadership.
+//! 4. A round older than [`crate::leadership::timers::MAX_ROUND_AGE`] is refused once its leader's delay is known.
 
 mod epoch_gate;
+mod origin;
 mod publisher;
 mod staleness;
 mod succession;
 
 pub use epoch_gate::EpochGate;
+pub use origin::{Origin, SignatureState};
 pub use publisher::PublisherFilter;
 pub use staleness::StalenessFilter;
 pub use succession::SuccessionFilter;
@@ -42,6 +46,8 @@ pub struct RoundFilter {
     verdicts: SuccessionFilter,
     verdict_age: StalenessFilter,
     reputations: SuccessionFilter,
+    /// The last leadership of which a proven round was accepted.
+    proven: Option<Epoch>,
 }
 
 /// A round that was accepted.
@@ -70,6 +76,8 @@ pub enum Refusal {
     Implausible,
     /// It was under way for too long.
     Stale,
+    /// Its leader proves its rounds, and this one is not proven.
+    Unproven,
 }
 
 impl Refusal {
@@ -81,6 +89,7 @@ impl Refusal {
             Self::NotElected => Some(RejectReason::NotElected),
             Self::Implausible => Some(RejectReason::OutOfRange),
             Self::Stale => Some(RejectReason::Stale),
+            Self::Unproven => Some(RejectReason::BadSignature),
         }
     }
 }
@@ -98,6 +107,7 @@ impl RoundFilter {
             verdict_age: StalenessFilter::new(now),
             // Brokers retain them: a node that starts gets them before it can have heard of any term.
             reputations: SuccessionFilter::of_any_term(floor),
+            proven: None,
         }
     }
 
@@ -108,12 +118,15 @@ impl RoundFilter {
     pub fn accept_map(
         &mut self,
         map: &GlobalMap,
+        origin: Origin,
         received_at: Timestamp,
         leadership: &Leadership,
     ) -> Result<AcceptedRound, Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
+        self.check_origin(&epoch, origin)?;
         self.maps.admit(&epoch, map.round, received_at, leadership)?;
         check_age(&mut self.map_age, &epoch, map.fused_at_us, received_at)?;
+        self.note_origin(&epoch, origin);
         self.map_accepted_at = Some(received_at);
         Ok(accepted(epoch, map.round, true, leadership))
     }
@@ -125,12 +138,15 @@ impl RoundFilter {
     pub fn accept_verdicts(
         &mut self,
         verdicts: &Verdicts,
+        origin: Origin,
         received_at: Timestamp,
         leadership: &Leadership,
     ) -> Result<AcceptedRound, Refusal> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
+        self.check_origin(&epoch, origin)?;
         self.verdicts.admit(&epoch, verdicts.round, received_at, leadership)?;
         check_age(&mut self.verdict_age, &epoch, verdicts.fused_at_us, received_at)?;
+        self.note_origin(&epoch, origin);
         let is_sign_of_life = self.map_accepted_at.is_none_or(|at| received_at.since(at) >= EPOCH_MEMORY);
         Ok(accepted(epoch, verdicts.round, is_sign_of_life, leadership))
     }
@@ -142,12 +158,26 @@ impl RoundFilter {
     pub fn accept_reputations(
         &mut self,
         reputations: &Reputations,
+        origin: Origin,
         received_at: Timestamp,
         leadership: &Leadership,
     ) -> Result<AcceptedRound, Refusal> {
         let epoch = Epoch::new(reputations.epoch, reputations.aggregator.clone().unwrap_or(UNNAMED));
+        self.check_origin(&epoch, origin)?;
         self.reputations.admit(&epoch, reputations.round, received_at, leadership)?;
+        self.note_origin(&epoch, origin);
         Ok(accepted(epoch, reputations.round, false, leadership))
+    }
+
+    fn check_origin(&self, epoch: &Epoch, origin: Origin) -> Result<(), Refusal> {
+        let is_doubtful = origin == Origin::Claimed && self.proven.as_ref() == Some(epoch);
+        if is_doubtful { Err(Refusal::Unproven) } else { Ok(()) }
+    }
+
+    fn note_origin(&mut self, epoch: &Epoch, origin: Origin) {
+        if origin == Origin::Proven && self.proven.as_ref() != Some(epoch) {
+            self.proven = Some(epoch.clone());
+        }
     }
 }
 
@@ -207,7 +237,7 @@ mod tests {
     }
 
     fn take(filter: &mut RoundFilter, map: &GlobalMap, at: Timestamp, leadership: &Leadership) -> Result<(), Refusal> {
-        filter.accept_map(map, at, leadership).map(|_| ())
+        filter.accept_map(map, Origin::Claimed, at, leadership).map(|_| ())
     }
 
     #[test]
@@ -259,10 +289,10 @@ mod tests {
             round,
             reputations: Default::default(),
         };
-        assert!(filter.accept_map(&map(7, 9, now), now, &seeking).is_ok());
-        assert!(filter.accept_reputations(&reputations(7, 1, None), now, &seeking).is_ok());
-        assert!(filter.accept_reputations(&reputations(7, 1, Some("edge")), now, &seeking).is_ok());
-        let late = filter.accept_reputations(&reputations(7, 2, None), now, &seeking);
+        assert!(filter.accept_map(&map(7, 9, now), Origin::Claimed, now, &seeking).is_ok());
+        assert!(filter.accept_reputations(&reputations(7, 1, None), Origin::Claimed, now, &seeking).is_ok());
+        assert!(filter.accept_reputations(&reputations(7, 1, Some("edge")), Origin::Claimed, now, &seeking).is_ok());
+        let late = filter.accept_reputations(&reputations(7, 2, None), Origin::Claimed, now, &seeking);
         assert_eq!(late, Err(Refusal::Superseded));
     }
 
@@ -285,10 +315,13 @@ mod tests {
             verdicts: Vec::new(),
         };
         let is_sign = |round: u64, filter: &mut RoundFilter| {
-            filter.accept_verdicts(&verdicts(round), ms(100 * round), &leadership).unwrap().is_sign_of_life
+            filter
+                .accept_verdicts(&verdicts(round), Origin::Claimed, ms(100 * round), &leadership)
+                .unwrap()
+                .is_sign_of_life
         };
         assert!(is_sign(1, &mut filter));
-        assert!(filter.accept_map(&map(8, 2, ms(200)), ms(200), &leadership).unwrap().is_sign_of_life);
+        assert!(filter.accept_map(&map(8, 2, ms(200)), Origin::Claimed, ms(200), &leadership).unwrap().is_sign_of_life);
         assert!(!is_sign(2, &mut filter));
         assert!((3..40).any(|round| is_sign(round, &mut filter)), "maps come no more");
     }
@@ -296,9 +329,23 @@ mod tests {
     #[test]
     fn a_term_that_no_election_knows_is_accepted_and_not_gone_on_from() {
         let mut filter = RoundFilter::new(0, ms(0));
-        let next = filter.accept_map(&map(8, 1, ms(0)), ms(0), &seeking()).unwrap();
+        let next = filter.accept_map(&map(8, 1, ms(0)), Origin::Claimed, ms(0), &seeking()).unwrap();
         assert!(!next.is_known_term);
-        let known = filter.accept_map(&map(8, 2, ms(100)), ms(100), &following(8, "edge")).unwrap();
+        let known = filter.accept_map(&map(8, 2, ms(100)), Origin::Claimed, ms(100), &following(8, "edge")).unwrap();
         assert!(known.is_known_term);
+    }
+
+    #[test]
+    fn a_leader_that_proves_its_rounds_is_not_heard_without_proof() {
+        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
+        let mut take = |epoch, round: u64, origin, leadership: &Leadership| {
+            let at = ms(100 * round);
+            filter.accept_map(&map(epoch, round, at), origin, at, leadership).map(|_| ())
+        };
+        assert_eq!(take(8, 1, Origin::Claimed, &leadership), Ok(()), "nothing is known of it");
+        assert_eq!(take(8, 2, Origin::Proven, &leadership), Ok(()));
+        assert_eq!(take(8, 3, Origin::Claimed, &leadership), Err(Refusal::Unproven));
+        assert_eq!(take(8, 3, Origin::Proven, &leadership), Ok(()), "the refused one leaves no trace");
+        assert_eq!(take(9, 4, Origin::Claimed, &following(9, "edge")), Ok(()), "the next may not be able to");
     }
 }

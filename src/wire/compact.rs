@@ -91,7 +91,7 @@ impl Form<Uuid> for UuidBytes {
 
 /// Collections that are left out when they are empty.
 pub(crate) mod skip_empty {
-    use super::{Decode, Decoder, Encode, Encoder, Write, decode, encode};
+    use super::{Decode, Decoder, Encode, Encoder, Type, Write, decode, encode};
 
     pub(crate) fn encode<C, T: Encode<()>, W: Write>(
         value: &T,
@@ -101,8 +101,14 @@ pub(crate) mod skip_empty {
         e.encode(value)?.ok()
     }
 
-    pub(crate) fn decode<'b, C, T: Decode<'b, ()>>(d: &mut Decoder<'b>, _: &mut C) -> Result<T, decode::Error> {
-        d.decode()
+    pub(crate) fn decode<'b, C, T: Decode<'b, ()> + Default>(
+        d: &mut Decoder<'b>,
+        _: &mut C,
+    ) -> Result<T, decode::Error> {
+        match d.datatype()? {
+            Type::Null => d.null().map(|()| T::default()),
+            _ => d.decode(),
+        }
     }
 
     pub(crate) fn nil<T: Default>() -> Option<T> {

@@ -60,7 +60,7 @@ reject_reasons! {
     NotElected = "not_elected",
     /// A report for an algorithm that the cell does not run.
     NotFused = "not_fused",
-    /// A payload without a signature of the cell, or evidence without its aggregator's, where there must be one.
+    /// A payload without a signature of the cell, or evidence or a round without its aggregator's, where there must be one.
     BadSignature = "bad_signature",
     /// Evidence of a node that is not known as a candidate.
     NotCandidate = "not_candidate",

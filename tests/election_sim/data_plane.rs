@@ -8,6 +8,7 @@ use std::collections::btree_map::Entry;
 use ecod::aggregator::round::FirstRound;
 use ecod::leadership::links::{LinkState, WantedLinks};
 use ecod::leadership::node::Input;
+use ecod::leadership::round_filter::Origin;
 use ecod::leadership::timers::{ELECTED_SILENCE, EPOCH_MEMORY, MAX_ROUND_AGE};
 use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
@@ -157,7 +158,7 @@ impl World {
             objects: Vec::new(),
             pose_corrections: Default::default(),
         };
-        let Ok(accepted) = node.filter.accept_map(&global, received_at, &node.leadership) else {
+        let Ok(accepted) = node.filter.accept_map(&global, Origin::Claimed, received_at, &node.leadership) else {
             node.refused += 1;
             return;
         };
@@ -205,6 +206,10 @@ impl World {
             }
         }
         let Some(later) = of_this_run().find(|accepted| accepted.epoch > map.epoch) else { return };
+        // Nobody can have forged what it published itself.
+        if later.epoch.leader == node.name {
+            fail("it led itself in a later term");
+        }
         let is_elected = node.leadership.present_epoch() == Some(&map.epoch);
         let is_alone =
             node.leadership.leader().is_none() && u128::from(self.now - later.at) >= EPOCH_MEMORY.as_micros() - 1000;

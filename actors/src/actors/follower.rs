@@ -16,7 +16,7 @@ use std::sync::Arc;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
-use ecod::leadership::round_filter::{AcceptedRound, Refusal, RoundFilter};
+use ecod::leadership::round_filter::{AcceptedRound, Origin, Refusal, RoundFilter};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Verdicts};
@@ -101,15 +101,21 @@ impl Actor for Follower {
         let (taken, sender) = match message {
             FollowerMessage::TakeMap { delivery } => {
                 let map = &delivery.message;
-                (state.take_map(map, delivery.received_at), Some(map.aggregator.clone()))
+                (state.take_map(map, delivery.origin, delivery.received_at), Some(map.aggregator.clone()))
             }
             FollowerMessage::TakeVerdicts { delivery } => {
                 let verdicts = &delivery.message;
-                (state.take_verdicts(verdicts, delivery.received_at), Some(verdicts.aggregator.clone()))
+                (
+                    state.take_verdicts(verdicts, delivery.origin, delivery.received_at),
+                    Some(verdicts.aggregator.clone()),
+                )
             }
             FollowerMessage::TakeReputations { delivery } => {
                 let reputations = &delivery.message;
-                (state.take_reputations(reputations, delivery.received_at), reputations.aggregator.clone())
+                (
+                    state.take_reputations(reputations, delivery.origin, delivery.received_at),
+                    reputations.aggregator.clone(),
+                )
             }
         };
         match taken.map_err(Refusal::reject_reason) {
@@ -139,8 +145,8 @@ impl FollowerState {
         Self { newest, filter, log, recording, leadership, election, fuser, clock, counters, spans }
     }
 
-    fn take_map(&mut self, map: &Arc<GlobalMap>, received_at: Timestamp) -> Result<(), Refusal> {
-        let accepted = self.filter.accept_map(map, received_at, &self.leadership.borrow())?;
+    fn take_map(&mut self, map: &Arc<GlobalMap>, origin: Origin, received_at: Timestamp) -> Result<(), Refusal> {
+        let accepted = self.filter.accept_map(map, origin, received_at, &self.leadership.borrow())?;
         let _accept = self.spans.accept("map", &**map, received_at);
         self.counters.count(Event::MapAccepted);
         if accepted.is_known_term {
@@ -156,8 +162,13 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_verdicts(&mut self, verdicts: &Arc<Verdicts>, received_at: Timestamp) -> Result<(), Refusal> {
-        let accepted = self.filter.accept_verdicts(verdicts, received_at, &self.leadership.borrow())?;
+    fn take_verdicts(
+        &mut self,
+        verdicts: &Arc<Verdicts>,
+        origin: Origin,
+        received_at: Timestamp,
+    ) -> Result<(), Refusal> {
+        let accepted = self.filter.accept_verdicts(verdicts, origin, received_at, &self.leadership.borrow())?;
         let _accept = self.spans.accept("verdicts", &**verdicts, received_at);
         self.counters.count(Event::VerdictsAccepted);
         self.recording.send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
@@ -166,8 +177,13 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_reputations(&mut self, reputations: &Arc<Reputations>, received_at: Timestamp) -> Result<(), Refusal> {
-        self.filter.accept_reputations(reputations, received_at, &self.leadership.borrow())?;
+    fn take_reputations(
+        &mut self,
+        reputations: &Arc<Reputations>,
+        origin: Origin,
+        received_at: Timestamp,
+    ) -> Result<(), Refusal> {
+        self.filter.accept_reputations(reputations, origin, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::ReputationsAccepted);
         self.recording.send(received_at, LogItem::Reputations(Arc::clone(reputations)));
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));

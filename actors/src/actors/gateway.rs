@@ -179,8 +179,8 @@ impl GatewayState {
         let seal = |payload| Bytes::from(security.seal(&status_topic, payload));
         let will = LastWill { topic: status_topic.clone(), payload: seal(offline_payload(&status, encoding)) };
         let status_payload = seal(encode(&status, encoding));
-        let signing = security.signing.clone();
-        let inbox = Inbox::new(&status, topics.clone(), &mqtt, signing, clock, Arc::clone(&counters), subscriber);
+        let inbox =
+            Inbox::new(&status, topics.clone(), &mqtt, security.clone(), clock, Arc::clone(&counters), subscriber);
         // One client id for each run: a broker ends the old connection before it accepts the new one, so that the last
         // will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
@@ -258,8 +258,10 @@ impl GatewayState {
     }
 
     fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, retention: Retention) {
-        let payload = encode(payload, self.encoding);
-        let path = self.topics.path(topic);
+        let (path, mut payload) = (self.topics.path(topic), encode(payload, self.encoding));
+        if matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations) {
+            payload = self.setup.security.sign_round(&path, payload);
+        }
         if self.fits::<T>(&path, payload.len()) {
             let payload = self.setup.security.seal(&path, payload).into();
             self.send(&path, &payload, retention);

@@ -148,6 +148,8 @@ impl Actor for Membership {
             MembershipMessage::CheckCertificates => {
                 if let Some(identity) = state.certificates.as_mut().map(CertificateWatch::identity) {
                     state.machine.set_identity(identity, now);
+                    // Nodes may have shown renewed certificates, which is no event.
+                    state.tell_members();
                 }
             }
             MembershipMessage::Wake => state.wake(),
@@ -192,9 +194,18 @@ impl MembershipState {
             }
         }
         if changed {
-            self.members.send_replace(self.machine.members());
+            self.tell_members();
         }
         self.deadline.send_replace(self.machine.next_deadline());
+    }
+
+    fn tell_members(&self) {
+        let members = self.machine.members();
+        self.members.send_if_modified(|told| {
+            let has_changed = *told != members;
+            *told = members;
+            has_changed
+        });
     }
 }
 

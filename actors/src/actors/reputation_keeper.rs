@@ -42,7 +42,7 @@ use crate::messages::newest::Received;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
-use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::Delivery;
 use crate::transport::pki::{Credentials, EvidenceSigner};
@@ -96,7 +96,6 @@ pub struct ReputationKeeperState {
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
     disk_failed: bool,
-    cannot_sign: bool,
 }
 
 impl Actor for ReputationKeeper {
@@ -176,7 +175,6 @@ impl ReputationKeeperState {
             unadopted: false,
             writing: None,
             disk_failed: false,
-            cannot_sign: false,
         }
     }
 
@@ -212,13 +210,20 @@ impl ReputationKeeperState {
     fn merge(&mut self, delivery: &Delivery<Arc<LedgerShare>>) {
         let share = &delivery.message;
         let candidates = self.candidates();
+        let leadership = self.arguments.leadership.borrow().clone();
+        let broker = delivery.broker.as_ref();
+        let way = self.resync.check_way(broker, share, &self.arguments.reputations.open().ledger, &leadership);
+        if let Err(reason) = way {
+            let broker = broker.map_or(OTHERS, NodeName::as_str);
+            tracing::debug!(node = %share.node, broker, "evidence over this broker not used");
+            return reason.map_or((), |reason| self.arguments.counters.reject(reason, broker));
+        }
         if let Some(signer) = self.signer.as_mut().filter(|_| !share.is_empty())
             && let Err(error) = signer.verify(share)
         {
             tracing::debug!(node = %share.node, %error, "evidence not used");
             return self.arguments.counters.reject(RejectReason::BadSignature, share.node.as_str());
         }
-        let leadership = self.arguments.leadership.borrow().clone();
         let mut store = self.arguments.reputations.open();
         let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, delivery.received_at);
         drop(store);
@@ -297,8 +302,6 @@ impl ReputationKeeperState {
             };
             if let Some(share) = share {
                 self.arguments.gateway.send(GatewayMessage::PublishShare { share });
-            } else if !std::mem::replace(&mut self.cannot_sign, true) {
-                tracing::warn!("evidence not shared: `tls.key` is not an ECDSA P-256 key, as `ecod-node pki` makes it");
             }
         }
     }

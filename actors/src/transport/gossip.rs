@@ -54,6 +54,8 @@ pub struct Member {
     pub broker: Option<SocketAddr>,
     /// The role it was started with; in a cell with certificates at most that of its own.
     pub role: Role,
+    /// Its certificate in DER, as it has proven it; `None` in a cell without certificates.
+    pub certificate: Option<Arc<[u8]>>,
 }
 
 /// An event of the membership.

@@ -6,6 +6,7 @@ pub(crate) mod hearing;
 pub(crate) mod inbox;
 pub(crate) mod link;
 pub(crate) mod probe;
+mod round_signature;
 pub(crate) mod security;
 pub(crate) mod subscription_role;
 pub use config::{MqttConfig, MqttVersion};

@@ -23,7 +23,7 @@ mod subject;
 
 pub(crate) use attestation::{Distrust, MAX_CERTIFICATE_BYTES, is_signed_by};
 pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
-pub use broker_trust::BrokerTrust;
+pub use broker_trust::{BrokerIdentity, BrokerTrust};
 pub use config::TlsConfig;
 pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external_broker};
 pub use evidence::{EvidenceError, EvidenceSigner};

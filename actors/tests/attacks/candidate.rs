@@ -1,21 +1,110 @@
 //! The owner of a candidate's certificate, which may lead and does not.
 
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::leadership::election::{Body, MAX_TERM};
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::wire::{Encoding, GlobalMap, MAX_INTEGER, Role, SCHEMA_VERSION, encode};
+use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::EvidenceSigner;
 use futures_util::future::join_all;
+use tokio::io::AsyncWriteExt;
+use tokio::time::sleep;
 
-use crate::cell::{CANDIDATE, CELL, Target};
-use crate::client::{publish, send_for_ever};
+use crate::cell::{CANDIDATE, CELL, LEADER, Target};
+use crate::client::{log_in, publish, send_for_ever};
+use crate::insider::Insider;
 use crate::row::{Means, Row, UNHARMED};
+use crate::shares::inverted;
 
-pub(crate) const ROWS: &[Row] = &[Row {
-    attack: "30 connections flood with maps of 8 MB",
-    means: Means::Candidate,
-    bar: UNHARMED,
-    quick: false,
-    run: |target| Box::pin(flood(target)),
-}];
+pub(crate) const ROWS: &[Row] = &[
+    Row {
+        attack: "30 connections flood with maps of 8 MB",
+        means: Means::Candidate,
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(flood(target)),
+    },
+    Row {
+        attack: "a member's status with the largest term",
+        means: Means::Candidate,
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(largest_term(target)),
+    },
+    Row {
+        attack: "maps with the largest round, in the leader's name",
+        means: Means::Candidate,
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(largest_round(target)),
+    },
+    Row {
+        attack: "a member's forged evidence",
+        means: Means::Candidate,
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(forged_evidence(target)),
+    },
+];
+
+/// Time between two forged messages.
+const PAUSE: Duration = Duration::from_millis(20);
+
+/// Terms that a cell has reached soon after its start.
+const TERMS: [u64; 3] = [1, 2, 3];
 
 async fn flood(target: Target) -> anyhow::Result<()> {
     let map = publish(&format!("ecod/v1/{CELL}/global_detections"), &vec![b'x'; 8_000_000]);
     join_all((0..30).map(|_| send_for_ever(target.broker, (&target.candidate, CANDIDATE), &[], &map))).await;
     Ok(())
+}
+
+async fn join(target: &Target) -> anyhow::Result<Insider> {
+    Insider::join(target, (CANDIDATE, Role::Auto), Some(Arc::clone(&target.credentials))).await
+}
+
+async fn largest_term(target: Target) -> anyhow::Result<()> {
+    join(&target).await?.repeat(MAX_TERM, None, Body::Status { over: None }).await
+}
+
+async fn largest_round(target: Target) -> anyhow::Result<()> {
+    let map = |epoch| GlobalMap {
+        schema: SCHEMA_VERSION,
+        aggregator: NodeName::from_static(LEADER),
+        epoch,
+        round: MAX_INTEGER,
+        fused_at_us: Timestamp(clock::now().micros()),
+        oldest_capture_us: None,
+        landmarks: Vec::new(),
+        objects: Vec::new(),
+        pose_corrections: Default::default(),
+    };
+    let mut stream = log_in(target.broker, &target.candidate, CANDIDATE).await?;
+    loop {
+        for epoch in TERMS {
+            let payload = encode(&map(epoch), Encoding::Json);
+            stream.write_all(&publish(&format!("ecod/v1/{CELL}/global_detections"), &payload)).await?;
+        }
+        sleep(PAUSE).await;
+    }
+}
+
+/// Shares in the names of others, signed by the attacker or not at all, and of leaderships that never were.
+async fn forged_evidence(target: Target) -> anyhow::Result<()> {
+    let _member = join(&target).await?;
+    let signer = EvidenceSigner::new(NodeName::from_static(CELL), Arc::clone(&target.credentials));
+    let mut stream = log_in(target.broker, &target.candidate, CANDIDATE).await?;
+    loop {
+        for (term, aggregator) in TERMS.into_iter().flat_map(|term| [(term, LEADER), (term, CANDIDATE)]) {
+            let share = inverted(CANDIDATE, term, aggregator);
+            for share in [Some(share.clone()), signer.sign(share)].into_iter().flatten() {
+                let payload = encode(&share, Encoding::Json);
+                stream.write_all(&publish(&format!("ecod/v1/{CELL}/ledger/{CANDIDATE}"), &payload)).await?;
+            }
+        }
+        sleep(PAUSE).await;
+    }
 }

@@ -17,6 +17,7 @@ use rustls::ClientConfig;
 use serde::Deserialize;
 use tempfile::TempDir;
 
+use crate::key_holder;
 use crate::ports::Ports;
 use crate::process::{Process, command};
 use crate::row::Outcome;
@@ -34,6 +35,9 @@ const NODES: [(&str, Role); 3] = [("edge", Role::Edge), ("v01", Role::Auto), ("v
 /// The vehicle, and the node that may lead, whose certificates the attackers hold.
 pub(crate) const VEHICLE: &str = "gauss";
 pub(crate) const CANDIDATE: &str = "turing";
+
+/// The node that leads.
+pub(crate) const LEADER: &str = NODES[0].0;
 
 /// Time for all processes to start and agree, and for how long they must have agreed.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
@@ -55,6 +59,7 @@ pub(crate) struct Cell {
     nodes: Vec<Node>,
     vehicle: TlsConfig,
     candidate: TlsConfig,
+    foreign: TlsConfig,
     directory: TempDir,
 }
 
@@ -78,6 +83,12 @@ pub(crate) struct Target {
     pub(crate) vehicle: Arc<ClientConfig>,
     /// TLS with the certificate of a node that may lead, [`CANDIDATE`].
     pub(crate) candidate: Arc<ClientConfig>,
+    /// The same certificate for a membership.
+    pub(crate) credentials: Arc<Credentials>,
+    /// A certificate of another CA, for [`key_holder::NAME`](crate::key_holder::NAME).
+    pub(crate) foreign: Arc<Credentials>,
+    /// Directory of the cell's CA, for whoever defends the cell.
+    pub(crate) pki: PathBuf,
 }
 
 impl Cell {
@@ -91,6 +102,9 @@ impl Cell {
         let mut authority = Authority::init(&home.join("pki"), &NodeName::new(CELL)?, clock::now())?;
         let vehicle = issue(&mut authority, VEHICLE, Role::Cav)?;
         let candidate = issue(&mut authority, CANDIDATE, Role::Auto)?;
+        let mut elsewhere = Authority::init(&home.join("elsewhere"), &NodeName::new(CELL)?, clock::now())?;
+        let foreign = issue(&mut elsewhere, key_holder::NAME, Role::Edge)?;
+        let foreign = TlsConfig { ca: authority.ca(), revocation_list: None, ..foreign };
         let mut ports = Ports::new();
         let mut addresses = Vec::new();
         for _ in NODES {
@@ -100,9 +114,15 @@ impl Cell {
         let seeds: Vec<SocketAddr> = addresses.iter().map(|(_, gossip)| *gossip).collect();
         let mut nodes = Vec::new();
         for ((name, role), (broker, gossip)) in NODES.into_iter().zip(addresses) {
-            let tls = issue(&mut authority, name, role)?;
+            let mut tls = issue(&mut authority, name, role)?;
             let directory = home.join(name);
             fs::create_dir(&directory)?;
+            if name == LEADER {
+                // Its owner does not put a newer list there.
+                let own_list = directory.join("revoked.pem");
+                fs::copy(authority.revocation_list(), &own_list)?;
+                tls.revocation_list = Some(own_list);
+            }
             let text = configuration(name, role, broker, gossip, &seeds, &tls, home);
             fs::write(directory.join("node.toml"), text)?;
             let program = std::env::var("PROGRAM").unwrap_or_else(|_| PROGRAM.to_owned());
@@ -114,7 +134,7 @@ impl Cell {
             command.stderr(File::create(directory.join("node.log"))?).current_dir(&directory);
             nodes.push(Node { name, broker, gossip, process: Process::start(&mut command)? });
         }
-        Ok(Self { nodes, vehicle, candidate, directory })
+        Ok(Self { nodes, vehicle, candidate, foreign, directory })
     }
 
     /// Waits until maps hold the reports of all honest vehicles, and have done so for a while.
@@ -126,7 +146,7 @@ impl Cell {
             ensure!(ended.is_empty(), "ended at once: {}, files in {:?}", ended.join(", "), self.keep());
             let since = Timestamp(clock::now().micros() - SETTLED.as_micros() as u64);
             let maps = self.maps(since)?;
-            let is_whole = |map: &Map| map.reporters().is_superset(&honest());
+            let is_whole = |line: &Line| line.map.reporters().is_superset(&honest());
             if maps.len() >= 12 && maps.iter().all(is_whole) {
                 return Ok(());
             }
@@ -139,15 +159,17 @@ impl Cell {
 
     /// Knowledge and secrets for an attacker.
     pub(crate) fn target(&self) -> anyhow::Result<Target> {
-        let client = |files: &TlsConfig, name| -> anyhow::Result<_> {
-            Ok(Arc::clone(&Credentials::load(files, &NodeName::from_static(name))?.current().client))
-        };
+        let load = |files, name| Credentials::load(files, &NodeName::from_static(name)).map(Arc::new);
+        let client = |files, name| load(files, name).map(|loaded| Arc::clone(&loaded.current().client));
         Ok(Target {
             broker: self.nodes[0].broker,
             gossip: self.nodes.iter().map(|node| node.gossip).collect(),
             key: KEY,
             vehicle: client(&self.vehicle, VEHICLE)?,
             candidate: client(&self.candidate, CANDIDATE)?,
+            credentials: load(&self.candidate, CANDIDATE)?,
+            foreign: load(&self.foreign, key_holder::NAME)?,
+            pki: self.directory.path().join("pki"),
         })
     }
 
@@ -167,7 +189,9 @@ impl Cell {
         Ok(Outcome {
             maps: maps.len(),
             expected: (time.as_millis() / ROUND.as_millis()) as usize,
-            honest: maps.iter().filter(|map| map.reporters().is_superset(&honest())).count(),
+            honest: maps.iter().filter(|line| line.map.reporters().is_superset(&honest())).count(),
+            longest_gap_ms: longest_gap_ms(&maps, from),
+            is_replaced: maps.last().is_some_and(|line| line.map.aggregator != LEADER),
             rss_mb: if ended.is_empty() { self.peak_memory_mb()? } else { 0 },
             false_verdicts: None,
             ended,
@@ -175,13 +199,13 @@ impl Cell {
     }
 
     /// Maps that the vehicle has accepted since a time.
-    fn maps(&self, since: Timestamp) -> anyhow::Result<Vec<Map>> {
+    fn maps(&self, since: Timestamp) -> anyhow::Result<Vec<Line>> {
         let file = self.directory.path().join("v02/maps.jsonl");
         let text = fs::read_to_string(&file).unwrap_or_default();
         let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
         let lines = whole.lines().map(serde_json::from_str::<Line>);
         let lines = lines.collect::<Result<Vec<_>, _>>().with_context(|| file.display().to_string())?;
-        Ok(lines.into_iter().filter(|line| line.received_at_us >= since).map(|line| line.map).collect())
+        Ok(lines.into_iter().filter(|line| line.received_at_us >= since).collect())
     }
 
     fn ended(&mut self) -> anyhow::Result<Vec<String>> {
@@ -216,6 +240,7 @@ struct Line {
 
 #[derive(Deserialize)]
 struct Map {
+    aggregator: String,
     landmarks: Vec<Landmark>,
 }
 
@@ -228,6 +253,14 @@ impl Map {
     fn reporters(&self) -> BTreeSet<&str> {
         self.landmarks.iter().flat_map(|landmark| &landmark.contributors).map(String::as_str).collect()
     }
+}
+
+/// Longest time without a map since `from`, up to now.
+fn longest_gap_ms(maps: &[Line], from: Timestamp) -> u64 {
+    let times = [from].into_iter().chain(maps.iter().map(|line| line.received_at_us)).chain([clock::now()]);
+    let times: Vec<_> = times.collect();
+    let longest = times.windows(2).map(|pair| pair[1].since(pair[0])).max().unwrap_or_default();
+    longest.as_millis() as u64
 }
 
 /// The honest vehicles.

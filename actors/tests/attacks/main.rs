@@ -13,7 +13,9 @@
 mod candidate;
 mod cell;
 mod client;
+mod insider;
 mod key_holder;
+mod leader;
 mod row;
 mod stranger;
 mod vehicle;
@@ -28,6 +30,8 @@ mod ports;
 #[allow(dead_code, reason = "shared with the trials")]
 #[path = "../trials/process.rs"]
 mod process;
+#[path = "../security/shares.rs"]
+mod shares;
 
 use std::time::Duration;
 
@@ -39,7 +43,7 @@ use crate::machine::Machine;
 use crate::row::{Outcome, Row, table};
 
 /// Kinds of attackers.
-const ATTACKERS: [&[Row]; 4] = [stranger::ROWS, key_holder::ROWS, vehicle::ROWS, candidate::ROWS];
+const ATTACKERS: [&[Row]; 5] = [stranger::ROWS, key_holder::ROWS, vehicle::ROWS, candidate::ROWS, leader::ROWS];
 
 /// Duration of an attack, and of a quick one.
 const ATTACK_TIME: Duration = Duration::from_secs(20);

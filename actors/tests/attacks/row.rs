@@ -32,6 +32,8 @@ pub(crate) enum Means {
     Vehicle,
     /// Holds the certificate of a node that may lead, and does not.
     Candidate,
+    /// Owns the node that leads.
+    Leader,
 }
 
 impl Means {
@@ -41,6 +43,7 @@ impl Means {
             Self::CellKey => "cell key",
             Self::Vehicle => "cav certificate",
             Self::Candidate => "candidate's",
+            Self::Leader => "leader's",
         }
     }
 }
@@ -54,10 +57,15 @@ pub(crate) struct Bar {
     pub(crate) honest: f64,
     /// Most memory of the edge at any time, in MB.
     pub(crate) rss_mb: u64,
+    /// Longest time without a map, in ms.
+    pub(crate) longest_gap_ms: Option<u64>,
+    /// Whether another node leads in the end than in the beginning.
+    pub(crate) is_replaced: bool,
 }
 
 /// The bar of attacks that may cost a cell nothing.
-pub(crate) const UNHARMED: Bar = Bar { maps: 0.95, honest: 0.95, rss_mb: 200 };
+pub(crate) const UNHARMED: Bar =
+    Bar { maps: 0.95, honest: 0.95, rss_mb: 200, longest_gap_ms: None, is_replaced: false };
 
 /// Measurements of a row.
 #[derive(Debug, Clone)]
@@ -70,6 +78,10 @@ pub(crate) struct Outcome {
     pub(crate) honest: usize,
     /// Largest memory of the edge in MB.
     pub(crate) rss_mb: u64,
+    /// Longest time between two maps in ms.
+    pub(crate) longest_gap_ms: u64,
+    /// Whether the last map is of another node than the leader of the beginning.
+    pub(crate) is_replaced: bool,
     /// Wrong verdicts, where the cell votes.
     pub(crate) false_verdicts: Option<usize>,
     /// Nodes that ended.
@@ -83,6 +95,8 @@ impl Bar {
         part(outcome.maps, outcome.expected) >= self.maps
             && part(outcome.honest, outcome.expected.max(outcome.maps)) >= self.honest
             && outcome.rss_mb <= self.rss_mb
+            && self.longest_gap_ms.is_none_or(|most| outcome.longest_gap_ms <= most)
+            && outcome.is_replaced == self.is_replaced
             && outcome.false_verdicts.unwrap_or_default() == 0
             && outcome.ended.is_empty()
     }
@@ -90,14 +104,21 @@ impl Bar {
 
 impl fmt::Display for Bar {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:.0} %, {:.0} %, {} MB", 100.0 * self.maps, 100.0 * self.honest, self.rss_mb)
+        write!(f, "{:.0} %, {:.0} %, {} MB", 100.0 * self.maps, 100.0 * self.honest, self.rss_mb)?;
+        self.longest_gap_ms.map_or(Ok(()), |most| write!(f, ", {most} ms"))
     }
 }
 
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { maps, expected, honest, rss_mb, .. } = self;
-        write!(f, "{maps} of {expected} maps, {honest} with all honest reports, {rss_mb} MB")?;
+        let Self { maps, expected, honest, rss_mb, longest_gap_ms, .. } = self;
+        write!(
+            f,
+            "{maps} of {expected} maps, {honest} with all honest reports, {rss_mb} MB, longest gap {longest_gap_ms} ms"
+        )?;
+        if self.is_replaced {
+            write!(f, ", another leader")?;
+        }
         if !self.ended.is_empty() {
             write!(f, ", ended: {}", self.ended.join(", "))?;
         }
@@ -109,8 +130,8 @@ impl fmt::Display for Outcome {
 pub(crate) fn table(lines: &[(&Row, Outcome)]) -> String {
     let width = lines.iter().map(|(row, _)| row.attack.chars().count()).max().unwrap_or_default();
     let mut text = format!(
-        "{:width$}  {:16}  {:>11}  {:>6}  {:>6}  {:>5}  {:18}  verdict\n",
-        "attack", "means", "maps", "honest", "RSS MB", "false", "bar"
+        "{:width$}  {:16}  {:>11}  {:>6}  {:>6}  {:>6}  {:>5}  {:27}  verdict\n",
+        "attack", "means", "maps", "honest", "RSS MB", "gap ms", "false", "bar"
     );
     for (row, outcome) in lines {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
@@ -121,9 +142,10 @@ pub(crate) fn table(lines: &[(&Row, Outcome)]) -> String {
             (false, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),
         };
         let (attack, means, honest, rss) = (row.attack, row.means.name(), outcome.honest, outcome.rss_mb);
+        let gap = outcome.longest_gap_ms;
         let _ = writeln!(
             text,
-            "{attack:width$}  {means:16}  {maps:>11}  {honest:>6}  {rss:>6}  {wrong:>5}  {:18}  {verdict}",
+            "{attack:width$}  {means:16}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {wrong:>5}  {:27}  {verdict}",
             row.bar.to_string()
         );
     }

@@ -8,7 +8,7 @@ use std::time::Duration;
 use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::reputation::Evidence;
-use ecod::wire::{Encoding, LedgerEntry, LedgerShare, RejectReason, Reputation, Role, SCHEMA_VERSION, encode};
+use ecod::wire::{Encoding, RejectReason, Reputation, Role, encode};
 use ecod_actors::messages::reputation_keeper::ReputationKeeperMessage;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
@@ -18,6 +18,7 @@ use ecod_actors::transport::pki::{Credentials, EvidenceSigner, TlsConfig};
 use tokio::time::{Instant, sleep};
 
 use crate::fixture::{Client, DAY, Pki, SOON, client_config, node as name};
+use crate::shares::inverted;
 
 fn config(node: &str, role: Role, tls: &TlsConfig, state: &Path) -> NodeConfig {
     let ball = LandmarkConfig {
@@ -55,23 +56,6 @@ async fn until(what: &str, is_reached: impl Fn() -> bool) {
 
 fn reputations(node: &NodeHandle) -> BTreeMap<NodeName, Reputation> {
     node.newest_reputations().borrow().as_ref().map(|newest| newest.message.reputations.clone()).unwrap_or_default()
-}
-
-/// Counts by which the liar is always right and the honest vehicle never.
-fn inverted(epoch: u64, aggregator: &str) -> LedgerShare {
-    let entry = |node: &str, correct, incorrect| {
-        let (aggregator, node, label) = (name(aggregator), name(node), "cup".into());
-        LedgerEntry { epoch, aggregator, node, label, correct, incorrect }
-    };
-    LedgerShare {
-        schema: SCHEMA_VERSION,
-        node: name("gauss"),
-        epoch: None,
-        entries: vec![entry("honest", 0, 1_000_000_000), entry("liar", 1_000_000_000, 0)],
-        marks: Vec::new(),
-        signed: None,
-        reset_at_us: None,
-    }
 }
 
 /// Has a leader count forty votes of each vehicle; returns its term.
@@ -141,8 +125,8 @@ async fn a_candidate_that_does_not_lead_changes_no_reputation_by_forged_evidence
     attacker.log_in().await.unwrap();
     let credentials = Arc::new(Credentials::load(&gauss_files, &name("gauss")).unwrap());
     let signer = EvidenceSigner::new(NodeName::from_static("lot"), credentials);
-    let others = [(1, "edge"), (term, "edge"), (term, "long-gone")].map(|(term, node)| inverted(term, node));
-    let own = [1, term].map(|term| signer.sign(inverted(term, "gauss")).unwrap());
+    let others = [(1, "edge"), (term, "edge"), (term, "long-gone")].map(|(term, node)| inverted("gauss", term, node));
+    let own = [1, term].map(|term| signer.sign(inverted("gauss", term, "gauss")).unwrap());
     let posing = others.clone().map(|share| signer.sign(share).unwrap());
     for share in others.iter().chain(&posing).chain(&own) {
         let payload = encode(share, Encoding::Json);

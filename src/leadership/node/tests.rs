@@ -215,17 +215,18 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
     }
 }
 
-/// A leader to which a better candidate says that it is ready; the leader can log in at its broker or cannot.
-fn leading_beside_a_ready_challenger(logs_in: bool) -> Scene {
+/// A leader to which a better candidate says that it is ready. It can log in at `broker`, if one is given.
+fn leading_beside_a_ready_challenger(external: Option<SocketAddr>, broker: Option<SocketAddr>) -> Scene {
     let mut scene = Scene::new(Role::Auto, None);
+    scene.machine.links = Links::new(DataPlane { external: external.map(Into::into), embedded: true });
     scene.take(Input::MemberAlive { member: member("edge", 2) });
     scene.members.push(member("edge", 2));
     scene.run_for(1300);
     assert!(scene.machine.leadership.is_leading());
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
     for ms in 0..4500 {
-        if ms == 1000 && logs_in {
-            scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Up });
+        if let Some(broker) = broker.filter(|_| ms == 1000) {
+            scene.take(Input::LinkChanged { broker: broker.into(), state: LinkState::Up });
         }
         if ms % 50 == 0 {
             scene.hear_in(epoch.clone(), Body::Status { over: None });
@@ -245,7 +246,7 @@ fn is_yield(effect: &Effect) -> bool {
 
 #[test]
 fn a_round_is_held_before_the_word_that_yields_the_next() {
-    let scene = leading_beside_a_ready_challenger(true);
+    let scene = leading_beside_a_ready_challenger(None, Some(broker(2)));
     let yielded = scene.position_of(is_yield).expect("a better candidate is handed the lead");
     assert_eq!(scene.effects[yielded - 1], Effect::HoldRound);
     let snapshot = scene.position_of(|effect| *effect == Effect::SendSnapshot { to: name("edge") });
@@ -254,10 +255,15 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
 
 #[test]
 fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
-    let scene = leading_beside_a_ready_challenger(false);
-    assert_eq!(scene.position_of(is_yield), None);
-    assert!(scene.machine.leadership.is_leading());
-    assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
+    // An external broker that is down serves nobody either.
+    for external in [None, Some(broker(9))] {
+        let scene = leading_beside_a_ready_challenger(external, None);
+        assert_eq!(scene.position_of(is_yield), None, "{external:?}");
+        assert!(scene.machine.leadership.is_leading());
+        assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
+    }
+    let both = leading_beside_a_ready_challenger(Some(broker(9)), Some(broker(9)));
+    assert!(both.position_of(is_yield).is_some(), "all use the external broker");
 }
 
 #[test]

@@ -16,7 +16,14 @@ fn name(name: &str) -> NodeName {
 }
 
 fn member(node: &str, role: Role) -> Member {
-    Member { name: name(node), run: 1, gossip: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)), broker: None, role }
+    Member {
+        name: name(node),
+        run: 1,
+        gossip: SocketAddr::from((Ipv4Addr::LOCALHOST, 1)),
+        broker: None,
+        role,
+        certificate: None,
+    }
 }
 
 fn counted(epoch: u64, aggregator: &str) -> LedgerEntry {
@@ -161,6 +168,37 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     let mut last = ReputationKeeperState::new(with());
     store::restore(&last.arguments, last.signer.as_mut());
     assert_eq!(votes(&last), (1, 0));
+}
+
+#[tokio::test]
+async fn a_candidates_broker_passes_on_no_evidence_that_others_are_said_to_vouch_for() {
+    let (gateway, _published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let mut certificates = Certificates::new();
+    let credentials = Some(certificates.of("euclid"));
+    let mut keeper =
+        ReputationKeeperState::new(ReputationKeeperArguments { credentials, ..arguments(&gateway, &counters) });
+    // `turing` signs counts of a leadership that never was, and lets anybody say anything at its own broker.
+    let invented = share("gauss", None, vec![counted(6, "turing")]);
+    let over = |broker: &str, mut share: Delivery<Arc<LedgerShare>>| {
+        share.broker = Some(name(broker));
+        share
+    };
+    keeper.merge(&over("turing", certificates.signed("turing", &invented)));
+    assert!(keeper.arguments.reputations.open().ledger.totals().is_empty(), "gauss did not say that");
+    assert_eq!(counters.rejects(RejectReason::Unattested), 1);
+    assert_eq!(counters.rejects_by_source()[0].source, "turing", "the broker's node is to blame");
+
+    let honest = share("edge", Some(7), vec![counted(7, "edge")]);
+    keeper.merge(&over("turing", certificates.signed("edge", &honest)));
+    assert_eq!(keeper.arguments.reputations.open().ledger.totals()[&name("gauss")], (0, 1), "signed by its sender");
+    for broker in ["edge", "gauss", "euclid"] {
+        let term = 3 + u64::from(broker == "gauss") + 2 * u64::from(broker == "euclid");
+        let passed_on = share("gauss", None, vec![counted(term, "old")]);
+        keeper.merge(&over(broker, certificates.signed("old", &passed_on)));
+    }
+    assert_eq!(keeper.arguments.reputations.open().ledger.totals()[&name("gauss")], (0, 4));
+    assert_eq!(counters.rejects(RejectReason::Unattested), 1);
 }
 
 #[tokio::test]

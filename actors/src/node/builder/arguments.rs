@@ -65,7 +65,7 @@ impl NodeBuilder {
             role: self.gateway_part(),
             status: self.status(),
             mqtt: self.config.mqtt.clone(),
-            security: self.security.clone(),
+            security: self.security.clone().with_members(self.members()),
             clock: self.clock.clone(),
             counters: self.counters(),
             subscriber: self.subscriber(),

@@ -166,6 +166,7 @@ mod tests {
             gossip: "10.0.0.3:17884".parse().unwrap(),
             broker: None,
             role: Role::Auto,
+            certificate: None,
         };
         let live_state = LiveState::default();
         let say = |node, via: &BrokerAddress| {

@@ -74,7 +74,7 @@ pub(crate) struct SignedMessage<'a> {
 pub(crate) struct Proven {
     /// The node that the certificate names; the session may be an observer's.
     pub(crate) holder: NodeName,
-    pub(crate) certificate: Vec<u8>,
+    pub(crate) certificate: Arc<[u8]>,
     pub(crate) expires: Timestamp,
     pub(crate) rights: Rights,
 }
@@ -266,7 +266,7 @@ pub(crate) fn agree(
 fn proven(subject: &CertificateSubject, name: &NodeName, certificate: &[u8]) -> Proven {
     Proven {
         holder: subject.name().clone(),
-        certificate: certificate.to_vec(),
+        certificate: certificate.into(),
         expires: subject.expires(),
         rights: subject.rights_of(name),
     }

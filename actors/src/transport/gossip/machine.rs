@@ -364,9 +364,10 @@ impl GossipMachine {
     /// A node as others are told of it: by what it has proven itself, if nodes of the cell do, and not by hearsay.
     fn member(&self, id: &NodeId) -> Member {
         let address = self.sessions.address(&id.name);
-        let Some((proven, rights)) = self.sessions.proven(&id.name) else { return id.member(address) };
-        let member = proven.member(address);
-        Member { role: rights.limit_role(member.role), ..member }
+        let Some((stated, proven)) = self.sessions.proven(&id.name) else { return id.member(address) };
+        let member = stated.member(address);
+        let role = proven.rights.limit_role(member.role);
+        Member { role, certificate: Some(Arc::clone(&proven.certificate)), ..member }
     }
 
     fn due(&self) -> Timestamp {

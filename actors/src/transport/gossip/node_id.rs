@@ -40,7 +40,7 @@ impl NodeId {
         let is_near = |broker: &SocketAddr| !broker.ip().is_loopback() || is_of_this_machine(gossip.ip());
         let broker = self.broker.filter(is_near);
         let broker = broker.map(|broker| SocketAddr::new(reached(broker.ip()), broker.port()));
-        Member { name: self.name.clone(), run: self.run, gossip, broker, role: self.role }
+        Member { name: self.name.clone(), run: self.run, gossip, broker, role: self.role, certificate: None }
     }
 }
 

@@ -1,5 +1,6 @@
 //! Throttle of answers to nodes without a session.
 
+use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
@@ -8,11 +9,14 @@ use ecod::model::time::Timestamp;
 use super::key::SessionId;
 use crate::platform::throttle::{KeyedThrottle, TokenBucket, host_network};
 
-/// Limits answers to all unknown nodes together, to each host, and to each session at its address. One recorded
-/// greeting, sent over and over, does not use up the share of others; nor does one host that makes up sessions.
+/// Limits answers to all unknown hosts together, to each host, and to each session at its address. One recorded
+/// greeting, sent over and over, does not use up the share of others; nor does one host that makes up sessions. A host
+/// from which a node was admitted has room of its own: its restarted node is answered whatever strangers do.
 #[derive(Debug)]
 pub(crate) struct ReplyThrottle {
     all: TokenBucket,
+    /// Hosts with room of their own, and when a node was last admitted from there.
+    known: BTreeMap<IpAddr, (TokenBucket, Timestamp)>,
     by_host: KeyedThrottle<IpAddr>,
     by_session: KeyedThrottle<(SessionId, SocketAddr)>,
 }
@@ -21,6 +25,7 @@ impl ReplyThrottle {
     pub(crate) fn new(now: Timestamp) -> Self {
         Self {
             all: TokenBucket::new(REPLY_BURST, REPLY_INTERVAL, now),
+            known: BTreeMap::new(),
             by_host: KeyedThrottle::new(REPLY_BURST, HOST_INTERVAL),
             by_session: KeyedThrottle::new(1, MIN_SESSION_INTERVAL),
         }
@@ -34,7 +39,22 @@ impl ReplyThrottle {
     /// Whether a proof from this address may be verified now, whatever session it claims: forged proofs must not use up
     /// the share of an honest one.
     pub(crate) fn allow_host(&mut self, from: SocketAddr, now: Timestamp) -> bool {
-        self.by_host.allow(&host_network(from.ip()), now) && self.all.allow(now)
+        let host = host_network(from.ip());
+        match self.known.get_mut(&host) {
+            Some((own, _)) => own.allow(now),
+            None => self.by_host.allow(&host, now) && self.all.allow(now),
+        }
+    }
+
+    /// Gives a host room of its own, as a node was admitted from there. The one heard of least lately gives way.
+    pub(crate) fn know(&mut self, from: SocketAddr, now: Timestamp) {
+        let host = host_network(from.ip());
+        if !self.known.contains_key(&host) && self.known.len() >= MAX_KNOWN {
+            let oldest = self.known.iter().min_by_key(|(_, (_, at))| *at).map(|(host, _)| *host);
+            oldest.and_then(|host| self.known.remove(&host));
+        }
+        let new = || (TokenBucket::new(REPLY_BURST, HOST_INTERVAL, now), now);
+        self.known.entry(host).or_insert_with(new).1 = now;
     }
 }
 
@@ -46,3 +66,49 @@ const HOST_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Minimum time between two answers to one session.
 const MIN_SESSION_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Maximum hosts with room of their own.
+const MAX_KNOWN: usize = 1024;
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use super::*;
+
+    fn address(host: u32) -> SocketAddr {
+        SocketAddr::from((Ipv4Addr::from(host), 1))
+    }
+
+    /// Of the proofs that a host sends in a second, beside 500 made-up hosts, as many are verified.
+    fn verified_beside_a_flood(throttle: &mut ReplyThrottle, host: u32) -> usize {
+        let verified = (0..1000u32).filter(|ms| {
+            let now = Timestamp(u64::from(*ms) * 1000);
+            for stranger in 0..5 {
+                throttle.allow_host(address(1_000_000 + (5 * ms + stranger) % 500), now);
+            }
+            ms % 50 == 0 && throttle.allow_host(address(host), now)
+        });
+        verified.count()
+    }
+
+    #[test]
+    fn a_flood_from_many_hosts_leaves_a_host_that_was_met_its_room() {
+        let mut throttle = ReplyThrottle::new(Timestamp(0));
+        throttle.know(address(7), Timestamp(0));
+        assert_eq!(verified_beside_a_flood(&mut throttle, 7), 20);
+        let mut throttle = ReplyThrottle::new(Timestamp(0));
+        assert!(verified_beside_a_flood(&mut throttle, 7) < 20, "a stranger shares");
+    }
+
+    #[test]
+    fn the_hosts_with_room_of_their_own_are_bounded_and_so_is_the_room() {
+        let mut throttle = ReplyThrottle::new(Timestamp(0));
+        (0..2 * MAX_KNOWN as u32).for_each(|host| throttle.know(address(host), Timestamp(host.into())));
+        assert_eq!(throttle.known.len(), MAX_KNOWN);
+        assert!(!throttle.known.contains_key(&address(0).ip()), "the oldest gave way");
+        let latest = address(2 * MAX_KNOWN as u32 - 1);
+        let allowed = (0..1000).filter(|_| throttle.allow_host(latest, Timestamp(5000))).count();
+        assert_eq!(allowed, REPLY_BURST as usize);
+    }
+}

@@ -23,7 +23,7 @@ use serde::de::DeserializeOwned;
 
 use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameHeader, FrameKind, Greeting, HEADER_BYTES, Hello, Introduction, Version};
-use super::handshake::{Identity, Prover};
+use super::handshake::{Identity, Proven, Prover};
 use super::key::{BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of};
 use super::node_id::NodeId;
 use super::refusals::Refusals;
@@ -165,10 +165,10 @@ impl Sessions {
         Some(self.peers.speaker(name)?.address)
     }
 
-    /// Identity and rights of a node as it has proven them; `None` in a cell without certificates.
-    pub(crate) fn proven(&self, name: &NodeName) -> Option<(&NodeId, Rights)> {
+    /// Identity of a node as it states it, and what its certificate proves; `None` in a cell without certificates.
+    pub(crate) fn proven(&self, name: &NodeName) -> Option<(&NodeId, &Proven)> {
         let peer = self.peers.speaker(name)?;
-        Some((&peer.id, peer.proven.as_ref()?.rights))
+        Some((&peer.id, peer.proven.as_ref()?))
     }
 
     /// Whether a node was heard a moment ago.

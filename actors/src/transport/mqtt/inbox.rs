@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::links::LinkState;
+use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
@@ -16,7 +17,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
 
 use super::config::MqttConfig;
-use super::security::SigningKey;
+use super::security::Security;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
@@ -66,18 +67,31 @@ pub struct Delivery<T = Incoming> {
     pub message: T,
     /// Time when its packet was read from the socket, or when it was delivered in-process.
     pub received_at: Timestamp,
+    /// What proves the aggregator of a round; of other messages nothing is asked.
+    pub origin: Origin,
+    /// The node whose certificate the broker has proven; `None` without certificates, and for messages of this node.
+    pub broker: Option<NodeName>,
     _place: Option<OwnedSemaphorePermit>,
+}
+
+/// The broker that passed a packet on.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Via<'a> {
+    pub(crate) address: &'a BrokerAddress,
+    /// The node whose certificate it has proven, for a broker of a cell with certificates.
+    pub(crate) node: Option<&'a NodeName>,
 }
 
 impl<T> Delivery<T> {
     /// A message of this node itself. It occupies no place: the node's own pace bounds it.
     pub(crate) fn local(message: T, at: Timestamp) -> Self {
-        Self { message, received_at: at, _place: None }
+        Self { message, received_at: at, origin: Origin::Proven, broker: None, _place: None }
     }
 
-    /// The same delivery of a part of its message: time and place stay.
+    /// The same delivery of a part of its message: all else stays.
     pub(crate) fn map<U>(self, part: impl FnOnce(T) -> U) -> Delivery<U> {
-        Delivery { message: part(self.message), received_at: self.received_at, _place: self._place }
+        let Self { message, received_at, origin, broker, _place } = self;
+        Delivery { message: part(message), received_at, origin, broker, _place }
     }
 }
 
@@ -90,7 +104,7 @@ pub(crate) struct Inbox {
     run: Uuid,
     topics: Topics,
     limits: Limits,
-    signing: Option<SigningKey>,
+    security: Security,
     clock: CellClock,
     counters: Arc<Counters>,
     subscriber: RwLock<Subscriber>,
@@ -121,7 +135,7 @@ impl Inbox {
         own: &NodeStatus,
         topics: Topics,
         config: &MqttConfig,
-        signing: Option<SigningKey>,
+        security: Security,
         clock: CellClock,
         counters: Arc<Counters>,
         subscriber: Subscriber,
@@ -132,7 +146,7 @@ impl Inbox {
             run: own.id,
             topics,
             limits: config.limits(),
-            signing,
+            security,
             clock,
             counters,
             subscriber: RwLock::new(subscriber),
@@ -148,13 +162,7 @@ impl Inbox {
     }
 
     /// Processes one packet of a broker. A payload that cannot be used is counted by its reason.
-    pub(crate) fn accept(
-        &self,
-        via: &BrokerAddress,
-        topic: &[u8],
-        payload: &[u8],
-        received_at: Timestamp,
-    ) -> PacketOutcome {
+    pub(crate) fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
         self.counters.count(Event::Received);
         self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
             self.counters.reject(reason, &self.source(via, topic));
@@ -169,9 +177,10 @@ impl Inbox {
     }
 
     /// Delivers a message of a broker. Dropped and counted when receivers are too far behind.
-    fn deliver(&self, message: Incoming, received_at: Timestamp) -> PacketOutcome {
+    fn deliver(&self, via: Via<'_>, message: Incoming, origin: Origin, received_at: Timestamp) -> PacketOutcome {
+        let broker = via.node.cloned();
         match Arc::clone(&self.capacity).try_acquire_owned() {
-            Ok(place) => self.hand_over(Delivery { message, received_at, _place: Some(place) }),
+            Ok(place) => self.hand_over(Delivery { message, received_at, origin, broker, _place: Some(place) }),
             Err(_) => self.counters.count(Event::InboxFull),
         }
         PacketOutcome::Done
@@ -184,21 +193,24 @@ impl Inbox {
 
     fn read(
         &self,
-        via: &BrokerAddress,
+        via: Via<'_>,
         topic: &[u8],
         payload: &[u8],
         received_at: Timestamp,
     ) -> Result<PacketOutcome, RejectReason> {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
-        let payload = match &self.signing {
+        let payload = match &self.security.signing {
             // An empty payload deletes a retained message. It carries nothing to sign.
             Some(key) if !payload.is_empty() => key.verify(topic, payload).ok_or(RejectReason::BadSignature)?,
             _ => payload,
         };
-        let message = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
-            Topic::Detections(node) => return self.read_report(ReportKind::Detections, &node, payload, received_at),
+        let origin = |aggregator| self.origin(via, aggregator, topic, payload).ok_or(RejectReason::BadSignature);
+        let (message, origin) = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
+            Topic::Detections(node) => {
+                return self.read_report(via, ReportKind::Detections, &node, payload, received_at);
+            }
             Topic::VoteDetections(node) => {
-                return self.read_report(ReportKind::VoteDetections, &node, payload, received_at);
+                return self.read_report(via, ReportKind::VoteDetections, &node, payload, received_at);
             }
             Topic::Nodes(node) => return self.read_status(via, &node, payload, received_at),
             Topic::Ledger(node) if node == self.node => return Ok(self.echo()),
@@ -206,7 +218,7 @@ impl Inbox {
                 if self.is_shed(&self.ledger_throttle, ShedReason::LedgerThrottled, &node, received_at) {
                     return Ok(PacketOutcome::Done);
                 }
-                Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?))
+                (Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?)), Origin::Claimed)
             }
             Topic::GlobalDetections => {
                 let map: GlobalMap = decode(payload, &self.limits)?;
@@ -214,7 +226,8 @@ impl Inbox {
                     return Ok(self.echo());
                 }
                 self.check_date(map.fused_at_us, received_at)?;
-                Incoming::Map(Arc::new(map))
+                let origin = origin(Some(&map.aggregator))?;
+                (Incoming::Map(Arc::new(map)), origin)
             }
             Topic::GlobalVerdicts => {
                 let verdicts: Verdicts = decode(payload, &self.limits)?;
@@ -222,7 +235,8 @@ impl Inbox {
                     return Ok(self.echo());
                 }
                 self.check_date(verdicts.fused_at_us, received_at)?;
-                Incoming::Verdicts(Arc::new(verdicts))
+                let origin = origin(Some(&verdicts.aggregator))?;
+                (Incoming::Verdicts(Arc::new(verdicts)), origin)
             }
             Topic::Reputations if payload.is_empty() => return Ok(PacketOutcome::Done),
             Topic::Reputations => {
@@ -230,10 +244,16 @@ impl Inbox {
                 if reputations.aggregator.as_ref() == Some(&self.node) {
                     return Ok(self.echo());
                 }
-                Incoming::Reputations(Arc::new(reputations))
+                let origin = origin(reputations.aggregator.as_ref())?;
+                (Incoming::Reputations(Arc::new(reputations)), origin)
             }
         };
-        Ok(self.deliver(message, received_at))
+        Ok(self.deliver(via, message, origin, received_at))
+    }
+
+    /// What proves the aggregator of a round; `None` if the broker is not to be believed.
+    fn origin(&self, via: Via<'_>, aggregator: Option<&NodeName>, topic: &[u8], payload: &[u8]) -> Option<Origin> {
+        Origin::of(aggregator, via.node, || self.security.check_round(aggregator, topic, payload))
     }
 
     /// Checks that a round is not from the far future, as far as this node knows the time.
@@ -243,6 +263,7 @@ impl Inbox {
 
     fn read_report(
         &self,
+        via: Via<'_>,
         kind: ReportKind,
         node: &NodeName,
         payload: &[u8],
@@ -256,12 +277,12 @@ impl Inbox {
             return Ok(PacketOutcome::Done);
         }
         let report = Arc::new(decode_report(payload, node, &self.limits)?);
-        Ok(self.deliver(Incoming::Report { kind, report }, received_at))
+        Ok(self.deliver(via, Incoming::Report { kind, report }, Origin::Claimed, received_at))
     }
 
     fn read_status(
         &self,
-        via: &BrokerAddress,
+        via: Via<'_>,
         node: &NodeName,
         payload: &[u8],
         received_at: Timestamp,
@@ -275,7 +296,12 @@ impl Inbox {
         }
         if status.node != self.node {
             let status = Arc::new(status);
-            return Ok(self.deliver(Incoming::Status { status, via: via.clone() }, received_at));
+            return Ok(self.deliver(
+                via,
+                Incoming::Status { status, via: via.address.clone() },
+                Origin::Claimed,
+                received_at,
+            ));
         }
         Ok(if status.state == NodeState::Offline {
             PacketOutcome::DeclaredOffline
@@ -289,13 +315,13 @@ impl Inbox {
     }
 
     /// Name of the node that a topic belongs to, or else the address of the broker.
-    fn source(&self, via: &BrokerAddress, topic: &[u8]) -> String {
+    fn source(&self, via: Via<'_>, topic: &[u8]) -> String {
         let topic = std::str::from_utf8(topic).ok().and_then(|path| self.topics.parse(path));
         match topic {
             Some(Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Ledger(node) | Topic::Nodes(node)) => {
                 node.to_string()
             }
-            _ => via.to_string(),
+            _ => via.address.to_string(),
         }
     }
 
@@ -333,11 +359,20 @@ mod tests {
         let own = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
         let config = MqttConfig { inbox: capacity, max_report_hz, ..MqttConfig::default() };
         let topics = Topics::new(&NodeName::from_static("lot"));
-        Inbox::new(&own, topics, &config, None, CellClock::default(), Arc::clone(counters), Arc::new(receiver))
+        Inbox::new(
+            &own,
+            topics,
+            &config,
+            Security::default(),
+            CellClock::default(),
+            Arc::clone(counters),
+            Arc::new(receiver),
+        )
     }
 
-    fn broker() -> BrokerAddress {
-        "10.0.0.2:1883".parse().unwrap()
+    fn accept(inbox: &Inbox, topic: &[u8], payload: &[u8], at: Timestamp) -> PacketOutcome {
+        let address = "10.0.0.2:1883".parse().unwrap();
+        inbox.accept(Via { address: &address, node: None }, topic, payload, at)
     }
 
     /// One of 30 reports a second that counts what it delivers by the node that `node_of` names.
@@ -365,9 +400,8 @@ mod tests {
                 Reputations { schema: 1, aggregator, epoch: 1, round: 1, reputations: Default::default() };
             encode(&reputations, Encoding::Json)
         };
-        let accept_from = |aggregator: &str, at| {
-            inbox.accept(&broker(), b"ecod/v1/lot/reputations", &payload(aggregator), Timestamp(at))
-        };
+        let accept_from =
+            |aggregator: &str, at| accept(&inbox, b"ecod/v1/lot/reputations", &payload(aggregator), Timestamp(at));
         let accept = |at| accept_from("gauss", at);
         for at in 1..=5 {
             assert_eq!(accept(at), PacketOutcome::Done);
@@ -394,7 +428,7 @@ mod tests {
             let accept = |node: &str| {
                 let report = ObjectReport::new(NodeName::new(node).unwrap(), ms, Timestamp(ms));
                 let topic = format!("ecod/v1/lot/detections/{node}");
-                inbox.accept(&broker(), topic.as_bytes(), &encode(&report, Encoding::Json), Timestamp(ms * 1000))
+                accept(&inbox, topic.as_bytes(), &encode(&report, Encoding::Json), Timestamp(ms * 1000))
             };
             for _ in 0..10 {
                 accept("mallory");
@@ -418,7 +452,7 @@ mod tests {
         let accept = |node: &'static str, ms: u64| {
             let status = NodeStatus::starting(NodeName::from_static(node), Uuid::max(), Role::Auto, "0.1.0");
             let topic = format!("ecod/v1/lot/nodes/{node}");
-            inbox.accept(&broker(), topic.as_bytes(), &encode(&status, Encoding::Json), Timestamp(ms * 1000))
+            accept(&inbox, topic.as_bytes(), &encode(&status, Encoding::Json), Timestamp(ms * 1000))
         };
         for ms in 0..1000 {
             accept("mallory", ms);

@@ -18,10 +18,11 @@ use uuid::Uuid;
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
 use super::hearing::Hearing;
-use super::inbox::{Inbox, PacketOutcome};
+use super::inbox::{Inbox, PacketOutcome, Via};
 use super::security::Security;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
+use crate::transport::pki::BrokerIdentity;
 
 /// Id of a link; a new link to the same broker has another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -203,8 +204,9 @@ impl LinkTask {
         let Some(trust) = self.setup.security.tls(&self.broker).map_err(Box::new)? else {
             return self.session(None).await;
         };
+        let tls = (trust.client(), trust.identity());
         tokio::select! {
-            ended = self.session(Some(trust.client())) => ended,
+            ended = self.session(Some(tls)) => ended,
             error = trust.invalidated() => {
                 self.setup.counters.count(Event::Disconnected);
                 Err(ConnectionError::BrokerInvalidated(error))
@@ -213,14 +215,16 @@ impl LinkTask {
     }
 
     /// One connection from CONNECT to its end; `Ok` after DISCONNECT.
-    async fn session(&mut self, tls: Option<Arc<ClientConfig>>) -> Result<(), ConnectionError> {
+    async fn session(&mut self, tls: Option<(Arc<ClientConfig>, BrokerIdentity)>) -> Result<(), ConnectionError> {
         let setup = Arc::clone(&self.setup);
         let LinkSetup { client_id, will, config, inbox, counters, .. } = &*setup;
         let will = will.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let (tls, identity) = tls.unzip();
         let (client, mut connection) = connection::open(&self.broker, client_id, Some(&will), config, tls);
         // The protocol's own timeouts are whole seconds.
         connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
+        let node = identity.and_then(|identity| identity.node());
         self.hearing.note();
         self.reported_refusal.take_if(|reported_refusal| reported_refusal.starts_with(NOT_ADMITTED));
         if !self.tell(LinkChange::Accepted(client)) {
@@ -246,7 +250,8 @@ impl LinkTask {
             }
             match packet {
                 Packet::Message { topic, payload } => {
-                    match inbox.accept(&self.broker, &topic, &payload, clock::now()) {
+                    let via = Via { address: &self.broker, node: node.as_ref() };
+                    match inbox.accept(via, &topic, &payload, clock::now()) {
                         PacketOutcome::DeclaredOffline => {
                             self.tell(LinkChange::DeclaredOffline);
                         }

@@ -5,14 +5,17 @@ use std::sync::Arc;
 
 use chrono::DateTime;
 use ecod::leadership::BrokerAddress;
+use ecod::leadership::round_filter::SignatureState;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ring::hmac;
+use tokio::sync::watch;
 
 use super::config::MqttConfig;
+use super::round_signature;
 use crate::platform::clock;
-use crate::transport::gossip::{KeyError, MembershipConfig, payload_key};
-use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker};
+use crate::transport::gossip::{KeyError, Member, MembershipConfig, payload_key};
+use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker, is_signed_by};
 
 /// Protection of links and payloads; by default there is none.
 #[derive(Debug, Clone, Default)]
@@ -21,6 +24,8 @@ pub struct Security {
     pub credentials: Option<Arc<Credentials>>,
     external: Option<ExternalBroker>,
     pub(crate) signing: Option<SigningKey>,
+    /// The other nodes, with the certificates that they have proven.
+    members: Option<watch::Receiver<Vec<Member>>>,
 }
 
 /// A broker outside the cell. Without `ca` it is reached in plaintext.
@@ -54,11 +59,16 @@ impl Security {
         let credentials = tls.map(|(files, name)| Credentials::load(files, name)).transpose()?.map(Arc::new);
         let external = mqtt.broker.clone().map(|address| ExternalBroker { address, ca: mqtt.ca.clone() });
         let signing = mqtt.sign.then(|| payload_key(membership, cell)).transpose()?;
-        let security = Self { credentials, external, signing: signing.map(SigningKey) };
+        let security = Self { credentials, external, signing: signing.map(SigningKey), members: None };
         if let Some(external) = &security.external {
             security.tls(&external.address)?;
         }
         Ok(security)
+    }
+
+    /// The same protection for a node that knows the others: it verifies their signatures under rounds.
+    pub fn with_members(self, members: watch::Receiver<Vec<Member>>) -> Self {
+        Self { members: Some(members), ..self }
     }
 
     /// TLS for one connection to a broker; `None` for plaintext.
@@ -100,6 +110,31 @@ impl Security {
             Some(key) => key.sign(topic, &payload),
             None => payload,
         }
+    }
+
+    /// A round with this node's signature, if the node has certificates.
+    pub(crate) fn sign_round(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
+        let Some(credentials) = &self.credentials else { return payload };
+        let sign =
+            |signed: &[u8]| credentials.current().sign(&round_signature::statement(topic.as_bytes(), signed)).ok();
+        round_signature::append(&payload, sign).unwrap_or(payload)
+    }
+
+    /// State of the signature under a round.
+    pub(crate) fn check_round(&self, aggregator: Option<&NodeName>, topic: &[u8], payload: &[u8]) -> SignatureState {
+        let Some(members) = self.members.as_ref().filter(|_| self.credentials.is_some()) else {
+            return SignatureState::Unverifiable;
+        };
+        let certificate = members
+            .borrow()
+            .iter()
+            .find(|member| Some(&member.name) == aggregator)
+            .and_then(|member| member.certificate.clone());
+        let is_valid =
+            certificate.zip(round_signature::split(payload)).is_some_and(|(certificate, (signed, signature))| {
+                is_signed_by(&certificate, &round_signature::statement(topic, signed), &signature)
+            });
+        if is_valid { SignatureState::Valid } else { SignatureState::Invalid }
     }
 
     /// Whether arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz targets.
@@ -180,6 +215,49 @@ mod tests {
             let fault = security.clock_fault();
             assert_eq!(fault.as_ref().is_some_and(|fault| fault.contains("set the clock")), is_wrong, "{fault:?}");
         }
+    }
+
+    #[test]
+    fn a_signed_round_is_its_aggregators_and_any_change_shows() {
+        let (cell, [edge, euclid]) = (NodeName::from_static("lot"), ["edge", "euclid"].map(NodeName::from_static));
+        let directory = tempfile::tempdir().unwrap();
+        let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        let [of_edge, of_euclid] = [&edge, &euclid].map(|name| {
+            authority.issue(name, Role::Auto, Duration::from_secs(3600), clock::now()).unwrap();
+            let (certificate, key) = authority.files_of(name);
+            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+            let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
+            Security::load(Some((&tls, name)), &mqtt, (&membership, &cell)).unwrap()
+        });
+        let certificate = of_edge.credentials.as_ref().unwrap().current().certificate().into();
+        let gossip = "10.0.0.2:17884".parse().unwrap();
+        let member = Member {
+            name: edge.clone(),
+            run: 1,
+            gossip,
+            broker: None,
+            role: Role::Auto,
+            certificate: Some(certificate),
+        };
+        let (members, told) = watch::channel(vec![member]);
+        let receiver = of_euclid.clone().with_members(told);
+        let (topic, payload) = ("ecod/v1/lot/global_detections", br#"{"schema":1,"round":7}"#.to_vec());
+        let signed = of_edge.sign_round(topic, payload.clone());
+        let check = |topic: &str, payload: &[u8]| receiver.check_round(Some(&edge), topic.as_bytes(), payload);
+        assert_eq!(check(topic, &signed), SignatureState::Valid);
+        assert_eq!(check("ecod/v1/lot/global_verdicts", &signed), SignatureState::Invalid);
+        assert_eq!(check(topic, &payload), SignatureState::Invalid, "none");
+        assert_eq!(check(topic, &of_euclid.sign_round(topic, payload.clone())), SignatureState::Invalid);
+        assert_eq!(receiver.check_round(Some(&euclid), topic.as_bytes(), &signed), SignatureState::Invalid);
+        for at in 0..signed.len() - 2 {
+            let mut changed = signed.clone();
+            changed[at] ^= 1;
+            assert_eq!(check(topic, &changed), SignatureState::Invalid, "byte {at}");
+        }
+        assert_eq!(of_euclid.check_round(Some(&edge), topic.as_bytes(), &signed), SignatureState::Unverifiable);
+        members.send_replace(Vec::new());
+        assert_eq!(check(topic, &signed), SignatureState::Invalid, "no member any more");
+        assert_eq!(Security::default().sign_round(topic, payload.clone()), payload, "without certificates");
     }
 
     fn key(text: &str, cell: &'static str) -> SigningKey {

@@ -1,5 +1,6 @@
 //! Proof of a node's certificate outside TLS: the membership's handshake uses the same files, CA and revocation list.
 
+use ring::signature::{ECDSA_P256_SHA256_ASN1, UnparsedPublicKey};
 use rustls::SignatureScheme;
 use rustls::crypto::ring::sign::any_ecdsa_type;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
@@ -49,9 +50,11 @@ pub(super) fn signer(key: &PrivateKeyDer<'_>) -> Option<Box<dyn Signer>> {
 
 /// Whether the owner of a certificate signed a message.
 pub(crate) fn is_signed_by(certificate: &[u8], message: &[u8], signature: &[u8]) -> bool {
-    use ring::signature::{ECDSA_P256_SHA256_ASN1, UnparsedPublicKey};
-
     let Ok((_, parsed)) = X509Certificate::from_der(certificate) else { return false };
-    let key = UnparsedPublicKey::new(&ECDSA_P256_SHA256_ASN1, &parsed.public_key().subject_public_key.data);
-    key.verify(message, signature).is_ok()
+    is_signed_with(&parsed.public_key().subject_public_key.data, message, signature)
+}
+
+/// Whether the owner of a public key signed a message.
+pub(super) fn is_signed_with(public_key: &[u8], message: &[u8], signature: &[u8]) -> bool {
+    UnparsedPublicKey::new(&ECDSA_P256_SHA256_ASN1, public_key).verify(message, signature).is_ok()
 }

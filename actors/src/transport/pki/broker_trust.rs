@@ -3,12 +3,13 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use ecod::model::names::NodeName;
 use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
 
-use super::{Credentials, LoadedCredentials};
+use super::{CertificateSubject, Credentials, LoadedCredentials};
 
 /// TLS of one connection to a broker, and the repeated verification of its certificate.
 #[derive(Debug)]
@@ -19,6 +20,19 @@ pub struct BrokerTrust {
     /// Source of changed revocation lists, for a broker of the cell.
     reloaded_from: Option<(Arc<Credentials>, Arc<LoadedCredentials>)>,
     checked: Instant,
+}
+
+/// The node that has proven to be a broker, once the handshake is over.
+#[derive(Debug)]
+pub struct BrokerIdentity(Option<Arc<RecordingVerifier>>);
+
+impl BrokerIdentity {
+    /// The node whose certificate the broker has; `None` for a broker outside the cell.
+    pub fn node(&self) -> Option<NodeName> {
+        let chain = self.0.as_ref()?.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        let (certificates, _) = chain.as_ref()?;
+        Some(CertificateSubject::of(certificates.first()?).ok()?.name().clone())
+    }
 }
 
 /// Time between two checks for changed files.
@@ -50,6 +64,11 @@ impl BrokerTrust {
     /// TLS configuration for one connection.
     pub fn client(&self) -> Arc<ClientConfig> {
         Arc::clone(&self.client)
+    }
+
+    /// The broker's own name, to be asked for after the handshake.
+    pub fn identity(&self) -> BrokerIdentity {
+        BrokerIdentity(self.reloaded_from.as_ref().map(|_| Arc::clone(&self.recorded)))
     }
 
     /// Waits until the broker's certificate is no longer valid; the result is the reason.
@@ -167,7 +186,9 @@ mod tests {
             let trust = BrokerTrust::of_cell(&credentials);
             let recorded = CertificateDer::from_pem_file(authority.files_of(broker).0).unwrap();
             let name = ServerName::try_from(BROKER_NAME).unwrap();
+            assert_eq!(trust.identity().node(), None, "before the handshake");
             trust.recorded.verify_server_cert(&recorded, &[], &name, &[], UnixTime::now()).unwrap();
+            assert_eq!(trust.identity().node().as_ref(), Some(broker));
             trust
         };
         let (mut brief_trust, mut edge_trust) = (connected(&brief), connected(&edge));

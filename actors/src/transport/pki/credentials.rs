@@ -151,13 +151,6 @@ impl Credentials {
     }
 }
 
-impl LoadedCredentials {
-    /// The node's own certificate and key.
-    pub(super) fn own(&self) -> Option<(&CertificateDer<'static>, &PrivateKeyDer<'static>)> {
-        Some((self.certificates.first()?, &self.key))
-    }
-}
-
 /// Trust in a broker outside the cell. Its certificate must be signed by a CA in `ca` and have the configured host name.
 /// The node presents its own certificate, if it has one.
 ///

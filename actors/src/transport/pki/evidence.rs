@@ -8,13 +8,11 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use ecod::model::names::NodeName;
 use ecod::wire::{LedgerShare, LedgerSignature};
-use ring::signature::{ECDSA_P256_SHA256_ASN1, UnparsedPublicKey};
-use rustls::SignatureScheme;
-use rustls::crypto::ring::sign::any_ecdsa_type;
 use rustls::pki_types::{CertificateDer, UnixTime};
 use x509_parser::certificate::X509Certificate;
 use x509_parser::prelude::FromDer;
 
+use super::attestation::is_signed_with;
 use super::{CertificateSubject, Credentials, LoadedCredentials};
 
 /// Signer and verifier of evidence, with the certificates of one node.
@@ -62,13 +60,11 @@ impl EvidenceSigner {
         Self { cell, credentials, loaded, known: BTreeMap::new() }
     }
 
-    /// Signs a share of the node's own counts. `None` if the node's key is not of ECDSA P-256.
+    /// Signs a share of the node's own counts. `None` if the system gives no random numbers.
     pub fn sign(&self, share: LedgerShare) -> Option<LedgerShare> {
         let loaded = self.credentials.current();
-        let (certificate, key) = loaded.own()?;
-        let signer = any_ecdsa_type(key).ok()?.choose_scheme(&[SignatureScheme::ECDSA_NISTP256_SHA256])?;
-        let signature = BASE64.encode(signer.sign(&share.signed_bytes(&self.cell)).ok()?);
-        let signed = Some(LedgerSignature { certificate: BASE64.encode(certificate), signature });
+        let signature = BASE64.encode(loaded.sign(&share.signed_bytes(&self.cell)).ok()?);
+        let signed = Some(LedgerSignature { certificate: BASE64.encode(loaded.certificate()), signature });
         Some(LedgerShare { signed, ..share })
     }
 
@@ -114,8 +110,8 @@ impl EvidenceSigner {
     fn verify_signature(&self, share: &LedgerShare, signatory: &Signatory) -> Result<(), EvidenceError> {
         let signature = share.signed.as_ref().and_then(|signed| BASE64.decode(&signed.signature).ok());
         let signature = signature.ok_or(EvidenceError::Signature)?;
-        let key = UnparsedPublicKey::new(&ECDSA_P256_SHA256_ASN1, &signatory.public_key);
-        key.verify(&share.signed_bytes(&self.cell), &signature).map_err(|_| EvidenceError::Signature)
+        let is_signed = is_signed_with(&signatory.public_key, &share.signed_bytes(&self.cell), &signature);
+        if is_signed { Ok(()) } else { Err(EvidenceError::Signature) }
     }
 
     /// The aggregator whose counts a share has, by the certificate beside them.

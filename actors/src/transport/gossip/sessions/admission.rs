@@ -279,6 +279,9 @@ impl Sessions {
             };
             self.peers.insert(head.sender, peer)?;
         }
+        for throttle in [&mut self.challenges, &mut self.proofs, &mut self.verifications] {
+            throttle.know(address, now);
+        }
         self.peers.settle(head.sender, &id.name, claim != NameClaim::Taken, now);
         Ok(claim)
     }

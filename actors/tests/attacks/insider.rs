@@ -1,0 +1,98 @@
+//! An attacker that takes part in the membership, as far as it is admitted, and says anything there.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use ecod::leadership::election::{Body, Candidacy, ElectionMessage};
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::wire::{Encoding, Role, SCHEMA_VERSION};
+use ecod_actors::actors::membership::{Membership, MembershipArguments};
+use ecod_actors::messages::membership::MembershipMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::platform::secret::Secret;
+use ecod_actors::transport::gossip::{Member, MembershipConfig};
+use ecod_actors::transport::pki::Credentials;
+use ractor::{Actor, ActorRef};
+use tokio::sync::watch;
+use tokio::time::sleep;
+
+use crate::cell::{CELL, Target};
+
+/// Time in which a cell admits a node, if it does.
+const ADMISSION: Duration = Duration::from_secs(2);
+
+/// A membership of the attacker's own.
+pub(crate) struct Insider {
+    name: NodeName,
+    role: Role,
+    run: u64,
+    membership: ActorRef<MembershipMessage>,
+    members: watch::Receiver<Vec<Member>>,
+}
+
+impl Insider {
+    /// Greets all nodes with the cell's key, and with a certificate if one is given.
+    pub(crate) async fn join(
+        target: &Target,
+        (name, role): (&'static str, Role),
+        credentials: Option<Arc<Credentials>>,
+    ) -> anyhow::Result<Self> {
+        let mut config = MembershipConfig {
+            key: Some(Secret::new(target.key)),
+            bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
+            seeds: target.gossip.iter().map(ToString::to_string).collect(),
+            ..MembershipConfig::default()
+        };
+        config.multicast.enabled = false;
+        let name = NodeName::from_static(name);
+        let (run, (sender, members)) = (clock::now().micros(), watch::channel(Vec::new()));
+        let arguments = MembershipArguments {
+            name: name.clone(),
+            cell: NodeName::from_static(CELL),
+            run,
+            role,
+            broker: None,
+            credentials,
+            config,
+            events: Arc::new(drop),
+            members: sender,
+            counters: Arc::default(),
+        };
+        let (membership, _) = Actor::spawn(None, Membership, arguments).await?;
+        sleep(ADMISSION).await;
+        Ok(Self { name, role, run, membership, members })
+    }
+
+    /// An epoch of its own.
+    pub(crate) fn epoch(&self, term: u64) -> Epoch {
+        Epoch::new(term, self.name.clone())
+    }
+
+    /// Says the same to all members, ten times a second.
+    pub(crate) async fn repeat(&self, term: u64, epoch: Option<Epoch>, body: Body) -> anyhow::Result<()> {
+        for seq in 1.. {
+            let message = ElectionMessage {
+                schema: SCHEMA_VERSION,
+                from: self.name.clone(),
+                run: self.run,
+                seq,
+                candidacy: Candidacy { role: self.role, priority: u8::MAX, load: 0, fit: false },
+                term,
+                epoch: epoch.clone(),
+                hears_you: true,
+                clock: None,
+                body: body.clone(),
+            };
+            let payload = Bytes::from(message.encode(Encoding::Cbor));
+            let names: Vec<_> = self.members.borrow().iter().map(|member| member.name.clone()).collect();
+            for to in names {
+                self.membership.cast(MembershipMessage::Send { to, payload: payload.clone() })?;
+            }
+            sleep(Duration::from_millis(100)).await;
+        }
+        Ok(())
+    }
+}

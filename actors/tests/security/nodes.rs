@@ -1,0 +1,58 @@
+//! Whole nodes of a cell with certificates, in this process.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use ecod::leadership::Position;
+use ecod::wire::Role;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::transport::pki::TlsConfig;
+use tokio::time::{Instant, sleep};
+
+use crate::fixture::{SOON, node as name};
+
+/// Starts a node that greets another one.
+pub(crate) async fn start(node: &str, role: Role, tls: TlsConfig, seed: Option<SocketAddr>) -> NodeHandle {
+    let mut config = NodeConfig {
+        name: Some(name(node)),
+        cell: name("lot"),
+        role,
+        listen: Some("127.0.0.1:0".parse().unwrap()),
+        tls: Some(tls),
+        ..NodeConfig::default()
+    };
+    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+    config.membership.multicast.enabled = false;
+    config.membership.seeds = seed.iter().map(ToString::to_string).collect();
+    config.dashboard.enabled = false;
+    node::start(config).await.unwrap()
+}
+
+/// The edge, the candidate `euclid` and the vehicle `gauss`, once the edge leads both and `euclid` stands by.
+pub(crate) async fn start_cell([edge, euclid, gauss]: [TlsConfig; 3]) -> [NodeHandle; 3] {
+    let edge = start("edge", Role::Edge, edge, None).await;
+    let euclid = start("euclid", Role::Auto, euclid, edge.gossip_address()).await;
+    let gauss = start("gauss", Role::Cav, gauss, euclid.gossip_address()).await;
+    until("edge leads all, with a standby", || {
+        let stands_by = euclid.leadership().borrow().position == Position::StandingBy;
+        stands_by && [&euclid, &gauss].iter().all(|node| aggregator(node).as_deref() == Some("edge"))
+    })
+    .await;
+    [edge, euclid, gauss]
+}
+
+/// Leader of the newest map of a node.
+pub(crate) fn aggregator(node: &NodeHandle) -> Option<String> {
+    node.newest_map().borrow().as_ref().map(|newest| newest.map.aggregator.to_string())
+}
+
+/// Waits for something; the time that it took.
+pub(crate) async fn until(what: &str, is_reached: impl Fn() -> bool) -> Duration {
+    let start = Instant::now();
+    while !is_reached() {
+        assert!(start.elapsed() < SOON, "never: {what}");
+        sleep(Duration::from_millis(5)).await;
+    }
+    start.elapsed()
+}

@@ -1,0 +1,22 @@
+//! Forged evidence about vehicles.
+
+use ecod::model::names::NodeName;
+use ecod::wire::{LedgerEntry, LedgerShare, SCHEMA_VERSION};
+
+/// Counts by which the liar is always right and the honest vehicle never, as a node shares them.
+pub(crate) fn inverted(sender: &str, epoch: u64, aggregator: &str) -> LedgerShare {
+    let name = |name: &str| NodeName::new(name).unwrap();
+    let entry = |node: &str, correct, incorrect| {
+        let (aggregator, node, label) = (name(aggregator), name(node), "cup".into());
+        LedgerEntry { epoch, aggregator, node, label, correct, incorrect }
+    };
+    LedgerShare {
+        schema: SCHEMA_VERSION,
+        node: name(sender),
+        epoch: None,
+        entries: vec![entry("honest", 0, 1_000_000_000), entry("liar", 1_000_000_000, 0)],
+        marks: Vec::new(),
+        signed: None,
+        reset_at_us: None,
+    }
+}
