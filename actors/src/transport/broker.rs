@@ -6,6 +6,7 @@ mod backlog;
 mod byte_throttle;
 mod connect_packet;
 mod connection_throttle;
+mod door;
 mod embedded;
 mod frontend;
 mod heartbeat;
@@ -22,6 +23,7 @@ use std::net::SocketAddr;
 
 #[cfg(fuzzing)]
 pub use connect_packet::read_connect_packet;
+pub use door::{Door, DoorSetup};
 pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
 pub use permissions::{AccessPolicy, LeaderCheck};
 
