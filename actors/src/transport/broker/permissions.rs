@@ -14,7 +14,6 @@
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use ecod::model::names::NodeName;
 use ecod::wire::{Limits, Topic, Topics};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
@@ -25,13 +24,10 @@ use rmqtt::types::{
 };
 
 use super::door::{Door, Place, Refusal};
-use super::principal::{Principal, PrincipalRegistry};
+use super::principal::{LeaderCheck, Principal, PrincipalRegistry, is_run};
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::ENVELOPE_BYTES;
 use crate::transport::pki::{CertificateSubject, Credentials};
-
-/// Decides whether a node may publish maps, verdicts and reputations.
-pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 
 /// Rules of access to an embedded broker.
 #[derive(Clone)]
@@ -230,15 +226,11 @@ fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
     client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.may_act_as(name))
 }
 
-/// Whether the end of a client id is that of a node's run.
-pub(super) fn is_run(text: &str) -> bool {
-    text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
-}
-
 #[cfg(test)]
 mod tests {
     use std::time::Duration;
 
+    use ecod::model::names::NodeName;
     use ecod::wire::Role;
 
     use super::*;

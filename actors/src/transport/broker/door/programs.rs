@@ -24,8 +24,7 @@ use super::refusals::RefusalReason;
 use super::{Door, DoorState, Publication, Refusal, lock};
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
-use crate::transport::broker::permissions::is_run;
-use crate::transport::broker::principal::{Principal, PrincipalRegistry};
+use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
 
 /// Where a message is inside the broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
