@@ -14,6 +14,16 @@ pub mod round;
 
 mod command;
 mod config;
+/// The report as its vehicle's: what a part saw, its vehicle saw. So the parts of a vehicle are one witness, with one
+/// reputation.
+fn of_vehicle(report: &Arc<ObjectReport>) -> Arc<ObjectReport> {
+    let vehicle = report.node.vehicle();
+    if vehicle == report.node {
+        return Arc::clone(report);
+    }
+    Arc::new(ObjectReport { node: vehicle, ..ObjectReport::clone(report) })
+}
+
 #[cfg(test)]
 mod tests;
 
@@ -154,6 +164,7 @@ impl Aggregator {
             ReportKind::Detections => {
                 let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
                 let admitted = window.admit(report, now)?;
+                let report = &of_vehicle(report);
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
                 let tracks = self.tracks.as_mut();
                 let is_tracked = tracks.is_some_and(|tracks| {
@@ -173,7 +184,7 @@ impl Aggregator {
                 if let Admitted::OutOfOrder(_) = window.admit(report, now)? {
                     return Err(RejectReason::OutOfOrder);
                 }
-                vote.observe(report, now)?;
+                vote.observe(&of_vehicle(report), now)?;
                 self.voted = true;
             }
         }

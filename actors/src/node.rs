@@ -3,7 +3,7 @@
 //! ```text
 //! Node
 //! ├─ Recorder          writes the log                     if configured
-//! ├─ Broker            embedded MQTT broker               may lead, and the nodes' own brokers are used
+//! ├─ Broker            embedded MQTT broker               unless switched off where it is only a door
 //! ├─ Membership        who is there, datagrams            always
 //! ├─ Gateway           the only owner of MQTT clients     always
 //! ├─ Follower          takes maps, verdicts, reputations  always
@@ -96,6 +96,7 @@ pub struct NodeHandle {
     failure: watch::Receiver<Option<String>>,
     newest: Newest,
     broker: watch::Receiver<Option<SocketAddr>>,
+    listens_at: watch::Receiver<Option<SocketAddr>>,
     gossip: watch::Receiver<Option<SocketAddr>>,
     members: watch::Receiver<Vec<Member>>,
     leadership: watch::Receiver<Leadership>,
@@ -121,7 +122,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let builder = NodeBuilder::new(config, security, failed);
     let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());
     let (members, leadership) = (builder.members(), builder.leadership());
-    let dashboard = builder.dashboard_address();
+    let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
     let (slots, counters) = (builder.slots().clone(), builder.counters());
     let started = Actor::spawn(None, Node, builder).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
@@ -132,6 +133,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
         failure,
         newest,
         broker,
+        listens_at,
         gossip,
         members,
         leadership,
@@ -157,7 +159,12 @@ impl NodeHandle {
         self.newest.reputations.subscribe()
     }
 
-    /// Where the embedded broker listens, if there is one.
+    /// Where the embedded broker listens for programs and, if it carries the cell, for nodes.
+    pub fn listens_at(&self) -> Option<SocketAddr> {
+        *self.listens_at.borrow()
+    }
+
+    /// Where the embedded broker listens for other nodes, if the node has one that may carry the cell.
     pub fn broker_address(&self) -> Option<SocketAddr> {
         *self.broker.borrow()
     }

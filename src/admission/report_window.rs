@@ -92,7 +92,7 @@ impl ReportWindow {
             cell_offset: self.cell_offset_us,
         };
         if !self.vehicles.contains_key(&report.node) {
-            self.make_room(received_at)?;
+            self.make_room(&report.node, received_at)?;
         }
         let known = self.vehicles.entry(report.node.clone());
         let vehicle = known.or_insert_with(|| VehicleClock::new(received_at));
@@ -110,23 +110,45 @@ impl ReportWindow {
 
     /// The share of the vehicles heard lately whose reports are admitted.
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
-        let mut timeliness = Timeliness::default();
-        for vehicle in self.vehicles.values().filter(|vehicle| now.since(vehicle.last_heard) < UNTIMELY_TIME) {
-            match vehicle.untimely_since {
-                Some(since) if now.since(since) >= UNTIMELY_TIME => timeliness.untimely += 1,
-                _ => timeliness.timely += 1,
-            }
+        // By vehicle: the parts of one must not speak for many.
+        let mut vehicles = BTreeMap::new();
+        for (name, vehicle) in self.vehicles.iter().filter(|(_, vehicle)| now.since(vehicle.last_heard) < UNTIMELY_TIME)
+        {
+            let is_untimely = vehicle.untimely_since.is_some_and(|since| now.since(since) >= UNTIMELY_TIME);
+            *vehicles.entry(name.vehicle()).or_insert(false) |= !is_untimely;
         }
-        timeliness
+        let timely = vehicles.values().filter(|is_timely| **is_timely).count();
+        Timeliness { timely, untimely: vehicles.len() - timely }
     }
 
-    fn make_room(&mut self, now: Timestamp) -> Result<(), RejectReason> {
-        if self.vehicles.len() >= self.config.max_vehicles {
+    /// Makes room for a vehicle or a part of one, if there is any.
+    fn make_room(&mut self, name: &NodeName, now: Timestamp) -> Result<(), RejectReason> {
+        let is_full = |vehicles: &BTreeMap<NodeName, VehicleClock>| {
+            vehicles.len() >= self.config.max_vehicles || parts_beside(vehicles, name) >= MAX_PARTS
+        };
+        if is_full(&self.vehicles) {
             self.vehicles.retain(|_, vehicle| now.since(vehicle.last_received) < RETENTION);
         }
-        if self.vehicles.len() < self.config.max_vehicles { Ok(()) } else { Err(RejectReason::TooManyVehicles) }
+        if is_full(&self.vehicles) { Err(RejectReason::TooManyVehicles) } else { Ok(()) }
     }
 }
+
+/// Number of parts of the same vehicle, if the name is that of a part.
+fn parts_beside(vehicles: &BTreeMap<NodeName, VehicleClock>, name: &NodeName) -> usize {
+    let vehicle = name.vehicle();
+    if vehicle == *name {
+        return 0;
+    }
+    // Only a name with one more mark sorts between a vehicle and its parts.
+    let names = vehicles.range(vehicle.clone()..).map(|(name, _)| name);
+    names
+        .take_while(|name| name.as_str().starts_with(vehicle.as_str()))
+        .filter(|name| name.vehicle() == vehicle)
+        .count()
+}
+
+/// Maximum parts of a vehicle at a time: a vehicle that invents names takes nobody else's room.
+const MAX_PARTS: usize = 16;
 
 /// Time after which a silent vehicle's clock is forgotten when room is short.
 const RETENTION: Duration = Duration::from_secs(10);

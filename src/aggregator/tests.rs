@@ -210,3 +210,21 @@ fn a_vehicle_that_is_rejected_for_its_time_deposes_nobody_by_sending_both_kinds(
     }
     assert_eq!((last, last.is_usable()), (Timeliness { timely: 0, untimely: 1 }, true));
 }
+
+#[test]
+fn the_parts_of_a_vehicle_are_one_witness() {
+    let mut cell = leader(FusionConfig::default());
+    for (n, part) in (0..).zip(["euclid", "euclid--lidar", "euclid--radar", "gauss"]) {
+        let label = if part == "gauss" { "car" } else { "cup" };
+        for kind in [Detections, VoteDetections] {
+            cell.report(kind, &report(part, label, 10 + n), at(15 + n)).unwrap();
+        }
+    }
+    let fused = cell.tick(at(100)).unwrap();
+    let (map, verdicts) = (fused.map.unwrap(), fused.verdicts.unwrap());
+    let verdict = &verdicts.verdicts[0];
+    assert_eq!(verdict.contributors, ["euclid", "gauss"].map(NodeName::from_static));
+    let votes: Vec<_> = verdict.votes.values().collect();
+    assert!((votes[0] - votes[1]).abs() < 1e-9, "three parts against one vehicle: {:?}", verdict.votes);
+    assert!(map.landmarks[0].observers.iter().all(|node| !node.as_str().contains("--")), "{:?}", map.landmarks);
+}

@@ -10,6 +10,9 @@ use smol_str::SmolStr;
 /// Longest accepted name, label or landmark id in bytes.
 pub const MAX_NAME_BYTES: usize = 64;
 
+/// Mark between a node's name and that of its part, such as a program beside it.
+pub const PART_MARK: &str = "--";
+
 /// A name that is not made of 1 to 64 of the characters `A-Z a-z 0-9 _ -`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("name {0:?} must be 1 to 64 characters of A-Z, a-z, 0-9, _ and -")]
@@ -48,6 +51,15 @@ impl NodeName {
     /// The name as text.
     pub fn as_str(&self) -> &str {
         &self.0
+    }
+
+    /// The node that this name belongs to: `euclid` for its part `euclid--lidar`, otherwise the name itself.
+    #[must_use]
+    pub fn vehicle(&self) -> Self {
+        match self.0.split_once(PART_MARK) {
+            Some((vehicle, _)) if !vehicle.is_empty() => Self(SmolStr::new(vehicle)),
+            _ => self.clone(),
+        }
     }
 }
 

@@ -70,6 +70,8 @@ reject_reasons! {
     Unattested = "unattested",
     /// Evidence of more votes than there can have been.
     Implausible = "implausible",
+    /// A program's message at its node's broker in another name than the node's, or on a topic that programs only read.
+    NotPermitted = "not_permitted",
 }
 
 impl fmt::Display for RejectReason {

@@ -37,6 +37,9 @@ pub enum ReportKind {
 }
 
 impl ReportKind {
+    /// All kinds.
+    pub const ALL: [Self; Self::COUNT] = [Self::Detections, Self::VoteDetections];
+
     /// How many kinds there are; `kind as usize` is below it.
     pub const COUNT: usize = 2;
 

@@ -3,7 +3,8 @@
 //! ```text
 //! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watches of the newest of each; maps also to an optional log file
 //!                                            ├── RoundAccepted ──> LeaderElection
-//!                                            └── TakeMap ──> Fuser
+//!                                            ├── TakeMap ──> Fuser
+//!                                            └── everything accepted ──> Door ──> programs beside the node
 //! ```
 //!
 //! It owns the node's [`RoundFilter`], which decides by the leadership of the moment. So each map is judged where it
@@ -14,12 +15,12 @@ mod map_log;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::{AcceptedRound, Origin, Refusal, RoundFilter};
+use ecod::leadership::{Leadership, Position};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, Reputations, Verdicts};
+use ecod::wire::{GlobalMap, Reputations, Topic, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
@@ -35,6 +36,7 @@ use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::telemetry::spans::Spans;
+use crate::transport::broker::Door;
 
 /// What a follower needs at its start.
 pub struct FollowerArguments {
@@ -53,6 +55,8 @@ pub struct FollowerArguments {
     pub election: ActorSlot<LeaderElectionMessage>,
     /// Goes on from the maps taken, when the node leads.
     pub fuser: ActorSlot<FuserMessage>,
+    /// Passes everything accepted on to programs.
+    pub door: Door,
     /// The cell's time.
     pub clock: CellClock,
     /// The node's counters.
@@ -74,6 +78,7 @@ pub struct FollowerState {
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
     fuser: ActorSlot<FuserMessage>,
+    door: Door,
     clock: CellClock,
     counters: Arc<Counters>,
     spans: Spans,
@@ -137,12 +142,13 @@ impl FollowerState {
             leadership,
             election,
             fuser,
+            door,
             clock,
             counters,
             spans,
         } = arguments;
         let (filter, log) = (RoundFilter::new(saved_term, clock::now()), log.map(MapLog::new));
-        Self { newest, filter, log, recording, leadership, election, fuser, clock, counters, spans }
+        Self { newest, filter, log, recording, leadership, election, fuser, door, clock, counters, spans }
     }
 
     fn take_map(&mut self, map: &Arc<GlobalMap>, origin: Origin, received_at: Timestamp) -> Result<(), Refusal> {
@@ -159,6 +165,8 @@ impl FollowerState {
         }
         self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
+        self.door.publish_round(&Topic::GlobalDetections, &**map);
+        self.door.request_reports(self.leadership.borrow().position == Position::Following);
         Ok(())
     }
 
@@ -174,6 +182,7 @@ impl FollowerState {
         self.recording.send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
         self.tell_election(accepted);
         self.newest.verdicts.send_replace(Some(Received { received_at, message: Arc::clone(verdicts) }));
+        self.door.publish_round(&Topic::GlobalVerdicts, &**verdicts);
         Ok(())
     }
 
@@ -187,6 +196,7 @@ impl FollowerState {
         self.counters.count(Event::ReputationsAccepted);
         self.recording.send(received_at, LogItem::Reputations(Arc::clone(reputations)));
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
+        self.door.publish_reputations(reputations);
         Ok(())
     }
 

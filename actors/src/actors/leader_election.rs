@@ -37,6 +37,7 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
+use crate::transport::broker::Door;
 use crate::transport::gossip::Member;
 
 /// Where the parts that the election commands or asks are reached.
@@ -52,6 +53,8 @@ pub struct Parts {
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The node's own broker.
     pub broker: ActorSlot<BrokerMessage>,
+    /// Shows the node's status to programs.
+    pub door: Door,
 }
 
 /// What an election needs at its start.

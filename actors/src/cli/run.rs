@@ -28,7 +28,7 @@ pub(super) struct RunArguments {
     role: Option<String>,
     #[command(flatten)]
     join: JoinArguments,
-    /// Address of the embedded broker, on a node that may lead
+    /// Address of the embedded broker
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     listen: Option<SocketAddr>,
     /// Directory for state that survives a restart
@@ -196,6 +196,7 @@ impl ObserverArguments {
         }
         (config.membership.advertise, config.state_dir, config.map_log) = (None, None, None);
         config.dashboard.enabled = false;
+        config.broker.door = false;
         Ok(config)
     }
 }
@@ -228,7 +229,7 @@ mod tests {
         let join = JoinArguments { config: Some(path), ..JoinArguments::default() };
         let arguments = ObserverArguments { join };
         let Ok(config) = arguments.load("recorder") else { panic!("the configuration is valid") };
-        assert!(!config.dashboard.enabled);
+        assert!(!config.dashboard.enabled && !config.has_broker());
         assert_eq!(config.membership.bind.map(|bind| bind.port()), Some(0));
         assert!(config.name.unwrap().as_str().starts_with("recorder-"));
     }

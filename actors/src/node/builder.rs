@@ -49,7 +49,7 @@ use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
 use crate::telemetry::spans::Spans;
-use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
+use crate::transport::broker::{AccessPolicy, BrokerError, Door, EmbeddedBroker, LeaderCheck};
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
@@ -69,7 +69,11 @@ pub(super) struct NodeBuilder {
     _state_lock: Option<File>,
     recording: LogSender,
     report_queue: LatestReportQueue,
+    /// Address of the broker that other nodes may use.
     broker_address: watch::Sender<Option<SocketAddr>>,
+    /// Address of the broker, whoever may use it.
+    listens_at: watch::Sender<Option<SocketAddr>>,
+    door: Door,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
@@ -104,7 +108,7 @@ impl NodeBuilder {
         let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
-        Self {
+        let mut builder = Self {
             _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
             config,
@@ -119,6 +123,8 @@ impl NodeBuilder {
             report_queue: LatestReportQueue::default(),
             reputations: SharedReputations::new(by_evidence),
             broker_address: watch::Sender::new(None),
+            listens_at: watch::Sender::new(None),
+            door: Door::default(),
             gossip_address: watch::Sender::new(None),
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
@@ -126,7 +132,9 @@ impl NodeBuilder {
             live_state: Arc::default(),
             dashboard_address: watch::Sender::new(None),
             failed,
-        }
+        };
+        builder.door = builder.new_door();
+        builder
     }
 
     pub(super) fn slots(&self) -> &ActorSlots {
@@ -147,6 +155,10 @@ impl NodeBuilder {
 
     pub(super) fn broker_address(&self) -> watch::Receiver<Option<SocketAddr>> {
         self.broker_address.subscribe()
+    }
+
+    pub(super) fn listens_at(&self) -> watch::Receiver<Option<SocketAddr>> {
+        self.listens_at.subscribe()
     }
 
     pub(super) fn gossip_address(&self) -> watch::Receiver<Option<SocketAddr>> {
@@ -178,7 +190,7 @@ impl NodeBuilder {
         let leads = self.config.may_lead();
         let mut parts = Vec::new();
         parts.extend(self.config.record.is_some().then_some(ActorKind::Recorder));
-        parts.extend((leads && self.config.data_plane().embedded).then_some(ActorKind::Broker));
+        parts.extend(self.config.has_broker().then_some(ActorKind::Broker));
         parts.extend([ActorKind::Membership, ActorKind::Gateway, ActorKind::Follower]);
         if leads {
             let rates = self.config.fusion.rates_vehicles(!self.config.landmarks.is_empty());
@@ -288,17 +300,26 @@ impl NodeBuilder {
     async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
         let (broker, _) =
             Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor).await.map_err(cause)?;
-        let before = *self.broker_address.borrow();
-        let address = before.unwrap_or(self.config.broker_listen());
+        let before = *self.listens_at.borrow();
+        let mut address = before.unwrap_or(self.config.broker_listen());
+        let takes_any_port = before.is_none() && self.config.listen.is_none() && !self.config.serves_nodes();
         let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
         let bound = loop {
             attempts -= 1;
             match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
+                Err(BrokerError::Bind { .. }) if takes_any_port && address.port() != 0 => {
+                    tracing::info!(%address, "the door takes a free port, key `listen` is not set and the usual one is in use");
+                    address.set_port(0);
+                    attempts += 1;
+                }
                 Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
                 outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
             }
         };
-        self.broker_address.send_replace(Some(bound));
+        self.listens_at.send_replace(Some(bound));
+        if self.config.serves_nodes() {
+            self.broker_address.send_replace(Some(bound));
+        }
         let id = broker.get_id();
         self.slots.broker.set(broker);
         Ok(id)
@@ -310,6 +331,7 @@ impl NodeBuilder {
         let (config, listen) = (self.config.broker(), self.config.broker_listen());
         let credentials = self.security.credentials.clone();
         match (&credentials, listen.ip().is_loopback()) {
+            _ if !self.config.serves_nodes() => tracing::info!(%listen, "broker for programs of this node"),
             (None, true) if self.config.data_plane().external.is_some() => tracing::warn!(
                 "mqtt.fallback_to_embedded serves this machine only: without certificates in [tls] or \
                  broker.allow_plaintext other machines are without maps when the external broker is gone"
@@ -320,7 +342,8 @@ impl NodeBuilder {
         }
         let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
         let (limits, counters) = (self.config.mqtt.limits(), self.counters());
-        EmbeddedBroker::protected(config, AccessPolicy { credentials, topics, limits, elected, counters })
+        let policy = AccessPolicy { credentials, topics, limits, elected, counters };
+        EmbeddedBroker::protected(config, policy).with_door(self.door.clone())
     }
 
     /// The membership comes back at the address it had, as the broker does.

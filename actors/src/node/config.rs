@@ -39,9 +39,9 @@ pub struct NodeConfig {
     pub cell: NodeName,
     /// What the node is meant to do. Default `auto`.
     pub role: Role,
-    /// Where the embedded broker of a node that may lead listens. Default port 8883 on all interfaces with `[tls]`;
-    /// without, port 1883 on 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says
-    /// otherwise.
+    /// Where the embedded broker listens. Default port 8883 on all interfaces with `[tls]`; without, port 1883 on
+    /// 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says otherwise. A broker that is
+    /// only a door for programs: the same port on 127.0.0.1, or a free one if that is taken.
     pub listen: Option<SocketAddr>,
     /// Directory for what survives a restart: reputations and the highest term of leadership. Default
     /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
@@ -218,7 +218,7 @@ impl NodeConfig {
     fn validate_listen(&self) -> Result<(), ConfigError> {
         let listen = self.broker_listen();
         let open = self.tls.is_none() && !self.broker.allow_plaintext && !listen.ip().is_loopback();
-        if open && self.may_lead() && self.data_plane().embedded {
+        if open && self.has_broker() {
             let allowed =
                 "a loopback address, unless there are certificates in `[tls]` or `broker.allow_plaintext` is true";
             return Err(ConfigError::new("listen", listen, allowed));
@@ -258,8 +258,9 @@ impl NodeConfig {
     /// Where the embedded broker listens.
     pub fn broker_listen(&self) -> SocketAddr {
         let (ip, port) = match &self.tls {
-            Some(_) => ([0, 0, 0, 0], 8883),
-            None if self.broker.allow_plaintext => ([0, 0, 0, 0], 1883),
+            Some(_) if self.serves_nodes() => ([0, 0, 0, 0], 8883),
+            Some(_) => ([127, 0, 0, 1], 8883),
+            None if self.serves_nodes() && self.broker.allow_plaintext => ([0, 0, 0, 0], 1883),
             None => ([127, 0, 0, 1], 1883),
         };
         self.listen.unwrap_or(SocketAddr::from((ip, port)))
@@ -276,6 +277,16 @@ impl NodeConfig {
     /// Whether the node may lead its cell.
     pub fn may_lead(&self) -> bool {
         self.role != Role::Cav
+    }
+
+    /// Whether the node's broker may carry the cell's data.
+    pub fn serves_nodes(&self) -> bool {
+        self.may_lead() && self.data_plane().embedded
+    }
+
+    /// Whether the node has a broker: for the cell, or only as a door for its programs.
+    pub fn has_broker(&self) -> bool {
+        self.serves_nodes() || self.broker.door
     }
 
     /// Which brokers carry the cell's data.

@@ -4,8 +4,10 @@
 
 mod backlog;
 mod byte_throttle;
+mod client_rejection;
 mod connect_packet;
 mod connection_throttle;
+mod door;
 mod embedded;
 mod frontend;
 mod heartbeat;
@@ -22,8 +24,10 @@ use std::net::SocketAddr;
 
 #[cfg(fuzzing)]
 pub use connect_packet::read_connect_packet;
+pub use door::{Door, DoorSetup};
 pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
-pub use permissions::{AccessPolicy, LeaderCheck};
+pub use permissions::AccessPolicy;
+pub use principal::LeaderCheck;
 
 /// State of an embedded broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

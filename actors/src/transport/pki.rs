@@ -32,6 +32,9 @@ pub use subject::{CertificateSubject, InvalidCertificate};
 /// DNS name in the certificate of every node that may lead, below a domain reserved for private use.
 pub const BROKER_NAME: &str = "broker.ecod.internal";
 
+/// Name by which programs know the door of a node. Nodes do not take it for a broker's.
+pub const DOOR_NAME: &str = "door.ecod.internal";
+
 /// Scheme of the URI in a node's certificate that holds its rights, such as `ecod:role=auto;priority=100`.
 const RIGHTS_SCHEME: &str = "ecod:";
 

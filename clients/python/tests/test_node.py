@@ -33,7 +33,7 @@ def test_a_node_takes_reports_and_its_messages_are_read(edge: Callable[..., Serv
     with ecod.Cell(node.address, cell_name, node="euclid") as cell:
         map = agreed(cell)
         first, second = map.landmarks
-        assert (first.id, first.contributors, first.observers) == ("slot-0", ["euclid--python"], ["euclid--python"])
+        assert (first.id, first.contributors, first.observers) == ("slot-0", ["euclid"], ["euclid"])
         assert (first.x_m, first.y_m) == pytest.approx((0.1, 0.2), abs=0.01) and first.confidence > 0.5
         assert (second.label, second.x_m, second.y_m) == (None, 2.5, 0.0)
         assert abs(map.fused_at.timestamp() - time.time()) < 20
@@ -61,8 +61,8 @@ def test_tracks_of_a_node_are_read(edge: Callable[..., Server], cell_name: str, 
 
         map = until(cell.maps(timeout=20), tracks)
         (track,) = tracks(map)
-        assert {thing.vehicle for thing in map.objects} == {None, "euclid--python"}, "who reports is there, too"
-        assert track.label == "car" and track.contributors == ["euclid--python"] and len(track.id) == 36
+        assert {thing.vehicle for thing in map.objects} == {None, "euclid"}, "who reports is there, too"
+        assert track.label == "car" and track.contributors == ["euclid"] and len(track.id) == 36
         assert track.velocity_mps == pytest.approx((5.0, 0.0), abs=2.0) and track.y_m == pytest.approx(3.0, abs=0.5)
         assert track.first_seen_us is not None and abs(track.first_seen_us / 1e6 - began) < 20
         assert not cell.counts, cell.counts
@@ -76,7 +76,7 @@ def test_maps_go_on_after_the_node_is_killed_and_started_again(edge: Callable[..
         wait_for(lambda: not cell.report([CAR]))
         node.start()
         # Its terms begin anew, as it has no `state_dir`.
-        assert agreed(cell).landmarks[0].contributors == ["euclid--python"]
+        assert agreed(cell).landmarks[0].contributors == ["euclid"]
 
 
 @pytest.fixture
@@ -107,6 +107,10 @@ def test_a_cell_with_certificates_takes_a_program_by_its_own(
     node = edge(ECOD_TLS__CA=own["ca"], ECOD_TLS__CERTIFICATE=own["cert"], ECOD_TLS__KEY=own["key"])
     with ecod.Cell(node.address, cell_name, node="euclid", part="", **other) as cell:
         assert agreed(cell).landmarks[0].contributors == ["euclid"]
+    with ecod.Cell(node.address, cell_name, node="euclid", part="lidar", **other) as cell:
+        assert agreed(cell).landmarks[0].contributors == ["euclid"]
+    with ecod.Cell(node.address, cell_name, node="edge", part="lidar", **own) as cell:
+        assert agreed(cell).landmarks[0].contributors == ["edge"]
     with pytest.raises(ecod.Refused, match=f"{node.address} refuses the login: Not authorized"):
         ecod.Cell(node.address, cell_name, node="gauss", part="", **other)
     with pytest.raises(ecod.Unreachable, match=f"no TLS with {node.address} .*broker.example.*check .*`broker_name`"):

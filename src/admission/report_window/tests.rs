@@ -62,6 +62,19 @@ fn a_clock_one_and_a_half_seconds_ahead_is_corrected() {
     assert_eq!(admitted, InOrder(Timestamp(late + 2_000)), "queueing does not move the capture time");
 }
 
+#[test]
+fn a_vehicle_that_invents_parts_takes_nobody_elses_room() {
+    let mut window = window();
+    let admitted =
+        (0..100).filter(|n| window.admit(&report(&format!("a--{n}"), NOON), Timestamp(NOON)).is_ok()).count();
+    assert_eq!(admitted, MAX_PARTS);
+    for other in ["a", "a-", "b", "b--1"] {
+        assert!(window.admit(&report(other, NOON), Timestamp(NOON)).is_ok(), "{other}");
+    }
+    let later = NOON + 11_000_000;
+    assert!(window.admit(&report("a--100", later), Timestamp(later)).is_ok(), "silent parts make room");
+}
+
 /// Reports every 100 ms with 2 ms of transit; the numbered one is stamped `ahead_us` ahead. Returns which of them
 /// are admitted in order.
 fn admitted_around_a_wrong_stamp(wrong: u64, ahead_us: u64) -> Vec<bool> {

@@ -54,6 +54,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             leadership: tokio::sync::watch::channel(leadership.clone()).1,
             election: ActorSlot::default(),
             fuser: fuser.clone(),
+            door: Default::default(),
             clock: CellClock::default(),
             counters: Arc::default(),
             spans: spans(),

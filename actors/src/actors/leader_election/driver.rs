@@ -157,6 +157,7 @@ impl ElectionDriver {
                 self.parts.gateway.send(GatewayMessage::SetBrokers { addresses: links.brokers });
             }
             Effect::PublishStatus { status } => {
+                self.parts.door.publish_status(&status);
                 self.parts.gateway.send(GatewayMessage::PublishStatus { status });
             }
             Effect::SendSnapshot { to } => {

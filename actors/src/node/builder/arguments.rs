@@ -10,7 +10,7 @@ use ecod::leadership::node::{Input, NodeSettings};
 use ecod::model::epoch::Epoch;
 use ecod::perception::landmark::Landmark;
 use ecod::replay::JournalEvent;
-use ecod::wire::{NodeState as NodeCondition, NodeStatus};
+use ecod::wire::{NodeState as NodeCondition, NodeStatus, Topics};
 
 use super::NodeBuilder;
 use crate::actors::dashboard::DashboardArguments;
@@ -21,8 +21,11 @@ use crate::actors::leader_election::{LeaderElectionArguments, Parts, saved_term}
 use crate::actors::membership::MembershipArguments;
 use crate::actors::recorder::RecorderArguments;
 use crate::actors::reputation_keeper::ReputationKeeperArguments;
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::broker::BrokerMessage;
 use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
+use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::ActorSlots;
@@ -34,6 +37,7 @@ use crate::observe::recorder::{LogIdentity, LogItem};
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
+use crate::transport::broker::{Door, DoorSetup};
 use crate::transport::gossip::{EventSink, MembershipConfig};
 use crate::transport::mqtt::{Incoming, Subscriber, SubscriptionRole};
 
@@ -107,10 +111,15 @@ impl NodeBuilder {
         let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
         let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
-        let (report_queue, counters) = (self.report_queue.clone(), self.counters());
+        let (report_queue, counters, door) = (self.report_queue.clone(), self.counters(), self.door.clone());
         Arc::new(move |delivery| {
             let at = delivery.received_at;
             live_state.update(&delivery.message, at);
+            match &delivery.message {
+                Incoming::Report { kind, report } => door.publish_report(*kind, report),
+                Incoming::Status { status, .. } => door.publish_status(status),
+                _ => {}
+            }
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
                     recording.send(at, LogItem::Report(*kind, Arc::clone(report)));
@@ -119,7 +128,7 @@ impl NodeBuilder {
                 // Evidence is for those that lead now or next; others that get it only look at it.
                 Incoming::Report { report, .. }
                     if live_state.wants_reports()
-                        && report.node != name
+                        && report.node.vehicle() != name
                         && leadership.borrow().position == Position::Following =>
                 {
                     true
@@ -179,6 +188,7 @@ impl NodeBuilder {
             leadership: self.leadership(),
             election: self.slots.election.clone(),
             fuser: self.slots.fuser.clone(),
+            door: self.door.clone(),
             clock: self.clock.clone(),
             counters: self.counters(),
             spans: self.spans(),
@@ -224,7 +234,8 @@ impl NodeBuilder {
     }
 
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
-        let ActorSlots { membership, gateway, fuser, keeper, broker, .. } = self.slots.clone();
+        let ActorSlots { membership, gateway, fuser, keeper, .. } = self.slots.clone();
+        let (broker, door) = (self.cell_broker(), self.door.clone());
         LeaderElectionArguments {
             settings: NodeSettings {
                 election: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
@@ -236,7 +247,7 @@ impl NodeBuilder {
             term_file: self.state_file("term"),
             own_broker: self.broker_address(),
             members: self.members(),
-            parts: Parts { membership, gateway, fuser, keeper, broker },
+            parts: Parts { membership, gateway, fuser, keeper, broker, door },
             leadership: self.leadership.clone(),
             clock: self.clock.clone(),
             counters: self.counters(),
@@ -281,8 +292,44 @@ impl NodeBuilder {
             security: self.security.clone(),
             fuser: self.slots.fuser.clone(),
             gateway: self.slots.gateway.clone(),
-            broker: self.slots.broker.clone(),
+            broker: self.cell_broker(),
         }
+    }
+
+    /// The node's broker, if it may carry the cell's data.
+    fn cell_broker(&self) -> ActorSlot<BrokerMessage> {
+        if self.config.serves_nodes() { self.slots.broker.clone() } else { ActorSlot::default() }
+    }
+
+    /// The way of programs beside the node into the cell.
+    pub(super) fn new_door(&self) -> Door {
+        if !self.config.broker.door {
+            return Door::default();
+        }
+        let (leadership, members) = (self.leadership(), self.members());
+        let (gateway, to_watch, live_state) =
+            (self.slots.gateway.clone(), self.slots.gateway.clone(), Arc::clone(&self.live_state));
+        Door::new(DoorSetup {
+            node: self.name.clone(),
+            gateway_id: format!("{}-{}", self.name, self.run.simple()),
+            topics: Topics::new(&self.config.cell),
+            limits: self.config.mqtt.limits(),
+            encoding: self.config.mqtt.encoding,
+            max_report_hz: self.config.mqtt.max_report_hz,
+            serves_nodes: self.config.serves_nodes(),
+            carries_reports: Arc::new(move || {
+                matches!(leadership.borrow().position, Position::Leading | Position::StandingBy)
+            }),
+            is_member: Arc::new(move |name| members.borrow().iter().any(|member| member.name == *name)),
+            report: Arc::new(move |kind, report| {
+                gateway.send(GatewayMessage::PublishReport { kind, report });
+            }),
+            watch_reports: Arc::new(move |wanted| {
+                live_state.set_programs_want_reports(wanted);
+                to_watch.send(GatewayMessage::WatchReports { wanted: live_state.wants_reports() });
+            }),
+            counters: self.counters(),
+        })
     }
 
     fn state_file(&self, what: &str) -> Option<StateFile> {

@@ -17,7 +17,8 @@ use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 #[derive(Debug, Default)]
 pub struct LiveState {
     reports: [AtomicU64; ReportKind::COUNT],
-    wants_reports: AtomicBool,
+    /// Whether browsers want reports, and whether programs do.
+    wants_reports: [AtomicBool; 2],
     latest: Mutex<Latest>,
 }
 
@@ -93,11 +94,16 @@ impl LiveState {
 
     /// Whether this node receives reports only to show them.
     pub fn wants_reports(&self) -> bool {
-        self.wants_reports.load(Relaxed)
+        self.wants_reports.iter().any(|wants| wants.load(Relaxed))
     }
 
     pub(crate) fn set_wants_reports(&self, wanted: bool) {
-        self.wants_reports.store(wanted, Relaxed);
+        self.wants_reports[0].store(wanted, Relaxed);
+    }
+
+    /// Notes whether programs beside the node want reports.
+    pub fn set_programs_want_reports(&self, wanted: bool) {
+        self.wants_reports[1].store(wanted, Relaxed);
     }
 
     /// Latest reports received at or after a time, by vehicle and kind. Drops older ones.

@@ -232,6 +232,7 @@ impl NodeMonitor {
         let wanted = self.viewers() > 0 && self.sources.vitals.leadership.borrow().position == Position::Following;
         if wanted || self.sources.live_state.wants_reports() {
             self.sources.live_state.set_wants_reports(wanted);
+            let wanted = self.sources.live_state.wants_reports();
             self.sources.vitals.gateway.send(GatewayMessage::WatchReports { wanted });
         }
     }

@@ -2,7 +2,7 @@
 
 use tokio::io::{AsyncRead, AsyncReadExt};
 
-use super::frontend::ClientRejection;
+use super::client_rejection::ClientRejection;
 
 /// A CONNECT packet as received.
 #[derive(Debug)]

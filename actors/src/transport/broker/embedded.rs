@@ -17,6 +17,7 @@ use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
+use super::door::{Door, DoorHooks};
 use super::frontend::BrokerFrontend;
 use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
 use super::in_flight::InFlightMeter;
@@ -83,6 +84,9 @@ pub enum BrokerError {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BrokerConfig {
+    /// Whether programs beside the node take part in the cell at its own `listen` address, whoever leads; default true.
+    /// Without, only nodes that may lead have a broker, and it is for nodes. Trade-off: a door costs some megabytes.
+    pub door: bool,
     /// Largest MQTT packet in bytes; default: as `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` need. A client that
     /// sends a larger one is cut off. Trade-off: larger admits other programs' packets, smaller saves memory in attacks.
     pub max_packet_bytes: Option<u32>,
@@ -119,6 +123,7 @@ pub struct BrokerConfig {
 impl Default for BrokerConfig {
     fn default() -> Self {
         Self {
+            door: true,
             max_packet_bytes: None,
             max_clients: 2048,
             max_clients_each: 32,
@@ -165,6 +170,7 @@ impl BrokerConfig {
 pub struct EmbeddedBroker {
     config: BrokerConfig,
     policy: Option<AccessPolicy>,
+    door: Door,
     running: Option<RunningBroker>,
 }
 
@@ -194,12 +200,19 @@ const END_TIMEOUT: Duration = Duration::from_millis(1500);
 impl EmbeddedBroker {
     /// A broker without a frontend, not started: every client may log in.
     pub fn new(config: BrokerConfig) -> Self {
-        Self { config, policy: None, running: None }
+        Self { config, policy: None, door: Door::default(), running: None }
     }
 
     /// A broker behind a frontend with an access policy, not started.
     pub fn protected(config: BrokerConfig, policy: AccessPolicy) -> Self {
-        Self { config, policy: Some(policy), running: None }
+        Self { config, policy: Some(policy), door: Door::default(), running: None }
+    }
+
+    /// The same with a door for the node's programs.
+    #[must_use]
+    pub fn with_door(mut self, door: Door) -> Self {
+        self.door = door;
+        self
     }
 }
 
@@ -213,11 +226,12 @@ impl MqttBroker for EmbeddedBroker {
         let (ready, started) = mpsc::channel();
         let (ending, ended) = mpsc::channel();
         let heartbeat = ThreadHeartbeat::default();
-        let (config, policy, beats) = (self.config.clone(), self.policy.clone(), heartbeat.beats());
+        let (config, policy, door) = (self.config.clone(), self.policy.clone(), self.door.clone());
+        let beats = heartbeat.beats();
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
             .spawn(move || {
-                serve(address, &config, policy, &beats, &ready, stopped);
+                serve(address, &config, (policy, door), &beats, &ready, stopped);
                 drop::<mpsc::Sender<()>>(ending);
             })
             .map_err(thread_error)?;
@@ -270,7 +284,7 @@ impl Drop for EmbeddedBroker {
 fn serve(
     address: SocketAddr,
     config: &BrokerConfig,
-    policy: Option<AccessPolicy>,
+    (policy, door): (Option<AccessPolicy>, Door),
     beats: &AtomicU64,
     ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>,
     stopped: oneshot::Receiver<()>,
@@ -283,7 +297,7 @@ fn serve(
         }
     };
     runtime.block_on(async {
-        let (server, frontend, bound) = match prepare(address, config, policy).await {
+        let (server, frontend, bound, context) = match prepare(address, config, policy, door.clone()).await {
             Ok(prepared) => prepared,
             Err(error) => {
                 let reason = error.root_cause().to_string();
@@ -307,6 +321,7 @@ fn serve(
         tokio::select! {
             () = beating => {}
             ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
+            () = door.run(context) => {}
             () = admitting => tracing::error!("frontend ended by itself"),
             _ = stopped => {}
         }
@@ -319,7 +334,8 @@ async fn prepare(
     address: SocketAddr,
     config: &BrokerConfig,
     policy: Option<AccessPolicy>,
-) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr)> {
+    door: Door,
+) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr, ServerContext)> {
     let listener = Builder::new()
         .name("ecod")
         // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
@@ -350,7 +366,8 @@ async fn prepare(
             let principals = frontend.principals();
             SubscriptionQuota::new(principals.clone(), Arc::clone(&policy.counters)).install(&context).await;
             InFlightMeter { in_flight: frontend.in_flight(), principals: principals.clone() }.install(&context).await;
-            Permissions { principals, policy: policy.clone() }.install(&context).await;
+            DoorHooks { principals: principals.clone(), door: door.clone() }.install(&context).await;
+            Permissions { principals, policy: policy.clone(), door }.install(&context).await;
             (Some(frontend), bound)
         }
         None => (None, own),
@@ -358,5 +375,6 @@ async fn prepare(
     let principals = frontend.as_ref().map(BrokerFrontend::principals).unwrap_or_default();
     let counters = policy.map(|policy| policy.counters).unwrap_or_default();
     PublishThrottle::new(config.max_messages_hz, principals, counters).install(&context).await;
-    Ok((MqttServer::new(context).listener_by_id(listener, 1).build(), frontend, bound))
+    let server = MqttServer::new(context.clone()).listener_by_id(listener, 1).build();
+    Ok((server, frontend, bound, context))
 }

@@ -8,7 +8,6 @@
 //! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore listens on a free
 //! loopback port, and accepts only connections that the frontend has registered.
 
-use std::io;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::pin::Pin;
 use std::sync::Arc;
@@ -24,6 +23,7 @@ use tokio_rustls::TlsAcceptor;
 
 use super::backlog::Backlog;
 use super::byte_throttle::ByteThrottle;
+use super::client_rejection::ClientRejection;
 use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
 use super::in_flight::InFlight;
 use super::permissions::AccessPolicy;
@@ -154,46 +154,6 @@ impl BrokerFrontend {
         if checked.elapsed() >= RECHECK_INTERVAL || !Arc::ptr_eq(&current, &sender.borrow()) {
             *checked = Instant::now();
             sender.send_replace(current);
-        }
-    }
-}
-
-/// Reason for which a client was refused or cut off.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum ClientRejection {
-    #[error("left without a word, as nodes do that only test the port")]
-    Left,
-    #[error("no login in time")]
-    TimedOut,
-    #[error("no login before many newer connections of its address")]
-    Evicted,
-    #[error("not trusted: {0}")]
-    Untrusted(String),
-    #[error("not an MQTT login")]
-    Malformed,
-    #[error("as many clients as allowed are connected")]
-    Full,
-    #[error("as many clients as allowed are connected of this certificate or address")]
-    Crowded,
-    #[error("does not read what it gets, or does not end what it begins")]
-    Stalled,
-    #[error("connection lost: {0}")]
-    Lost(#[from] io::Error),
-    #[error("certificate no longer valid: {0}")]
-    CertificateInvalidated(rustls::Error),
-}
-
-impl ClientRejection {
-    fn event(&self) -> Option<Event> {
-        match self {
-            Self::Left => None,
-            Self::TimedOut => Some(Event::ClientTimedOut),
-            Self::Evicted => Some(Event::ClientThrottled),
-            Self::Untrusted(_) => Some(Event::ClientUntrusted),
-            Self::Malformed | Self::Lost(_) => Some(Event::ClientMalformed),
-            Self::Full | Self::Crowded => Some(Event::ClientsFull),
-            Self::Stalled => Some(Event::ClientStalled),
-            Self::CertificateInvalidated(_) => Some(Event::ClientExpelled),
         }
     }
 }

@@ -85,10 +85,10 @@ pub(super) struct InFlightMeter {
 }
 
 impl InFlightMeter {
-    /// Registers the hook for every message.
+    /// Registers the hook for every message, before the door's.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
-        register.add(Type::MessagePublish, Box::new(self)).await;
+        register.add_priority(Type::MessagePublish, 1, Box::new(self)).await;
         register.start().await;
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! | topic | may publish |
 //! |---|---|
-//! | `detections/N`, `vote_detections/N` | the certificate of `N` |
+//! | `detections/N`, `detections/N--…`, `vote_detections/N`, `vote_detections/N--…` | the certificate of `N` |
 //! | `ledger/N` | the same, if `N` may lead |
 //! | `nodes/N`, `nodes/N--…` | the certificate of `N`, which its observers share |
 //! | `global_detections`, `global_verdicts`, `reputations` | the leader; without a leader, nodes that may lead |
@@ -11,26 +11,23 @@
 //! Only statuses and reputations may be retained: other messages are worthless when late. Everyone with a certificate
 //! of the cell may read everything. Topics and filters are bounded in length and in levels.
 
-use std::net::SocketAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use ecod::model::names::NodeName;
 use ecod::wire::{Limits, Topic, Topics};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
+use rmqtt::session::Session;
 use rmqtt::types::{
     AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, QoS, SubscribeAclResult, TopicFilter,
 };
 
-use super::principal::{Principal, PrincipalRegistry};
+use super::door::{Door, Place, Refusal};
+use super::principal::{LeaderCheck, Principal, PrincipalRegistry, is_run};
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::ENVELOPE_BYTES;
 use crate::transport::pki::{CertificateSubject, Credentials};
-
-/// Decides whether a node may publish maps, verdicts and reputations.
-pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 
 /// Rules of access to an embedded broker.
 #[derive(Clone)]
@@ -52,6 +49,7 @@ pub struct AccessPolicy {
 pub(super) struct Permissions {
     pub(super) principals: PrincipalRegistry,
     pub(super) policy: AccessPolicy,
+    pub(super) door: Door,
 }
 
 impl Permissions {
@@ -74,7 +72,10 @@ impl Permissions {
                 LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
                 LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
             };
-            self.allows(&principal, topic, retain, bytes)
+            match self.door.is_program(&principal, info.client_id()) {
+                true => self.is_within_limits(topic, retain, bytes) && self.door.allows_will(&principal, topic),
+                false => self.allows(&principal, topic, retain, bytes),
+            }
         };
         let is_own = |identity: &Arc<CertificateSubject>| {
             principal.has_generated_id || may_use_client_id(identity, info.client_id())
@@ -82,27 +83,59 @@ impl Permissions {
         principal.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
     }
 
-    fn allows_publish(&self, address: Option<SocketAddr>, publish: &Publish) -> bool {
-        let allows =
-            |principal: Principal| self.allows(&principal, &publish.topic, publish.retain, publish.payload.len());
-        self.principals.principal(address).is_some_and(allows)
+    /// Takes a message, or says why not.
+    fn check_publish(&self, session: &Session, publish: &Publish) -> Result<(), Refusal> {
+        let (place, topic) = Place::of(&publish.topic);
+        let refused = || Refusal::not_permitted(format!("no permission to publish {topic} here"));
+        let principal = self.principals.principal(session.id.remote_addr).ok_or_else(refused)?;
+        let (retain, bytes) = (publish.retain, publish.payload.len());
+        if self.door.is_program(&principal, &session.id.client_id) {
+            if !self.is_within_limits(topic, retain, bytes) {
+                let text = format!("{topic} is too long, may not be retained, or {bytes} bytes are too many for it");
+                return Err(Refusal::not_permitted(text));
+            }
+            return self.door.take(&principal, (place, topic), &publish.payload);
+        }
+        let is_allowed = place == Place::Cell && self.allows(&principal, topic, retain, bytes);
+        is_allowed.then_some(()).ok_or_else(refused)
     }
 
     /// Whether a principal may publish on a topic. Without certificates every topic is allowed, within its limits of size
     /// and retention.
     fn allows(&self, principal: &Principal, topic: &str, retain: bool, bytes: usize) -> bool {
+        let may_publish = |identity: &Arc<CertificateSubject>| {
+            let topic = self.policy.topics.parse(topic);
+            topic.is_some_and(|topic| may_publish(identity, &topic, &self.policy.elected))
+        };
+        self.is_within_limits(topic, retain, bytes) && principal.identity.as_ref().is_none_or(may_publish)
+    }
+
+    /// Whether a message is within its topic's limits of size and retention.
+    fn is_within_limits(&self, topic: &str, retain: bool, bytes: usize) -> bool {
         if !is_topic_bounded(topic) {
             return false;
         }
         let topic = self.policy.topics.parse(topic);
         let limits = &self.policy.limits;
         let limit = topic.as_ref().map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
-        bytes <= limit + ENVELOPE_BYTES
-            && (!retain || topic.as_ref().is_some_and(is_state))
-            && principal
-                .identity
-                .as_ref()
-                .is_none_or(|identity| topic.is_some_and(|topic| may_publish(identity, &topic, &self.policy.elected)))
+        bytes <= limit + ENVELOPE_BYTES && (!retain || topic.as_ref().is_some_and(is_state))
+    }
+
+    fn note_refusal(&self, session: &Session, publish: &Publish, refusal: &Refusal) {
+        let (client, topic) = (&session.id.client_id, Place::of(&publish.topic).1);
+        let principal = self.principals.principal(session.id.remote_addr);
+        if principal.is_some_and(|principal| self.door.is_program(&principal, client)) {
+            self.door.note_refusal(client, topic, refusal);
+        } else {
+            self.policy.counters.count(Event::ClientDenied);
+            tracing::debug!(%client, topic, "message refused");
+        }
+    }
+
+    /// The filter as it is inside the broker.
+    fn inner_filter(&self, session: &Session, filter: &TopicFilter) -> Option<TopicFilter> {
+        let principal = self.principals.principal(session.id.remote_addr)?;
+        self.door.is_program(&principal, &session.id.client_id).then(|| Place::Door.topic(filter).into())
     }
 }
 
@@ -132,12 +165,12 @@ impl Handler for Permissions {
                 AuthResult::NotAuthorized
             }),
             Parameter::MessagePublishCheckAcl(session, publish) => {
-                HookResult::PublishAclResult(if self.allows_publish(session.id.remote_addr, publish) {
-                    PublishAclResult::allow()
-                } else {
-                    self.policy.counters.count(Event::ClientDenied);
-                    tracing::debug!(client = %session.id.client_id, topic = %publish.topic, "message refused");
-                    PublishAclResult::rejected(false, None)
+                HookResult::PublishAclResult(match self.check_publish(session, publish) {
+                    Ok(()) => PublishAclResult::allow(),
+                    Err(refusal) => {
+                        self.note_refusal(session, publish, &refusal);
+                        refusal.answer()
+                    }
                 })
             }
             Parameter::ClientSubscribeCheckAcl(_, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
@@ -152,6 +185,9 @@ impl Handler for Permissions {
             Parameter::ClientUnsubscribe(_, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
                 self.policy.counters.count(Event::ClientDenied);
                 HookResult::TopicFilter(Some(TopicFilter::default()))
+            }
+            Parameter::ClientUnsubscribe(session, unsubscribe) => {
+                HookResult::TopicFilter(self.inner_filter(session, &unsubscribe.topic_filter))
             }
             _ => return (true, None),
         };
@@ -175,7 +211,7 @@ fn is_state(topic: &Topic) -> bool {
 
 fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderCheck) -> bool {
     match topic {
-        Topic::Detections(node) | Topic::VoteDetections(node) => identity.name() == node,
+        Topic::Detections(node) | Topic::VoteDetections(node) => identity.may_act_as(node.as_str()),
         Topic::Ledger(node) => identity.may_serve() && identity.name() == node,
         Topic::Nodes(node) => identity.may_act_as(node.as_str()),
         Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => {
@@ -187,7 +223,6 @@ fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderChe
 /// Whether a client id is the name and run of this node or of its observer. A connection ends an earlier one with the
 /// same client id, so that foreign ids are refused.
 fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
-    let is_run = |text: &str| text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit());
     client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.may_act_as(name))
 }
 
@@ -195,6 +230,7 @@ fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
 mod tests {
     use std::time::Duration;
 
+    use ecod::model::names::NodeName;
     use ecod::wire::Role;
 
     use super::*;
@@ -225,7 +261,7 @@ mod tests {
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::default(),
         };
-        Permissions { principals: PrincipalRegistry::default(), policy }
+        Permissions { principals: PrincipalRegistry::default(), policy, door: Door::default() }
     }
 
     #[test]
@@ -235,14 +271,18 @@ mod tests {
             permissions.allows(&with(identity), &format!("ecod/v1/lot/{topic}"), false, 0)
         };
         let (edge, euclid) = (identity("edge", Role::Edge), identity("euclid", Role::Auto));
-        for topic in
-            ["detections/euclid", "vote_detections/euclid", "ledger/euclid", "nodes/euclid", "nodes/euclid--top"]
-        {
+        for topic in [
+            "detections/euclid",
+            "vote_detections/euclid",
+            "detections/euclid--lidar",
+            "vote_detections/euclid--lidar",
+            "ledger/euclid",
+            "nodes/euclid",
+            "nodes/euclid--top",
+        ] {
             assert!(allows(&euclid, topic) && !allows(&edge, topic), "{topic}");
         }
-        for topic in ["detections/euclid--2", "vote_detections/euclid--2", "ledger/euclid--2"] {
-            assert!(!allows(&euclid, topic), "one certificate is one vehicle: {topic}");
-        }
+        assert!(!allows(&euclid, "ledger/euclid--2"), "parts see, and lead nothing");
         let vehicle = identity("euclid", Role::Cav);
         assert!(
             allows(&vehicle, "vote_detections/euclid") && !allows(&vehicle, "ledger/euclid"),

@@ -4,12 +4,15 @@ use std::collections::{HashMap, HashSet};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
+use ecod::model::names::NodeName;
 use rmqtt::types::{ClientId, TopicFilter};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-use super::permissions::LeaderCheck;
 use crate::platform::throttle::host_network;
 use crate::transport::pki::CertificateSubject;
+
+/// Decides whether a node may publish maps, verdicts and reputations.
+pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 
 /// Authenticated party of a connection: a node by its certificate, or else a host by its address.
 #[derive(Debug, Clone)]
@@ -53,6 +56,11 @@ impl Principal {
             None => self.quota_key.is_none(),
         }
     }
+}
+
+/// Whether the end of a client id is that of a node's run.
+pub(super) fn is_run(text: &str) -> bool {
+    text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
 /// Source of local clients without certificates.

@@ -3,9 +3,10 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use async_trait::async_trait;
+use rmqtt::codec::v5::PublishAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
-use rmqtt::types::PublishAclResult;
+use rmqtt::types::{PublishAclResult, PublishResult};
 
 use super::principal::{PrincipalRegistry, QuotaKey};
 use crate::platform::clock;
@@ -41,6 +42,8 @@ impl Handler for PublishThrottle {
             return (true, before);
         }
         self.counters.shed(ShedReason::BrokerThrottled, source.as_str());
-        (false, Some(HookResult::PublishAclResult(PublishAclResult::rejected(false, None))))
+        let text = Some("more than broker.max_messages_hz messages a second".into());
+        let refused = PublishResult::reason_code(PublishAckReason::QuotaExceeded, text, false);
+        (false, Some(HookResult::PublishAclResult(PublishAclResult(refused))))
     }
 }

@@ -11,12 +11,11 @@ use tokio::time::{sleep, timeout};
 
 use super::backlog::{Backlog, BacklogSlot};
 use super::byte_throttle::ByteThrottle;
-use super::frontend::ClientRejection;
+use super::client_rejection::ClientRejection;
 use super::in_flight::InFlight;
 use super::outbound_queue::OutboundQueue;
 use super::packet_scanner::{PacketScanner, Piece};
-use super::permissions::LeaderCheck;
-use super::principal::Principal;
+use super::principal::{LeaderCheck, Principal};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, ShedReason};
 

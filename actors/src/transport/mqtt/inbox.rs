@@ -269,11 +269,13 @@ impl Inbox {
         payload: &[u8],
         received_at: Timestamp,
     ) -> Result<PacketOutcome, RejectReason> {
-        if *node == self.node {
+        // Parts share the rate of their vehicle.
+        let vehicle = node.vehicle();
+        if vehicle == self.node {
             return Ok(self.echo());
         }
         let throttle = &self.report_throttles[kind as usize];
-        if self.is_shed(throttle, ShedReason::ReportThrottled, node, received_at) {
+        if self.is_shed(throttle, ShedReason::ReportThrottled, &vehicle, received_at) {
             return Ok(PacketOutcome::Done);
         }
         let report = Arc::new(decode_report(payload, node, &self.limits)?);

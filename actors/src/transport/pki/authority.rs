@@ -15,7 +15,7 @@ use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 
 use super::subject::rights_uri;
-use super::{BROKER_NAME, OBSERVER_MARK};
+use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
 use crate::platform::state_file::replace_file;
 
 /// Days for which a node's certificate is valid unless told otherwise.
@@ -157,14 +157,13 @@ impl Authority {
         parameters.distinguished_name.push(DnType::CommonName, node.as_str());
         parameters.use_authority_key_identifier_extension = true;
         parameters.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
+        parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
         let rights = Some(rights.into()).filter(|rights: &Rights| rights.may_lead()).unwrap_or(Rights::NONE);
         parameters.subject_alt_names.push(rcgen::SanType::URI(rights_uri(rights).try_into()?));
         if rights.may_lead() {
-            parameters.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
-            let name = BROKER_NAME.try_into()?;
-            parameters.subject_alt_names.push(rcgen::SanType::DnsName(name));
+            parameters.subject_alt_names.push(rcgen::SanType::DnsName(BROKER_NAME.try_into()?));
         }
+        parameters.subject_alt_names.push(rcgen::SanType::DnsName(DOOR_NAME.try_into()?));
         set_validity(&mut parameters, now, valid);
         let serial = draw_serial()?;
         parameters.serial_number = Some(serial.clone());

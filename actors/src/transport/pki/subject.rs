@@ -95,8 +95,8 @@ impl CertificateSubject {
         self.expires
     }
 
-    /// Whether the node may have a client of this name: its own, or that of an observer which shares its certificate. An
-    /// observer publishes nothing but a status, so that one certificate is one vehicle.
+    /// Whether the node may have a client of this name: its own, or that of a part or an observer which shares its
+    /// certificate. What parts see counts as their node's, so that one certificate is one vehicle.
     pub fn may_act_as(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
     }

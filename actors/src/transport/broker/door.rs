@@ -1,0 +1,233 @@
+//! The door of a node: programs beside it take part in the cell at its broker, whoever leads.
+//!
+//! ```text
+//! Follower, Gateway ── what the node accepted ──> Door ──> `$door/` + topic ──> programs
+//! program ── SUBSCRIBE a filter ────────────────> `$door/` + filter
+//! program ── report in the node's name ─────────> checked ──> Gateway ──> leader, standby, this node
+//! ```
+//!
+//! The brokers of leader and standby also carry the raw messages of all nodes. Programs have topics of their own there:
+//! the broker puts `$door/` before their filters and takes it off what it delivers. Wildcards of others do not match it.
+
+mod programs;
+mod recent_reports;
+mod refusals;
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use bytes::Bytes;
+use ecod::model::names::NodeName;
+use ecod::wire::{Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind, Reputations, Topic, Topics, encode};
+use rmqtt::context::ServerContext;
+use rmqtt::session::SessionState;
+use rmqtt::types::{ClientId, CodecPublish, From, Id, QoS, TopicFilter};
+use tokio::sync::mpsc;
+
+use self::recent_reports::RecentReports;
+use self::refusals::Refusals;
+use crate::platform::clock;
+use crate::platform::throttle::TokenBucket;
+use crate::telemetry::counters::{Counters, Event};
+
+pub(super) use self::programs::{DoorHooks, Place};
+pub(super) use self::refusals::Refusal;
+
+/// What a door needs to know of its node.
+pub struct DoorSetup {
+    /// The node.
+    pub node: NodeName,
+    /// Client id of the node's own gateway.
+    pub gateway_id: String,
+    /// The cell's topics.
+    pub topics: Topics,
+    /// Limits of what the node accepts.
+    pub limits: Limits,
+    /// Encoding of what programs get.
+    pub encoding: Encoding,
+    /// Reports of a vehicle and kind that the cell takes per second. Half of them are for programs.
+    pub max_report_hz: u32,
+    /// Whether other nodes have links to this broker.
+    pub serves_nodes: bool,
+    /// Whether this broker carries the cell's reports now.
+    pub carries_reports: Arc<dyn Fn() -> bool + Send + Sync>,
+    /// Whether another node has this name.
+    pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
+    /// Takes a program's report for the cell.
+    pub report: Arc<dyn Fn(ReportKind, Arc<ObjectReport>) + Send + Sync>,
+    /// Has the node receive the reports of all vehicles, or ends that.
+    pub watch_reports: Arc<dyn Fn(bool) + Send + Sync>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// The door of a node; by default there is none, and everything given to it is dropped.
+#[derive(Clone, Default)]
+pub struct Door(Option<Arc<DoorState>>);
+
+struct DoorState {
+    setup: DoorSetup,
+    /// To the broker's present run.
+    queue: Mutex<Option<mpsc::Sender<Publication>>>,
+    /// Last message of each topic that is retained, for the broker's next run.
+    retained: Mutex<BTreeMap<String, Bytes>>,
+    /// Filters of programs, and whether they match reports.
+    filters: Mutex<BTreeMap<(ClientId, TopicFilter), bool>>,
+    has_readers: AtomicBool,
+    wants_reports: AtomicBool,
+    watches_reports: AtomicBool,
+    recent_reports: Mutex<RecentReports>,
+    throttles: [Mutex<TokenBucket>; ReportKind::COUNT],
+    refusals: Mutex<Refusals>,
+}
+
+/// A message for programs.
+struct Publication {
+    topic: String,
+    payload: Bytes,
+    retain: bool,
+}
+
+/// Messages that wait for the broker's thread; more are dropped and counted.
+const MAX_WAITING: usize = 256;
+
+/// Topics whose last message is retained: as many nodes as a cell can have, and some.
+const MAX_RETAINED: usize = 8192;
+
+impl Door {
+    /// The door of a node, for one broker.
+    pub fn new(setup: DoorSetup) -> Self {
+        let per_second = (setup.max_report_hz / 2).max(1);
+        let interval = std::time::Duration::from_secs(1) / per_second;
+        let now = clock::now();
+        Self(Some(Arc::new(DoorState {
+            throttles: std::array::from_fn(|_| Mutex::new(TokenBucket::new(per_second, interval, now))),
+            setup,
+            queue: Mutex::default(),
+            retained: Mutex::default(),
+            filters: Mutex::default(),
+            has_readers: AtomicBool::new(false),
+            wants_reports: AtomicBool::new(false),
+            watches_reports: AtomicBool::new(false),
+            recent_reports: Mutex::default(),
+            refusals: Mutex::default(),
+        })))
+    }
+
+    /// Passes on a map or verdicts that the node accepted.
+    pub fn publish_round<T: Payload>(&self, topic: &Topic, round: &T) {
+        let Some(door) = &self.0 else { return };
+        if door.has_readers.load(Ordering::Relaxed) {
+            door.send(door.publication(topic, round, false));
+        }
+    }
+
+    /// Passes on reputations that the node accepted; the last are retained.
+    pub fn publish_reputations(&self, reputations: &Reputations) {
+        self.publish_state(&Topic::Reputations, reputations);
+    }
+
+    /// Passes on the status of a node; the last of each is retained.
+    pub fn publish_status(&self, status: &NodeStatus) {
+        self.publish_state(&Topic::Nodes(status.node.clone()), status);
+    }
+
+    /// Passes on a vehicle's report. Each passes once, although it may come over two links.
+    pub fn publish_report(&self, kind: ReportKind, report: &ObjectReport) {
+        let Some(door) = self.0.as_ref().filter(|door| door.wants_reports.load(Ordering::Relaxed)) else { return };
+        if lock(&door.recent_reports).is_new(kind, report) {
+            door.send(door.publication(&kind.topic(report.node.clone()), report, false));
+        }
+    }
+
+    /// Has a node that only follows receive reports while a program reads them. Called again and again: the gateway may
+    /// have been started anew.
+    pub fn request_reports(&self, follows: bool) {
+        let Some(door) = &self.0 else { return };
+        let wanted = follows && door.wants_reports.load(Ordering::Relaxed);
+        if door.watches_reports.swap(wanted, Ordering::Relaxed) || wanted {
+            (door.setup.watch_reports)(wanted);
+        }
+    }
+
+    fn publish_state<T: Payload>(&self, topic: &Topic, state: &T) {
+        if let Some(door) = &self.0 {
+            door.retain(door.publication(topic, state, true));
+        }
+    }
+
+    /// Publishes at the broker's present run, on the broker's thread; never ends.
+    pub(super) async fn run(self, context: ServerContext) {
+        let Some(door) = self.0 else { return std::future::pending().await };
+        let (sender, mut queue) = mpsc::channel(MAX_WAITING);
+        *lock(&door.queue) = Some(sender);
+        let before: Vec<_> = lock(&door.retained).clone().into_iter().collect();
+        let from = From::from_system(Id::new(context.node.id(), 0, None, None, "door".into(), None));
+        let publish = async |Publication { topic, payload, retain }| {
+            let topic = Place::Door.topic(&topic).into();
+            let (qos, properties) = (QoS::AtMostOnce, None);
+            let packet = CodecPublish { dup: false, retain, qos, topic, packet_id: None, payload, properties };
+            if let Err(error) = SessionState::forwards(&context, from.clone(), packet.into(), false, None).await {
+                tracing::debug!(%error, "not published at the door");
+            }
+        };
+        for (topic, payload) in before {
+            publish(Publication { topic, payload, retain: true }).await;
+        }
+        while let Some(publication) = queue.recv().await {
+            publish(publication).await;
+        }
+        std::future::pending::<()>().await;
+    }
+}
+
+impl fmt::Debug for Door {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Door").field(&self.0.as_ref().map(|door| &door.setup.node)).finish()
+    }
+}
+
+impl DoorState {
+    fn publication<T: Payload>(&self, topic: &Topic, payload: &T, retain: bool) -> Publication {
+        let payload = encode(payload, self.setup.encoding).into();
+        Publication { topic: self.setup.topics.path(topic), payload, retain }
+    }
+
+    /// Publishes a state that differs from the last one.
+    fn retain(&self, publication: Publication) {
+        let mut retained = lock(&self.retained);
+        let is_known = retained.contains_key(&publication.topic);
+        if retained.get(&publication.topic) == Some(&publication.payload)
+            || (!is_known && retained.len() >= MAX_RETAINED)
+        {
+            return;
+        }
+        retained.insert(publication.topic.clone(), publication.payload.clone());
+        drop(retained);
+        self.send(publication);
+    }
+
+    fn send(&self, publication: Publication) {
+        let queue = lock(&self.queue);
+        if queue.as_ref().is_some_and(|queue| queue.try_send(publication).is_err()) {
+            self.setup.counters.count(Event::PublishRefused);
+        }
+    }
+
+    /// Notes the filters of programs: what nobody reads is not even encoded.
+    fn change_filters(&self, change: impl FnOnce(&mut BTreeMap<(ClientId, TopicFilter), bool>)) {
+        let mut filters = lock(&self.filters);
+        change(&mut filters);
+        self.has_readers.store(!filters.is_empty(), Ordering::Relaxed);
+        let wants_reports = filters.values().any(|of_reports| *of_reports);
+        if self.wants_reports.swap(wants_reports, Ordering::Relaxed) && !wants_reports {
+            *lock(&self.recent_reports) = RecentReports::default();
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

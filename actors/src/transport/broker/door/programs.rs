@@ -1,0 +1,302 @@
+//! What programs may do at their node's door, as hooks of rmqtt.
+//!
+//! | topic | a program of the node `euclid` |
+//! |---|---|
+//! | `detections/euclid`, `detections/euclid--…`, `vote_detections/…` | is taken for the cell |
+//! | `nodes/euclid--…` | reaches the programs at this door |
+//! | other topics of the cell | is refused |
+//! | anything else | without certificates reaches the programs at this door |
+//!
+//! Without certificates, the broker of the leader and of its standby also takes reports of vehicles that have no node.
+
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use bytes::Bytes;
+use ecod::model::names::NodeName;
+use ecod::wire::{RejectReason, ReportKind, Topic, decode_report};
+use rmqtt::context::ServerContext;
+use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
+use rmqtt::session::Session;
+
+use super::refusals::RefusalReason;
+use super::{Door, DoorState, Publication, Refusal, lock};
+use crate::platform::clock;
+use crate::telemetry::counters::{Event, ShedReason};
+use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
+
+/// Where a message is inside the broker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::transport::broker) enum Place {
+    /// Among nodes, and vehicles without a node.
+    Cell,
+    /// Among programs.
+    Door,
+    /// On its way from a program to the node; nobody subscribes there.
+    Inbound,
+}
+
+/// Prefixes of places. Filters with a leading wildcard do not match them.
+const DOOR: &str = "$door/";
+const INBOUND: &str = "$inbound/";
+
+impl Place {
+    /// The topic or filter inside the broker.
+    pub(in crate::transport::broker) fn topic(self, topic: &str) -> String {
+        let prefix = match self {
+            Self::Cell => "",
+            Self::Door => DOOR,
+            Self::Inbound => INBOUND,
+        };
+        format!("{prefix}{topic}")
+    }
+
+    /// The place of a topic inside the broker, and the topic that clients see.
+    pub(in crate::transport::broker) fn of(topic: &str) -> (Self, &str) {
+        match (topic.strip_prefix(DOOR), topic.strip_prefix(INBOUND)) {
+            (Some(topic), _) => (Self::Door, topic),
+            (_, Some(topic)) => (Self::Inbound, topic),
+            _ => (Self::Cell, topic),
+        }
+    }
+}
+
+impl Door {
+    /// Whether a client is a program beside the node, and not a node's link.
+    pub(in crate::transport::broker) fn is_program(&self, principal: &Principal, client_id: &str) -> bool {
+        let Some(DoorState { setup, .. }) = self.0.as_deref() else { return false };
+        if client_id == setup.gateway_id {
+            return false;
+        }
+        if !setup.serves_nodes {
+            return true;
+        }
+        let named = client_id.rsplit_once('-').filter(|(_, run)| is_run(run));
+        let named = named.and_then(|(name, _)| NodeName::new(name).ok());
+        let is_own = |name: &NodeName| name.vehicle() == setup.node && !(setup.is_member)(name);
+        match &principal.identity {
+            Some(identity) if identity.name() != &setup.node => false,
+            _ => named.is_none_or(|name| is_own(&name)),
+        }
+    }
+
+    /// Whether a program may leave a last will on this topic.
+    pub(in crate::transport::broker) fn allows_will(&self, principal: &Principal, topic: &str) -> bool {
+        self.0.as_deref().is_some_and(|door| door.may_say(principal, topic).is_ok())
+    }
+
+    /// Takes a program's message.
+    pub(in crate::transport::broker) fn take(
+        &self,
+        principal: &Principal,
+        (place, topic): (Place, &str),
+        payload: &Bytes,
+    ) -> Result<(), Refusal> {
+        let Some(door) = self.0.as_deref() else { return Ok(()) };
+        match place {
+            Place::Cell => Ok(()),
+            Place::Door => door.may_say(principal, topic),
+            Place::Inbound => door.take_report(principal, topic, payload),
+        }
+    }
+
+    /// Counts and shows a refusal.
+    pub(in crate::transport::broker) fn note_refusal(&self, client_id: &str, topic: &str, refusal: &Refusal) {
+        let Some(door) = self.0.as_deref() else { return };
+        let setup = &door.setup;
+        // A client that connects anew stays the same.
+        let named = client_id.rsplit_once('-').filter(|(_, run)| is_run(run));
+        let client = named.map_or(client_id, |(name, _)| name);
+        match refusal.reason {
+            RefusalReason::Throttled => setup.counters.shed(ShedReason::ReportThrottled, client),
+            RefusalReason::Rejected(reason) => setup.counters.reject(reason, client),
+        }
+        if refusal.reason == RefusalReason::Rejected(RejectReason::NotPermitted) {
+            setup.counters.count(Event::ClientDenied);
+        }
+        tracing::debug!(client, topic, text = refusal.text, "program's message refused");
+        let status = lock(&door.refusals).note(&setup.node, (client, topic), refusal, clock::now());
+        if let Some(status) = status {
+            let topic = format!("{}/clients", setup.topics.path(&Topic::Nodes(setup.node.clone())));
+            door.retain(Publication { topic, payload: status.into(), retain: true });
+        }
+    }
+
+    /// The place for what a program publishes.
+    fn place_of(&self, principal: &Principal, topic: &str) -> Place {
+        let Some(door) = self.0.as_deref() else { return Place::Cell };
+        match door.setup.topics.parse(topic) {
+            Some(Topic::Detections(name) | Topic::VoteDetections(name)) if door.is_nodeless(principal, &name) => {
+                Place::Cell
+            }
+            Some(Topic::Detections(_) | Topic::VoteDetections(_)) => Place::Inbound,
+            _ => Place::Door,
+        }
+    }
+}
+
+impl DoorState {
+    /// Whether a name is that of a vehicle without a node whose reports this broker brings to the cell.
+    fn is_nodeless(&self, principal: &Principal, name: &NodeName) -> bool {
+        let (setup, vehicle) = (&self.setup, name.vehicle());
+        principal.identity.is_none()
+            && vehicle != setup.node
+            && setup.serves_nodes
+            && (setup.carries_reports)()
+            && !(setup.is_member)(&vehicle)
+    }
+
+    fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), Refusal> {
+        let node = &self.setup.node;
+        match self.setup.topics.parse(topic) {
+            Some(Topic::Nodes(name)) if name.vehicle() == *node && name != *node => Ok(()),
+            None if principal.identity.is_none() => Ok(()),
+            _ => Err(Refusal::not_permitted(format!(
+                "programs do not publish {topic}; reports go to detections/{node}--<part> and vote_detections/{node}--<part>"
+            ))),
+        }
+    }
+
+    fn take_report(&self, principal: &Principal, topic: &str, payload: &Bytes) -> Result<(), Refusal> {
+        let setup = &self.setup;
+        let (kind, name) = match setup.topics.parse(topic) {
+            Some(Topic::Detections(name)) => (ReportKind::Detections, name),
+            Some(Topic::VoteDetections(name)) => (ReportKind::VoteDetections, name),
+            _ => return Err(Refusal::not_permitted(format!("{topic} is no topic for reports"))),
+        };
+        let node = &setup.node;
+        let is_own = principal.identity.as_ref().is_none_or(|identity| identity.name() == node);
+        if name.vehicle() != *node || !is_own || (name != *node && (setup.is_member)(&name)) {
+            return Err(Refusal::not_permitted(format!(
+                "this is the door of {node}: its programs report as {node} or {node}--<part>, not as {name}"
+            )));
+        }
+        let now = clock::now();
+        let throttle = self.throttles.get(kind as usize);
+        if throttle.is_some_and(|throttle| !lock(throttle).allow(now)) {
+            return Err(Refusal {
+                reason: RefusalReason::Throttled,
+                text: format!(
+                    "the programs of {node} report more than {} times a second, half of mqtt.max_report_hz",
+                    setup.max_report_hz / 2
+                ),
+            });
+        }
+        let report = decode_report(payload, &name, &setup.limits).map_err(|reason| Refusal {
+            reason: RefusalReason::Rejected(reason),
+            text: format!("the report on {topic} is not usable: {reason}; see docs/protocol.md#rejections"),
+        })?;
+        (setup.report)(kind, Arc::new(report));
+        Ok(())
+    }
+
+    /// Whether a filter of a program matches reports.
+    fn is_of_reports(&self, filter: &str) -> bool {
+        let (_, filter) = Place::of(filter);
+        let node = &self.setup.node;
+        ReportKind::ALL.into_iter().any(|kind| {
+            let topic = self.setup.topics.path(&kind.topic(node.clone()));
+            let mut levels = filter.split('/');
+            let last = topic.split('/').count();
+            for (index, level) in topic.split('/').enumerate() {
+                match levels.next() {
+                    Some("#") => return true,
+                    Some("+") => {}
+                    // Whatever vehicle it names.
+                    Some(_) if index + 1 == last => {}
+                    Some(wanted) if wanted == level => {}
+                    _ => return false,
+                }
+            }
+            levels.next().is_none_or(|level| level == "#")
+        })
+    }
+}
+
+/// Hooks of rmqtt that keep programs and nodes apart.
+#[derive(Clone)]
+pub(in crate::transport::broker) struct DoorHooks {
+    pub(in crate::transport::broker) door: Door,
+    pub(in crate::transport::broker) principals: PrincipalRegistry,
+}
+
+impl DoorHooks {
+    /// Registers the hooks, after those that charge messages.
+    pub(in crate::transport::broker) async fn install(self, context: &ServerContext) {
+        use Type::{
+            ClientSubscribe, MessageDelivered, MessagePublish, SessionSubscribed, SessionTerminated,
+            SessionUnsubscribed,
+        };
+        if self.door.0.is_none() {
+            return;
+        }
+        let register = context.extends.hook_mgr().register();
+        for hook in [
+            ClientSubscribe,
+            MessagePublish,
+            MessageDelivered,
+            SessionSubscribed,
+            SessionUnsubscribed,
+            SessionTerminated,
+        ] {
+            register.add(hook, Box::new(self.clone())).await;
+        }
+        register.start().await;
+    }
+
+    /// The principal of a session that is a program's. One that has just left is known by its client id, by which it had
+    /// logged in: its last will is still to come.
+    fn program(&self, session: &Session) -> Option<Principal> {
+        let principal = self.principals.principal(session.id.remote_addr);
+        let principal = principal.unwrap_or_else(|| Principal::new(None, Ipv4Addr::LOCALHOST.into(), false));
+        self.door.is_program(&principal, &session.id.client_id).then_some(principal)
+    }
+}
+
+#[async_trait]
+impl Handler for DoorHooks {
+    async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
+        let Some(door) = self.door.0.as_deref() else { return (true, before) };
+        match parameter {
+            Parameter::ClientSubscribe(session, subscribe) if self.program(session).is_some() => {
+                (true, Some(HookResult::TopicFilter(Some(Place::Door.topic(&subscribe.topic_filter).into()))))
+            }
+            Parameter::MessagePublish(Some(session), _, publish) => {
+                let Some(principal) = self.program(session) else { return (true, before) };
+                let mut moved = match before {
+                    Some(HookResult::Publish(charged)) => charged,
+                    _ => (*publish).clone(),
+                };
+                let place = self.door.place_of(&principal, &publish.topic);
+                moved.topic = place.topic(&publish.topic).into();
+                (true, Some(HookResult::Publish(moved)))
+            }
+            Parameter::MessageDelivered(_, _, publish) => {
+                let (Place::Door, topic) = Place::of(&publish.topic) else { return (true, before) };
+                let mut shown = (*publish).clone();
+                shown.topic = topic.to_owned().into();
+                (true, Some(HookResult::Publish(shown)))
+            }
+            Parameter::SessionSubscribed(session, subscribe) if Place::of(&subscribe.topic_filter).0 == Place::Door => {
+                let filter = subscribe.topic_filter.clone();
+                let of_reports = door.is_of_reports(&filter);
+                door.change_filters(|filters| {
+                    filters.insert((session.id.client_id.clone(), filter), of_reports);
+                });
+                (true, before)
+            }
+            Parameter::SessionUnsubscribed(session, unsubscribe) => {
+                door.change_filters(|filters| {
+                    filters.remove(&(session.id.client_id.clone(), unsubscribe.topic_filter.clone()));
+                });
+                (true, before)
+            }
+            Parameter::SessionTerminated(session, _) => {
+                door.change_filters(|filters| filters.retain(|(client, _), _| *client != session.id.client_id));
+                (true, before)
+            }
+            _ => (true, before),
+        }
+    }
+}
