@@ -41,7 +41,7 @@ pub struct NodeConfig {
     pub role: Role,
     /// Where the embedded broker listens. Default port 8883 on all interfaces with `[tls]`; without, port 1883 on
     /// 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says otherwise. A broker that is
-    /// only a door for programs: the same port on 127.0.0.1, or a free one if that is taken.
+    /// only a door for programs takes a free port if that is taken.
     pub listen: Option<SocketAddr>,
     /// Directory for what survives a restart: reputations and the highest term of leadership. Default
     /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
@@ -258,9 +258,8 @@ impl NodeConfig {
     /// Where the embedded broker listens.
     pub fn broker_listen(&self) -> SocketAddr {
         let (ip, port) = match &self.tls {
-            Some(_) if self.serves_nodes() => ([0, 0, 0, 0], 8883),
-            Some(_) => ([127, 0, 0, 1], 8883),
-            None if self.serves_nodes() && self.broker.allow_plaintext => ([0, 0, 0, 0], 1883),
+            Some(_) => ([0, 0, 0, 0], 8883),
+            None if self.broker.allow_plaintext => ([0, 0, 0, 0], 1883),
             None => ([127, 0, 0, 1], 1883),
         };
         self.listen.unwrap_or(SocketAddr::from((ip, port)))

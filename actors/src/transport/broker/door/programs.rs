@@ -130,6 +130,7 @@ impl Door {
             Some(Topic::Detections(name) | Topic::VoteDetections(name)) if door.is_nodeless(principal, &name) => {
                 Place::Cell
             }
+            Some(Topic::Nodes(name)) if door.is_nodeless_name(principal, &name) => Place::Cell,
             Some(Topic::Detections(_) | Topic::VoteDetections(_)) => Place::Inbound,
             _ => Place::Door,
         }
@@ -139,12 +140,12 @@ impl Door {
 impl DoorState {
     /// Whether a name is that of a vehicle without a node whose reports this broker brings to the cell.
     fn is_nodeless(&self, principal: &Principal, name: &NodeName) -> bool {
+        (self.setup.carries_reports)() && self.is_nodeless_name(principal, name)
+    }
+
+    fn is_nodeless_name(&self, principal: &Principal, name: &NodeName) -> bool {
         let (setup, vehicle) = (&self.setup, name.vehicle());
-        principal.identity.is_none()
-            && vehicle != setup.node
-            && setup.serves_nodes
-            && (setup.carries_reports)()
-            && !(setup.is_member)(&vehicle)
+        principal.identity.is_none() && vehicle != setup.node && setup.serves_nodes && !(setup.is_member)(&vehicle)
     }
 
     fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), Refusal> {
