@@ -55,7 +55,7 @@ test: setup ## all tests
 
 test-dashboard: PACKAGES += chromium chromium-driver
 test-dashboard: setup monitoring ## the page in a real browser, with pictures in target/dashboard; installs Chromium
-	cargo test --locked -p ecod-actors --test dashboard -- --ignored --nocapture
+	cargo test --locked --test dashboard -- --ignored --nocapture
 
 monitoring: ## check the rules for Prometheus; takes promtool out of Debian's package if it is not installed
 	packaging/check-monitoring
@@ -65,19 +65,19 @@ sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of S
 
 trials: PACKAGES += iproute2 mosquitto nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
-	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact trials --nocapture
+	cargo test --release --locked --test trials -- --ignored --exact trials --nocapture
 
 clocks: PACKAGES += libfaketime
 clocks: setup ## real cells with wrong clocks that step, as vehicle and as leader; TRIAL=NAME runs those with it in their name
-	cargo test --release --locked -p ecod-actors --test clocks -- --ignored --exact all --nocapture
+	cargo test --release --locked --test clocks -- --ignored --exact all --nocapture
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
-	cargo test --release --locked -p ecod-actors --test trials -- --ignored --exact soak::soak --nocapture
+	cargo test --release --locked --test trials -- --ignored --exact soak::soak --nocapture
 
 attack: PACKAGES += iproute2
 attack: setup ## attackers of all kinds against real cells, and a table; ROWS=text runs those named so, ATTACK=quick a part
-	cargo test --release --locked -p ecod-actors --test attacks -- --ignored --exact attacks --nocapture
+	cargo test --release --locked --test attacks -- --ignored --exact attacks --nocapture
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
@@ -106,7 +106,7 @@ recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
 	python3 -m venv $(BUILD)/recording-venv
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap
-	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked -p ecod-actors --test recording -- --include-ignored --nocapture python
+	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked --test recording -- --include-ignored --nocapture python
 
 live-check: setup ## record with the feature foxglove, and look on as Foxglove does
 	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test recording
