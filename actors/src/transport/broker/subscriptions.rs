@@ -52,10 +52,10 @@ impl Handler for SharedQuota {
         let SubscriptionQuota { rate, principals, counters } = &*self.0;
         match parameter {
             Parameter::SessionSubscribed(session, subscribe) => {
-                principals.note_subscription(session.id.remote_addr, &subscribe.topic_filter, true)
+                principals.note_subscription(session.id.remote_addr, &subscribe.topic_filter, true);
             }
             Parameter::SessionUnsubscribed(session, unsubscribe) => {
-                principals.note_subscription(session.id.remote_addr, &unsubscribe.topic_filter, false)
+                principals.note_subscription(session.id.remote_addr, &unsubscribe.topic_filter, false);
             }
             Parameter::ClientSubscribeCheckAcl(session, _) => {
                 let address = session.id.remote_addr;

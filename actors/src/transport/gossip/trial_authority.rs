@@ -57,7 +57,6 @@ impl TrialAuthority {
     }
 
     /// Revokes a node; the others learn of it when they read the list.
-    #[expect(clippy::expect_used, reason = "a test ends without its certificate")]
     #[cfg(test)]
     pub(crate) fn revoke(&mut self, name: &NodeName) {
         self.authority.revoke(name, now()).expect("a certificate to revoke");
