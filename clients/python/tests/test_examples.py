@@ -200,7 +200,7 @@ def test_yolo_reports_what_it_sees(edge: Callable[..., Server], cell_name: str, 
 
         map = until(cell.maps(timeout=30), are_there)
         cars = sorted((thing for thing in map.objects if not thing.vehicle), key=lambda thing: thing.x_m)
-        assert [(car.label, car.contributors) for car in cars] == [("car", ["euclid--yolo"])] * 2
+        assert [(car.label, car.contributors) for car in cars] == [("car", ["euclid"])] * 2
         assert [(car.x_m, car.y_m) for car in cars] == [pytest.approx(at, abs=0.1) for at in ((1.0, 3.0), (4.5, 9.0))]
         said = yolo.communicate(timeout=30)
         assert yolo.returncode == 0, said
