@@ -35,7 +35,7 @@ use crate::telemetry::counters::{Counters, Event};
 pub(super) use self::programs::{DoorHooks, Place};
 pub(super) use self::refusals::Refusal;
 
-/// What a door needs to know of its node.
+/// The node of a door, and its ways to the cell.
 pub struct DoorSetup {
     /// The node.
     pub node: NodeName,

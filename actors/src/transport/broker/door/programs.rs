@@ -1,4 +1,4 @@
-//! What programs may do at their node's door, as hooks of rmqtt.
+//! Rights of programs at their node's door, as hooks of rmqtt.
 //!
 //! | topic | a program of the node `euclid` |
 //! |---|---|
