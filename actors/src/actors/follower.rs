@@ -16,10 +16,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use ecod::leadership::node::Input;
-use ecod::leadership::round_filter::{AcceptedRound, Origin, Refusal, RoundFilter};
+use ecod::leadership::round_filter::{AcceptedRound, Refusal, RoundFilter};
 use ecod::leadership::{Leadership, Position};
 use ecod::model::names::NodeName;
-use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Reputations, Topic, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
@@ -37,6 +36,7 @@ use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::telemetry::spans::Spans;
 use crate::transport::broker::Door;
+use crate::transport::mqtt::Delivery;
 
 /// What a follower needs at its start.
 pub struct FollowerArguments {
@@ -105,22 +105,13 @@ impl Actor for Follower {
     ) -> Result<(), ActorProcessingErr> {
         let (taken, sender) = match message {
             FollowerMessage::TakeMap { delivery } => {
-                let map = &delivery.message;
-                (state.take_map(map, delivery.origin, delivery.received_at), Some(map.aggregator.clone()))
+                (state.take_map(&delivery), Some(delivery.message.aggregator.clone()))
             }
             FollowerMessage::TakeVerdicts { delivery } => {
-                let verdicts = &delivery.message;
-                (
-                    state.take_verdicts(verdicts, delivery.origin, delivery.received_at),
-                    Some(verdicts.aggregator.clone()),
-                )
+                (state.take_verdicts(&delivery), Some(delivery.message.aggregator.clone()))
             }
             FollowerMessage::TakeReputations { delivery } => {
-                let reputations = &delivery.message;
-                (
-                    state.take_reputations(reputations, delivery.origin, delivery.received_at),
-                    reputations.aggregator.clone(),
-                )
+                (state.take_reputations(&delivery), delivery.message.aggregator.clone())
             }
         };
         match taken.map_err(Refusal::reject_reason) {
@@ -151,8 +142,10 @@ impl FollowerState {
         Self { newest, filter, log, recording, leadership, election, fuser, door, clock, counters, spans }
     }
 
-    fn take_map(&mut self, map: &Arc<GlobalMap>, origin: Origin, received_at: Timestamp) -> Result<(), Refusal> {
-        let accepted = self.filter.accept_map(map, origin, received_at, &self.leadership.borrow())?;
+    fn take_map(&mut self, delivery: &Delivery<Arc<GlobalMap>>) -> Result<(), Refusal> {
+        let Delivery { message: map, origin, received_at, .. } = delivery;
+        let received_at = *received_at;
+        let accepted = self.filter.accept_map(map, *origin, received_at, &self.leadership.borrow())?;
         let _accept = self.spans.accept("map", &**map, received_at);
         self.counters.count(Event::MapAccepted);
         if accepted.is_known_term {
@@ -170,13 +163,10 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_verdicts(
-        &mut self,
-        verdicts: &Arc<Verdicts>,
-        origin: Origin,
-        received_at: Timestamp,
-    ) -> Result<(), Refusal> {
-        let accepted = self.filter.accept_verdicts(verdicts, origin, received_at, &self.leadership.borrow())?;
+    fn take_verdicts(&mut self, delivery: &Delivery<Arc<Verdicts>>) -> Result<(), Refusal> {
+        let Delivery { message: verdicts, origin, received_at, .. } = delivery;
+        let received_at = *received_at;
+        let accepted = self.filter.accept_verdicts(verdicts, *origin, received_at, &self.leadership.borrow())?;
         let _accept = self.spans.accept("verdicts", &**verdicts, received_at);
         self.counters.count(Event::VerdictsAccepted);
         self.recording.send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
@@ -186,13 +176,10 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_reputations(
-        &mut self,
-        reputations: &Arc<Reputations>,
-        origin: Origin,
-        received_at: Timestamp,
-    ) -> Result<(), Refusal> {
-        self.filter.accept_reputations(reputations, origin, received_at, &self.leadership.borrow())?;
+    fn take_reputations(&mut self, delivery: &Delivery<Arc<Reputations>>) -> Result<(), Refusal> {
+        let Delivery { message: reputations, origin, received_at, .. } = delivery;
+        let received_at = *received_at;
+        self.filter.accept_reputations(reputations, *origin, received_at, &self.leadership.borrow())?;
         self.counters.count(Event::ReputationsAccepted);
         self.recording.send(received_at, LogItem::Reputations(Arc::clone(reputations)));
         self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));

@@ -2,7 +2,7 @@
 
 use crate::model::names::NodeName;
 
-/// What proves a round's aggregator.
+/// Proof of a round's aggregator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Origin {
     /// It came over the aggregator's own broker, has its signature, or is the node's own.

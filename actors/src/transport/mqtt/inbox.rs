@@ -67,7 +67,7 @@ pub struct Delivery<T = Incoming> {
     pub message: T,
     /// Time when its packet was read from the socket, or when it was delivered in-process.
     pub received_at: Timestamp,
-    /// What proves the aggregator of a round; of other messages nothing is asked.
+    /// Proof of a round's aggregator; of other messages nothing is asked.
     pub origin: Origin,
     /// The node whose certificate the broker has proven; `None` without certificates, and for messages of this node.
     pub broker: Option<NodeName>,
@@ -251,7 +251,7 @@ impl Inbox {
         Ok(self.deliver(via, message, origin, received_at))
     }
 
-    /// What proves the aggregator of a round; `None` if the broker is not to be believed.
+    /// Proof of a round's aggregator; `None` if the broker is not to be believed.
     fn origin(&self, via: Via<'_>, aggregator: Option<&NodeName>, topic: &[u8], payload: &[u8]) -> Option<Origin> {
         Origin::of(aggregator, via.node, || self.security.check_round(aggregator, topic, payload))
     }

@@ -16,7 +16,7 @@ use crate::telemetry::counters::ShedReason;
 #[derive(Debug)]
 pub(in crate::transport::broker) struct Refusal {
     pub(super) reason: RefusalReason,
-    /// What is wrong and what to do about it.
+    /// The fault and its remedy.
     pub(super) text: String,
 }
 
