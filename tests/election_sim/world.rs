@@ -119,12 +119,12 @@ impl World {
         self.alive().filter(|(_, node)| node.leads()).map(|(index, _)| index).collect()
     }
 
-    /// The node that should lead when all is well.
-    pub(crate) fn best(&self) -> Option<usize> {
-        self.alive()
-            .filter(|(_, node)| node.config.role != Role::Cav)
-            .min_by_key(|(_, node)| (node.config.role != Role::Edge, Reverse(node.config.priority), node.name.clone()))
-            .map(|(index, _)| index)
+    /// The nodes of which one should lead when all is well: candidates of the best role and priority.
+    pub(crate) fn best(&self) -> Vec<usize> {
+        let rank = |node: &Node| (node.config.role != Role::Edge, Reverse(node.config.priority));
+        let candidates = || self.alive().filter(|(_, node)| node.config.role != Role::Cav);
+        let best = candidates().map(|(_, node)| rank(node)).min();
+        candidates().filter(|(_, node)| Some(rank(node)) == best).map(|(index, _)| index).collect()
     }
 
     fn push(&mut self, after: u64, event: Event) {

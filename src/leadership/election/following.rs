@@ -184,8 +184,9 @@ impl Election {
                         self.adopt(other, now, now);
                     }
                     Some(other) if *other != own => {}
-                    _ if message.term > own.term => self.renew_later(now),
-                    _ => {}
+                    _ if message.term > own.term => self.renew_later(&message.from, now),
+                    Some(_) => self.peers.refuses(&message.from, false),
+                    None => {}
                 }
             }
             State::Seeking(_) | State::Following(_) | State::Leading(_) => {}
@@ -196,7 +197,7 @@ impl Election {
         if let State::Leading(leading) = &self.state
             && over.is_some_and(|over| *over >= leading.epoch)
         {
-            self.renew_later(now);
+            self.renew_later(from, now);
         }
         // Of two that began to lead at the same time, one ends at once, and may have followers that hear it next in a while.
         let current = self.current_epoch().cloned();

@@ -25,9 +25,9 @@ pub(super) struct Handover {
 impl Election {
     /// Starts a handover when a better candidate has been there long enough.
     pub(super) fn start_handover(&mut self, now: Timestamp) {
-        let own = (&self.id, self.candidacy());
+        let ours = self.candidacy().class();
         let State::Leading(leading) = &mut self.state else { return };
-        let challenger = self.peers.challenger(own, leading.since, self.config.stable(), now);
+        let challenger = self.peers.challenger(ours, self.config.stable(), now);
         let Some((to, _)) = challenger.filter(|(_, from)| leading.handover.is_none() && now >= *from) else { return };
         leading.handover =
             Some(Handover { to: to.clone(), retry_at: now, started_at: now, ready_at: None, yielded: false });

@@ -47,9 +47,12 @@ impl Election {
             return;
         }
         if leading.handover.is_none() && leading.renew_at.is_some_and(|at| now >= at) {
-            let after = leading.epoch.clone();
-            self.lead(Some(after), now);
-            return;
+            leading.renew_at = None;
+            if self.peers.any_refuses(now) {
+                let after = leading.epoch.clone();
+                self.lead(Some(after), now);
+                return;
+            }
         }
         leading.beat_at = next;
         leading.beats += 1;
@@ -67,9 +70,10 @@ impl Election {
         }
     }
 
-    /// Plans to lead on in a term that nobody can refuse: a follower knows a later term, or believes this epoch to have
-    /// ended. A newer leader that is just taking over is heard before.
-    pub(super) fn renew_later(&mut self, now: Timestamp) {
+    /// Plans to lead on in a term that a peer cannot refuse: it knows a later term, or believes this epoch to have ended.
+    /// A newer leader that is just taking over is heard before.
+    pub(super) fn renew_later(&mut self, refused_by: &NodeName, now: Timestamp) {
+        self.peers.refuses(refused_by, true);
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
             let is_renewed = leading.after.as_ref().is_some_and(|after| after.leader == self.id);

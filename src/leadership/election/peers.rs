@@ -32,6 +32,8 @@ pub(super) struct Peer {
     pub(super) epoch: Option<Epoch>,
     /// Whether our last message to it said that we hear it.
     pub(super) told: bool,
+    /// Whether it refused this node's leadership, and has not followed it since.
+    refuses: bool,
     /// Leadership of this node that the peer was last told to be over.
     corrected: Option<Epoch>,
     run: u64,
@@ -98,6 +100,18 @@ impl Peers {
             peer.corrected = over;
         }
         is_news
+    }
+
+    /// Notes whether a peer refuses this node's leadership.
+    pub(super) fn refuses(&mut self, name: &NodeName, refuses: bool) {
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.refuses = refuses;
+        }
+    }
+
+    /// Whether anybody heard lately refuses this node's leadership.
+    pub(super) fn any_refuses(&self, now: Timestamp) -> bool {
+        self.table.iter().any(|(name, peer)| peer.refuses && self.hears(name, now))
     }
 
     /// Notes what every message says about its sender; false for one that is repeated or overtaken.
@@ -216,31 +230,14 @@ impl Peers {
         fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
     }
 
-    /// The best peer that has been fit for `stable` and should have the lead of `leader` with `candidacy`.
+    /// The best peer of a better class than `ours`, and the time at which it has been fit for `stable`.
     ///
-    /// Load never takes the lead from a living leader: leading is load, so the lead would swing. Among equals the lesser
-    /// name is handed the lead unless it is busier, once the leader has led `since` long enough to know that nobody better
-    /// is there. Waits for a better candidate that is more than halfway through `stable`; otherwise the lead moves twice.
-    pub(super) fn challenger(
-        &self,
-        (leader, candidacy): (&NodeName, Candidacy),
-        since: Timestamp,
-        stable: Duration,
-        now: Timestamp,
-    ) -> Option<(NodeName, Timestamp)> {
-        let ours = candidacy.class();
-        let present = || self.candidates(now).filter(|(name, _)| self.hears(name, now));
-        let is_best = present().all(|(_, other)| other.class() >= ours);
-        present()
-            .filter(|&(name, other)| {
-                let theirs = other.class();
-                theirs < ours || (is_best && theirs == ours && other.load <= candidacy.load && name < leader)
-            })
-            .filter_map(|(name, other)| {
-                let fit_since = self.table.get(name)?.fit_since?;
-                let since = if other.class() < ours { fit_since } else { fit_since.max(since) };
-                Some((name, other, since + stable))
-            })
+    /// Neither load nor name takes the lead from a living leader: leading is load, and a move among equals serves nobody.
+    /// Waits for a better candidate that is more than halfway through `stable`; otherwise the lead moves twice.
+    pub(super) fn challenger(&self, ours: Class, stable: Duration, now: Timestamp) -> Option<(NodeName, Timestamp)> {
+        self.candidates(now)
+            .filter(|(name, other)| self.hears(name, now) && other.class() < ours)
+            .filter_map(|(name, other)| Some((name, other, self.table.get(name)?.fit_since? + stable)))
             .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.class(), name.clone()))
             .map(|(name, _, from)| (name.clone(), from))
     }

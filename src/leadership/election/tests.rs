@@ -1,3 +1,5 @@
+use std::time::Duration;
+
 use super::message::{MAX_FIRST_TERM, MAX_ROUND_STEP};
 use super::*;
 use crate::wire::Role;
@@ -168,6 +170,45 @@ fn the_word_of_a_node_that_never_leads_ends_no_leadership() {
     let ghost = Epoch::new(election.term() + 1, NodeName::from_static("ghost"));
     election.handle(of_hopper(1000, Some(&ghost)), now);
     assert!(election.is_leading());
+}
+
+/// Time and epoch of each leadership of euclid in twenty seconds after it led on once, as gauss had refused its first.
+fn renewals(gauss_follows: bool) -> Vec<Epoch> {
+    let gauss = NodeName::from_static("gauss");
+    let (mut election, mut now, mut seq) = (euclid(), NOW, 0);
+    let mut status = |election: &mut Election, epoch: Option<&Epoch>, over: Option<Epoch>, now| {
+        seq += 1;
+        election.handle(received(&gauss, seq, epoch, Body::Status { over }), now);
+    };
+    while !election.is_leading() {
+        status(&mut election, None, None, now);
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    let first = election.epoch().cloned();
+    status(&mut election, None, first.clone(), now);
+    let end = now + Duration::from_secs(20);
+    let mut led = Vec::new();
+    while now < end {
+        now = election.next_deadline();
+        for effect in election.tick(now) {
+            if let ElectionEffect::Lead { epoch, .. } = effect {
+                led.push(epoch);
+                // It was under way.
+                status(&mut election, None, led.last().cloned(), now);
+            }
+        }
+        let epoch = election.epoch().cloned();
+        let (epoch, over) = if gauss_follows && !led.is_empty() { (epoch, None) } else { (None, epoch) };
+        status(&mut election, epoch.as_ref(), over, now);
+    }
+    led
+}
+
+#[test]
+fn a_leader_whom_all_follow_again_does_not_lead_on_in_another_term() {
+    assert_eq!(renewals(true).len(), 1);
+    assert!(renewals(false).len() > 1, "nobody follows");
 }
 
 #[test]
