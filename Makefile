@@ -63,7 +63,7 @@ monitoring: ## check the rules for Prometheus; takes promtool out of Debian's pa
 sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of SEED=n
 	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election_sim -- --nocapture
 
-trials: PACKAGES += iproute2 mosquitto nftables
+trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
 	cargo test --release --locked --test trials -- --ignored --exact trials --nocapture
 

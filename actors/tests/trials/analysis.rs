@@ -10,6 +10,8 @@ use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
+use crate::doors::DoorVerdict;
+
 /// A map that a node accepted.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Accepted {
@@ -66,6 +68,8 @@ pub(crate) struct Verdict {
     /// Whether so much processor time was withheld from the machine that a missed bar of time tells nothing; judged by
     /// the caller.
     pub(crate) is_void: bool,
+    /// How programs beside the measured vehicles fared; judged by the caller.
+    pub(crate) doors: DoorVerdict,
 }
 
 /// A node that has taken no map for so long at the end of a phase is without service.

@@ -13,6 +13,7 @@ use ecod_actors::platform::clock;
 use tempfile::TempDir;
 
 use crate::analysis::{Accepted, NodeRun};
+use crate::doors;
 use crate::logs;
 use crate::network::{self, Bridged};
 use crate::ports::Ports;
@@ -71,6 +72,7 @@ struct Node {
     directory: PathBuf,
     namespace: Option<String>,
     process: Option<Process>,
+    door: Option<Process>,
     paused: bool,
     runs: usize,
 }
@@ -115,6 +117,7 @@ impl Cell {
                 directory: home,
                 namespace: plan.bridged.then(|| network::namespace(index)),
                 process: None,
+                door: None,
                 paused: false,
                 runs: 0,
             });
@@ -145,6 +148,28 @@ impl Cell {
             }
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
+    }
+
+    /// Puts a client at the broker of every node that runs, and waits until each has a map.
+    pub(crate) async fn open_doors(&mut self) -> anyhow::Result<()> {
+        for node in self.nodes.iter_mut().filter(|node| node.process.is_some()) {
+            let log = node.door_log();
+            node.door = Some(doors::open(node.address.broker, node.namespace.as_deref(), &log)?);
+        }
+        let started = Instant::now();
+        for node in self.nodes.iter().filter(|node| node.door.is_some()) {
+            while logs::at_door(&node.door_log())?.is_empty() {
+                ensure!(started.elapsed() < START_TIMEOUT, "the client beside {} gets no map", node.name);
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+        }
+        Ok(())
+    }
+
+    /// What the client at each door got.
+    pub(crate) fn doors(&self) -> anyhow::Result<Vec<NodeRun>> {
+        let opened = self.nodes.iter().filter(|node| node.door.is_some());
+        opened.map(|node| Ok(NodeRun { node: node.name.clone(), accepted: logs::at_door(&node.door_log())? })).collect()
     }
 
     /// What keeps the cell from being well.
@@ -338,6 +363,10 @@ impl Node {
 
     fn log(&self) -> PathBuf {
         self.directory.join("node.log")
+    }
+
+    fn door_log(&self) -> PathBuf {
+        self.directory.join("door.log")
     }
 
     fn map_log(&self) -> PathBuf {

@@ -11,6 +11,7 @@ use ecod::model::time::Timestamp;
 use serde::Deserialize;
 
 use crate::analysis::Accepted;
+use crate::doors;
 
 /// What the trials need of a line of a map log.
 #[derive(Deserialize)]
@@ -29,6 +30,19 @@ struct Map {
 
 /// All maps of a log; a line that a killed process left unfinished is none.
 pub(crate) fn accepted(path: &Path) -> anyhow::Result<Vec<Accepted>> {
+    maps(path, parse)
+}
+
+/// All maps that a client at a node's door got.
+pub(crate) fn at_door(path: &Path) -> anyhow::Result<Vec<Accepted>> {
+    maps(path, |line| {
+        let (time, payload) = line.split_once(' ').context("no time")?;
+        let map: Map = serde_json::from_str(payload)?;
+        Ok(map.received(doors::time(time).context("no time")?))
+    })
+}
+
+fn maps(path: &Path, parse: impl Fn(&str) -> anyhow::Result<Accepted>) -> anyhow::Result<Vec<Accepted>> {
     let text = match fs::read_to_string(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         text => text.with_context(|| format!("cannot read {}", path.display()))?,
@@ -54,10 +68,16 @@ pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
     Ok(name.and_then(|name| NodeName::new(name).ok()))
 }
 
-fn parse(line: &str) -> serde_json::Result<Accepted> {
+fn parse(line: &str) -> anyhow::Result<Accepted> {
     let Line { received_at_us, map } = serde_json::from_str(line)?;
-    let Map { epoch, aggregator, round, fused_at_us: fused_at } = map;
-    Ok(Accepted { at: received_at_us, epoch: Epoch::new(epoch, aggregator), round, fused_at })
+    Ok(map.received(received_at_us))
+}
+
+impl Map {
+    fn received(self, at: Timestamp) -> Accepted {
+        let Self { epoch, aggregator, round, fused_at_us: fused_at } = self;
+        Accepted { at, epoch: Epoch::new(epoch, aggregator), round, fused_at }
+    }
 }
 
 fn tail(path: &Path) -> anyhow::Result<Option<String>> {

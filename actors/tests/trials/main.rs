@@ -9,6 +9,7 @@
 
 mod analysis;
 mod cell;
+mod doors;
 mod logs;
 mod machine;
 mod network;
@@ -29,6 +30,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use crate::analysis::{Phase, Verdict, judge};
 use crate::cell::{Cell, EDGE, Plan};
+use crate::doors::judge_doors;
 use crate::machine::Machine;
 use crate::report::{Outcome, table};
 use crate::scenario::{Cure, Fault, Needs, SCENARIOS, Scenario, Step, Who};
@@ -128,6 +130,7 @@ async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> 
 
 async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict> {
     cell.settle().await?;
+    cell.open_doors().await?;
     let mut voters = if scenario.votes { Some(Voters::connect(cell.brokers()).await?) } else { None };
     let before = match &mut voters {
         Some(voters) => Some(voters.vote().await?),
@@ -150,7 +153,9 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
     if machine.is_starved() {
         println!("the machine stood still: {}", machine.account());
     }
-    Ok(Verdict { reputations_changed, is_void: machine.is_starved(), ..judge(&cell.runs()?, &phases) })
+    let runs = cell.runs()?;
+    let doors = judge_doors(&runs, &cell.doors()?, &phases);
+    Ok(Verdict { reputations_changed, is_void: machine.is_starved(), doors, ..judge(&runs, &phases) })
 }
 
 fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {

@@ -7,6 +7,10 @@ use serde::Serialize;
 use crate::analysis::{Verdict, percentile};
 use crate::scenario::Scenario;
 
+/// Parts of a second.
+const MILLIS: u128 = 1000;
+const MICROS: u128 = 1_000_000;
+
 /// All trials of one scenario with one number of nodes.
 #[derive(Debug, Serialize)]
 pub(crate) struct Outcome {
@@ -22,6 +26,7 @@ pub(crate) struct Outcome {
     double_leader_after_quiet: usize,
     false_failovers: u64,
     reputations_changed: usize,
+    doors: Doors,
     #[serde(skip)]
     gap_bar_ms: Option<u64>,
     #[serde(skip)]
@@ -35,25 +40,68 @@ struct Gaps {
     max: Option<u64>,
 }
 
+/// How programs beside the vehicles fared.
+#[derive(Debug, Serialize)]
+struct Doors {
+    /// By how much the gap of a program exceeds that of its node, over the trials.
+    longer_gap_us: Gaps,
+    /// By how much a program has a map later than its node.
+    delay_us: Gaps,
+    wrong_maps: u64,
+}
+
+impl Gaps {
+    /// The percentiles of these times, in so many parts of a second.
+    fn new(times: impl Iterator<Item = Duration>, parts: u128) -> Self {
+        let mut times: Vec<Duration> = times.collect();
+        times.sort_unstable();
+        let at = |percent| percentile(&times, percent).map(|time| (time.as_nanos() * parts / 1_000_000_000) as u64);
+        Self { p50: at(50), p99: at(99), max: at(100) }
+    }
+}
+
+impl Doors {
+    const LONGER_GAP_BAR: Duration = Duration::from_millis(5);
+    const DELAY_BAR: Duration = Duration::from_millis(1);
+
+    fn new(verdicts: &[&Verdict], all: &[Verdict]) -> Self {
+        let doors = || verdicts.iter().map(|verdict| &verdict.doors);
+        Self {
+            longer_gap_us: Gaps::new(doors().filter_map(|door| door.longer_gap), MICROS),
+            delay_us: Gaps::new(doors().flat_map(|door| door.delays.iter().copied()), MICROS),
+            wrong_maps: all.iter().map(|verdict| verdict.doors.wrong).sum(),
+        }
+    }
+
+    /// The bars that were missed. They are for the median, as all nodes share this machine's few processors.
+    fn misses(&self) -> impl Iterator<Item = String> {
+        let over = |what: &str, gaps: &Gaps, bar: Duration| {
+            let bar = bar.as_micros() as u64;
+            gaps.p50.filter(|p50| *p50 > bar).map(|p50| format!("{what} p50 {p50} us, at most {bar}"))
+        };
+        let wrong = (self.wrong_maps > 0).then(|| format!("wrong maps at doors {}, must be 0", self.wrong_maps));
+        let longer = over("longer gap at doors", &self.longer_gap_us, Self::LONGER_GAP_BAR);
+        [wrong, longer, over("delay at doors", &self.delay_us, Self::DELAY_BAR)].into_iter().flatten()
+    }
+}
+
 impl Outcome {
     /// What the verdicts come to: of void ones only what no want of processor time excuses.
     pub(crate) fn new(scenario: &Scenario, nodes: usize, all: &[Verdict]) -> Self {
         let verdicts: Vec<&Verdict> = all.iter().filter(|verdict| !verdict.is_void).collect();
-        let mut gaps: Vec<Duration> = verdicts.iter().filter_map(|verdict| verdict.gap).collect();
-        gaps.sort_unstable();
-        let gap = |percent| percentile(&gaps, percent).map(|gap| gap.as_millis() as u64);
         Self {
             scenario: scenario.name,
             nodes,
             trials: verdicts.len(),
             void: all.len() - verdicts.len(),
-            gap_ms: Gaps { p50: gap(50), p99: gap(99), max: gap(100) },
+            gap_ms: Gaps::new(verdicts.iter().filter_map(|verdict| verdict.gap), MILLIS),
             stale_accepted: all.iter().map(|verdict| verdict.stale_accepted).sum(),
             missed_rounds: verdicts.iter().map(|verdict| verdict.missed_rounds).sum(),
             unrecovered: verdicts.iter().filter(|verdict| verdict.unrecovered).count(),
             double_leader_after_quiet: verdicts.iter().filter(|verdict| verdict.double_leader).count(),
             false_failovers: verdicts.iter().map(|verdict| verdict.false_failovers).sum(),
             reputations_changed: all.iter().filter(|verdict| verdict.reputations_changed).count(),
+            doors: Doors::new(&verdicts, all),
             gap_bar_ms: scenario.gap.limit(nodes).map(|limit| limit.as_millis() as u64),
             seamless: scenario.seamless,
         }
@@ -74,7 +122,7 @@ impl Outcome {
             none("false_failovers", self.false_failovers),
             none("reputations_changed", self.reputations_changed as u64),
         ];
-        gap.into_iter().chain(counts.into_iter().flatten()).collect()
+        gap.into_iter().chain(counts.into_iter().flatten()).chain(self.doors.misses()).collect()
     }
 }
 
@@ -109,9 +157,29 @@ pub(crate) fn table(outcomes: &[Outcome]) -> String {
             outcome.false_failovers,
         );
     }
+    text += &doors_table(outcomes);
     text + "gaps in ms, of the worst vehicle, the period of 100 ms included; bar: the most that p99 may be\n\
             void: missed a bar while more than a tenth of the processors' time was withheld for half a second,\n\
             or the harness woke more than 100 ms too late\n"
+}
+
+/// The same trials as programs beside the vehicles see them.
+fn doors_table(outcomes: &[Outcome]) -> String {
+    let mut text = format!(
+        "\n{:<29}{:>6}{:>12}{:>9}{:>12}{:>9}{:>9}{:>7}\n",
+        "at doors", "nodes", "longer gap", "max", "later, p50", "p99", "max", "wrong"
+    );
+    for Outcome { scenario, nodes, doors, .. } in outcomes {
+        let Doors { longer_gap_us: longer, delay_us: delay, wrong_maps } = doors;
+        let [longer, longest] = [longer.p50, longer.max].map(millis);
+        let [p50, p99, max] = [delay.p50, delay.p99, delay.max].map(millis);
+        text += &format!("{scenario:<29}{nodes:>6}{longer:>12}{longest:>9}{p50:>12}{p99:>9}{max:>9}{wrong_maps:>7}\n");
+    }
+    text + "in ms: how much longer a program waited than its node, p50 and most of the trials, and how much later it had each map\n\n"
+}
+
+fn millis(micros: Option<u64>) -> String {
+    micros.map_or_else(|| "-".to_owned(), |micros| format!("{}.{:03}", micros / 1000, micros % 1000))
 }
 
 fn number(value: Option<u64>) -> String {
@@ -121,6 +189,7 @@ fn number(value: Option<u64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::doors::DoorVerdict;
     use crate::scenario::SCENARIOS;
 
     fn outcome(name: &str, mut verdict: Verdict) -> Outcome {
@@ -141,6 +210,19 @@ mod tests {
             outcome("six_busy_loops", wrong).misses(),
             ["unrecovered 1, must be 0", "false_failovers 2, must be 0"]
         );
+    }
+
+    #[test]
+    fn programs_are_served_as_their_nodes_are() {
+        let doors = |longer, later, wrong| {
+            let (longer, later) = (Duration::from_millis(longer), Duration::from_micros(later));
+            let doors = DoorVerdict { longer_gap: Some(longer), delays: vec![later], wrong };
+            outcome("edge_sigkill", Verdict { doors, ..Verdict::default() }).misses()
+        };
+        assert!(doors(5, 1000, 0).is_empty());
+        let misses = ["longer gap at doors p50 6000 us, at most 5000", "delay at doors p50 1001 us, at most 1000"];
+        assert_eq!(doors(6, 1001, 0), misses);
+        assert_eq!(doors(0, 0, 1), ["wrong maps at doors 1, must be 0"]);
     }
 
     #[test]
@@ -172,6 +254,7 @@ mod tests {
             "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "void": 0, "gap_ms": {"p50": 150, "p99": 150, "max": 150},
             "stale_accepted": 0, "missed_rounds": 0, "unrecovered": 0, "double_leader_after_quiet": 0,
             "false_failovers": 0, "reputations_changed": 0,
+            "doors": {"longer_gap_us": {"p50": null, "p99": null, "max": null}, "delay_us": {"p50": null, "p99": null, "max": null}, "wrong_maps": 0},
         }]);
         assert_eq!(json, expected);
     }
