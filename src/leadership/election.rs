@@ -29,8 +29,9 @@
 //! 5. Time that a node was stalled is no silence of others.
 //! 6. A node whose broker, fuser or gateway is broken does not lead.
 //!
-//! There are no votes and no majority: every side of a split network serves its vehicles. When two leaders meet, the
-//! higher epoch stays. Epochs tell apart what each of them published before.
+//! There are no votes and no majority: every side of a split network serves its vehicles. When two leaders meet, the one
+//! that should lead stays, unless more nodes follow the other. It goes on in a term above both. Epochs tell apart what each
+//! of them published before.
 //!
 //! # Why the leader beats by itself
 //!
@@ -404,6 +405,7 @@ impl Election {
 }
 
 /// A beat as received.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Beat {
     epoch: Epoch,
     hears_us: bool,

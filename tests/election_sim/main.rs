@@ -6,6 +6,7 @@
 mod data_plane;
 mod evidence;
 mod gaps;
+mod liar;
 mod node;
 mod random;
 mod world;

@@ -62,12 +62,16 @@ impl Election {
             State::Leading(_) => self.meet_leader(beat, now),
             State::Seeking(_) if Some(&beat.epoch) >= self.epoch.as_ref() => self.follow(beat, now),
             State::Following(following) if beat.epoch > following.epoch => {
+                let (leader, claimant) = (following.epoch.leader.clone(), beat.epoch.leader.clone());
                 let content = now < following.suspect_at(&self.config);
                 let rightful = beat.followers > 0 || beat.after.as_ref() >= Some(&following.epoch);
-                if content && !(beat.hears_us && rightful) {
-                    self.send_status(&beat.epoch.leader, now);
-                } else {
+                if leader == claimant || self.outranks(&claimant, &leader) && (!content || beat.hears_us && rightful) {
                     self.follow(beat, now);
+                } else {
+                    if let State::Following(following) = &mut self.state {
+                        following.claim = Some((now, beat).into());
+                    }
+                    self.send_status(&claimant, now);
                 }
             }
             State::Following(_) => self.send_status(&beat.epoch.leader, now),
@@ -79,34 +83,40 @@ impl Election {
         }
     }
 
-    /// Decides which of two leaders stays: the higher epoch, but never one without followers before one with some.
+    /// Decides which of two leaders stays. A claim to have followers, or a higher epoch, lets none stop for one that it
+    /// outranks: only the word of more nodes than follow it does. It goes on in a term above both.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else { return };
-        let own = leading.epoch.clone();
-        let followers = self.peers.followers(&own, now);
+        let (own, other) = (leading.epoch.clone(), beat.epoch.leader.clone());
         if beat.epoch < own {
-            let succeeded = leading.after.as_ref() >= Some(&beat.epoch);
-            if beat.hears_us && followers == 0 && beat.followers > 0 && !succeeded {
-                self.close(own.clone());
-                self.effects.push(ElectionEffect::StopPublishing { epoch: own });
-                self.effects.push(ElectionEffect::SendSnapshot { to: beat.epoch.leader.clone() });
-                self.seek(vec![beat.epoch.leader.clone()], now + self.config.response_timeout(), now);
-                self.send_status(&beat.epoch.leader, now);
-            } else {
-                self.send_beat(&beat.epoch.leader, now);
-            }
+            self.send_beat(&other, now);
             return;
         }
-        let stays = if beat.hears_us {
-            followers > 0 && beat.followers == 0 && beat.after.as_ref() < Some(&own)
-        } else {
+        let followers = self.peers.followers(&self.id, now);
+        let stays = if !beat.hears_us {
             // It does not hear us. An edge that nobody else hears either serves nobody; a vehicle serves itself.
             followers > 0 || self.config.role != Role::Edge
+        } else if self.outranks(&other, &self.id) {
+            followers > 0 && beat.followers == 0 && beat.after.as_ref() < Some(&own)
+        } else {
+            self.peers.followers(&other, now) <= followers
         };
         if !stays {
-            self.stop_leading(&beat.epoch.leader.clone());
+            self.stop_leading(&other);
             self.follow(beat, now);
+        } else if beat.hears_us {
+            self.contest(now);
         }
+    }
+
+    /// Whether the first of two nodes should lead rather than the second, by what their certificates allow.
+    fn outranks(&self, name: &NodeName, other: &NodeName) -> bool {
+        let rank = |name: &NodeName| {
+            let own = (*name == self.id).then(|| self.candidacy());
+            let candidacy = own.or_else(|| self.peers.get(name)?.candidacy)?;
+            Some((candidacy.class(), name.clone()))
+        };
+        rank(other).is_none_or(|other| rank(name).is_some_and(|name| name < other))
     }
 
     fn stop_leading(&mut self, next: &NodeName) {
@@ -172,16 +182,17 @@ impl Election {
             State::Leading(leading) if message.hears_you => {
                 let own = leading.epoch.clone();
                 match &message.epoch {
-                    // The word of a node that never leads ends no leadership.
-                    Some(other)
-                        if *other > own
-                            && other.leader != message.from
-                            && other.leader != self.id
-                            && message.candidacy.role != Role::Cav =>
-                    {
-                        let other = other.clone();
-                        self.stop_leading(&other.leader);
-                        self.adopt(other, now, now);
+                    Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
+                        // The word of fewer nodes than follow this one ends no leadership, nor that about a stranger.
+                        let is_majority =
+                            self.peers.followers(&other.leader, now) > self.peers.followers(&self.id, now);
+                        if is_majority && self.peers.may_lead(&other.leader, now) {
+                            let other = other.clone();
+                            self.stop_leading(&other.leader);
+                            self.adopt(other, now, now);
+                        } else {
+                            self.renew_later(now);
+                        }
                     }
                     Some(other) if *other != own => {}
                     _ if message.term > own.term => self.renew_later(&message.from, now),
@@ -253,10 +264,15 @@ impl Election {
         }
     }
 
+    /// Follows who claimed the lead since the leader was last heard, or seeks.
     fn lose_leader(&mut self, now: Timestamp) {
-        if let State::Following(following) = &mut self.state {
-            let order = std::mem::take(&mut following.successors);
-            self.seek(order, now, now);
+        let State::Following(following) = &mut self.state else { return };
+        let order = std::mem::take(&mut following.successors);
+        let claim = following.claim.take().map(|claim| *claim);
+        match claim.filter(|(at, beat)| now.since(*at) <= self.config.response_timeout() && !self.is_over(&beat.epoch))
+        {
+            Some((_, beat)) => self.follow(beat, now),
+            None => self.seek(order, now, now),
         }
     }
 }

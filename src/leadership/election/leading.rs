@@ -22,6 +22,8 @@ pub(super) struct Leading {
     pub(super) successors: Vec<NodeName>,
     /// The handover under way.
     pub(super) handover: Option<Handover>,
+    /// Whether this node led already when it began this epoch.
+    pub(super) is_renewed: bool,
     /// Time at which to lead on in a higher epoch, as some refuse this one.
     renew_at: Option<Timestamp>,
     beat_at: Timestamp,
@@ -30,7 +32,17 @@ pub(super) struct Leading {
 
 impl Leading {
     pub(super) fn new(epoch: Epoch, after: Option<Epoch>, successors: Vec<NodeName>, now: Timestamp) -> Self {
-        Self { epoch, since: now, after, successors, handover: None, renew_at: None, beat_at: now, beats: 0 }
+        Self {
+            epoch,
+            since: now,
+            after,
+            successors,
+            handover: None,
+            is_renewed: false,
+            renew_at: None,
+            beat_at: now,
+            beats: 0,
+        }
     }
 
     pub(super) fn deadline(&self) -> Timestamp {
@@ -76,9 +88,16 @@ impl Election {
         self.peers.refuses(refused_by, true);
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
-            let is_renewed = leading.after.as_ref().is_some_and(|after| after.leader == self.id);
-            let earliest = if is_renewed { leading.since + RENEWAL_PAUSE } else { at };
+            let earliest = if leading.is_renewed { leading.since + RENEWAL_PAUSE } else { at };
             leading.renew_at.get_or_insert(at.max(earliest));
+        }
+    }
+
+    /// Plans to outdo a rival, and asks all whom they follow: this node may have been held up, and they may have left it.
+    pub(super) fn contest(&mut self, now: Timestamp) {
+        if matches!(&self.state, State::Leading(leading) if leading.renew_at.is_none()) {
+            self.renew_later(now);
+            self.beat_all(now);
         }
     }
 
@@ -93,7 +112,7 @@ impl Election {
         let body = Body::Beat {
             every_ms: self.beat_for(leading, to).as_millis() as u64,
             round: self.round,
-            followers: u8::try_from(self.peers.followers(&leading.epoch, now)).unwrap_or(u8::MAX),
+            followers: u8::try_from(self.peers.followers(&self.id, now)).unwrap_or(u8::MAX),
             after: leading.after.clone(),
             successors: leading.successors.clone(),
         };

@@ -19,6 +19,7 @@ use std::time::Duration;
 
 use crate::aggregator::round::EARLY_ROUNDS;
 use crate::leadership::config::ElectionConfig;
+use crate::leadership::election::Beat;
 use crate::leadership::timers::{REGULAR_GAPS, missing, overdue};
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -48,6 +49,8 @@ pub(super) struct Following {
     pub(super) indirect_heard_at: Timestamp,
     /// Whether the membership gave the leader up since it was last heard.
     pub(super) given_up: bool,
+    /// The last claim to lead of a node that it outranks, since it was last heard.
+    pub(super) claim: Option<Box<(Timestamp, Beat)>>,
     /// Time of the first question about it since it was last heard.
     pub(super) asked_at: Option<Timestamp>,
     /// Time of the leader's last offer of the lead.
@@ -77,6 +80,7 @@ impl Following {
             bidirectional_at: direct_at,
             indirect_heard_at,
             given_up: false,
+            claim: None,
             asked_at: None,
             offered_at: None,
             prepared: false,
@@ -92,6 +96,7 @@ impl Following {
     pub(super) fn hear(&mut self, now: Timestamp) {
         self.direct_at = now;
         self.given_up = false;
+        self.claim = None;
         self.asked_at = None;
     }
 
@@ -116,8 +121,9 @@ impl Following {
 
     /// First deadline: the leader is doubted.
     pub(super) fn suspect_at(&self, config: &ElectionConfig) -> Timestamp {
-        let silent_at = self.silent_at(config);
-        self.telling_interval().map_or(silent_at, |gap| silent_at.min(self.direct_at + overdue(gap)))
+        let late_at = self.telling_interval().map(|gap| self.direct_at + overdue(gap));
+        let claimed_at = self.claim.as_ref().map(|claim| claim.0);
+        [late_at, claimed_at].into_iter().flatten().fold(self.silent_at(config), Timestamp::min)
     }
 
     /// Time from when on more than a round is missing.
@@ -135,8 +141,9 @@ impl Following {
         let unheard_at = self.bidirectional_at + silence.max(config.response_timeout());
         let missing_at = self.telling_interval().map(|gap| self.direct_at + missing(gap));
         let given_up_at = self.given_up.then(|| self.direct_at + config.given_up_timeout());
+        let claimed_at = self.claim.as_ref().map(|claim| claim.0 + config.given_up_timeout());
         let silent_at = (self.direct_at + silence).min(unheard_at);
-        [missing_at, given_up_at].into_iter().flatten().fold(silent_at, Timestamp::min)
+        [missing_at, given_up_at, claimed_at].into_iter().flatten().fold(silent_at, Timestamp::min)
     }
 
     /// Third deadline: the leader is lost.

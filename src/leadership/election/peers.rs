@@ -187,9 +187,10 @@ impl Peers {
         self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| at >= since)
     }
 
-    /// How many nodes heard lately follow `epoch`.
-    pub(super) fn followers(&self, epoch: &Epoch, now: Timestamp) -> usize {
-        self.table.iter().filter(|(name, peer)| peer.epoch.as_ref() == Some(epoch) && self.hears(name, now)).count()
+    /// How many nodes heard lately follow a leader, by their own word.
+    pub(super) fn followers(&self, leader: &NodeName, now: Timestamp) -> usize {
+        let follows = |peer: &Peer| peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == *leader);
+        self.table.iter().filter(|(name, peer)| *name != leader && follows(peer) && self.hears(name, now)).count()
     }
 
     /// Whether a peer could lead, as far as is known without having heard it lately.

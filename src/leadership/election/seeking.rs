@@ -136,7 +136,7 @@ impl Election {
                 following.indirect_heard_at = following.indirect_heard_at.max(heard_at);
                 return;
             }
-            State::Following(following) => now >= following.suspect_at(&self.config),
+            State::Following(following) => now >= following.direct_timeout_at(&self.config),
             State::Seeking(seeking) => Some(&epoch) != self.epoch.as_ref() || heard_at > seeking.known_until,
             State::Leading(_) => false,
         };
@@ -160,7 +160,9 @@ impl Election {
             State::Leading(_) => FirstRound::InStep,
         };
         self.effects.push(ElectionEffect::Lead { epoch: epoch.clone(), first_round: self.next_round(), first });
-        self.state = State::Leading(Leading::new(epoch, after, successors, now));
+        let mut leading = Leading::new(epoch, after, successors, now);
+        leading.is_renewed = self.is_leading();
+        self.state = State::Leading(leading);
         self.beat_all(now);
     }
 

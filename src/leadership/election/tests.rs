@@ -127,7 +127,9 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
         }
     }
     let (own, next) = (election.epoch().cloned(), Epoch::new(2, gauss.clone()));
-    election.handle(received(&gauss, 1, Some(&next), beat_after(own.as_ref())), now);
+    let ElectionInput::Receive { message } = received(&gauss, 1, Some(&next), beat_after(own.as_ref())) else { return };
+    let candidacy = Candidacy { role: Role::Edge, ..message.candidacy };
+    election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
     assert_eq!(election.leader(), Some(&gauss));
     let effects = election.handle(received(&hopper, 1000, own.as_ref(), status()), now);
     let is_answer = |effect: &ElectionEffect| matches!(effect, ElectionEffect::Send { to, message } if *to == hopper && message.epoch.as_ref() == Some(&next));
@@ -221,4 +223,39 @@ fn a_term_rises_by_a_bounded_step_in_an_hour_however_many_messages_state_more() 
     assert!(election.term() <= 8 + MAX_TERM_STEP, "{}", election.term());
     let beat = election.handle(of_edge(100, MAX_TERM, beat(88)), NOW);
     assert!(is_counted(&beat) && election.leader() == Some(&NodeName::from_static("edge")), "heard all the same");
+}
+
+/// A message of gauss, which claims to have taken over from edge and to be followed by all.
+fn claim_of_gauss(seq: u64) -> ElectionInput {
+    let gauss = NodeName::from_static("gauss");
+    let epoch = Epoch::new(9, gauss.clone());
+    let after = Some(epoch_of_edge());
+    let body = Body::Beat { every_ms: 50, round: 1, followers: 200, after, successors: Vec::new() };
+    received(&gauss, seq, Some(&epoch), body)
+}
+
+#[test]
+fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent() {
+    let mut election = euclid();
+    election.handle(of_edge(1, 8, beat(1)), NOW);
+    for ms in 1..1000 {
+        let now = NOW + std::time::Duration::from_millis(ms);
+        election.handle(claim_of_gauss(ms), now);
+        if ms % 100 == 0 {
+            election.handle(of_edge(ms, 8, beat(ms)), now);
+        }
+        assert_eq!(election.leader(), Some(&NodeName::from_static("edge")), "after {ms} ms");
+    }
+    let mut now = NOW + std::time::Duration::from_millis(1000);
+    election.handle(claim_of_gauss(1000), now);
+    while election.leader() == Some(&NodeName::from_static("edge")) {
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    assert_eq!(
+        election.leader(),
+        Some(&NodeName::from_static("gauss")),
+        "the leader is gone, and it has claimed the lead"
+    );
+    assert!(now.since(NOW) < std::time::Duration::from_millis(1500));
 }

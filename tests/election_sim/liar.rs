@@ -1,0 +1,82 @@
+//! A candidate of a lower rank than the leader that says whatever takes the lead.
+
+use ecod::leadership::Rights;
+use ecod::leadership::election::{Body, Candidacy, ElectionMessage};
+use ecod::leadership::node::Input;
+use ecod::model::epoch::Epoch;
+use ecod::wire::{Role, SCHEMA_VERSION};
+
+use super::{SECOND, cell, check, ensure, for_seeds, one_best_leader, seeds, start_all};
+use crate::world::{MS, World};
+
+/// Sequence numbers beyond those of the liar's own election, which nobody hears any more.
+const FORGED: u64 = 1 << 40;
+
+/// The lead stays where it is, and every honest node gets its rounds, while one in twenty packets is lost.
+#[test]
+fn a_liar_takes_the_lead_from_nobody() {
+    for_seeds(seeds() / 10, |seed| {
+        let mut world = cell(seed);
+        start_all(&mut world);
+        check(&mut world, seed, |world| {
+            world.run_for(9 * SECOND);
+            let leader = world.leaders()[0];
+            let may_lie = |world: &World, node: usize| node != leader && world.nodes[node].config.role != Role::Cav;
+            let Some(liar) = (0..world.nodes.len()).find(|node| may_lie(world, *node)) else { return Ok(()) };
+            one_best_leader(world)?;
+            world.loss_percent = seed % 6;
+            let before = world.led.len();
+            for lie in 0..1000 {
+                tell_lies(world, liar, leader, FORGED + lie);
+                world.run_for(10 * MS);
+                ensure(world.nodes[leader].leads(), "the leader gave way")?;
+                for (index, node) in world.alive().filter(|(index, _)| *index != liar) {
+                    let follows = node.leader() == Some(&world.nodes[leader].name);
+                    ensure(index == leader || follows, &format!("{} left the leader", node.name))?;
+                }
+            }
+            ensure(world.led.len() <= before + 2, "the leader renews its term without end")
+        });
+    });
+}
+
+/// Tells every honest node the same lie, one of all kinds.
+fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
+    let (name, config) = (world.nodes[liar].name.clone(), world.nodes[liar].config.clone());
+    let Some(present) = world.nodes[leader].election().and_then(|election| election.epoch().cloned()) else { return };
+    let other = world.random.index(world.nodes.len());
+    let own = Epoch::new(present.term + 1, name.clone());
+    let of_other = Epoch::new(present.term + 1, world.nodes[other].name.clone());
+    let beat = |followers, after| Body::Beat { every_ms: 50, round: 1, followers, after, successors: Vec::new() };
+    let (epoch, hears_you, body) = match world.random.between(0, 5) {
+        0 => (Some(own), true, beat(200, None)),
+        1 => (Some(own), true, beat(200, Some(present))),
+        // A leader that nobody follows makes way for one that does not hear it.
+        2 if world.nodes.len() > 2 => (Some(own), false, beat(200, Some(present))),
+        3 => (Some(of_other), true, Body::Status { over: None }),
+        4 => (Some(of_other.clone()), true, Body::LeaderEvidence { ask: seq % 32, age_ms: 0 }),
+        _ => (None, true, Body::Status { over: Some(present) }),
+    };
+    let run = 1_900_000_000_000_000;
+    let candidacy = Candidacy { role: config.role, priority: config.priority, load: 0, fit: true };
+    let term = epoch.as_ref().map_or(own_term(world, leader), |epoch| epoch.term);
+    let message = ElectionMessage {
+        schema: SCHEMA_VERSION,
+        from: name.clone(),
+        run,
+        seq,
+        candidacy,
+        term,
+        epoch,
+        hears_you,
+        body,
+        clock: None,
+    };
+    for to in (0..world.nodes.len()).filter(|to| *to != liar) {
+        world.handle(to, Input::Receive { from: name.clone(), rights: Rights::default(), message: message.clone() });
+    }
+}
+
+fn own_term(world: &World, node: usize) -> u64 {
+    world.nodes[node].election().map_or(0, |election| election.term())
+}
