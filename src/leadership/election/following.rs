@@ -83,8 +83,8 @@ impl Election {
         }
     }
 
-    /// Decides which of two leaders stays. A claim to have followers, or a higher epoch, lets none stop for one that it
-    /// outranks: only the word of more nodes than follow it does. It goes on in a term above both.
+    /// Decides which of two leaders stays. A higher epoch lets none stop for one that does not outrank it and that fewer
+    /// nodes say to follow, whatever that one claims. It goes on in a term above both.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else { return };
         let (own, other) = (leading.epoch.clone(), beat.epoch.leader.clone());
@@ -99,22 +99,22 @@ impl Election {
         } else if self.outranks(&other, &self.id) {
             followers > 0 && beat.followers == 0 && beat.after.as_ref() < Some(&own)
         } else {
-            self.peers.followers(&other, now) <= followers
+            let theirs = self.peers.followers(&other, now);
+            theirs < followers || theirs == followers && self.outranks(&self.id, &other)
         };
         if !stays {
             self.stop_leading(&other);
             self.follow(beat, now);
         } else if beat.hears_us {
-            self.contest(now);
+            self.contest(&other, now);
         }
     }
 
-    /// Whether the first of two nodes should lead rather than the second, by what their certificates allow.
+    /// Whether the first of two nodes should lead rather than the second, by role and priority: certificates bound them.
     fn outranks(&self, name: &NodeName, other: &NodeName) -> bool {
         let rank = |name: &NodeName| {
             let own = (*name == self.id).then(|| self.candidacy());
-            let candidacy = own.or_else(|| self.peers.get(name)?.candidacy)?;
-            Some((candidacy.class(), name.clone()))
+            Some(own.or_else(|| self.peers.get(name)?.candidacy)?.class())
         };
         rank(other).is_none_or(|other| rank(name).is_some_and(|name| name < other))
     }
@@ -191,7 +191,7 @@ impl Election {
                             self.stop_leading(&other.leader);
                             self.adopt(other, now, now);
                         } else {
-                            self.renew_later(now);
+                            self.renew_later(&message.from, now);
                         }
                     }
                     Some(other) if *other != own => {}

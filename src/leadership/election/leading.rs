@@ -94,9 +94,9 @@ impl Election {
     }
 
     /// Plans to outdo a rival, and asks all whom they follow: this node may have been held up, and they may have left it.
-    pub(super) fn contest(&mut self, now: Timestamp) {
+    pub(super) fn contest(&mut self, rival: &NodeName, now: Timestamp) {
         if matches!(&self.state, State::Leading(leading) if leading.renew_at.is_none()) {
-            self.renew_later(now);
+            self.renew_later(rival, now);
             self.beat_all(now);
         }
     }
