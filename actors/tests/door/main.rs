@@ -200,7 +200,7 @@ async fn the_door_is_the_same_with_an_external_broker() {
         assert_eq!(cell.node(name).broker_address(), None, "no node is told of a door");
         let program = Program::connect("lidar", cell.door(name), &["global_detections"]).await;
         reported(&cell, &program, &format!("{name}--lidar"), "euclid", 3.1, name).await;
-        assert!(!program.rounds().is_empty());
+        cell.until("the program has a round", |_| !program.rounds().is_empty()).await;
     }
     cell.stop().await;
 }

@@ -86,12 +86,12 @@ async fn a_lone_vehicle_serves_itself_in_ever_later_epochs() {
     cell.stop().await;
 }
 
-/// A leader that loses its broker stops leading at once; it is handed the lead again when it is whole.
+/// A leader that loses its broker stops leading at once; an edge is handed the lead again when it is whole.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
     let mut cell = Cell::default();
-    for name in ["euclid", "gauss"] {
-        cell.start(name, Role::Auto).await;
+    for (name, role) in [("euclid", Role::Edge), ("gauss", Role::Auto)] {
+        cell.start(name, role).await;
     }
     cell.served_by("euclid").await;
     cell.standby_is_named().await;
