@@ -40,6 +40,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::newest::Received;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::{Counters, Event, OTHERS};
@@ -77,6 +78,8 @@ pub struct ReputationKeeperArguments {
     pub gateway: ActorSlot<GatewayMessage>,
     /// Starts from evidence of others.
     pub fuser: ActorSlot<FuserMessage>,
+    /// The cell's time, by which resets are judged.
+    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -225,7 +228,8 @@ impl ReputationKeeperState {
             return self.arguments.counters.reject(RejectReason::BadSignature, share.node.as_str());
         }
         let mut store = self.arguments.reputations.open();
-        let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, delivery.received_at);
+        let (at, date) = (delivery.received_at, self.arguments.clock.date(delivery.received_at));
+        let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, at, date);
         drop(store);
         let merged = match merged {
             Ok(merged) => merged,
