@@ -1,6 +1,7 @@
 //! Evidence of others: what it costs, and where it goes.
 
 use std::net::{Ipv4Addr, SocketAddr};
+use std::time::Duration;
 
 use ecod::leadership::Position;
 use ecod::leadership::cell_time::ClockReading;
