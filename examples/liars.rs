@@ -102,7 +102,7 @@ impl Ledger {
                 reset_at_us: None,
             };
             let candidates = std::slice::from_ref(&forger);
-            is_news |= self.resync.merge(&share, &mut self.ledger, candidates, &self.leadership, now)?.is_news;
+            is_news |= self.resync.merge(&share, &mut self.ledger, candidates, &self.leadership, now, now)?.is_news;
         }
         Ok(is_news)
     }

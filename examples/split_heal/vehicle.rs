@@ -186,7 +186,7 @@ impl Vehicle {
     fn merge(&mut self, share: &LedgerShare, now: Timestamp) {
         self.handle(Input::EvidenceReceived { from: share.node.clone() }, now);
         let candidates: Vec<_> = self.members.keys().cloned().collect();
-        let Ok(merged) = self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, now) else {
+        let Ok(merged) = self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, now, now) else {
             return;
         };
         if merged.is_news {

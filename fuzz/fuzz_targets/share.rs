@@ -49,7 +49,8 @@ fuzz_target!(|input: &[u8]| {
         let mut resync = new(NodeName::from_static("gauss"), 10);
         let mut ledger = ReputationLedger::default();
         for at in [1_000_000, 2_000_000] {
-            let _merged = resync.merge(&transplanted, &mut ledger, &candidates, &leadership, Timestamp(at));
+            let _merged =
+                resync.merge(&transplanted, &mut ledger, &candidates, &leadership, Timestamp(at), Timestamp(at));
             let _shares = resync.tick(&ledger, &leadership, Timestamp(at));
         }
         assert!(ledger.lanes() <= MAX_LANES && ledger.entries().count() <= MAX_ENTRIES);

@@ -61,10 +61,11 @@ pub use crate::leadership::config::ElectionConfig;
 pub use awake_clock::AwakeClock;
 pub use clock_stamps::{AnsweredStamps, ClockStamps};
 pub use interface::{ElectionEffect, ElectionInput, Health};
+pub(crate) use message::MAX_FIRST_TERM;
+use message::MAX_ROUND_STEP;
 pub use message::{
     Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP,
 };
-use message::{MAX_FIRST_TERM, MAX_ROUND_STEP};
 
 use crate::leadership::timers::TERM_WINDOW;
 use crate::model::epoch::Epoch;

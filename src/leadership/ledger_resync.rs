@@ -31,7 +31,7 @@ use crate::model::time::Timestamp;
 use crate::reputation::{EntryKey, Evidence, MAX_ENTRIES, ReputationLedger};
 use crate::wire::{LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION};
 use growth::GrowthLimit;
-pub use growth::MAX_FIRST_VOTES;
+pub use growth::is_plausible;
 
 /// Number of times that a leader is sent what it was not told, in case it was lost.
 const REPEATS: u32 = 3;
@@ -157,7 +157,8 @@ impl LedgerResync {
         Err(is_news.then_some(RejectReason::Unattested))
     }
 
-    /// Takes in another candidate's share. `candidates` are the other nodes that may lead.
+    /// Takes in another candidate's share. `candidates` are the other nodes that may lead, `date` is `now` in the cell's
+    /// time.
     ///
     /// # Errors
     /// [`RejectReason::NotCandidate`] for the share of a node that may not lead, [`RejectReason::BadSignature`] for one
@@ -169,6 +170,7 @@ impl LedgerResync {
         candidates: &[NodeName],
         leadership: &Leadership,
         now: Timestamp,
+        date: Timestamp,
     ) -> Result<Merged, RejectReason> {
         if !candidates.contains(&share.node) {
             return Err(RejectReason::NotCandidate);
@@ -177,7 +179,7 @@ impl LedgerResync {
             return Err(RejectReason::BadSignature);
         }
         self.note_leader(leadership, now);
-        let is_reset = self.take_reset(share, ledger, now);
+        let is_reset = self.take_reset(share, ledger, date);
         let is_over = !self.is_signed && share.reset_at_us.unwrap_or_default() < ledger.reset_at();
         let (mut taken, refused) =
             if is_over { (share.clone(), Vec::new()) } else { self.judge(share, ledger, leadership, now) };
@@ -266,8 +268,8 @@ impl LedgerResync {
     }
 
     /// Forgets all evidence if the share knows of a later reset than this node; true if it does.
-    fn take_reset(&mut self, share: &LedgerShare, ledger: &mut ReputationLedger, now: Timestamp) -> bool {
-        let later = share.reset_at_us.filter(|at| *at > ledger.reset_at() && at.since(now) < MAX_RESET_AHEAD);
+    fn take_reset(&mut self, share: &LedgerShare, ledger: &mut ReputationLedger, date: Timestamp) -> bool {
+        let later = share.reset_at_us.filter(|at| *at > ledger.reset_at() && at.since(date) < MAX_RESET_AHEAD);
         let Some(reset_at) = later.filter(|_| !self.is_signed) else { return false };
         *ledger = ReputationLedger::reset(reset_at);
         self.shared = ReputationLedger::default();

@@ -87,7 +87,7 @@ impl World {
         let candidates = self.candidates(to);
         let now = Timestamp(self.now).shifted(self.nodes[to].steady_clock);
         let node = &mut self.nodes[to];
-        if let Ok(merged) = node.resync.merge(share, &mut node.ledger, &candidates, &node.leadership, now) {
+        if let Ok(merged) = node.resync.merge(share, &mut node.ledger, &candidates, &node.leadership, now, now) {
             self.judge_merge(to, share);
             self.share(to, merged.shares);
         }

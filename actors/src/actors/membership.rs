@@ -19,6 +19,7 @@ use ring::rand::{SecureRandom, SystemRandom};
 use rustls::pki_types::UnixTime;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
+use tokio::time::timeout;
 
 use crate::messages::membership::MembershipMessage;
 use crate::platform::clock;
@@ -91,7 +92,7 @@ impl Actor for Membership {
         let socket = Arc::new(GossipSocket::bind(&config)?);
         let address = socket.address();
         log_who_can_take_part(&config, credentials.is_some(), address);
-        let mut certificates = credentials.map(CertificateWatch::new);
+        let mut certificates = credentials.clone().map(CertificateWatch::new);
         let identity = certificates.as_mut().map(CertificateWatch::identity);
         let now = clock::now();
         let gossip = config.advertise.unwrap_or(address);
@@ -103,8 +104,8 @@ impl Actor for Membership {
         let handled = Arc::new(Notify::new());
         let mut tasks = JoinSet::new();
         tasks.spawn(watch_socket(Arc::clone(&socket), deadlines, Arc::clone(&handled), myself.clone()));
-        if certificates.is_some() {
-            tasks.spawn(check_certificates(myself.clone()));
+        if let Some(credentials) = credentials {
+            tasks.spawn(check_certificates(credentials, myself.clone()));
         }
         if !join_group(&socket, &config.multicast) {
             tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
@@ -239,12 +240,13 @@ impl CertificateWatch {
     }
 }
 
-/// Time between two checks of the certificates.
+/// Time between two checks of the certificates against the clock.
 const CERTIFICATE_PERIOD: Duration = Duration::from_millis(500);
 
-async fn check_certificates(membership: ActorRef<MembershipMessage>) {
+async fn check_certificates(credentials: Arc<Credentials>, membership: ActorRef<MembershipMessage>) {
+    let mut known = credentials.current();
     loop {
-        tokio::time::sleep(CERTIFICATE_PERIOD).await;
+        known = timeout(CERTIFICATE_PERIOD, credentials.changed(&known)).await.unwrap_or(known);
         if membership.cast(MembershipMessage::CheckCertificates).is_err() {
             return;
         }

@@ -7,7 +7,7 @@
 //! ```
 //!
 //! With certificates, this actor signs the counts of its node, and verifies those of others. When a certificate is revoked,
-//! the counts that it signed are dropped within a second, from the published reputations and from the fuser.
+//! the counts that it signed are dropped at once, from the published reputations and from the fuser.
 //!
 //! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. Reputations are
 //! saved before they are published. The [`ReputationStore`] outlives the actor, and the state directory the node.
@@ -17,7 +17,6 @@ mod store;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Duration;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::ledger_resync::LedgerResync;
@@ -28,7 +27,7 @@ use ecod::reputation::{Evidence, ReputationConfig};
 use ecod::wire::{LedgerShare, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, JoinSet};
 
 pub use config::ReputationKeeperConfig;
 #[cfg(fuzzing)]
@@ -40,6 +39,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::newest::Received;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::{Counters, Event, OTHERS};
@@ -47,9 +47,6 @@ use crate::transport::gossip::Member;
 use crate::transport::mqtt::Delivery;
 use crate::transport::pki::{Credentials, EvidenceSigner};
 use store::Saved;
-
-/// Time between two looks at the revocation list.
-const REVOCATION_CHECK_PERIOD: Duration = Duration::from_secs(1);
 
 /// What a keeper needs at its start.
 pub struct ReputationKeeperArguments {
@@ -77,6 +74,8 @@ pub struct ReputationKeeperArguments {
     pub gateway: ActorSlot<GatewayMessage>,
     /// Starts from evidence of others.
     pub fuser: ActorSlot<FuserMessage>,
+    /// The cell's time, by which resets are judged.
+    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
@@ -96,6 +95,8 @@ pub struct ReputationKeeperState {
     unadopted: bool,
     writing: Option<JoinHandle<std::io::Result<()>>>,
     disk_failed: bool,
+    /// Tasks that end with the actor.
+    tasks: JoinSet<()>,
 }
 
 impl Actor for ReputationKeeper {
@@ -114,7 +115,9 @@ impl Actor for ReputationKeeper {
         if state.signer.is_some() {
             // Certificates may have been revoked while the actor did not run.
             state.drop_revoked();
-            myself.send_interval(REVOCATION_CHECK_PERIOD, || ReputationKeeperMessage::CheckCertificates);
+        }
+        if let Some(credentials) = state.arguments.credentials.clone() {
+            state.tasks.spawn(watch_certificates(credentials, myself));
         }
         Ok(state)
     }
@@ -175,6 +178,7 @@ impl ReputationKeeperState {
             unadopted: false,
             writing: None,
             disk_failed: false,
+            tasks: JoinSet::new(),
         }
     }
 
@@ -225,7 +229,8 @@ impl ReputationKeeperState {
             return self.arguments.counters.reject(RejectReason::BadSignature, share.node.as_str());
         }
         let mut store = self.arguments.reputations.open();
-        let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, delivery.received_at);
+        let (at, date) = (delivery.received_at, self.arguments.clock.date(delivery.received_at));
+        let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, at, date);
         drop(store);
         let merged = match merged {
             Ok(merged) => merged,
@@ -345,6 +350,14 @@ impl ReputationKeeperState {
             let path = self.arguments.file.as_ref().map(|file| file.path().display().to_string());
             tracing::warn!(path, %error, "reputations not saved");
         }
+    }
+}
+
+/// Tells the keeper of changed certificates and revocation lists.
+async fn watch_certificates(credentials: Arc<Credentials>, keeper: ActorRef<ReputationKeeperMessage>) {
+    let mut known = credentials.current();
+    while keeper.cast(ReputationKeeperMessage::CheckCertificates).is_ok() {
+        known = credentials.changed(&known).await;
     }
 }
 

@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::time::timeout;
 use uuid::Uuid;
 
-use crate::fixture::{Cell, DAY, SOON, node};
+use crate::fixture::{Cell, DAY, GONE_WITHIN, SOON, node};
 
 /// A second broker of the cell.
 fn stolen(cell: &mut Cell) -> (EmbeddedBroker, BrokerAddress) {
@@ -66,7 +66,7 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
     }
 
     cell.pki.authority.revoke(&node("stolen"), ecod_actors::platform::clock::now()).unwrap();
-    let lost = timeout(SOON, links.recv()).await.expect("still connected");
+    let lost = timeout(GONE_WITHIN, links.recv()).await.expect("still connected");
     assert_eq!(lost, Some((stolen.clone(), LinkState::Down)));
     let refused = async {
         while counters.events(Event::ConnectFailed) < 2 {

@@ -12,7 +12,7 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 
-use crate::fixture::{Cell, Client, DAY, Pki, SOON, client_config};
+use crate::fixture::{Cell, Client, DAY, GONE_WITHIN, Pki, SOON, client_config};
 
 /// A login as MQTT 3.1.1 writes it, with an empty client id.
 const LOGIN_PACKET: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 4, 2, 0, 60, 0, 0];
@@ -76,7 +76,7 @@ async fn who_is_revoked_is_cut_off_and_stays_out_and_the_broker_runs_on() {
     let mut gauss = Client::new(cell.address, "gauss", &tls);
     gauss.log_in().await.unwrap();
     cell.pki.authority.revoke(&crate::fixture::node("gauss"), ecod_actors::platform::clock::now()).unwrap();
-    timeout(SOON, gauss.drive()).await.expect("still connected");
+    timeout(GONE_WITHIN, gauss.drive()).await.expect("still connected");
     cell.counted(Event::ClientExpelled, 1).await;
     let refused = Client::new(cell.address, "gauss", &tls).log_in().await;
     assert!(refused.as_ref().is_err_and(|error| error.to_lowercase().contains("revoked")), "{refused:?}");

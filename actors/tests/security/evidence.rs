@@ -17,7 +17,8 @@ use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::pki::{Credentials, EvidenceSigner, TlsConfig};
 use tokio::time::{Instant, sleep};
 
-use crate::fixture::{Client, DAY, Pki, SOON, client_config, node as name};
+use crate::fixture::{Client, DAY, GONE_WITHIN, Pki, SOON, client_config, node as name};
+use crate::nodes::aggregator;
 use crate::shares::inverted;
 
 fn config(node: &str, role: Role, tls: &TlsConfig, state: &Path) -> NodeConfig {
@@ -75,8 +76,8 @@ fn record(leader: &NodeHandle, vehicles: [(&str, bool); 2]) -> u64 {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_false_leader_counted_is_gone_when_it_is_revoked() {
     let (mut pki, state) = (Pki::new(), tempfile::tempdir().unwrap());
-    let [edge_files, gauss_files] =
-        [("edge", Role::Edge), ("gauss", Role::Auto)].map(|(node, role)| pki.issue(node, role, DAY));
+    let [edge_files, gauss_files, euclid_files] = [("edge", Role::Edge), ("gauss", Role::Auto), ("euclid", Role::Cav)]
+        .map(|(node, role)| pki.issue(node, role, DAY));
     let gauss = node::start(config("gauss", Role::Auto, &gauss_files, state.path())).await.unwrap();
     until("a false leader", || gauss.leadership().borrow().is_leading()).await;
     record(&gauss, [("honest", false), ("liar", true)]);
@@ -85,19 +86,25 @@ async fn what_a_false_leader_counted_is_gone_when_it_is_revoked() {
     let edge = node::start(better).await.unwrap();
     let leads = || edge.leadership().borrow().is_leading();
     until("the lead handed over", || leads() && reputations(&edge).contains_key(&name("liar"))).await;
+    let mut follower = config("euclid", Role::Cav, &euclid_files, state.path());
+    follower.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
+    let euclid = node::start(follower).await.unwrap();
+    until("a follower", || aggregator(&euclid).as_deref() == Some("edge")).await;
     record(&edge, [("honest", true), ("other", true)]);
-    until("both leaders' evidence", || reputations(&edge).len() == 3).await;
+    until("both leaders' evidence", || reputations(&edge).len() == 3 && reputations(&euclid).len() == 3).await;
     let before = reputations(&edge);
     assert!(before[&name("liar")].score > 0.8 && before[&name("honest")].incorrect == 40, "{before:?}");
 
     pki.authority.revoke(&name("gauss"), clock::now()).unwrap();
-    until("evidence gone", || !reputations(&edge).contains_key(&name("liar"))).await;
+    let written = Instant::now();
+    until("evidence gone", || [&edge, &euclid].iter().all(|node| !reputations(node).contains_key(&name("liar")))).await;
     let after = reputations(&edge);
     assert_eq!((after[&name("honest")].correct, after[&name("honest")].incorrect), (40, 0));
     let saved = state.path().join("lot.edge.reputations.json");
     let lane = "\"aggregator\":\"gauss\"";
     until("gone from the disk", || !std::fs::read_to_string(&saved).unwrap().contains(lane)).await;
-    for node in [gauss, edge] {
+    assert!(written.elapsed() < GONE_WITHIN, "{:?}", written.elapsed());
+    for node in [gauss, edge, euclid] {
         node.stop().await;
     }
 }

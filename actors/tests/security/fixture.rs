@@ -25,6 +25,9 @@ pub(crate) const DAY: Duration = Duration::from_secs(86_400);
 /// How long anything may take on a machine that does much else.
 pub(crate) const SOON: Duration = Duration::from_secs(20);
 
+/// Longest time from a changed revocation list until a node has nothing to do with the revoked one any more.
+pub(crate) const GONE_WITHIN: Duration = Duration::from_secs(2);
+
 /// Largest packet of the broker.
 pub(crate) const MAX_PACKET: usize = 64 * 1024;
 

@@ -15,7 +15,7 @@ use ractor::{Actor, ActorRef, call_t};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep};
 
-use crate::fixture::{DAY, Pki, SOON, node};
+use crate::fixture::{DAY, GONE_WITHIN, Pki, SOON, node};
 
 struct Node {
     actor: ActorRef<MembershipMessage>,
@@ -107,6 +107,7 @@ async fn a_revoked_node_is_down_soon_after_the_list_is_written() {
     let is_down = |event: &MembershipEvent| *event == MembershipEvent::Down { name: node("euclid") };
     until("it is down", || edge.events.lock().unwrap().iter().any(is_down)).await;
     println!("down {:?} after the list was written", written.elapsed());
+    assert!(written.elapsed() < GONE_WITHIN, "{:?}", written.elapsed());
     assert_eq!(edge.counters.get(FrameEvent::Expelled), 1);
     sleep(Duration::from_secs(2)).await;
     assert!(edge.sees().is_empty(), "it does not come back");

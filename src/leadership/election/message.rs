@@ -20,7 +20,7 @@ pub const MAX_TERM: u64 = (1 << 53) - 1;
 pub const MAX_TERM_STEP: u64 = 1 << 20;
 
 /// Largest term that a node without any takes from another: it may join a cell that has led for long.
-pub(super) const MAX_FIRST_TERM: u64 = 1 << 40;
+pub(crate) const MAX_FIRST_TERM: u64 = 1 << 40;
 
 /// Largest step by which one message raises the known number of the last round: more rounds than a cell publishes in
 /// years. A node that has just started believes any number up to [`MAX_ROUND`].

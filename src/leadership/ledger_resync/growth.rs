@@ -2,14 +2,15 @@
 
 use std::collections::BTreeMap;
 
+use crate::leadership::election::MAX_FIRST_TERM;
 use crate::model::epoch::Epoch;
 use crate::model::time::Timestamp;
 use crate::reputation::{EntryKey, ReputationLedger};
-use crate::wire::{LedgerEntry, LedgerMark, LedgerShare};
+use crate::wire::{LedgerEntry, LedgerMark, LedgerShare, Limits, Payload};
 
 /// Maximum number of votes of a vehicle for one label in a leadership when this node first hears of them: 100 million,
 /// three years at one a second.
-pub const MAX_FIRST_VOTES: u64 = 100_000_000;
+pub(super) const MAX_FIRST_VOTES: u64 = 100_000_000;
 
 /// Maximum number of votes of a vehicle for one label in a second, from then on: 1024 objects in ten reports.
 const MAX_VOTES_PER_S: u64 = 10_240;
@@ -19,6 +20,16 @@ const ALLOWANCE: u64 = 1024;
 
 /// Votes from one mark to the next.
 const MARK_VOTES: u64 = 32;
+
+/// Whether evidence that this node did not hear of before is plausible: the bounds of the wire, for files.
+pub fn is_plausible(share: &LedgerShare) -> bool {
+    let (unknown, never) = (GrowthLimit::default(), Timestamp::default());
+    let mut terms = share.entries.iter().map(|entry| entry.epoch).chain(share.marks.iter().map(|mark| mark.epoch));
+    share.check(&Limits::default()).is_ok()
+        && terms.all(|term| term <= MAX_FIRST_TERM)
+        && share.entries.iter().all(|entry| unknown.admits(entry, never))
+        && share.marks.iter().all(|mark| unknown.admits_mark(mark, never))
+}
 
 /// Number of votes of each count when this node first heard of it, with the time.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

@@ -1,5 +1,6 @@
 //! Evidence of others: whose is accepted, what it costs, and how it survives the end of leaders.
 
+use super::growth::MAX_FIRST_VOTES;
 use super::*;
 use crate::leadership::view::Position;
 use crate::reputation::MAX_LANES;
@@ -36,7 +37,8 @@ impl Candidate {
 
     fn merge(&mut self, share: &LedgerShare, at_ms: u64) -> Result<Merged, RejectReason> {
         let candidates = ["a", "b1", "b2", "edge", "gauss", "leader", "other"].map(name);
-        self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, Timestamp(at_ms * 1000))
+        let now = Timestamp(at_ms * 1000);
+        self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, now, now)
     }
 
     /// Lets snapshot periods pass; returns what is shared.

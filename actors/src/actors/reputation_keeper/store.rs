@@ -3,15 +3,18 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use ecod::leadership::ledger_resync::MAX_FIRST_VOTES;
+use ecod::leadership::cell_time::EARLIEST;
+use ecod::leadership::ledger_resync::is_plausible;
+use ecod::leadership::timers::MAX_RESET_AHEAD;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
-use ecod::wire::{LedgerEntry, LedgerMark, LedgerShare, Reputation, SCHEMA_VERSION};
+use ecod::wire::{LedgerEntry, LedgerMark, LedgerShare, Limits, Payload, Reputation, Reputations, SCHEMA_VERSION};
 use serde::{Deserialize, Serialize};
 
 use super::ReputationKeeperArguments;
+use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::transport::pki::EvidenceSigner;
 
@@ -31,38 +34,49 @@ impl ReputationStore {
         if self.by_evidence { self.ledger.reputations(config) } else { self.standing.clone() }
     }
 
-    /// Takes over what was saved, as far as it is evidence. Where evidence is signed, `signer` verifies it.
-    fn take(&mut self, saved: Saved, signer: Option<&mut EvidenceSigner>) {
-        let Saved { mut entries, mut marks, statements, standing, signed, reset_at_us, .. } = saved;
-        self.standing = standing;
-        if reset_at_us > self.ledger.reset_at() {
+    /// Takes over what was saved, within the bounds of what others send. Where evidence is signed, `signer` verifies it.
+    /// `date` is the present time; a clock that was never set judges no other.
+    fn take(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
+        let Saved { entries, marks, mut statements, standing, signed, reset_at_us, node, .. } = saved;
+        if reset_at_us.since(date) >= MAX_RESET_AHEAD && date >= EARLIEST {
+            tracing::warn!(%reset_at_us, "saved time of a reset not used: it is in the future");
+        } else if reset_at_us > self.ledger.reset_at() {
             self.ledger = ReputationLedger::reset(reset_at_us);
         }
-        let (counts, statement_count) = (entries.len(), statements.len());
-        entries.retain(|entry| entry.correct.saturating_add(entry.incorrect) <= MAX_FIRST_VOTES);
-        marks.retain(|mark| mark.correct.saturating_add(mark.incorrect) <= MAX_FIRST_VOTES);
-        if signer.is_some() && !signed {
-            (entries, marks) = (Vec::new(), Vec::new());
+        let standing =
+            Reputations { schema: SCHEMA_VERSION, aggregator: None, epoch: 0, round: 0, reputations: standing };
+        match standing.check(&Limits::default()) {
+            Ok(()) => self.standing = standing.reputations,
+            Err(reason) => tracing::warn!(%reason, "saved reputations not used"),
         }
-        if entries.len() < counts {
-            let dropped = counts - entries.len();
+        let share = |entries, marks| LedgerShare {
+            schema: SCHEMA_VERSION,
+            node: node.clone(),
+            epoch: None,
+            entries,
+            marks,
+            signed: None,
+            reset_at_us: None,
+        };
+        let counts = entries.into_iter().map(|entry| share(vec![entry], Vec::new()));
+        let mut counts: Vec<_> = counts.chain(marks.into_iter().map(|mark| share(Vec::new(), vec![mark]))).collect();
+        let read = counts.len() + statements.len();
+        counts.retain(|share| (signer.is_none() || signed) && is_plausible(share));
+        let mut is_valid = |share: &_| signer.as_mut().is_none_or(|signer| signer.verify_again(share).is_ok());
+        statements.retain(|share| is_plausible(share) && is_valid(share));
+        let dropped = read - counts.len() - statements.len();
+        if dropped > 0 {
             tracing::warn!(
                 dropped,
-                "saved evidence not used: it is not signed, or claims more votes than there can be"
+                "saved evidence not used: not signed, of a revoked node, or more than there can be"
             );
         }
-        self.ledger.merge_entries(entries, None);
-        self.ledger.merge_marks(marks, None);
-        match signer {
-            Some(signer) => {
-                let is_valid = |share: &LedgerShare| signer.verify_again(share).is_ok();
-                let valid: Vec<_> = statements.into_iter().filter(is_valid).map(Arc::new).collect();
-                if valid.len() < statement_count {
-                    tracing::info!(dropped = statement_count - valid.len(), "saved evidence of revoked nodes not used");
-                }
-                valid.iter().for_each(|share| _ = self.ledger.merge_statement(share, None));
-            }
-            None => statements.iter().for_each(|share| _ = self.ledger.merge_share(share, None)),
+        counts.iter().for_each(|share| _ = self.ledger.merge_share(share, None));
+        for share in statements {
+            match signer {
+                Some(_) => self.ledger.merge_statement(&Arc::new(share), None),
+                None => self.ledger.merge_share(&share, None),
+            };
         }
     }
 }
@@ -163,7 +177,8 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments, signer: Option<&mut
         return;
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
-        store.take(saved, signer);
+        let date = arguments.clock.date(clock::now());
+        store.take(saved, signer, date);
         tracing::info!(path = %file.path().display(), entries = store.ledger.entries().count(), "reputations restored");
     }
 }
@@ -173,7 +188,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments, signer: Option<&mut
 pub fn read_saved(bytes: &[u8]) {
     if let Ok(saved) = serde_json::from_slice(bytes) {
         let store = SharedReputations::new(true);
-        store.open().take(saved, None);
+        store.open().take(saved, None, EARLIEST);
         drop(store.open().reputations(&ReputationConfig::default()));
     }
 }

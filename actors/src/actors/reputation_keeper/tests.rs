@@ -1,8 +1,10 @@
 //! Evidence of others: what it costs, and where it goes.
 
 use std::net::{Ipv4Addr, SocketAddr};
+use std::time::Duration;
 
 use ecod::leadership::Position;
+use ecod::leadership::cell_time::ClockReading;
 use ecod::model::time::Timestamp;
 use ecod::wire::LedgerEntry;
 use tempfile::TempDir;
@@ -63,6 +65,7 @@ fn arguments(gateway: &ActorSlot<GatewayMessage>, counters: &Arc<Counters>) -> R
         leadership: watch::channel(leadership).1,
         gateway: gateway.clone(),
         fuser: ActorSlot::default(),
+        clock: CellClock::default(),
         counters: Arc::clone(counters),
     }
 }
@@ -231,6 +234,68 @@ async fn a_ledger_that_an_earlier_version_let_be_poisoned_is_not_used() {
         ReputationKeeperState::new(ReputationKeeperArguments { file: Some(file), ..arguments(&gateway, &counters) });
     store::restore(&keeper.arguments, keeper.signer.as_mut());
     assert_eq!(keeper.arguments.reputations.open().ledger.reset_at(), Timestamp(5));
+}
+
+#[tokio::test]
+async fn a_file_is_held_to_the_bounds_of_the_wire() {
+    let (gateway, _published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let directory = tempfile::tempdir().unwrap();
+    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let restored = |fields: &str| {
+        let text = format!(r#"{{"schema":1,"cell":"lot","node":"euclid",{fields}}}"#);
+        std::fs::write(file.path(), text).unwrap();
+        let arguments = ReputationKeeperArguments { file: Some(file.clone()), ..arguments(&gateway, &counters) };
+        store::restore(&arguments, None);
+        let store = arguments.reputations.open();
+        (store.ledger.totals().len(), store.standing.len(), store.ledger.reset_at())
+    };
+    let none = Timestamp::default();
+    let entry = |term: u64, label: &str, incorrect: u64| {
+        let counts = format!(r#""label":"{label}","correct":0,"incorrect":{incorrect}"#);
+        format!(r#"{{"epoch":{term},"aggregator":"edge","node":"gauss",{counts}}}"#)
+    };
+    for (term, label, incorrect, expected) in
+        [(1, "cup", 7, 1), (1, "cup", 1_000_000_000, 0), (1 << 52, "cup", 7, 0), (1, "c\\u202eup", 7, 0)]
+    {
+        let entry = entry(term, label, incorrect);
+        let own = format!(r#""entries":[{entry}],"standing":{{}}"#);
+        assert_eq!(restored(&own), (expected, 0, none), "{own}");
+        let told = format!(r#"{{"schema":1,"node":"edge","entries":[{entry}]}}"#);
+        let told = format!(r#""entries":[],"standing":{{}},"statements":[{told}]"#);
+        assert_eq!(restored(&told), (expected, 0, none), "{told}");
+    }
+    let mark = |correct| {
+        let mark =
+            format!(r#"{{"epoch":1,"aggregator":"edge","node":"gauss","number":2,"correct":{correct},"incorrect":0}}"#);
+        restored(&format!(r#""entries":[],"marks":[{mark}],"standing":{{}}"#)).0
+    };
+    assert_eq!((mark(64), mark(65)), (1, 0));
+    for (score, correct, expected) in [("0.9", 7, 1), ("1e300", 7, 0), ("-1.0", 7, 0), ("0.9", u64::MAX, 0)] {
+        let standing = format!(r#"{{"gauss":{{"score":{score},"correct":{correct},"incorrect":0}}}}"#);
+        assert_eq!(restored(&format!(r#""entries":[],"standing":{standing}"#)).1, expected, "{standing}");
+    }
+    let hours = |hours: u64| clock::now() + Duration::from_secs(hours * 3600);
+    for (at, expected) in [(hours(23), hours(23)), (hours(25), none)] {
+        let reset_at = restored(&format!(r#""entries":[],"standing":{{}},"reset_at_us":{at}"#, at = at.micros())).2;
+        assert!(reset_at.micros().abs_diff(expected.micros()) < 60_000_000, "{reset_at:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_node_that_booted_in_1970_judges_a_reset_by_the_cells_time() {
+    let (gateway, _published) = listening::slot().await;
+    let mut keeper = ReputationKeeperState::new(arguments(&gateway, &Arc::default()));
+    let now = clock::now();
+    let reset =
+        LedgerShare { reset_at_us: Some(now), ..LedgerShare::clone(&share("edge", Some(7), Vec::new()).message) };
+    let reset = Delivery::local(Arc::new(reset), Timestamp(60_000_000));
+    let reset_at = |keeper: &ReputationKeeperState| keeper.arguments.reputations.open().ledger.reset_at();
+    keeper.merge(&reset);
+    assert_eq!(reset_at(&keeper), Timestamp(0), "decades ahead, as far as it knows");
+    keeper.arguments.clock.show(ClockReading { offset_us: now.micros() as i64, error_us: Some(1000) });
+    keeper.merge(&reset);
+    assert_eq!(reset_at(&keeper), now);
 }
 
 #[tokio::test]

@@ -209,6 +209,7 @@ impl NodeBuilder {
             leadership: self.leadership(),
             gateway: self.slots.gateway.clone(),
             fuser: self.slots.fuser.clone(),
+            clock: self.clock.clone(),
             counters: self.counters(),
         }
     }

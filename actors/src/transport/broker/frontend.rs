@@ -17,7 +17,7 @@ use rustls::pki_types::{CertificateDer, UnixTime};
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::{Semaphore, watch};
-use tokio::time::{Instant, MissedTickBehavior, interval, sleep, timeout_at};
+use tokio::time::{Instant, interval, sleep, timeout_at};
 use tokio_io_timeout::TimeoutStream;
 use tokio_rustls::TlsAcceptor;
 
@@ -53,9 +53,6 @@ struct FrontendState {
     handshake_timeout: Duration,
     counters: Arc<Counters>,
 }
-
-/// Time between two checks for changed certificate files.
-const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Time between two checks of connected clients for expired certificates.
 const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
@@ -113,9 +110,7 @@ impl BrokerFrontend {
 
     /// Accepts clients; never ends.
     pub(super) async fn run(self) {
-        let mut reloads = interval(RELOAD_INTERVAL);
-        reloads.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut checked = Instant::now();
+        let mut rechecks = interval(RECHECK_INTERVAL);
         loop {
             tokio::select! {
                 accepted = self.listener.accept() => match accepted {
@@ -125,7 +120,8 @@ impl BrokerFrontend {
                         sleep(ACCEPT_PAUSE).await;
                     }
                 },
-                _ = reloads.tick() => self.recheck(&mut checked),
+                current = self.reloaded() => self.recheck(current),
+                _ = rechecks.tick() => self.shared.credentials.iter().for_each(|credentials| self.recheck(credentials.current())),
             }
         }
     }
@@ -147,14 +143,18 @@ impl BrokerFrontend {
         });
     }
 
+    /// Waits until certificates or the revocation list changed.
+    async fn reloaded(&self) -> Arc<LoadedCredentials> {
+        let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) else {
+            return std::future::pending().await;
+        };
+        let known = Arc::clone(&sender.borrow());
+        credentials.changed(&known).await
+    }
+
     /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
-    fn recheck(&self, checked: &mut Instant) {
-        let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) else { return };
-        let current = credentials.current();
-        if checked.elapsed() >= RECHECK_INTERVAL || !Arc::ptr_eq(&current, &sender.borrow()) {
-            *checked = Instant::now();
-            sender.send_replace(current);
-        }
+    fn recheck(&self, current: Arc<LoadedCredentials>) {
+        self.current.iter().for_each(|sender| _ = sender.send_replace(Arc::clone(&current)));
     }
 }
 

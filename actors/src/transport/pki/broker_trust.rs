@@ -8,6 +8,7 @@ use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
+use tokio::time::{sleep, timeout};
 
 use super::{CertificateSubject, Credentials, LoadedCredentials};
 
@@ -34,9 +35,6 @@ impl BrokerIdentity {
         Some(CertificateSubject::of(certificates.first()?).ok()?.name().clone())
     }
 }
-
-/// Time between two checks for changed files.
-const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Time between two verifications of a certificate, which may have expired.
 const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
@@ -74,7 +72,10 @@ impl BrokerTrust {
     /// Waits until the broker's certificate is no longer valid; the result is the reason.
     pub async fn invalidated(mut self) -> rustls::Error {
         loop {
-            tokio::time::sleep(RELOAD_INTERVAL).await;
+            match &self.reloaded_from {
+                Some((credentials, known)) => drop(timeout(RECHECK_INTERVAL, credentials.changed(known)).await),
+                None => sleep(RECHECK_INTERVAL).await,
+            }
             if let Err(error) = self.recheck(Instant::now()) {
                 return error;
             }
@@ -162,6 +163,8 @@ impl ServerCertVerifier for RecordingVerifier {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use ecod::model::names::NodeName;
     use ecod::wire::Role;
     use rustls::pki_types::pem::PemObject;
@@ -170,27 +173,52 @@ mod tests {
     use crate::platform::clock;
     use crate::transport::pki::{Authority, BROKER_NAME, TlsConfig};
 
-    #[test]
-    fn a_broker_is_trusted_until_its_certificate_is_revoked_or_has_expired() {
-        let directory = tempfile::tempdir().unwrap();
-        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+    const DAY: Duration = Duration::from_secs(86_400);
+
+    /// The credentials of `euclid`, and certificates of `edge` and, for two seconds, of `brief`.
+    fn credentials(directory: &Path) -> (Authority, Arc<Credentials>) {
+        let mut authority = Authority::init(directory, &NodeName::from_static("lot"), clock::now()).unwrap();
         let [euclid, edge, brief] = ["euclid", "edge", "brief"].map(NodeName::from_static);
-        let day = Duration::from_secs(86_400);
-        for (name, valid) in [(&euclid, day), (&edge, day), (&brief, Duration::from_secs(2))] {
+        for (name, valid) in [(&euclid, DAY), (&edge, DAY), (&brief, Duration::from_secs(2))] {
             authority.issue(name, Role::Auto, valid, clock::now()).unwrap();
         }
         let ((certificate, key), list) = (authority.files_of(&euclid), authority.revocation_list());
         let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list) };
-        let credentials = Arc::new(Credentials::load(&files, &euclid).unwrap());
-        let connected = |broker: &NodeName| {
-            let trust = BrokerTrust::of_cell(&credentials);
-            let recorded = CertificateDer::from_pem_file(authority.files_of(broker).0).unwrap();
-            let name = ServerName::try_from(BROKER_NAME).unwrap();
-            assert_eq!(trust.identity().node(), None, "before the handshake");
-            trust.recorded.verify_server_cert(&recorded, &[], &name, &[], UnixTime::now()).unwrap();
-            assert_eq!(trust.identity().node().as_ref(), Some(broker));
-            trust
-        };
+        (authority, Arc::new(Credentials::load(&files, &euclid).unwrap()))
+    }
+
+    /// Trust of a connection to a broker, after the handshake.
+    fn connected(credentials: &Arc<Credentials>, authority: &Authority, broker: &NodeName) -> BrokerTrust {
+        let trust = BrokerTrust::of_cell(credentials);
+        let recorded = CertificateDer::from_pem_file(authority.files_of(broker).0).unwrap();
+        let name = ServerName::try_from(BROKER_NAME).unwrap();
+        assert_eq!(trust.identity().node(), None, "before the handshake");
+        trust.recorded.verify_server_cert(&recorded, &[], &name, &[], UnixTime::now()).unwrap();
+        assert_eq!(trust.identity().node().as_ref(), Some(broker));
+        trust
+    }
+
+    #[tokio::test]
+    async fn all_connections_to_a_revoked_broker_end_as_soon_as_the_list_is_read() {
+        let (directory, edge) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
+        let (mut authority, credentials) = credentials(directory.path());
+        let mut connections = tokio::task::JoinSet::new();
+        for _ in 0..4 {
+            connections.spawn(connected(&credentials, &authority, &edge).invalidated());
+            sleep(Duration::from_millis(200)).await;
+        }
+        authority.revoke(&edge, clock::now()).unwrap();
+        let written = Instant::now();
+        connections.join_all().await;
+        assert!(written.elapsed() < Duration::from_millis(700), "{:?}", written.elapsed());
+    }
+
+    #[test]
+    fn a_broker_is_trusted_until_its_certificate_is_revoked_or_has_expired() {
+        let directory = tempfile::tempdir().unwrap();
+        let (mut authority, credentials) = credentials(directory.path());
+        let [edge, brief] = ["edge", "brief"].map(NodeName::from_static);
+        let connected = |broker: &NodeName| connected(&credentials, &authority, broker);
         let (mut brief_trust, mut edge_trust) = (connected(&brief), connected(&edge));
         assert_eq!(brief_trust.recheck(Instant::now() + RECHECK_INTERVAL), Ok(()));
         std::thread::sleep(Duration::from_millis(3100));
@@ -200,7 +228,7 @@ mod tests {
 
         assert_eq!(edge_trust.recheck(Instant::now() + RECHECK_INTERVAL), Ok(()));
         authority.revoke(&edge, clock::now()).unwrap();
-        std::thread::sleep(RELOAD_INTERVAL);
+        std::thread::sleep(Duration::from_millis(600));
         let revoked = edge_trust.recheck(Instant::now());
         let why = rustls::Error::InvalidCertificate(rustls::CertificateError::Revoked);
         assert_eq!(revoked, Err(why), "at once when the list has changed");

@@ -16,6 +16,8 @@ use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::sign::Signer;
 use rustls::version::TLS13;
 use rustls::{ClientConfig, RootCertStore, ServerConfig};
+use tokio::sync::Notify;
+use tokio::time::timeout;
 
 use super::attestation::signer;
 use super::broker_trust::RecordingVerifier;
@@ -28,6 +30,7 @@ pub struct Credentials {
     files: TlsConfig,
     node: NodeName,
     cache: Mutex<CachedCredentials>,
+    changed: Notify,
 }
 
 #[derive(Debug)]
@@ -104,7 +107,7 @@ pub enum CredentialsError {
 }
 
 /// Minimum time between two checks of the files.
-const RELOAD_INTERVAL: Duration = Duration::from_secs(1);
+const RELOAD_INTERVAL: Duration = Duration::from_millis(500);
 
 impl Credentials {
     /// Reads a node's files.
@@ -114,7 +117,7 @@ impl Credentials {
     pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
         let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
         let cache = Mutex::new(CachedCredentials { checked_at: Instant::now(), fingerprints, current });
-        Ok(Self { files: files.clone(), node: node.clone(), cache })
+        Ok(Self { files: files.clone(), node: node.clone(), cache, changed: Notify::new() })
     }
 
     /// Checks that the node's certificate allows what the node is configured to be.
@@ -142,12 +145,26 @@ impl Credentials {
                     Ok(current) => {
                         tracing::info!("certificates read again");
                         cache.current = Arc::new(current);
+                        self.changed.notify_waiters();
                     }
                     Err(error) => tracing::warn!(%error, "changed certificates not used"),
                 }
             }
         }
         Arc::clone(&cache.current)
+    }
+
+    /// Waits until the content of the files is another than `known`: half a second at most from its change. All that wait
+    /// learn it at once.
+    pub async fn changed(&self, known: &Arc<LoadedCredentials>) -> Arc<LoadedCredentials> {
+        loop {
+            let changed = self.changed.notified();
+            let current = self.current();
+            if !Arc::ptr_eq(&current, known) {
+                return current;
+            }
+            timeout(RELOAD_INTERVAL, changed).await.unwrap_or_default();
+        }
     }
 }
 
