@@ -120,8 +120,8 @@ impl BrokerFrontend {
                         sleep(ACCEPT_PAUSE).await;
                     }
                 },
-                current = self.reloaded() => self.recheck(current),
-                _ = rechecks.tick() => self.shared.credentials.iter().for_each(|credentials| self.recheck(credentials.current())),
+                current = self.reloaded() => self.recheck(&current),
+                _ = rechecks.tick() => self.shared.credentials.iter().for_each(|credentials| self.recheck(&credentials.current())),
             }
         }
     }
@@ -153,8 +153,8 @@ impl BrokerFrontend {
     }
 
     /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
-    fn recheck(&self, current: Arc<LoadedCredentials>) {
-        self.current.iter().for_each(|sender| _ = sender.send_replace(Arc::clone(&current)));
+    fn recheck(&self, current: &Arc<LoadedCredentials>) {
+        self.current.iter().for_each(|sender| _ = sender.send_replace(Arc::clone(current)));
     }
 }
 
