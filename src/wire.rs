@@ -10,12 +10,14 @@
 //! aggregator  -> reputations              Reputations    retained
 //! candidate   -> ledger/<node>            LedgerShare    evidence behind the reputations, for the next aggregator
 //! every node  -> nodes/<node>             NodeStatus     retained, with last will
+//! broker      -> nodes/<node>/clients     ClientRefusals retained, at that node's broker alone
 //! ```
 //!
 //! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
 
 #![deny(clippy::indexing_slicing)]
 
+mod client_refusals;
 mod codec;
 mod compact;
 mod ledger;
@@ -31,6 +33,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
@@ -375,6 +378,7 @@ pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
         ("Reputations", schemars::schema_for!(Reputations)),
         ("LedgerShare", schemars::schema_for!(LedgerShare)),
         ("NodeStatus", schemars::schema_for!(NodeStatus)),
+        ("ClientRefusals", schemars::schema_for!(ClientRefusals)),
     ]
     .into()
 }

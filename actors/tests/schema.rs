@@ -48,9 +48,9 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
         Topic::GlobalVerdicts,
         Topic::Reputations,
         Topic::Ledger(node.clone()),
-        Topic::Nodes(node),
+        Topic::Nodes(node.clone()),
     ];
-    let spoken: BTreeSet<_> = kinds.iter().map(|topic| topics.path(topic)).collect();
+    let spoken: BTreeSet<_> = kinds.iter().map(|topic| topics.path(topic)).chain([topics.clients(&node)]).collect();
     let addresses = values(&document, "address: ", '\n');
     let documented: BTreeSet<_> =
         addresses.iter().map(|address| address.replace("{cell}", "cell").replace("{node}", "node")).collect();

@@ -69,6 +69,11 @@ impl Topics {
         format!("{}/{topic}", self.root)
     }
 
+    /// The topic on which a node's broker tells programs what it refused.
+    pub fn clients(&self, node: &NodeName) -> String {
+        format!("{}/nodes/{node}/clients", self.root)
+    }
+
     /// A subscription filter for one kind of topic, such as `ecod/v1/lot-1/detections/+`.
     pub fn filter(&self, level: &str) -> String {
         format!("{}/{level}", self.root)

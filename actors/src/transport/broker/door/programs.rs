@@ -118,7 +118,7 @@ impl Door {
         tracing::debug!(client, topic, text = refusal.text, "program's message refused");
         let status = lock(&door.refusals).note(&setup.node, (client, topic), refusal, clock::now());
         if let Some(status) = status {
-            let topic = format!("{}/clients", setup.topics.path(&Topic::Nodes(setup.node.clone())));
+            let topic = setup.topics.clients(&setup.node);
             door.retain(Publication { topic, payload: status.into(), retain: true });
         }
     }

@@ -5,10 +5,9 @@ use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{RejectReason, SCHEMA_VERSION};
+use ecod::wire::{ClientRefusal, ClientRefusals, RejectReason, SCHEMA_VERSION};
 use rmqtt::codec::v5::PublishAckReason;
 use rmqtt::types::{PublishAclResult, PublishResult};
-use serde::Serialize;
 
 use crate::telemetry::counters::ShedReason;
 
@@ -55,27 +54,8 @@ impl RefusalReason {
 /// Refusals so far, by client and reason.
 #[derive(Debug, Default)]
 pub(super) struct Refusals {
-    known: BTreeMap<(String, RefusalReason), Refused>,
+    known: BTreeMap<(String, RefusalReason), ClientRefusal>,
     shown_at: Option<Timestamp>,
-}
-
-/// Refused messages of one client for one reason.
-#[derive(Debug, Clone, Serialize)]
-struct Refused {
-    client: String,
-    reason: &'static str,
-    /// Topic of the last one.
-    topic: String,
-    text: String,
-    times: u64,
-}
-
-/// Payload of `nodes/<node>/clients`.
-#[derive(Serialize)]
-struct ClientsStatus<'a> {
-    schema: u32,
-    node: &'a NodeName,
-    refused: Vec<&'a Refused>,
 }
 
 /// Clients and reasons that are shown; the first ones stay.
@@ -98,8 +78,8 @@ impl Refusals {
         if is_first && self.known.len() >= MAX_SHOWN {
             return None;
         }
-        let (client, reason) = (client.to_owned(), refusal.reason.as_str());
-        let empty = || Refused { client, reason, topic: String::new(), text: String::new(), times: 0 };
+        let (client, reason) = (client.to_owned(), refusal.reason.as_str().to_owned());
+        let empty = || ClientRefusal { client, reason, topic: String::new(), text: String::new(), times: 0 };
         let refused = self.known.entry(key).or_insert_with(empty);
         refused.times += 1;
         (refused.topic, refused.text) = (topic.to_owned(), refusal.text.clone());
@@ -107,7 +87,7 @@ impl Refusals {
             return None;
         }
         self.shown_at = Some(now);
-        let status = ClientsStatus { schema: SCHEMA_VERSION, node, refused: self.known.values().collect() };
-        serde_json::to_vec(&status).ok()
+        let refused = self.known.values().cloned().collect();
+        serde_json::to_vec(&ClientRefusals { schema: SCHEMA_VERSION, node: node.clone(), refused }).ok()
     }
 }
