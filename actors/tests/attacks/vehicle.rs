@@ -114,7 +114,7 @@ async fn unfinished_packets(target: Target) -> anyhow::Result<()> {
                     target.did(part.len());
                 }
                 // Until the broker ends it.
-                stream.read(&mut [0]).await.ok();
+                stream.read_u8().await.ok();
             }
             sleep(Duration::from_millis(100)).await;
         }
