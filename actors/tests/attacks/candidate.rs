@@ -23,6 +23,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "30 connections flood with maps of 8 MB",
         means: Means::Candidate,
+        on_brokers: true,
+        deeds: (3_000_000, "bytes"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(flood(target)),
@@ -30,6 +32,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "a member's status with the largest term",
         means: Means::Candidate,
+        on_brokers: false,
+        deeds: (30, "messages"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(largest_term(target)),
@@ -37,6 +41,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "maps with the largest round, in the leader's name",
         means: Means::Candidate,
+        on_brokers: true,
+        deeds: (30, "maps"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(largest_round(target)),
@@ -44,6 +50,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "a member's forged evidence",
         means: Means::Candidate,
+        on_brokers: true,
+        deeds: (30, "shares"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(forged_evidence(target)),
@@ -58,12 +66,12 @@ const TERMS: [u64; 3] = [1, 2, 3];
 
 async fn flood(target: Target) -> anyhow::Result<()> {
     let map = publish(&format!("ecod/v1/{CELL}/global_detections"), &vec![b'x'; 8_000_000]);
-    join_all((0..30).map(|_| send_for_ever(target.broker, (&target.candidate, CANDIDATE), &[], &map))).await;
+    join_all((0..30).map(|_| send_for_ever(&target, (&target.candidate, CANDIDATE), &[], &map))).await;
     Ok(())
 }
 
 async fn join(target: &Target) -> anyhow::Result<Insider> {
-    Insider::join(target, (CANDIDATE, Role::Auto), Some(Arc::clone(&target.credentials))).await
+    Insider::join(target, (CANDIDATE, Role::Auto), Some(Arc::clone(&target.credentials))).await?.admitted().await
 }
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {
@@ -82,11 +90,19 @@ async fn largest_round(target: Target) -> anyhow::Result<()> {
         objects: Vec::new(),
         pose_corrections: Default::default(),
     };
-    let mut stream = log_in(target.broker, &target.candidate, CANDIDATE).await?;
+    let maps =
+        TERMS.map(|epoch| publish(&format!("ecod/v1/{CELL}/global_detections"), &encode(&map(epoch), Encoding::Json)));
+    publish_for_ever(&target, &maps).await
+}
+
+/// Publishes the same again and again, over a new connection whenever one ends.
+async fn publish_for_ever(target: &Target, packets: &[Vec<u8>]) -> anyhow::Result<()> {
     loop {
-        for epoch in TERMS {
-            let payload = encode(&map(epoch), Encoding::Json);
-            stream.write_all(&publish(&format!("ecod/v1/{CELL}/global_detections"), &payload)).await?;
+        if let Ok(mut stream) = log_in(target.broker, &target.candidate, CANDIDATE).await {
+            while stream.write_all(&packets.concat()).await.is_ok() {
+                target.did(packets.len());
+                sleep(PAUSE).await;
+            }
         }
         sleep(PAUSE).await;
     }
@@ -96,15 +112,11 @@ async fn largest_round(target: Target) -> anyhow::Result<()> {
 async fn forged_evidence(target: Target) -> anyhow::Result<()> {
     let _member = join(&target).await?;
     let signer = EvidenceSigner::new(NodeName::from_static(CELL), Arc::clone(&target.credentials));
-    let mut stream = log_in(target.broker, &target.candidate, CANDIDATE).await?;
-    loop {
-        for (term, aggregator) in TERMS.into_iter().flat_map(|term| [(term, LEADER), (term, CANDIDATE)]) {
+    let shares =
+        TERMS.into_iter().flat_map(|term| [(term, LEADER), (term, CANDIDATE)]).flat_map(|(term, aggregator)| {
             let share = inverted(CANDIDATE, term, aggregator);
-            for share in [Some(share.clone()), signer.sign(share)].into_iter().flatten() {
-                let payload = encode(&share, Encoding::Json);
-                stream.write_all(&publish(&format!("ecod/v1/{CELL}/ledger/{CANDIDATE}"), &payload)).await?;
-            }
-        }
-        sleep(PAUSE).await;
-    }
+            [Some(share.clone()), signer.sign(share)]
+        });
+    let packet = |share| publish(&format!("ecod/v1/{CELL}/ledger/{CANDIDATE}"), &encode(&share, Encoding::Json));
+    publish_for_ever(&target, &shares.flatten().map(packet).collect::<Vec<_>>()).await
 }

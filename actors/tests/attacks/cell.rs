@@ -5,6 +5,7 @@ use std::fs::{self, File};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
@@ -70,10 +71,25 @@ struct Node {
     process: Process,
 }
 
+/// A broker that is attacked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Victim {
+    Leader,
+    Standby,
+}
+
+impl Victim {
+    pub(crate) fn name(self) -> &'static str {
+        if self == Self::Leader { "leader" } else { "standby" }
+    }
+}
+
 /// Knowledge and secrets of an attacker. A row uses what its means allow.
 #[derive(Clone)]
 pub(crate) struct Target {
-    /// The edge's broker.
+    /// Number of its deeds so far, in the row's unit.
+    pub(crate) deeds: Arc<AtomicU64>,
+    /// The attacked broker.
     pub(crate) broker: SocketAddr,
     /// Where the nodes gossip.
     pub(crate) gossip: Vec<SocketAddr>,
@@ -89,6 +105,13 @@ pub(crate) struct Target {
     pub(crate) foreign: Arc<Credentials>,
     /// Directory of the cell's CA, for whoever defends the cell.
     pub(crate) pki: PathBuf,
+}
+
+impl Target {
+    /// Counts deeds.
+    pub(crate) fn did(&self, deeds: usize) {
+        self.deeds.fetch_add(deeds as u64, Ordering::Relaxed);
+    }
 }
 
 impl Cell {
@@ -158,11 +181,12 @@ impl Cell {
     }
 
     /// Knowledge and secrets for an attacker.
-    pub(crate) fn target(&self) -> anyhow::Result<Target> {
+    pub(crate) fn target(&self, victim: Victim) -> anyhow::Result<Target> {
         let load = |files, name| Credentials::load(files, &NodeName::from_static(name)).map(Arc::new);
         let client = |files, name| load(files, name).map(|loaded| Arc::clone(&loaded.current().client));
         Ok(Target {
-            broker: self.nodes[0].broker,
+            deeds: Arc::default(),
+            broker: self.nodes[usize::from(victim == Victim::Standby)].broker,
             gossip: self.nodes.iter().map(|node| node.gossip).collect(),
             key: KEY,
             vehicle: client(&self.vehicle, VEHICLE)?,
@@ -176,8 +200,9 @@ impl Cell {
     /// The beginning of a measurement.
     pub(crate) fn mark(&self) -> anyhow::Result<Timestamp> {
         // Writing 5 sets the peak of memory back to what is used now.
-        let edge = self.nodes[0].process.id();
-        fs::write(format!("/proc/{edge}/clear_refs"), "5").context("peak memory of the edge")?;
+        for node in &self.nodes[..2] {
+            fs::write(format!("/proc/{}/clear_refs", node.process.id()), "5").context("peak memory of a broker")?;
+        }
         Ok(clock::now())
     }
 
@@ -195,6 +220,8 @@ impl Cell {
             rss_mb: if ended.is_empty() { self.peak_memory_mb()? } else { 0 },
             false_verdicts: None,
             ended,
+            deeds: 0,
+            fault: None,
         })
     }
 
@@ -219,9 +246,12 @@ impl Cell {
     }
 
     fn peak_memory_mb(&self) -> anyhow::Result<u64> {
-        let text = fs::read_to_string(format!("/proc/{}/status", self.nodes[0].process.id()))?;
-        let peak = text.lines().find_map(|line| line.strip_prefix("VmHWM:")).context("no peak of memory")?;
-        Ok(peak.trim().trim_end_matches(" kB").parse::<u64>()? * 1024 / 1_000_000)
+        let peak = |node: &Node| {
+            let text = fs::read_to_string(format!("/proc/{}/status", node.process.id()))?;
+            let peak = text.lines().find_map(|line| line.strip_prefix("VmHWM:")).context("no peak of memory")?;
+            anyhow::Ok(peak.trim().trim_end_matches(" kB").parse::<u64>()? * 1024 / 1_000_000)
+        };
+        Ok(peak(&self.nodes[0])?.max(peak(&self.nodes[1])?))
     }
 
     /// Leaves the files where they are.

@@ -15,6 +15,7 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 use uuid::Uuid;
 
+use crate::cell::Target;
 use crate::packets::{packet, text};
 
 /// The attacker's address, another than the cell's.
@@ -62,16 +63,18 @@ pub(crate) async fn log_in_as(
 
 /// Sends the opening once and the packet for ever, over a new connection whenever one ends.
 pub(crate) async fn send_for_ever(
-    broker: SocketAddr,
+    target: &Target,
     (tls, name): (&Arc<ClientConfig>, &str),
     opening: &[u8],
     packet: &[u8],
 ) {
     loop {
-        if let Ok(mut stream) = log_in(broker, tls, name).await
+        if let Ok(mut stream) = log_in(target.broker, tls, name).await
             && stream.write_all(opening).await.is_ok()
         {
-            while stream.write_all(packet).await.is_ok() {}
+            while stream.write_all(packet).await.is_ok() {
+                target.did(packet.len());
+            }
         }
         sleep(Duration::from_millis(100)).await;
     }

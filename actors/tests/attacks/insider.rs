@@ -2,6 +2,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -13,7 +14,7 @@ use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
 use ecod_actors::platform::clock;
 use ecod_actors::platform::secret::Secret;
-use ecod_actors::transport::gossip::{Member, MembershipConfig};
+use ecod_actors::transport::gossip::{FrameCounters, FrameEvent, Member, MembershipConfig};
 use ecod_actors::transport::pki::Credentials;
 use ractor::{Actor, ActorRef};
 use tokio::sync::watch;
@@ -30,6 +31,8 @@ pub(crate) struct Insider {
     role: Role,
     run: u64,
     membership: ActorRef<MembershipMessage>,
+    counters: Arc<FrameCounters>,
+    target: Target,
     members: watch::Receiver<Vec<Member>>,
 }
 
@@ -47,7 +50,7 @@ impl Insider {
             ..MembershipConfig::default()
         };
         config.multicast.enabled = false;
-        let name = NodeName::from_static(name);
+        let (name, counters) = (NodeName::from_static(name), Arc::<FrameCounters>::default());
         let (run, (sender, members)) = (clock::now().micros(), watch::channel(Vec::new()));
         let arguments = MembershipArguments {
             name: name.clone(),
@@ -59,11 +62,27 @@ impl Insider {
             config,
             events: Arc::new(drop),
             members: sender,
-            counters: Arc::default(),
+            counters: Arc::clone(&counters),
         };
         let (membership, _) = Actor::spawn(None, Membership, arguments).await?;
         sleep(ADMISSION).await;
-        Ok(Self { name, role, run, membership, members })
+        Ok(Self { name, role, run, membership, counters, target: target.clone(), members })
+    }
+
+    /// The same, once all nodes have admitted it.
+    pub(crate) async fn admitted(self) -> anyhow::Result<Self> {
+        let known = self.members.borrow().len();
+        anyhow::ensure!(known == self.target.gossip.len(), "admitted by {known} nodes only");
+        Ok(self)
+    }
+
+    /// Knocks for ever, and is admitted by nobody.
+    pub(crate) async fn knock(&self) -> anyhow::Result<()> {
+        loop {
+            self.target.deeds.store(self.counters.get(FrameEvent::Sent), Ordering::Relaxed);
+            anyhow::ensure!(self.members.borrow().is_empty(), "admitted");
+            sleep(Duration::from_millis(100)).await;
+        }
     }
 
     /// An epoch of its own.
@@ -90,6 +109,7 @@ impl Insider {
             let names: Vec<_> = self.members.borrow().iter().map(|member| member.name.clone()).collect();
             for to in names {
                 self.membership.cast(MembershipMessage::Send { to, payload: payload.clone() })?;
+                self.target.did(1);
             }
             sleep(Duration::from_millis(100)).await;
         }

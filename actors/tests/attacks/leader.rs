@@ -10,8 +10,10 @@ use crate::row::{Bar, Means, Row, UNHARMED};
 pub(crate) const ROWS: &[Row] = &[Row {
     attack: "it goes on leading after it is revoked",
     means: Means::Leader,
-    // Up to a second passes until the list is read, and a second until the next leader's first map.
-    bar: Bar { maps: 0.5, honest: 0.5, longest_gap_ms: Some(2000), is_replaced: true, ..UNHARMED },
+    on_brokers: false,
+    deeds: (1, "revocation"),
+    // Half a second passes until the list is read, and a second until the next leader's first map.
+    bar: Bar { maps: 0.5, honest: 0.5, longest_gap_ms: Some(1500), is_replaced: true, ..UNHARMED },
     quick: true,
     run: |target| Box::pin(revoked(target)),
 }];
@@ -19,5 +21,6 @@ pub(crate) const ROWS: &[Row] = &[Row {
 /// Its own list stays as it was.
 async fn revoked(target: Target) -> anyhow::Result<()> {
     Authority::open(&target.pki)?.revoke(&NodeName::from_static(LEADER), clock::now())?;
+    target.did(1);
     Ok(())
 }

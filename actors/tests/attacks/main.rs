@@ -2,11 +2,11 @@
 //!
 //! ```text
 //! harness ── starts ──> edge, v01, v02   real nodes with certificates, which report and fuse throughout
-//!    └────── runs ───>  a row            one attack, by the means of one kind of attacker
+//!    └────── runs ───>  a row            one attack, by the means of one kind of attacker, who must have done enough
 //!    └────── reads ──>  map logs, memory of the edge ──> the row's line in the table
 //! ```
 //!
-//! Each kind of attacker has a file with its rows. `ROWS=a,b` runs those whose names contain `a` or `b`;
+//! Each kind of attacker has a file with its rows. Those on brokers run against the leader's, then against the standby's. `ROWS=a,b` runs those whose names contain `a` or `b`;
 //! `ATTACK=quick` runs only those for every change, `PROGRAM=file` attacks another build. A row that missed its bar
 //! while the machine stood still is repeated.
 
@@ -33,12 +33,14 @@ mod process;
 #[path = "../security/shares.rs"]
 mod shares;
 
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
 use tokio::runtime::{Builder, Runtime};
 
-use crate::cell::{Cell, Target};
+use crate::cell::{Cell, Target, Victim};
 use crate::machine::Machine;
 use crate::row::{Outcome, Row, table};
 
@@ -75,26 +77,30 @@ async fn run_all() -> anyhow::Result<()> {
     let time = if is_quick { QUICK_TIME } else { ATTACK_TIME };
     let mut lines = Vec::new();
     for row in ATTACKERS.into_iter().flatten().filter(is_wanted) {
-        lines.push((row, attempt(row, time).await.with_context(|| row.attack)?));
+        for victim in [Victim::Leader, Victim::Standby] {
+            if victim == Victim::Leader || (row.on_brokers && !is_quick) {
+                lines.push((row, victim, attempt(row, victim, time).await.with_context(|| row.attack)?));
+            }
+        }
     }
     println!("\n{}", table(&lines));
-    let misses: Vec<_> = lines.iter().filter(|(row, outcome)| !row.bar.is_met(outcome)).collect();
+    let misses: Vec<_> = lines.iter().filter(|(row, _, outcome)| !row.is_met(outcome)).collect();
     if lines.is_empty() {
         bail!("no row's name contains any of ROWS={wanted}");
     }
     if !misses.is_empty() {
-        bail!("bars missed: {}", misses.iter().map(|(row, _)| row.attack).collect::<Vec<_>>().join(", "));
+        bail!("bars missed: {}", misses.iter().map(|(row, ..)| row.attack).collect::<Vec<_>>().join(", "));
     }
     Ok(())
 }
 
 /// Runs a row until it meets its bar, or misses it on a machine that runs.
-async fn attempt(row: &Row, time: Duration) -> anyhow::Result<Outcome> {
+async fn attempt(row: &Row, victim: Victim, time: Duration) -> anyhow::Result<Outcome> {
     for left in (0..MAX_ATTEMPTS).rev() {
         let mut machine = Machine::default();
-        let outcome = run(row, time, &mut machine).await?;
-        println!("{}: {outcome}", row.attack);
-        if row.bar.is_met(&outcome) || left == 0 || !machine.is_starved() {
+        let outcome = run(row, victim, time, &mut machine).await?;
+        println!("{}, {}: {outcome}", row.attack, victim.name());
+        if row.is_met(&outcome) || left == 0 || !machine.is_starved() {
             return Ok(outcome);
         }
         println!("    repeated, the machine stood still: {}", machine.account());
@@ -102,18 +108,17 @@ async fn attempt(row: &Row, time: Duration) -> anyhow::Result<Outcome> {
     bail!("no attempt")
 }
 
-async fn run(row: &Row, time: Duration, machine: &mut Machine) -> anyhow::Result<Outcome> {
+async fn run(row: &Row, victim: Victim, time: Duration, machine: &mut Machine) -> anyhow::Result<Outcome> {
     let mut cell = Cell::start()?;
     cell.settle().await?;
-    let attacker = Attacker::start(row, cell.target()?)?;
+    let target = cell.target(victim)?;
+    let deeds = Arc::clone(&target.deeds);
+    let attacker = Attacker::start(row, target)?;
     let from = cell.mark()?;
     machine.sleep(time).await?;
-    let fault = attacker.stop();
+    let fault = attacker.stop().map(|error| format!("{error:#}"));
     machine.sleep(AFTERMATH).await?;
-    if let Some(error) = fault {
-        println!("    the attacker gave up: {error:#}");
-    }
-    cell.outcome(from)
+    Ok(Outcome { deeds: deeds.load(Ordering::Relaxed), fault, ..cell.outcome(from)? })
 }
 
 /// An attack under way, on threads of its own.
@@ -132,7 +137,8 @@ impl Attacker {
     /// Ends the attack; the result is the reason for which it ended before, if it failed.
     fn stop(self) -> Option<anyhow::Error> {
         let fault = match self.task.is_finished() {
-            true => futures_util::FutureExt::now_or_never(self.task).and_then(Result::ok).and_then(Result::err),
+            true => futures_util::FutureExt::now_or_never(self.task)
+                .and_then(|ended| ended.unwrap_or_else(|panic| Err(panic.into())).err()),
             false => None,
         };
         self.runtime.shutdown_background();

@@ -4,13 +4,17 @@ use std::fmt;
 use std::fmt::Write as _;
 use std::pin::Pin;
 
-use crate::cell::Target;
+use crate::cell::{Target, Victim};
 
 /// One attack by one kind of attacker.
 pub(crate) struct Row {
     /// Name, as in the table.
     pub(crate) attack: &'static str,
     pub(crate) means: Means,
+    /// Whether it is on brokers: then the standby's is attacked, too.
+    pub(crate) on_brokers: bool,
+    /// Least number of deeds, and their unit: without them the attack has not taken place.
+    pub(crate) deeds: (u64, &'static str),
     pub(crate) bar: Bar,
     /// Whether it runs on every change.
     pub(crate) quick: bool,
@@ -76,7 +80,7 @@ pub(crate) struct Outcome {
     pub(crate) expected: usize,
     /// Maps with the reports of all honest vehicles.
     pub(crate) honest: usize,
-    /// Largest memory of the edge in MB.
+    /// Largest memory of a broker's process in MB.
     pub(crate) rss_mb: u64,
     /// Longest time between two maps in ms.
     pub(crate) longest_gap_ms: u64,
@@ -86,11 +90,24 @@ pub(crate) struct Outcome {
     pub(crate) false_verdicts: Option<usize>,
     /// Nodes that ended.
     pub(crate) ended: Vec<String>,
+    /// Deeds of the attacker, and why it gave up.
+    pub(crate) deeds: u64,
+    pub(crate) fault: Option<String>,
+}
+
+impl Row {
+    /// Whether the attack took place and its outcome is good enough.
+    pub(crate) fn is_met(&self, outcome: &Outcome) -> bool {
+        self.took_place(outcome) && self.bar.is_met(outcome)
+    }
+
+    fn took_place(&self, outcome: &Outcome) -> bool {
+        outcome.fault.is_none() && outcome.deeds >= self.deeds.0
+    }
 }
 
 impl Bar {
-    /// Whether an outcome is good enough.
-    pub(crate) fn is_met(&self, outcome: &Outcome) -> bool {
+    fn is_met(&self, outcome: &Outcome) -> bool {
         let part = |count: usize, of: usize| count as f64 / of.max(1) as f64;
         part(outcome.maps, outcome.expected) >= self.maps
             && part(outcome.honest, outcome.expected.max(outcome.maps)) >= self.honest
@@ -116,6 +133,8 @@ impl fmt::Display for Outcome {
             f,
             "{maps} of {expected} maps, {honest} with all honest reports, {rss_mb} MB, longest gap {longest_gap_ms} ms"
         )?;
+        write!(f, ", {} deeds", self.deeds)?;
+        self.fault.iter().try_for_each(|fault| write!(f, ", the attacker gave up: {fault}"))?;
         if self.is_replaced {
             write!(f, ", another leader")?;
         }
@@ -127,25 +146,26 @@ impl fmt::Display for Outcome {
 }
 
 /// All outcomes, for people.
-pub(crate) fn table(lines: &[(&Row, Outcome)]) -> String {
-    let width = lines.iter().map(|(row, _)| row.attack.chars().count()).max().unwrap_or_default();
+pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
+    let width = lines.iter().map(|(row, ..)| row.attack.chars().count()).max().unwrap_or_default();
     let mut text = format!(
-        "{:width$}  {:16}  {:>11}  {:>6}  {:>6}  {:>6}  {:>5}  {:27}  verdict\n",
-        "attack", "means", "maps", "honest", "RSS MB", "gap ms", "false", "bar"
+        "{:width$}  {:16}  {:7}  {:22}  {:>11}  {:>6}  {:>6}  {:>6}  {:>5}  {:27}  verdict\n",
+        "attack", "means", "at", "did", "maps", "honest", "RSS MB", "gap ms", "false", "bar"
     );
-    for (row, outcome) in lines {
+    for (row, victim, outcome) in lines {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
         let wrong = outcome.false_verdicts.map_or_else(|| "-".to_owned(), |count| count.to_string());
-        let verdict = match (row.bar.is_met(outcome), outcome.ended.is_empty()) {
-            (true, _) => "held".to_owned(),
-            (false, true) => "BROKEN".to_owned(),
-            (false, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),
+        let verdict = match (row.took_place(outcome), row.bar.is_met(outcome)) {
+            (false, _) => format!("NOT ATTACKED: {}", outcome.fault.as_deref().unwrap_or("too few deeds")),
+            (true, true) => "held".to_owned(),
+            (true, false) if outcome.ended.is_empty() => "BROKEN".to_owned(),
+            (true, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),
         };
         let (attack, means, honest, rss) = (row.attack, row.means.name(), outcome.honest, outcome.rss_mb);
-        let gap = outcome.longest_gap_ms;
+        let (gap, did, at) = (outcome.longest_gap_ms, format!("{} {}", outcome.deeds, row.deeds.1), victim.name());
         let _ = writeln!(
             text,
-            "{attack:width$}  {means:16}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {wrong:>5}  {:27}  {verdict}",
+            "{attack:width$}  {means:16}  {at:7}  {did:22}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {wrong:>5}  {:27}  {verdict}",
             row.bar.to_string()
         );
     }

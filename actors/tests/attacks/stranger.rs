@@ -12,6 +12,8 @@ use crate::row::{Means, Row, UNHARMED};
 pub(crate) const ROWS: &[Row] = &[Row {
     attack: "connections by the hundred",
     means: Means::Stranger,
+    on_brokers: true,
+    deeds: (300, "connections"),
     bar: UNHARMED,
     quick: true,
     run: |target| Box::pin(connections(target)),
@@ -23,7 +25,7 @@ async fn connections(target: Target) -> anyhow::Result<()> {
     let mut ticks = interval(Duration::from_millis(2));
     loop {
         ticks.tick().await;
-        held.extend(knock(target.broker).await);
+        held.extend(knock(target.broker).await.inspect(|_| target.did(1)));
         if held.len() > 1000 {
             held.pop_front();
         }

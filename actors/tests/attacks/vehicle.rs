@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use futures_util::future::{join_all, try_join_all};
+use futures_util::future::join_all;
 use rustls::ClientConfig;
-use tokio::io::AsyncWriteExt;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::time::sleep;
 
 use crate::cell::{CELL, Target, VEHICLE};
@@ -17,6 +17,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "30 connections flood with 255 kB",
         means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (3_000_000, "bytes"),
         bar: UNHARMED,
         quick: true,
         run: |target| Box::pin(flood(target, 0)),
@@ -24,6 +26,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "30 readers of everything read nothing, beside a flood",
         means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (3_000_000, "bytes"),
         bar: UNHARMED,
         quick: true,
         run: |target| Box::pin(flood(target, 30)),
@@ -31,6 +35,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "packets that never end",
         means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (1_000_000, "bytes"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(unfinished_packets(target)),
@@ -38,6 +44,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "retained messages asked for again and again",
         means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (500_000, "bytes"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(repeated_subscriptions(target)),
@@ -45,6 +53,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "sessions left behind with full queues",
         means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (5, "sessions"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(abandoned_sessions(target)),
@@ -52,6 +62,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "filters of 15,000 levels",
         means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (5, "packets"),
         bar: UNHARMED,
         quick: true,
         run: |target| Box::pin(deep_filters(target)),
@@ -59,6 +71,8 @@ pub(crate) const ROWS: &[Row] = &[
     Row {
         attack: "client ids and topics of others",
         means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (5, "refusals"),
         bar: UNHARMED,
         quick: true,
         run: |target| Box::pin(claims(target)),
@@ -81,7 +95,7 @@ async fn flood(target: Target, readers: usize) -> anyhow::Result<()> {
     let reading = [subscribe("#"), report()];
     let connection = |index| {
         let opening = if index < readers { &reading[0][..] } else { &[] };
-        send_for_ever(target.broker, (&target.vehicle, VEHICLE), opening, &reading[1])
+        send_for_ever(&target, (&target.vehicle, VEHICLE), opening, &reading[1])
     };
     join_all((0..CONNECTIONS).map(connection)).await;
     Ok(())
@@ -92,11 +106,15 @@ async fn unfinished_packets(target: Target) -> anyhow::Result<()> {
     let packet = publish(&detections(VEHICLE), &vec![b'x'; 8 * 1024 * 1024]);
     let send = |_| async {
         loop {
-            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await
-                && stream.write_all(&packet[..packet.len() - 1]).await.is_ok()
-                && stream.flush().await.is_ok()
-            {
-                sleep(Duration::from_secs(60)).await;
+            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+                let mut parts = packet[..packet.len() - 1].chunks(64 * 1024);
+                while let Some(part) = parts.next()
+                    && stream.write_all(part).await.is_ok()
+                {
+                    target.did(part.len());
+                }
+                // Until the broker ends it.
+                stream.read_u8().await.ok();
             }
             sleep(Duration::from_millis(100)).await;
         }
@@ -117,7 +135,9 @@ async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
     let ask = |_| async {
         loop {
             if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
-                while stream.write_all(&packet).await.is_ok() {}
+                while stream.write_all(&packet).await.is_ok() {
+                    target.did(packet.len());
+                }
             }
             sleep(Duration::from_millis(100)).await;
         }
@@ -130,12 +150,13 @@ async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
 async fn abandoned_sessions(target: Target) -> anyhow::Result<()> {
     let leave = async {
         loop {
-            if leave_session(&target, &target.vehicle).await.is_err() {
-                sleep(Duration::from_millis(100)).await;
+            match leave_session(&target, &target.vehicle).await {
+                Ok(()) => target.did(1),
+                Err(_) => sleep(Duration::from_millis(100)).await,
             }
         }
     };
-    tokio::join!(flood(target.clone(), 0), leave).0
+    tokio::join!(flood(Target { deeds: Arc::default(), ..target.clone() }, 0), leave).0
 }
 
 async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<()> {
@@ -152,8 +173,9 @@ async fn deep_filters(target: Target) -> anyhow::Result<()> {
     let filter = vec!["a"; 15_000].join("/");
     loop {
         if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
-            stream.write_all(&subscribe(&filter)).await?;
-            stream.write_all(&publish(&filter, b"payload")).await?;
+            for packet in [subscribe(&filter), publish(&filter, b"payload")] {
+                target.did(usize::from(stream.write_all(&packet).await.is_ok()));
+            }
         }
         sleep(Duration::from_millis(100)).await;
     }
@@ -163,12 +185,16 @@ async fn deep_filters(target: Target) -> anyhow::Result<()> {
 async fn claims(target: Target) -> anyhow::Result<()> {
     loop {
         let run = uuid::Uuid::now_v7().simple().to_string();
-        let ids = ["edge", "v01", "v02"].map(|name| format!("{name}-{run}"));
-        let refused = try_join_all(ids.iter().map(|id| log_in_as(target.broker, &target.vehicle, id))).await;
-        anyhow::ensure!(refused.is_err(), "logged in as another");
-        let mut stream = log_in(target.broker, &target.vehicle, VEHICLE).await?;
-        for topic in ["detections/v01", "nodes/v01", "global_detections", "reputations", "ledger/v01"] {
-            stream.write_all(&publish(&format!("ecod/v1/{CELL}/{topic}"), b"{}")).await?;
+        for name in ["edge", "v01", "v02"] {
+            match log_in_as(target.broker, &target.vehicle, &format!("{name}-{run}")).await {
+                Ok(_) => anyhow::bail!("logged in as {name}"),
+                Err(error) => target.did(usize::from(error.to_string().contains("login"))),
+            }
+        }
+        if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+            for topic in ["detections/v01", "nodes/v01", "global_detections", "reputations", "ledger/v01"] {
+                stream.write_all(&publish(&format!("ecod/v1/{CELL}/{topic}"), b"{}")).await.ok();
+            }
         }
         sleep(Duration::from_millis(50)).await;
     }

@@ -17,7 +17,7 @@ use ecod_actors::transport::pki::Authority;
 use tempfile::TempDir;
 
 use crate::feeder::Feeder;
-use crate::record::Record;
+use crate::record::{Entry, Record};
 
 /// How long anything may take.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -52,6 +52,8 @@ pub(crate) struct Cell {
     authority: Option<Authority>,
     /// The maps that a node with the right clock took.
     record: Record,
+    /// Whether each node said that it is ready, with the true time.
+    claims: BTreeMap<String, Vec<(Timestamp, bool)>>,
     brokers: BTreeMap<&'static str, SocketAddr>,
 }
 
@@ -78,6 +80,7 @@ impl Cell {
             feeder: None,
             authority: None,
             record: Record::default(),
+            claims: BTreeMap::new(),
             brokers,
         }
     }
@@ -118,7 +121,8 @@ impl Cell {
     fn certificates(&mut self, name: &str) -> String {
         let Some(authority) = &mut self.authority else { return String::new() };
         let node = NodeName::new(name).unwrap();
-        authority.issue(&node, Role::Auto, Duration::from_secs(3600), true_time()).unwrap();
+        let role = if name == "edge" { Role::Edge } else { Role::Auto };
+        authority.issue(&node, role, Duration::from_secs(3600), true_time()).unwrap();
         let (certificate, key) = authority.files_of(&node);
         format!("[tls]\nca = {:?}\ncertificate = {certificate:?}\nkey = {key:?}\n", authority.ca())
     }
@@ -191,29 +195,59 @@ impl Cell {
             assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
             for (name, node) in &mut self.nodes {
                 assert_eq!(node.child.try_wait().unwrap(), None, "{name} ended");
+                let claim = (true_time(), readiness(node.page).0);
+                self.claims.entry(name.clone()).or_default().push(claim);
             }
             std::thread::sleep(Duration::from_millis(50));
         }
     }
 
-    /// Waits until the reason of a node's readiness contains this.
-    pub(crate) fn until_ready(&self, name: &str, reason: &str) {
+    /// Waits until a node is not ready for a reason that contains this.
+    pub(crate) fn until_unready(&mut self, name: &str, reason: &str) {
         let deadline = Instant::now() + PATIENCE;
-        while !self.readiness(name).contains(reason) {
+        while readiness(self.nodes[name].page).1.find(reason).is_none() {
             assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {reason}, but {}", self.readiness(name));
             std::thread::sleep(Duration::from_millis(50));
         }
+        assert!(!readiness(self.nodes[name].page).0, "{name} is ready and says {reason}");
     }
 
     /// A node's readiness in its own words; nothing while there is no page.
     pub(crate) fn readiness(&self, name: &str) -> String {
-        let page = self.nodes[name].page;
-        let Ok(mut stream) = TcpStream::connect(page) else { return String::new() };
-        write!(stream, "GET /readyz HTTP/1.1\r\nHost: {page}\r\nConnection: close\r\n\r\n").unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        answer.split("\r\n\r\n").nth(1).unwrap_or_default().trim().to_owned()
+        readiness(self.nodes[name].page).1
     }
+
+    /// When a node first said that it is ready.
+    pub(crate) fn first_ready(&self, name: &str, since: Timestamp) -> Timestamp {
+        let ready = |(at, is_ready): &&(Timestamp, bool)| *is_ready && *at >= since;
+        self.claims[name].iter().find(ready).map_or_else(true_time, |(at, _)| *at)
+    }
+
+    /// Longest time for which a node said that it is ready while no useful map came.
+    pub(crate) fn longest_idle(
+        &self,
+        name: &str,
+        since: Timestamp,
+        is_useful: impl Fn(&Entry<'_>) -> bool,
+    ) -> Duration {
+        let useful = self.record.times(since, is_useful);
+        let (mut longest, mut idle_since) = (Duration::ZERO, None);
+        for (at, is_ready) in self.claims.get(name).into_iter().flatten().filter(|(at, _)| *at >= since) {
+            let last_useful = useful[..useful.partition_point(|time| time <= at)].last().copied();
+            idle_since = is_ready.then(|| idle_since.unwrap_or(*at).max(last_useful.unwrap_or_default()));
+            longest = longest.max(idle_since.map_or(Duration::ZERO, |idle_since| at.since(idle_since)));
+        }
+        longest
+    }
+}
+
+/// Whether a node is ready, and its reason; nothing while there is no page.
+fn readiness(page: SocketAddr) -> (bool, String) {
+    let Ok(mut stream) = TcpStream::connect(page) else { return (false, String::new()) };
+    write!(stream, "GET /readyz HTTP/1.1\r\nHost: {page}\r\nConnection: close\r\n\r\n").unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    (answer.starts_with("HTTP/1.1 200"), answer.split("\r\n\r\n").nth(1).unwrap_or_default().trim().to_owned())
 }
 
 impl Drop for Cell {

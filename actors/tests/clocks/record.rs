@@ -39,20 +39,25 @@ impl Record {
         self.maps.last().map(|(_, received)| received.map.aggregator.as_str())
     }
 
+    /// Whether the last map has the reports of all these vehicles.
+    pub(crate) fn has_lately<const N: usize>(&self, vehicles: [&str; N]) -> bool {
+        self.maps.last().is_some_and(|(_, received)| vehicles.iter().all(|name| Entry(received).has(name)))
+    }
+
     /// Arrival of the last map.
     pub(crate) fn last_at(&self) -> Option<Timestamp> {
         self.maps.last().map(|(at, _)| *at)
     }
 
-    pub(crate) fn count(&self, since: Timestamp, is_counted: impl Fn(&Entry<'_>) -> bool) -> usize {
-        self.since(since).filter(|(_, received)| is_counted(&Entry(received))).count()
+    /// Arrivals of certain maps.
+    pub(crate) fn times(&self, since: Timestamp, is_meant: impl Fn(&Entry<'_>) -> bool) -> Vec<Timestamp> {
+        self.since(since).filter(|(_, received)| is_meant(&Entry(received))).map(|(at, _)| *at).collect()
     }
 
     /// Longest time in which no map with a vehicle's detection came.
     pub(crate) fn longest_without(&self, vehicle: &str, since: Timestamp) -> Duration {
-        let with = self.since(since).filter(|(_, received)| Entry(received).has(vehicle)).map(|(at, _)| *at);
         let mut times = vec![since];
-        times.extend(with);
+        times.extend(self.times(since, |map| map.has(vehicle)));
         times.extend(self.last_at());
         times.windows(2).map(|pair| pair[1].since(pair[0])).max().unwrap_or_default()
     }

@@ -120,8 +120,8 @@ impl BrokerFrontend {
                         sleep(ACCEPT_PAUSE).await;
                     }
                 },
-                current = self.reloaded() => self.recheck(&current),
-                _ = rechecks.tick() => self.shared.credentials.iter().for_each(|credentials| self.recheck(&credentials.current())),
+                () = self.reloaded() => self.recheck(),
+                _ = rechecks.tick() => self.recheck(),
             }
         }
     }
@@ -144,17 +144,19 @@ impl BrokerFrontend {
     }
 
     /// Waits until certificates or the revocation list changed.
-    async fn reloaded(&self) -> Arc<LoadedCredentials> {
+    async fn reloaded(&self) {
         let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) else {
             return std::future::pending().await;
         };
         let known = Arc::clone(&sender.borrow());
-        credentials.changed(&known).await
+        credentials.changed(&known).await;
     }
 
     /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
-    fn recheck(&self, current: &Arc<LoadedCredentials>) {
-        self.current.iter().for_each(|sender| _ = sender.send_replace(Arc::clone(current)));
+    fn recheck(&self) {
+        if let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) {
+            sender.send_replace(credentials.current());
+        }
     }
 }
 
