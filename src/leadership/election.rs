@@ -112,12 +112,19 @@ enum State {
 struct Terms {
     /// Highest term that any node is known to have used.
     seen: u64,
-    /// Term found on disk at the start: this node may have used it.
+    /// Term found on disk at the start, or led in last: this node may have used it.
     found: u64,
     /// Term handed to the disk.
     persisted: u64,
     /// Highest known term at the beginning of the present [`TERM_WINDOW`], and when that was.
     window: (u64, Timestamp),
+}
+
+impl Terms {
+    /// Whether this node knows a term other than by what it was told in this run. A first run leaves a 1 on disk.
+    fn has_own(&self) -> bool {
+        self.found > 1
+    }
 }
 
 impl Election {
@@ -256,7 +263,11 @@ impl Election {
         if message.from == self.id {
             return;
         }
+        if !self.terms.has_own() && message.candidacy.role != Role::Cav && message.term <= MAX_FIRST_TERM {
+            self.peers.note_term(&message.from, message.term);
+        }
         let limit = self.term_limit(message.candidacy.role, now);
+        self.unlearn_first_term(limit, now);
         if message.term > limit {
             self.effects.push(ElectionEffect::CountImplausible { from: message.from.clone() });
             // A node that was told a wrong term is heard all the same.
@@ -288,14 +299,33 @@ impl Election {
         }
     }
 
-    /// Highest term that a node of this role may state now. A node without any term believes possible leaders.
+    /// Highest term that a node of this role may state now. A node that has no term of its own believes the possible leader
+    /// with the lowest: a claim of another cannot separate it from the rest.
     fn term_limit(&mut self, role: Role, now: Timestamp) -> u64 {
+        let has_own = self.terms.has_own();
         let Terms { seen, window: (before, since), .. } = &mut self.terms;
         if *before == 0 || now.since(*since) >= TERM_WINDOW {
             (*before, *since) = (*seen, now);
         }
-        let limit = if *before == 0 && role != Role::Cav { MAX_FIRST_TERM } else { *before + MAX_TERM_STEP };
-        limit.min(MAX_TERM)
+        let stated = if has_own { None } else { self.peers.lowest_term() };
+        match stated.into_iter().chain([*before]).filter(|term| *term > 0).min() {
+            None if role != Role::Cav => MAX_FIRST_TERM,
+            lowest => (lowest.unwrap_or(0) + MAX_TERM_STEP).min(MAX_TERM),
+        }
+    }
+
+    /// Forgets a term that this node, without one of its own, learnt first, and that others never reached.
+    fn unlearn_first_term(&mut self, limit: u64, now: Timestamp) {
+        if self.terms.has_own() || self.terms.seen <= limit {
+            return;
+        }
+        let is_beyond = |epoch: &mut Epoch| epoch.term > limit;
+        self.terms = Terms { seen: 0, persisted: 0, window: (0, now), ..self.terms };
+        self.epoch.take_if(is_beyond);
+        self.over.take_if(is_beyond);
+        if self.current_epoch().is_some_and(|epoch| epoch.term > limit) {
+            self.seek(Vec::new(), now + self.config.response_timeout(), now);
+        }
     }
 
     fn learn_term(&mut self, term: u64) {

@@ -1,7 +1,8 @@
 //! Replication of the evidence about vehicles between the candidates of a cell.
 //!
-//! - The leader records in the lane of its own epoch. What changed it shares after the round, and everything in every
-//!   snapshot period. Receivers keep the larger count, so that shares may come late, twice, or in any order.
+//! - The leader records in the lane of the epoch in which it began, also in terms that it renews. What changed it shares
+//!   after the round, and everything in every snapshot period. Receivers keep the larger count, so that shares may come
+//!   late, twice, or in any order.
 //! - A node that has led sends a leader all it knows when it first hears it. Every other candidate listens for longer than
 //!   leaders take to share all they know, and then sends what nobody has shared, each at a time of its own. So evidence of
 //!   leaders that are gone is kept, too, when a split heals.
@@ -45,6 +46,8 @@ pub struct LedgerResync {
     ticks_per_snapshot: u32,
     /// The node's own leadership, while it leads.
     leads: Option<Epoch>,
+    /// The epoch in which that leadership began: followers can make a leader renew its term.
+    lane: Option<Epoch>,
     has_led: bool,
     /// Ticks since the last snapshot.
     ticks: u32,
@@ -88,6 +91,7 @@ impl LedgerResync {
             is_signed: false,
             ticks_per_snapshot,
             leads: None,
+            lane: None,
             has_led: false,
             ticks: 0,
             leader: None,
@@ -106,30 +110,32 @@ impl LedgerResync {
         self.leads.as_ref()
     }
 
-    /// Begins a leadership of this node. Share [`Self::snapshot`] next.
+    /// Begins a leadership of this node, or renews its term. Share [`Self::snapshot`] next.
     pub fn lead(&mut self, epoch: Epoch) {
+        self.lane.get_or_insert_with(|| epoch.clone());
         self.leads = Some(epoch);
         self.has_led = true;
     }
 
     /// Ends the leadership of this node.
     pub fn step_down(&mut self) {
-        self.leads = None;
+        (self.leads, self.lane) = (None, None);
     }
 
     /// Records what a round of the node's own leadership says about vehicles.
     pub fn record(&mut self, epoch: &Epoch, evidence: &[Evidence], ledger: &mut ReputationLedger) -> Vec<LedgerShare> {
+        self.lead(epoch.clone());
+        let lane = self.lane.as_ref().unwrap_or(epoch);
         let key = |evidence: &Evidence| {
             let Evidence { node, label, .. } = evidence.clone();
-            EntryKey { lane: epoch.clone(), node, label }
+            EntryKey { lane: lane.clone(), node, label }
         };
         let keys: BTreeSet<_> = evidence.iter().map(key).collect();
         for evidence in evidence {
-            ledger.record(epoch.term, &epoch.leader, evidence);
+            ledger.record(lane.term, &lane.leader, evidence);
         }
         let changed = ledger.entries_of(&keys);
-        let reached = ledger.marks_reached(epoch.term, &epoch.leader, evidence);
-        self.leads = Some(epoch.clone());
+        let reached = ledger.marks_reached(lane.term, &lane.leader, evidence);
         self.shares(ledger, &changed, &reached)
     }
 
@@ -195,7 +201,7 @@ impl LedgerResync {
         if self.repeats > 0 {
             self.shared.merge_share(&taken, self.leader.as_ref());
         }
-        let present = self.leads.as_ref().or(leadership.epoch.as_ref());
+        let present = self.lane.as_ref().or(leadership.epoch.as_ref());
         let taken = Arc::new(taken);
         let is_statement = self.is_signed && taken.lane().is_some_and(|lane| !self.has_counted(&lane, ledger));
         let is_news =
@@ -214,7 +220,7 @@ impl LedgerResync {
     ) -> (LedgerShare, Vec<RejectReason>) {
         let mut refused = BTreeSet::new();
         let mut is_usable = |lane: Epoch, is_plausible: bool, is_news: &dyn Fn() -> bool| {
-            if self.leads.as_ref() == Some(&lane) {
+            if self.lane.as_ref() == Some(&lane) {
                 // Only this node knows what it counts now.
                 return false;
             }
@@ -404,7 +410,7 @@ impl LedgerResync {
         LedgerShare {
             schema: SCHEMA_VERSION,
             node: self.name.clone(),
-            epoch: self.leads.as_ref().map(|epoch| epoch.term),
+            epoch: self.lane.as_ref().map(|lane| lane.term),
             entries: entries.to_vec(),
             marks: marks.to_vec(),
             signed: None,
@@ -414,7 +420,7 @@ impl LedgerResync {
 
     /// A share of another aggregator as this node sends it.
     fn passed_on(&self, share: &LedgerShare) -> LedgerShare {
-        let epoch = self.leads.as_ref().map(|epoch| epoch.term);
+        let epoch = self.lane.as_ref().map(|lane| lane.term);
         LedgerShare { node: self.name.clone(), epoch, ..share.clone() }
     }
 }

@@ -36,7 +36,7 @@
 //! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is understood after its node was given up |
 //! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a membership that restarts costs no leader |
 //! | [`DISK_TIMEOUT`] | 1 s | below `handover` | a hung disk delays a handover and does not end it |
-//! | [`RENEWAL_PAUSE`] | 10 s | above `response_timeout` | a follower that refuses each epoch does not wear out terms and lanes |
+//! | [`RENEWAL_PAUSE`] | 10 s | above `response_timeout` | a follower that refuses each epoch does not wear out terms |
 //! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, whoever states them |
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
@@ -126,7 +126,7 @@ pub const REDISCOVERY_TIME: Duration = Duration::from_secs(2);
 /// Time for which a node waits for its disk: for its term before it leads, for reputations before it publishes them.
 pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Least time between two renewals of a leadership that followers refuse.
+/// Longest pause between two renewals of a leadership that followers refuse. The first is `given_up_timeout`.
 pub const RENEWAL_PAUSE: Duration = Duration::from_secs(10);
 
 /// Time in which the known term rises by [`MAX_TERM_STEP`](crate::leadership::election::MAX_TERM_STEP) at most.

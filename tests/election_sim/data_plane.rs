@@ -128,7 +128,7 @@ impl World {
 
     /// Sends shares to all candidates that have a link to one of the brokers that the node publishes to; some are lost.
     pub(crate) fn share(&mut self, index: usize, shares: Vec<LedgerShare>) {
-        let leads = self.nodes[index].publishing.as_ref().map(|(epoch, _)| epoch.term);
+        let leads = self.nodes[index].lane.as_ref().map(|lane| lane.term);
         for share in shares {
             assert_eq!(share.epoch, leads, "{} shares what another leadership recorded as its own", share.node);
             for broker in self.brokers_of(index) {

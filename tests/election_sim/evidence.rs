@@ -67,7 +67,8 @@ impl World {
         }
         let vehicle = self.random.index(VEHICLES);
         let (node, correct) = (self.nodes[vehicle].name.clone(), self.random.chance(90));
-        let evidence = self.votes.settle(epoch, node, correct);
+        let lane = self.nodes[index].lane.as_ref().unwrap_or(epoch);
+        let evidence = self.votes.settle(lane, node, correct);
         let node = &mut self.nodes[index];
         let shares = node.resync.record(epoch, &[evidence], &mut node.ledger);
         self.share(index, shares);

@@ -159,6 +159,8 @@ pub(crate) struct Node {
     pub(crate) paused_until: u64,
     pub(crate) waiting: Vec<Arrival>,
     pub(crate) publishing: Option<(Epoch, u64)>,
+    /// The epoch in which its present leadership began: there it counts, also in terms that it renews.
+    pub(crate) lane: Option<Epoch>,
     pub(crate) rounds: RoundTrigger,
     pub(crate) broker_works: bool,
     pub(crate) fuser_works: bool,
@@ -199,6 +201,7 @@ impl Node {
             paused_until: 0,
             waiting: Vec::new(),
             publishing: None,
+            lane: None,
             rounds: RoundTrigger::new(
                 RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() },
                 Timestamp(0),
@@ -223,6 +226,7 @@ impl Node {
         (self.broker_works, self.fuser_works, self.gateway_works) = (true, true, true);
         self.closed = (0, now);
         self.publishers = PublisherFilter::default();
+        self.lane = None;
         self.resync = LedgerResync::new(self.name.clone(), TICKS_PER_SNAPSHOT);
         if !self.has_disk {
             self.saved = ReputationLedger::default();

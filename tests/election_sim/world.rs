@@ -337,12 +337,13 @@ impl World {
                 self.led.push((self.now, epoch.clone()));
                 self.history.push(format!("{:>10} µs {epoch} leads", self.now - START));
                 self.nodes[index].resync.lead(epoch.clone());
+                self.nodes[index].lane.get_or_insert_with(|| epoch.clone());
                 self.begin_to_publish(index, epoch, first_round, first);
                 self.share_all(index);
             }
             Effect::HoldRound => self.nodes[index].rounds.hold(),
             Effect::StopPublishing { .. } => {
-                self.nodes[index].publishing = None;
+                (self.nodes[index].publishing, self.nodes[index].lane) = (None, None);
                 self.nodes[index].resync.step_down();
             }
             Effect::SendSnapshot { .. } => self.share_all(index),

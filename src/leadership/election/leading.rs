@@ -22,8 +22,8 @@ pub(super) struct Leading {
     pub(super) successors: Vec<NodeName>,
     /// The handover under way.
     pub(super) handover: Option<Handover>,
-    /// Whether this node led already when it began this epoch.
-    pub(super) is_renewed: bool,
+    /// Least length of this epoch before it is renewed.
+    pause: Duration,
     /// Time at which to lead on in a higher epoch, as some refuse this one.
     renew_at: Option<Timestamp>,
     beat_at: Timestamp,
@@ -38,11 +38,17 @@ impl Leading {
             after,
             successors,
             handover: None,
-            is_renewed: false,
+            pause: Duration::ZERO,
             renew_at: None,
             beat_at: now,
             beats: 0,
         }
+    }
+
+    /// Sets the pause of an epoch that renews another: each is twice as long as the one before, up to [`RENEWAL_PAUSE`].
+    pub(super) fn renewed(&mut self, before: &Self, least: Duration) {
+        let is_calm = self.since.since(before.since) > RENEWAL_PAUSE * 6;
+        self.pause = if is_calm { least } else { (before.pause * 2).clamp(least, RENEWAL_PAUSE) };
     }
 
     pub(super) fn deadline(&self) -> Timestamp {
@@ -88,8 +94,7 @@ impl Election {
         self.peers.refuses(refused_by, true);
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
-            let earliest = if leading.is_renewed { leading.since + RENEWAL_PAUSE } else { at };
-            leading.renew_at.get_or_insert(at.max(earliest));
+            leading.renew_at.get_or_insert(at.max(leading.since + leading.pause));
         }
     }
 

@@ -36,6 +36,8 @@ pub(super) struct Peer {
     refuses: bool,
     /// Leadership of this node that the peer was last told to be over.
     corrected: Option<Epoch>,
+    /// Lowest term that it stated, if it may lead; 0 before any.
+    term: u64,
     run: u64,
     seq: u64,
     heard_at: Option<Timestamp>,
@@ -74,6 +76,17 @@ impl Peers {
 
     pub(super) fn add(&mut self, name: &NodeName) {
         self.table.entry(name.clone()).or_default();
+    }
+
+    /// Notes a term that a possible leader states.
+    pub(super) fn note_term(&mut self, name: &NodeName, term: u64) {
+        let lowest = &mut self.table.entry(name.clone()).or_default().term;
+        *lowest = if *lowest == 0 { term } else { term.min(*lowest) };
+    }
+
+    /// The lowest term that a possible leader states; none while no node knows of any.
+    pub(super) fn lowest_term(&self) -> Option<u64> {
+        self.table.values().map(|peer| peer.term).filter(|term| *term > 0).min()
     }
 
     pub(super) fn names(&self) -> impl Iterator<Item = &NodeName> {

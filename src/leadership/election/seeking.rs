@@ -149,7 +149,7 @@ impl Election {
     pub(super) fn lead(&mut self, after: Option<Epoch>, now: Timestamp) {
         let term = self.terms.seen.max(self.terms.found) + 1;
         self.persist(term);
-        self.terms.seen = term;
+        (self.terms.seen, self.terms.found) = (term, term);
         let epoch = Epoch::new(term, self.id.clone());
         self.epoch = Some(epoch.clone());
         let successors = self.peers.successors(MAX_SUCCESSORS, now);
@@ -161,7 +161,9 @@ impl Election {
         };
         self.effects.push(ElectionEffect::Lead { epoch: epoch.clone(), first_round: self.next_round(), first });
         let mut leading = Leading::new(epoch, after, successors, now);
-        leading.is_renewed = self.is_leading();
+        if let State::Leading(before) = &self.state {
+            leading.renewed(before, self.config.given_up_timeout());
+        }
         self.state = State::Leading(leading);
         self.beat_all(now);
     }

@@ -259,3 +259,19 @@ fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent()
     );
     assert!(now.since(NOW) < std::time::Duration::from_millis(1500));
 }
+
+#[test]
+fn a_first_boot_beside_a_liar_is_no_separate_cell() {
+    let gauss = NodeName::from_static("gauss");
+    let lie = Epoch::new(MAX_FIRST_TERM - 1, gauss.clone());
+    let mut election = euclid_after(1);
+    election.handle(received(&gauss, 1, Some(&lie), beat_after(None)), NOW);
+    assert_eq!(election.leader(), Some(&gauss), "nobody else is there");
+    let effects = election.handle(of_edge(1, 8, beat(1)), NOW);
+    assert!(effects.contains(&ElectionEffect::PersistTerm { term: 9 }), "{effects:?}");
+    assert_eq!(election.leader(), Some(&NodeName::from_static("edge")));
+    election.handle(received(&gauss, 2, Some(&lie), beat_after(None)), NOW);
+    let gone = ElectionInput::PeerGone { peer: NodeName::from_static("edge") };
+    election.handle(gone, NOW);
+    assert_eq!((election.leader(), election.term()), (Some(&NodeName::from_static("euclid")), 9));
+}

@@ -370,3 +370,25 @@ fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back()
     assert!(!leader.merge(&forged, 7000).unwrap().is_news, "a reset from a far future would be the last");
     assert_eq!(leader.vehicles(), ["gauss"]);
 }
+
+/// A follower that claims a higher term makes the leader renew its own: that costs no older evidence.
+#[test]
+fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
+    let (mut edge, mut gauss) = (Candidate::new("edge"), Candidate::new("gauss"));
+    for candidate in [&mut edge, &mut gauss] {
+        candidate.ledger.record(1, &name("a"), &Evidence { node: name("hopper"), label: "cup".into(), correct: true });
+    }
+    for term in 2..2 + 2 * MAX_LANES as u64 {
+        edge.lead(term);
+        gauss.leadership = Leadership {
+            position: Position::Following,
+            epoch: Some(Epoch::new(term, name("edge"))),
+            ..gauss.leadership
+        };
+        gauss.hear(&edge.record(term, "euclid"));
+    }
+    for candidate in [&edge, &gauss] {
+        assert!(candidate.vehicles().contains(&"hopper".to_owned()), "evidence of an earlier leader is forgotten");
+        assert_eq!(candidate.ledger.totals()[&name("euclid")].0, 2 * MAX_LANES as u64);
+    }
+}
