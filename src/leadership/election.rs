@@ -112,7 +112,7 @@ enum State {
 struct Terms {
     /// Highest term that any node is known to have used.
     seen: u64,
-    /// Term found on disk at the start, or led in last: this node may have used it.
+    /// Term found on disk at the start, led in last, or known for so long that every candidate has been heard.
     found: u64,
     /// Term handed to the disk.
     persisted: u64,
@@ -300,15 +300,19 @@ impl Election {
     }
 
     /// Highest term that a node of this role may state now. A node that has no term of its own believes the possible leader
-    /// with the lowest: a claim of another cannot separate it from the rest.
+    /// with the lowest: a claim of another cannot separate it from the rest. It has its own once it has heard all.
     fn term_limit(&mut self, role: Role, now: Timestamp) -> u64 {
-        let has_own = self.terms.has_own();
-        let Terms { seen, window: (before, since), .. } = &mut self.terms;
+        let heard_all = self.config.contact_timeout();
+        let Terms { seen, found, window: (before, since), .. } = &mut self.terms;
+        if *before > 0 && now.since(*since) >= heard_all {
+            *found = (*found).max(*seen);
+        }
         if *before == 0 || now.since(*since) >= TERM_WINDOW {
             (*before, *since) = (*seen, now);
         }
+        let has_own = self.terms.has_own();
         let stated = if has_own { None } else { self.peers.lowest_term() };
-        match stated.into_iter().chain([*before]).filter(|term| *term > 0).min() {
+        match stated.into_iter().chain([self.terms.window.0]).filter(|term| *term > 0).min() {
             None if role != Role::Cav => MAX_FIRST_TERM,
             lowest => (lowest.unwrap_or(0) + MAX_TERM_STEP).min(MAX_TERM),
         }

@@ -200,10 +200,12 @@ impl Peers {
         self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| at >= since)
     }
 
-    /// How many nodes heard lately follow a leader, by their own word.
+    /// How many nodes heard lately follow a leader, by their own word. Parts share the certificate of their node, which
+    /// counts once.
     pub(super) fn followers(&self, leader: &NodeName, now: Timestamp) -> usize {
         let follows = |peer: &Peer| peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == *leader);
-        self.table.iter().filter(|(name, peer)| *name != leader && follows(peer) && self.hears(name, now)).count()
+        let is_node = |name: &NodeName| name != leader && name.vehicle() == *name;
+        self.table.iter().filter(|(name, peer)| follows(peer) && is_node(name) && self.hears(name, now)).count()
     }
 
     /// Whether a peer could lead, as far as is known without having heard it lately.

@@ -260,6 +260,32 @@ fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent()
     assert!(now.since(NOW) < std::time::Duration::from_millis(1500));
 }
 
+/// One certificate is good for several names: a node's and those of its parts.
+#[test]
+fn the_parts_of_a_node_depose_no_leader() {
+    let (mut election, mut now) = (euclid(), NOW);
+    let (gauss, hopper) = (NodeName::from_static("gauss"), NodeName::from_static("hopper"));
+    let mut seq = 0;
+    let mut status = |election: &mut Election, from: &NodeName, epoch: Option<&Epoch>, now| {
+        seq += 1;
+        election.handle(received(from, seq, epoch, Body::Status { over: None }), now);
+    };
+    while !election.is_leading() {
+        status(&mut election, &gauss, None, now);
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    let own = election.epoch().cloned();
+    status(&mut election, &gauss, own.as_ref(), now);
+    status(&mut election, &hopper, own.as_ref(), now);
+    let lie = Epoch::new(election.term() + 1, gauss);
+    for part in 0..15 {
+        let part = NodeName::new(format!("mallory--{part}")).unwrap();
+        status(&mut election, &part, Some(&lie), now);
+    }
+    assert!(election.is_leading());
+}
+
 #[test]
 fn a_first_boot_beside_a_liar_is_no_separate_cell() {
     let gauss = NodeName::from_static("gauss");
@@ -274,4 +300,18 @@ fn a_first_boot_beside_a_liar_is_no_separate_cell() {
     let gone = ElectionInput::PeerGone { peer: NodeName::from_static("edge") };
     election.handle(gone, NOW);
     assert_eq!((election.leader(), election.term()), (Some(&NodeName::from_static("euclid")), 9));
+}
+
+#[test]
+fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
+    let (gauss, edge) = (NodeName::from_static("gauss"), NodeName::from_static("edge"));
+    let old = Epoch::new(1_800_000_000, edge.clone());
+    let mut election = euclid_after(0);
+    let mut now = NOW;
+    for seq in 1..80 {
+        election.handle(received(&edge, seq, Some(&old), beat(seq)), now);
+        now = now + Duration::from_millis(100);
+    }
+    election.handle(received(&gauss, 1, Some(&Epoch::new(1, gauss.clone())), beat_after(None)), now);
+    assert_eq!((election.leader(), election.term()), (Some(&edge), old.term));
 }

@@ -41,7 +41,7 @@ pub enum FrameEvent {
     Superseded,
     /// Gossip in the name of another node than its sender.
     NameMismatch,
-    /// Not answered: too many were answered lately.
+    /// Not answered or not taken: too many came lately.
     Throttled,
     /// From a node beyond `membership.max_peers`.
     TooManyPeers,

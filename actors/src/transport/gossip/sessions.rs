@@ -262,6 +262,7 @@ impl Sessions {
         };
         let Some((body, taken)) = peer.keys.open(head, frame) else { return Err(FrameEvent::BadSeal) };
         match taken {
+            Ok(()) if !peer.frames.allow(now) => return Err(FrameEvent::Throttled),
             Ok(()) => peer.note_heard(now),
             Err(FrameEvent::CounterJump) => return Ok(self.stranger(FrameEvent::CounterJump)),
             Err(reason) => return Err(reason),

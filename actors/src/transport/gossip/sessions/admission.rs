@@ -272,6 +272,7 @@ impl Sessions {
                 proven,
                 address,
                 keys: KeyRing::new(keys),
+                frames: PeerSession::frames(now),
                 proof_counter: if is_proof { head.counter } else { 0 },
                 heard: now,
                 unheard_since: None,

@@ -2,11 +2,13 @@
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
+use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
 use super::SESSION_IDLE_TIMEOUT;
+use crate::platform::throttle::TokenBucket;
 use crate::transport::gossip::counters::FrameEvent;
 use crate::transport::gossip::frame::FrameHeader;
 use crate::transport::gossip::handshake::Proven;
@@ -29,6 +31,8 @@ pub(super) struct PeerSession {
     pub(super) proven: Option<Proven>,
     pub(super) address: SocketAddr,
     pub(super) keys: KeyRing,
+    /// What it may still send: the election handles each frame, and answers some.
+    pub(super) frames: TokenBucket,
     /// Counter of the frame with its last proof: no earlier one is accepted.
     pub(super) proof_counter: u64,
     pub(super) heard: Timestamp,
@@ -41,7 +45,15 @@ pub(super) struct PeerSession {
 /// Maximum sessions by one certificate: a node, its former run, and observers that share its certificate.
 const MAX_SESSIONS_EACH: usize = 16;
 
+/// Frames that a session may send at once, and time for one more. A leader under election sends about 100 a second.
+const FRAMES: u32 = 1000;
+const FRAME_INTERVAL: Duration = Duration::from_millis(2);
+
 impl PeerSession {
+    pub(super) fn frames(now: Timestamp) -> TokenBucket {
+        TokenBucket::new(FRAMES, FRAME_INTERVAL, now)
+    }
+
     pub(super) fn note_heard(&mut self, now: Timestamp) {
         self.heard = now;
         self.unheard_since = None;

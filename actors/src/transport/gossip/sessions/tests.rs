@@ -104,6 +104,21 @@ fn a_counter_from_beyond_mutes_nobody() {
 }
 
 #[test]
+fn a_member_that_floods_is_not_heard_for_long() {
+    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    introduce(&mut a, &mut b);
+    let mut taken_in_a_second = |second: u64| {
+        let mut is_taken = |n: u64| {
+            let (frame, now) = (a.seal(&b.id.name, b"?"), NOW + Duration::from_micros(1_000_000 * second + 100 * n));
+            b.open(&frame, a.address, now).is_ok()
+        };
+        (0..10_000).filter(|n| is_taken(*n)).count()
+    };
+    assert!(taken_in_a_second(0) <= 1500, "a burst");
+    assert!((450..=550).contains(&taken_in_a_second(1)));
+}
+
+#[test]
 fn recorded_handshakes_admit_nobody() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
     let [hello, challenge, proof, accept] = introduce(&mut a, &mut b);
