@@ -29,7 +29,7 @@ pub struct ElectionConfig {
     /// leader that is there, and a lone vehicle wait.
     pub join_ms: u64,
     /// How much longer each next candidate waits before it claims the lead, in ms. Default 60. Must exceed the
-    /// network's usual delay, or two candidates claim at once (harmless, the later epoch wins).
+    /// network's usual delay. Otherwise two candidates claim at once, and one of them gives way.
     pub claim_step_ms: u64,
     /// How long a better candidate must have been fit and heard before it is handed the lead, in ms. Default 3000.
     /// Longer suffers a node that comes and goes less, and stays with the substitute longer.

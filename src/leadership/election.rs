@@ -21,17 +21,17 @@
 //!
 //! 1. No two leaderships share an [`Epoch`]: a node uses a term once, and the epoch holds its name. The term is handed to
 //!    the disk first; see [`ElectionEffect::Lead`] for a disk that fails.
-//! 2. The epoch that a node follows or leads never goes back while it runs, nor below the saved term after a
-//!    restart.
+//! 2. The epoch that a node follows or leads never goes back while it runs, nor below the saved term after a restart.
+//!    One exception: a node without a term of its own drops a first term that the other candidates never reached.
 //! 3. A component whose links all work both ways, left alone, has exactly one leader: the best candidate by role and
 //!    priority, if one is fit.
 //! 4. Only a better candidate replaces a leader that is there and fit, by handover.
 //! 5. Time that a node was stalled is no silence of others.
 //! 6. A node whose broker, fuser or gateway is broken does not lead.
 //!
-//! There are no votes and no majority: every side of a split network serves its vehicles. When two leaders meet, the one
-//! that should lead stays, unless more nodes follow the other. It goes on in a term above both. Epochs tell apart what each
-//! of them published before.
+//! There are no votes and no majority: every side of a split network serves its vehicles. When two leaders meet, rank
+//! (role, priority) and the number of followers decide which one stays. If that one has the lower epoch, it goes on in a
+//! term above both. Epochs tell apart what each of them published before.
 //!
 //! # Why the leader beats by itself
 //!
@@ -112,7 +112,7 @@ enum State {
 struct Terms {
     /// Highest term that any node is known to have used.
     seen: u64,
-    /// Term found on disk at the start, led in last, or known for so long that every candidate has been heard.
+    /// Highest term that counts as this node's own: from its disk, led in, or known for `contact_timeout`.
     found: u64,
     /// Term handed to the disk.
     persisted: u64,
@@ -121,7 +121,7 @@ struct Terms {
 }
 
 impl Terms {
-    /// Whether this node knows a term other than by what it was told in this run. A first run leaves a 1 on disk.
+    /// Whether this node has a term of its own. A first run that led alone leaves a 1 on disk, which does not count.
     fn has_own(&self) -> bool {
         self.found > 1
     }
@@ -299,8 +299,8 @@ impl Election {
         }
     }
 
-    /// Highest term that a node of this role may state now. A node that has no term of its own believes the possible leader
-    /// with the lowest: a claim of another cannot separate it from the rest. It has its own once it has heard all.
+    /// Highest term that a node of this role may state now. A node without a term of its own believes the possible leader
+    /// that states the lowest term: one false claim does not separate it from the cell.
     fn term_limit(&mut self, role: Role, now: Timestamp) -> u64 {
         let heard_all = self.config.contact_timeout();
         let Terms { seen, found, window: (before, since), .. } = &mut self.terms;
@@ -318,7 +318,7 @@ impl Election {
         }
     }
 
-    /// Forgets a term that this node, without one of its own, learnt first, and that others never reached.
+    /// Drops a first term that the other candidates never reached. Only a node without a term of its own does so.
     fn unlearn_first_term(&mut self, limit: u64, now: Timestamp) {
         if self.terms.has_own() || self.terms.seen <= limit {
             return;

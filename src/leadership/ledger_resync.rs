@@ -201,7 +201,8 @@ impl LedgerResync {
         if self.repeats > 0 {
             self.shared.merge_share(&taken, self.leader.as_ref());
         }
-        let present = self.lane.as_ref().or(leadership.epoch.as_ref());
+        let present = self.lane_of_leader(leadership).or(leadership.epoch.as_ref()).cloned();
+        let present = present.as_ref();
         let taken = Arc::new(taken);
         let is_statement = self.is_signed && taken.lane().is_some_and(|lane| !self.has_counted(&lane, ledger));
         let is_news =
@@ -257,9 +258,17 @@ impl LedgerResync {
         lane.leader == self.name && ledger.has_lane(lane) && !ledger.is_stated(lane)
     }
 
+    /// The lane in which the leader counts: this node's own, or by the leader's shares.
+    fn lane_of_leader(&self, leadership: &Leadership) -> Option<&Epoch> {
+        let is_of_leader =
+            |lane: &&Epoch| leadership.epoch.as_ref().is_some_and(|now| now.leader == lane.leader && **lane <= *now);
+        self.lane.as_ref().or(self.leader.as_ref().filter(is_of_leader))
+    }
+
     /// Whether a candidate may tell of a lane.
     fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
-        if leadership.present_epoch() == Some(lane) {
+        let is_present = leadership.present_epoch() == Some(lane) || self.lane_of_leader(leadership) == Some(lane);
+        if is_present {
             return *sender == lane.leader;
         }
         !self.is_signed || *sender != lane.leader || self.followed.contains_key(sender)

@@ -279,7 +279,8 @@ impl LeadershipNode {
     fn take_status(&mut self, status: &NodeStatus, now: Timestamp) {
         let peer = status.node.clone();
         if status.state != NodeState::Offline {
-            if self.runs.len() < MAX_RUNS || self.runs.contains_key(&peer) {
+            let has_room = self.runs.len() < MAX_RUNS && peer.vehicle() == peer;
+            if has_room || self.runs.contains_key(&peer) {
                 self.runs.insert(peer, status.id);
             }
             return;

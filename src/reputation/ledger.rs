@@ -27,8 +27,8 @@ pub(super) struct Record {
 pub struct ReputationLedger {
     /// By the epoch whose aggregator writes the lane, and by vehicle.
     pub(super) lanes: BTreeMap<Epoch, BTreeMap<NodeName, Record>>,
-    /// Number of counts and marks in all lanes.
-    pub(super) entries: usize,
+    /// Number of counts and marks by aggregator.
+    pub(super) sizes: BTreeMap<NodeName, usize>,
     /// Signed shares of aggregators, by lane. They are not serialised with the counts.
     pub(super) statements: BTreeMap<Epoch, Statements>,
     /// Time of the last reset, in cells without certificates; 0 if there was none.
@@ -53,9 +53,9 @@ impl From<Snapshot> for ReputationLedger {
         let mut ledger = Self::default();
         for (term, aggregators) in lanes {
             for (aggregator, vehicles) in aggregators {
+                ledger.resize(&aggregator, 0, vehicles.values().map(BTreeMap::len).sum());
                 let lane = ledger.lanes.entry(Epoch::new(term, aggregator)).or_default();
                 for (node, labels) in vehicles {
-                    ledger.entries += labels.len();
                     let sum = labels.values().copied().fold(Counts::default(), Counts::plus);
                     lane.insert(node, Record { labels, sum, marks: Marks::default() });
                 }

@@ -133,7 +133,7 @@ impl ReputationLedger {
             let before = record.marks.len();
             changed |= record.marks.insert(number, Counts { correct, incorrect });
             let after = record.marks.len();
-            self.entries = self.entries + after - before;
+            self.resize(&lane.leader, before, after);
         }
         changed
     }

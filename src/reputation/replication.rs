@@ -8,12 +8,13 @@ use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
 use crate::wire::{LedgerEntry, LedgerMark};
 
-/// Maximum number of lanes: the latest are kept.
-pub const MAX_LANES: usize = 64;
+/// Maximum number of lanes: the latest are kept. One aggregator has at most half of them.
+pub const MAX_LANES: usize = 128;
 
-/// Maximum number of counts and marks. For a new one the oldest lanes are dropped. It is not taken where only its own
-/// and later lanes are left, except in the present leader's lane, to which later lanes give way too.
-pub const MAX_ENTRIES: usize = 65_536;
+/// Maximum number of counts and marks, of which one aggregator has at most half. For a new one the oldest lanes are
+/// dropped: those of its own aggregator if that one has its half. It is not taken where only its own and later lanes are
+/// left, except in the present leader's lane, to which later lanes give way too.
+pub const MAX_ENTRIES: usize = 131_072;
 
 /// The key of a count: an entry without its numbers.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -108,7 +109,7 @@ impl ReputationLedger {
             if !self.make_room(lane, present) {
                 return None;
             }
-            self.entries += 1;
+            self.resize(&lane.leader, 0, 1);
         }
         Some(self.lanes.entry(lane.clone()).or_default().entry(node.clone()).or_default())
     }
@@ -116,17 +117,28 @@ impl ReputationLedger {
     /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false if the lanes that are
     /// left do not give way to it.
     pub(super) fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
-        while self.entries >= MAX_ENTRIES || (!self.lanes.contains_key(lane) && self.lanes.len() >= MAX_LANES) {
-            if !self.forget_oldest(lane, present) {
+        loop {
+            let is_new = !self.lanes.contains_key(lane);
+            let of_one = self.lanes.keys().filter(|other| other.leader == lane.leader).count();
+            let has_half = self.sizes.get(&lane.leader).is_some_and(|size| *size >= MAX_ENTRIES / 2)
+                || (is_new && of_one >= MAX_LANES / 2);
+            let is_full =
+                self.sizes.values().sum::<usize>() >= MAX_ENTRIES || (is_new && self.lanes.len() >= MAX_LANES);
+            if !has_half && !is_full {
+                return true;
+            }
+            if !self.forget_oldest(lane, present, has_half) {
                 return false;
             }
         }
-        true
     }
 
-    /// Forgets the oldest lane except the present one, if it is older than `lane` or `lane` is the present one.
-    fn forget_oldest(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
-        let oldest = self.lanes.keys().find(|other| *other != lane && Some(*other) != present).cloned();
+    /// Forgets the oldest lane except the present one, of the same aggregator or of all, if it is older than `lane` or
+    /// `lane` is the present one.
+    fn forget_oldest(&mut self, lane: &Epoch, present: Option<&Epoch>, same_aggregator: bool) -> bool {
+        let may_go = |other: &&Epoch| *other != lane && Some(*other) != present;
+        let mut old = self.lanes.keys().filter(may_go);
+        let oldest = old.find(|other| !same_aggregator || other.leader == lane.leader).cloned();
         let gives_way = |oldest: &Epoch| oldest < lane || present == Some(lane);
         let Some(oldest) = oldest.filter(gives_way) else { return false };
         self.forget(&oldest);
@@ -135,9 +147,17 @@ impl ReputationLedger {
 
     /// Forgets a lane.
     pub(super) fn forget(&mut self, lane: &Epoch) {
-        self.entries -= self.size_of(lane);
+        self.resize(&lane.leader, self.size_of(lane), 0);
         self.lanes.remove(lane);
         self.statements.remove(lane);
+    }
+
+    /// Notes that so many counts and marks of an aggregator became so many.
+    pub(super) fn resize(&mut self, aggregator: &NodeName, before: usize, after: usize) {
+        let size = (self.sizes.remove(aggregator).unwrap_or_default() + after).saturating_sub(before);
+        if size > 0 {
+            self.sizes.insert(aggregator.clone(), size);
+        }
     }
 
     /// Number of counts and marks in a lane.
@@ -218,9 +238,9 @@ mod tests {
             let entry = entry(&lane, &name("euclid"), &"cup".into(), Counts { correct: 1, incorrect: 0 });
             ledger.merge_entries([entry], None);
         }
-        assert_eq!(ledger.lanes(), MAX_LANES);
+        assert_eq!(ledger.lanes(), MAX_LANES / 2);
         let oldest = ledger.entries().next().unwrap();
-        assert_eq!(oldest.epoch, MAX_LANES as u64);
+        assert_eq!(oldest.epoch, (MAX_LANES + MAX_LANES / 2) as u64);
         let forgotten = LedgerEntry { epoch: 0, ..oldest };
         assert!(!ledger.merge_entries([forgotten], None), "an old lane does not come back");
     }
@@ -254,12 +274,30 @@ mod tests {
         let mut ledger = ReputationLedger::default();
         ledger.record(1, &name("edge"), &vote(true));
         ledger.record(2, &name("edge"), &vote(true));
-        for number in 0..MAX_ENTRIES {
+        for number in 0..MAX_ENTRIES / 2 {
             let node = name(&format!("v{number}"));
             ledger.record(2, &name("edge"), &Evidence { node, label: "cup".into(), correct: true });
         }
         ledger.record(2, &name("edge"), &vote(true));
-        assert_eq!((ledger.entries().count(), ledger.lanes()), (MAX_ENTRIES, 1));
+        assert_eq!((ledger.entries().count(), ledger.lanes()), (MAX_ENTRIES / 2, 1));
         assert_eq!(ledger.totals()[&name("euclid")], (2, 0), "who is known goes on being counted");
+    }
+
+    /// Its signed shares may invent any number of leaderships and vehicles.
+    #[test]
+    fn a_false_leader_displaces_none_of_the_latest_half() {
+        let counted = Counts { correct: 1, incorrect: 0 };
+        let mut ledger = ReputationLedger::default();
+        for term in 0..MAX_LANES as u64 / 2 {
+            ledger.record(term, &name("edge"), &vote(true));
+        }
+        let lane = |term: usize| Epoch::new(1000 + term as u64, name("liar"));
+        let lanes = (0..2 * MAX_LANES).map(|term| entry(&lane(term), &name("v"), &"cup".into(), counted));
+        ledger.merge_entries(lanes, None);
+        let present = lane(2 * MAX_LANES);
+        let vehicles = (0..2 * MAX_ENTRIES).map(|n| entry(&present, &name(&format!("v{n}")), &"cup".into(), counted));
+        ledger.merge_entries(vehicles, Some(&present));
+        assert_eq!(ledger.totals()[&name("euclid")], (MAX_LANES as u64 / 2, 0));
+        assert!(ledger.entries().count() <= MAX_LANES + MAX_ENTRIES / 2);
     }
 }

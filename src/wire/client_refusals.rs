@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::model::names::NodeName;
 
-/// What a node's broker refused from programs. Retained on `nodes/<node>/clients`, at that broker alone.
+/// Messages of programs that a node's broker refused. Retained on `nodes/<node>/clients`, at that broker alone.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ClientRefusals {
     /// Major version of the payload, [`SCHEMA_VERSION`](crate::wire::SCHEMA_VERSION).
@@ -16,7 +16,7 @@ pub struct ClientRefusals {
     pub refused: Vec<ClientRefusal>,
 }
 
-/// Messages that a client published in vain for one reason.
+/// Refused messages of one client, for one reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ClientRefusal {
     /// The client's MQTT identifier.

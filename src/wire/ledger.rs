@@ -18,7 +18,7 @@ pub struct LedgerShare {
     /// The sender; equals the last level of the topic.
     #[n(1)]
     pub node: NodeName,
-    /// Term of the sender's leadership; absent when it does not lead.
+    /// Term in which the sender's leadership began, also after it renewed its term; absent when it does not lead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(2)]
     pub epoch: Option<u64>,

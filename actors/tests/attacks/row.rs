@@ -90,7 +90,7 @@ pub(crate) struct Outcome {
     pub(crate) false_verdicts: Option<usize>,
     /// Nodes that ended.
     pub(crate) ended: Vec<String>,
-    /// Deeds of the attacker, and why it gave up.
+    /// Deeds of the attacker, and the reason for which the attack ended early.
     pub(crate) deeds: u64,
     pub(crate) fault: Option<String>,
 }
@@ -134,7 +134,7 @@ impl fmt::Display for Outcome {
             "{maps} of {expected} maps, {honest} with all honest reports, {rss_mb} MB, longest gap {longest_gap_ms} ms"
         )?;
         write!(f, ", {} deeds", self.deeds)?;
-        self.fault.iter().try_for_each(|fault| write!(f, ", the attacker gave up: {fault}"))?;
+        self.fault.iter().try_for_each(|fault| write!(f, ", attack ended: {fault}"))?;
         if self.is_replaced {
             write!(f, ", another leader")?;
         }
@@ -156,7 +156,10 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
         let wrong = outcome.false_verdicts.map_or_else(|| "-".to_owned(), |count| count.to_string());
         let verdict = match (row.took_place(outcome), row.bar.is_met(outcome)) {
-            (false, _) => format!("NOT ATTACKED: {}", outcome.fault.as_deref().unwrap_or("too few deeds")),
+            (false, _) => outcome
+                .fault
+                .as_ref()
+                .map_or_else(|| "NOT ATTACKED: too few deeds".to_owned(), |fault| format!("FAILED: {fault}")),
             (true, true) => "held".to_owned(),
             (true, false) if outcome.ended.is_empty() => "BROKEN".to_owned(),
             (true, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),

@@ -220,7 +220,7 @@ impl Cell {
     /// When a node first said that it is ready.
     pub(crate) fn first_ready(&self, name: &str, since: Timestamp) -> Timestamp {
         let ready = |(at, is_ready): &&(Timestamp, bool)| *is_ready && *at >= since;
-        self.claims[name].iter().find(ready).map_or_else(true_time, |(at, _)| *at)
+        self.claims[name].iter().find(ready).expect("never ready").0
     }
 
     /// Longest time for which a node said that it is ready while no useful map came.

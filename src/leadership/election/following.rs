@@ -83,8 +83,9 @@ impl Election {
         }
     }
 
-    /// Decides which of two leaders stays. A higher epoch lets none stop for one that does not outrank it and that fewer
-    /// nodes say to follow, whatever that one claims. It goes on in a term above both.
+    /// Decides whether this node stops for another leader of a higher epoch. It stops for one that outranks it, unless only
+    /// this node has followers. It stops for one of its own rank unless that one has fewer followers, and for one of a lower
+    /// rank only if that one has more. Followers are counted by their own word. Otherwise it goes on in a term above both.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else { return };
         let (own, other) = (leading.epoch.clone(), beat.epoch.leader.clone());
@@ -110,7 +111,8 @@ impl Election {
         }
     }
 
-    /// Whether the first of two nodes should lead rather than the second, by role and priority: certificates bound them.
+    /// Whether `name` has a higher rank (role, priority) than `other`. Certificates bound both. An unknown `other` ranks below
+    /// everyone.
     fn outranks(&self, name: &NodeName, other: &NodeName) -> bool {
         let rank = |name: &NodeName| {
             let own = (*name == self.id).then(|| self.candidacy());
@@ -183,10 +185,10 @@ impl Election {
                 let own = leading.epoch.clone();
                 match &message.epoch {
                     Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
-                        // The word of fewer nodes than follow this one ends no leadership, nor that about a stranger.
-                        let is_majority =
+                        // A leadership ends only on the word of more nodes than follow it, for a known candidate.
+                        let has_more_followers =
                             self.peers.followers(&other.leader, now) > self.peers.followers(&self.id, now);
-                        if is_majority && self.peers.may_lead(&other.leader, now) {
+                        if has_more_followers && self.peers.may_lead(&other.leader, now) {
                             let other = other.clone();
                             self.stop_leading(&other.leader);
                             self.adopt(other, now, now);
@@ -264,7 +266,7 @@ impl Election {
         }
     }
 
-    /// Follows who claimed the lead since the leader was last heard, or seeks.
+    /// Follows the latest claimant to the lead if its claim is recent, and seeks otherwise.
     fn lose_leader(&mut self, now: Timestamp) {
         let State::Following(following) = &mut self.state else { return };
         let order = std::mem::take(&mut following.successors);

@@ -76,7 +76,7 @@ impl Health {
 /// Something to be done, in the order given.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum ElectionEffect {
-    /// Hand a term to the disk. An [`ElectionEffect::Lead`] in it waits for the disk's answer.
+    /// Hand a term to the disk; it may be lower than the last one. An [`ElectionEffect::Lead`] in it waits for the answer.
     PersistTerm {
         /// To be given to [`crate::leadership::election::Election::new`] after a restart.
         term: u64,

@@ -22,7 +22,7 @@ pub(super) struct Leading {
     pub(super) successors: Vec<NodeName>,
     /// The handover under way.
     pub(super) handover: Option<Handover>,
-    /// Least length of this epoch before it is renewed.
+    /// Minimum time in this epoch before it is renewed.
     pause: Duration,
     /// Time at which to lead on in a higher epoch, as some refuse this one.
     renew_at: Option<Timestamp>,

@@ -10,6 +10,9 @@
 //! | [`Following::direct_timeout_at`] | `silence_beats` beats | 2.5 round intervals | `given_up_timeout` | asks less often |
 //! | [`Following::lost_at`] | the same | the same | the same | loses the leader, unless others heard it later |
 //!
+//! A claim to lead by another node counts like the membership's word: the leader is asked about at once, and lost after
+//! `given_up_timeout` without a sign of life.
+//!
 //! [`Following::silent_at`], two beats, says whom the first question goes to: before it to the leader and its successors,
 //! as one late round may be missing at all nodes; after it to all. Later questions go to all.
 //!
@@ -49,7 +52,8 @@ pub(super) struct Following {
     pub(super) indirect_heard_at: Timestamp,
     /// Whether the membership gave the leader up since it was last heard.
     pub(super) given_up: bool,
-    /// The last claim to lead of a node that it outranks, since it was last heard.
+    /// Latest claim to lead by another node, and its arrival, since the leader was last heard. It is followed if the leader
+    /// is lost.
     pub(super) claim: Option<Box<(Timestamp, Beat)>>,
     /// Time of the first question about it since it was last heard.
     pub(super) asked_at: Option<Timestamp>,

@@ -150,9 +150,9 @@ fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
     assert_eq!(election.leader(), Some(&gauss));
 }
 
-/// A vehicle's certificate lets nobody lead; its word about others ends no leadership either.
+/// A leader stays when another node follows a leader that was never heard.
 #[test]
-fn the_word_of_a_node_that_never_leads_ends_no_leadership() {
+fn the_word_about_an_unknown_leader_ends_no_leadership() {
     let mut election = euclid();
     let mut now = NOW;
     let hopper = NodeName::from_static("hopper");
@@ -174,7 +174,7 @@ fn the_word_of_a_node_that_never_leads_ends_no_leadership() {
     assert!(election.is_leading());
 }
 
-/// Time and epoch of each leadership of euclid in twenty seconds after it led on once, as gauss had refused its first.
+/// Epochs that euclid led in during the twenty seconds after gauss had refused its first one.
 fn renewals(gauss_follows: bool) -> Vec<Epoch> {
     let gauss = NodeName::from_static("gauss");
     let (mut election, mut now, mut seq) = (euclid(), NOW, 0);
@@ -196,7 +196,7 @@ fn renewals(gauss_follows: bool) -> Vec<Epoch> {
         for effect in election.tick(now) {
             if let ElectionEffect::Lead { epoch, .. } = effect {
                 led.push(epoch);
-                // It was under way.
+                // Gauss sent this before it heard of the new epoch.
                 status(&mut election, None, led.last().cloned(), now);
             }
         }

@@ -387,6 +387,8 @@ fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
         };
         gauss.hear(&edge.record(term, "euclid"));
     }
+    let merged = gauss.merge(&share("other", None, vec![slander(2, "edge", 1)]), 100_000).unwrap();
+    assert_eq!(merged.refused, [RejectReason::Unattested], "its leader alone tells of it");
     for candidate in [&edge, &gauss] {
         assert!(candidate.vehicles().contains(&"hopper".to_owned()), "evidence of an earlier leader is forgotten");
         assert_eq!(candidate.ledger.totals()[&name("euclid")].0, 2 * MAX_LANES as u64);

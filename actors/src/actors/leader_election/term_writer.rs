@@ -1,4 +1,4 @@
-//! The highest term on disk.
+//! The term on disk.
 
 use ecod::leadership::timers::DISK_TIMEOUT;
 use tokio::sync::watch;
@@ -42,7 +42,7 @@ pub(super) enum TermState {
 /// were forged, and that left no room for elections.
 const MAX_SAVED_TERM: u64 = 1 << 40;
 
-/// The highest term that an earlier run of the node knew; 0 without any.
+/// The term that the last run of the node saved; 0 without any.
 pub fn saved_term(file: Option<&StateFile>) -> u64 {
     let Some(file) = file else { return 0 };
     match file.load(|_| true).unwrap_or(0) {
@@ -74,15 +74,18 @@ impl TermWriter {
     /// Waits for the disk's answer to `term`, or to the last term handed in if that is lower. A disk that was found to hang
     /// is not waited for again until it answers something.
     pub(super) async fn wait_for(&mut self, term: u64) -> TermState {
-        let term = term.min(*self.wanted.borrow());
+        // A node may unlearn a term, and then hands in a lower one: earlier answers are not about it.
+        let wanted = *self.wanted.borrow();
+        let term = term.min(wanted);
+        let is_about = |answer: &Answer| (term..=wanted).contains(&answer.term);
         if !self.has_disk {
             return TermState::NoDisk;
         }
         let before = *self.answer.borrow();
-        if before.term < term && self.hung_at == Some(before) {
+        if !is_about(&before) && self.hung_at == Some(before) {
             return TermState::Unanswered;
         }
-        let answered = self.answer.wait_for(|answer| answer.term >= term);
+        let answered = self.answer.wait_for(is_about);
         let answered = tokio::time::timeout(DISK_TIMEOUT, answered).await.ok().and_then(Result::ok);
         match answered.map(|answer| answer.is_saved) {
             Some(true) => TermState::Saved,
@@ -131,7 +134,7 @@ mod tests {
     async fn a_term_that_was_waited_for_is_on_disk() {
         let directory = tempfile::tempdir().unwrap();
         let mut writer = TermWriter::new(Some(file(directory.path())));
-        for term in 1..20 {
+        for term in (1..20).chain([5]) {
             writer.save(term);
             assert_eq!(writer.wait_for(term).await, TermState::Saved);
             assert_eq!(saved_term(Some(&file(directory.path()))), term);

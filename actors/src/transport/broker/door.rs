@@ -195,13 +195,15 @@ impl DoorState {
         Publication { topic: self.setup.topics.path(topic), payload, retain }
     }
 
-    /// Publishes a state that differs from the last one.
+    /// Publishes a state that differs from the last one. One vehicle may have any number of parts: these leave half of the
+    /// room to nodes.
     fn retain(&self, publication: Publication) {
         let mut retained = lock(&self.retained);
         let is_known = retained.contains_key(&publication.topic);
-        if retained.get(&publication.topic) == Some(&publication.payload)
-            || (!is_known && retained.len() >= MAX_RETAINED)
-        {
+        let topic = self.setup.topics.parse(&publication.topic);
+        let is_of_part = matches!(topic, Some(Topic::Nodes(name)) if name.vehicle() != name);
+        let room = if is_of_part { MAX_RETAINED / 2 } else { MAX_RETAINED };
+        if retained.get(&publication.topic) == Some(&publication.payload) || (!is_known && retained.len() >= room) {
             return;
         }
         retained.insert(publication.topic.clone(), publication.payload.clone());

@@ -41,7 +41,7 @@ pub enum FrameEvent {
     Superseded,
     /// Gossip in the name of another node than its sender.
     NameMismatch,
-    /// Not answered or not taken: too many came lately.
+    /// Beyond the rate of answers, or beyond the frames that a session may send.
     Throttled,
     /// From a node beyond `membership.max_peers`.
     TooManyPeers,

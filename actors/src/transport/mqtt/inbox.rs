@@ -289,7 +289,8 @@ impl Inbox {
         payload: &[u8],
         received_at: Timestamp,
     ) -> Result<PacketOutcome, RejectReason> {
-        if payload.is_empty() || self.is_shed(&self.status_throttle, ShedReason::StatusThrottled, node, received_at) {
+        let is_shed = |vehicle| self.is_shed(&self.status_throttle, ShedReason::StatusThrottled, vehicle, received_at);
+        if payload.is_empty() || is_shed(&node.vehicle()) {
             return Ok(PacketOutcome::Done);
         }
         let status: NodeStatus = decode(payload, &self.limits)?;

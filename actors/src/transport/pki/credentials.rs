@@ -163,7 +163,10 @@ impl Credentials {
             if !Arc::ptr_eq(&current, known) {
                 return current;
             }
-            timeout(RELOAD_INTERVAL, changed).await.unwrap_or_default();
+            // Others look at the files, too: half a second after the last look the next one is due.
+            let since = self.cache.lock().unwrap_or_else(PoisonError::into_inner).checked_at.elapsed();
+            let due = RELOAD_INTERVAL.saturating_sub(since).max(Duration::from_millis(1));
+            timeout(due, changed).await.unwrap_or_default();
         }
     }
 }

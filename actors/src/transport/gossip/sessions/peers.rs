@@ -31,7 +31,7 @@ pub(super) struct PeerSession {
     pub(super) proven: Option<Proven>,
     pub(super) address: SocketAddr,
     pub(super) keys: KeyRing,
-    /// What it may still send: the election handles each frame, and answers some.
+    /// Limit of its frames: the election handles each one, and answers some.
     pub(super) frames: TokenBucket,
     /// Counter of the frame with its last proof: no earlier one is accepted.
     pub(super) proof_counter: u64,
@@ -45,11 +45,14 @@ pub(super) struct PeerSession {
 /// Maximum sessions by one certificate: a node, its former run, and observers that share its certificate.
 const MAX_SESSIONS_EACH: usize = 16;
 
-/// Frames that a session may send at once, and time for one more. A leader under election sends about 100 a second.
+/// Number of frames that a session may send at once. A leader in an election sends about 100 a second.
 const FRAMES: u32 = 1000;
+
+/// Time after which a session may send one more.
 const FRAME_INTERVAL: Duration = Duration::from_millis(2);
 
 impl PeerSession {
+    /// The limit of a new session.
     pub(super) fn frames(now: Timestamp) -> TokenBucket {
         TokenBucket::new(FRAMES, FRAME_INTERVAL, now)
     }
