@@ -274,7 +274,7 @@ impl Election {
             if message.highest_epoch() > limit {
                 return;
             }
-            message.term = self.terms.seen;
+            message.term = self.terms.seen.max(message.highest_epoch());
         }
         if !self.peers.note(&message, now) {
             return;

@@ -122,10 +122,20 @@ impl LedgerResync {
         (self.leads, self.lane) = (None, None);
     }
 
+    /// The lane in which this node counts when it leads in `epoch`: that of its first epoch, unless evidence of another
+    /// leadership is later. The latest votes count most.
+    pub fn lane_in(&mut self, epoch: &Epoch, ledger: &ReputationLedger) -> Epoch {
+        self.lead(epoch.clone());
+        let lane = self.lane.get_or_insert_with(|| epoch.clone());
+        if ledger.has_later_than(lane) && !ledger.has_later_than(epoch) {
+            lane.clone_from(epoch);
+        }
+        lane.clone()
+    }
+
     /// Records what a round of the node's own leadership says about vehicles.
     pub fn record(&mut self, epoch: &Epoch, evidence: &[Evidence], ledger: &mut ReputationLedger) -> Vec<LedgerShare> {
-        self.lead(epoch.clone());
-        let lane = self.lane.as_ref().unwrap_or(epoch);
+        let lane = self.lane_in(epoch, ledger);
         let key = |evidence: &Evidence| {
             let Evidence { node, label, .. } = evidence.clone();
             EntryKey { lane: lane.clone(), node, label }
@@ -267,8 +277,8 @@ impl LedgerResync {
 
     /// Whether a candidate may tell of a lane.
     fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
-        let is_present = leadership.present_epoch() == Some(lane) || self.lane_of_leader(leadership) == Some(lane);
-        if is_present {
+        let is_counting = |present: &Epoch| present == lane || self.lane_of_leader(leadership) == Some(lane);
+        if leadership.present_epoch().is_some_and(is_counting) {
             return *sender == lane.leader;
         }
         !self.is_signed || *sender != lane.leader || self.followed.contains_key(sender)

@@ -67,8 +67,10 @@ impl World {
         }
         let vehicle = self.random.index(VEHICLES);
         let (node, correct) = (self.nodes[vehicle].name.clone(), self.random.chance(90));
-        let lane = self.nodes[index].lane.as_ref().unwrap_or(epoch);
-        let evidence = self.votes.settle(lane, node, correct);
+        let leader = &mut self.nodes[index];
+        let lane = leader.resync.lane_in(epoch, &leader.ledger);
+        leader.lane = Some(lane.clone());
+        let evidence = self.votes.settle(&lane, node, correct);
         let node = &mut self.nodes[index];
         let shares = node.resync.record(epoch, &[evidence], &mut node.ledger);
         self.share(index, shares);
@@ -94,14 +96,16 @@ impl World {
         }
     }
 
-    /// Whether a node knows what it was told of terms that its election knows. Of the present leadership only its leader
-    /// tells.
+    /// Whether a node knows what it was told of terms that its election knows. Of its present leadership only
+    /// the leader tells.
     fn judge_merge(&self, to: usize, share: &LedgerShare) {
         let node = &self.nodes[to];
         let mut told = ReputationLedger::default();
         let counts = |term: u64, aggregator: &NodeName| {
             let lane = Epoch::new(term, aggregator.clone());
-            let is_told_by_another = node.leadership.present_epoch() == Some(&lane) && share.node != lane.leader;
+            let is_of_leader = |now: &Epoch| now.leader == lane.leader && lane <= *now;
+            let is_told_by_another =
+                share.node != lane.leader && node.leadership.present_epoch().is_some_and(is_of_leader);
             node.leadership.knows_term(term) && !is_told_by_another
         };
         let entries = share.entries.iter().filter(|entry| counts(entry.epoch, &entry.aggregator));

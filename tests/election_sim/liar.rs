@@ -1,7 +1,7 @@
 //! A candidate that does not outrank the leader says whatever takes the lead.
 
 use ecod::leadership::Rights;
-use ecod::leadership::election::{Body, Candidacy, ElectionMessage};
+use ecod::leadership::election::{Body, Candidacy, ElectionMessage, MAX_TERM, MAX_TERM_STEP};
 use ecod::leadership::node::Input;
 use ecod::model::epoch::Epoch;
 use ecod::wire::{Role, SCHEMA_VERSION};
@@ -53,18 +53,24 @@ fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
     let own = Epoch::new(present.term + 1, name.clone());
     let of_other = Epoch::new(present.term + 1, world.nodes[other].name.clone());
     let beat = |followers, after| Body::Beat { every_ms: 50, round: 1, followers, after, successors: Vec::new() };
-    let (epoch, hears_you, body) = match world.random.between(0, 5) {
+    let (epoch, hears_you, body) = match world.random.between(0, 7) {
         0 => (Some(own), true, beat(200, None)),
         1 => (Some(own), true, beat(200, Some(present))),
         // A leader that nobody follows makes way for one that does not hear it.
         2 if world.nodes.len() > 2 => (Some(own), false, beat(200, Some(present))),
         3 => (Some(of_other), true, Body::Status { over: None }),
         4 => (Some(of_other.clone()), true, Body::LeaderEvidence { ask: seq % 32, age_ms: 0 }),
+        5 => (
+            None,
+            true,
+            Body::Resign { epoch: Epoch::new(present.term + MAX_TERM_STEP / 2, name.clone()), last_round: 0 },
+        ),
         _ => (None, true, Body::Status { over: Some(present) }),
     };
     let run = 1_900_000_000_000_000;
     let candidacy = Candidacy { role: config.role, priority: config.priority, load: 0, fit: true };
-    let term = epoch.as_ref().map_or(own_term(world, leader), |epoch| epoch.term);
+    let stated = epoch.as_ref().map_or(own_term(world, leader), |epoch| epoch.term);
+    let term = if world.random.chance(20) { MAX_TERM } else { stated };
     let message = ElectionMessage {
         schema: SCHEMA_VERSION,
         from: name.clone(),

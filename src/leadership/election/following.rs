@@ -32,7 +32,7 @@ impl Election {
         let State::Following(following) = &mut self.state else { return };
         let first = following.asked_at.is_none();
         following.asked_at.get_or_insert(now);
-        if first && now < following.silent_at(&self.config) {
+        if first && following.claim.is_none() && now < following.silent_at(&self.config) {
             self.ask_near(now);
         } else {
             self.ask_all(now);
@@ -65,11 +65,17 @@ impl Election {
                 let (leader, claimant) = (following.epoch.leader.clone(), beat.epoch.leader.clone());
                 let content = now < following.suspect_at(&self.config);
                 let rightful = beat.followers > 0 || beat.after.as_ref() >= Some(&following.epoch);
-                if leader == claimant || self.outranks(&claimant, &leader) && (!content || beat.hears_us && rightful) {
+                let gives_way = if self.outranks(&claimant, &leader) {
+                    !content || beat.hears_us && rightful
+                } else {
+                    beat.hears_us && self.peers.followers(&claimant, now) > self.peers.followers(&leader, now)
+                };
+                if leader == claimant || gives_way {
                     self.follow(beat, now);
                 } else {
                     if let State::Following(following) = &mut self.state {
-                        following.claim = Some((now, beat).into());
+                        let since = following.claim.take().map_or(now, |claim| claim.0);
+                        following.claim = Some((since, beat).into());
                     }
                     self.send_status(&claimant, now);
                 }
@@ -111,14 +117,13 @@ impl Election {
         }
     }
 
-    /// Whether `name` has a higher rank (role, priority) than `other`. Certificates bound both. An unknown `other` ranks below
-    /// everyone.
+    /// Whether `name` has a higher rank (role, priority) than `other`. Certificates bound both. False if one is unknown.
     fn outranks(&self, name: &NodeName, other: &NodeName) -> bool {
         let rank = |name: &NodeName| {
             let own = (*name == self.id).then(|| self.candidacy());
             Some(own.or_else(|| self.peers.get(name)?.candidacy)?.class())
         };
-        rank(other).is_none_or(|other| rank(name).is_some_and(|name| name < other))
+        rank(name).zip(rank(other)).is_some_and(|(name, other)| name < other)
     }
 
     fn stop_leading(&mut self, next: &NodeName) {
@@ -229,9 +234,11 @@ impl Election {
         if self.epoch.as_ref() == Some(epoch) {
             self.learn_round(&epoch.leader, last_round);
         }
-        let followed = matches!(&self.state, State::Following(following) if following.epoch == *epoch);
-        self.close(epoch.clone());
-        if followed {
+        if let State::Following(following) = &mut self.state {
+            following.claim.take_if(|claim| claim.1.epoch == *epoch);
+        }
+        if self.epoch.as_ref() == Some(epoch) {
+            self.close(epoch.clone());
             self.lose_leader(now);
         }
     }
@@ -266,13 +273,17 @@ impl Election {
         }
     }
 
-    /// Follows the latest claimant to the lead if its claim is recent, and seeks otherwise.
+    /// Follows the claimant to the lead if its claim is recent and this node does not outrank it, and seeks otherwise.
     fn lose_leader(&mut self, now: Timestamp) {
         let State::Following(following) = &mut self.state else { return };
         let order = std::mem::take(&mut following.successors);
         let claim = following.claim.take().map(|claim| *claim);
-        match claim.filter(|(at, beat)| now.since(*at) <= self.config.response_timeout() && !self.is_over(&beat.epoch))
-        {
+        let is_good = |(at, beat): &(Timestamp, Beat)| {
+            let is_recent = now.since(*at) <= self.config.response_timeout();
+            let is_outranked = self.candidacy().may_lead() && self.outranks(&self.id, &beat.epoch.leader);
+            is_recent && !is_outranked && !self.is_over(&beat.epoch)
+        };
+        match claim.filter(is_good) {
             Some((_, beat)) => self.follow(beat, now),
             None => self.seek(order, now, now),
         }

@@ -100,7 +100,11 @@ impl Election {
 
     /// Plans to outdo a rival, and asks all whom they follow: this node may have been held up, and they may have left it.
     pub(super) fn contest(&mut self, rival: &NodeName, now: Timestamp) {
-        if matches!(&self.state, State::Leading(leading) if leading.renew_at.is_none()) {
+        let (soon, is_followed) = (now + self.config.given_up_timeout(), self.peers.followers(rival, now) > 0);
+        let State::Leading(leading) = &mut self.state else { return };
+        // The pause is for single nodes that refuse. A rival that others follow is none of them.
+        if leading.renew_at.is_none_or(|at| is_followed && at > soon) {
+            leading.renew_at = is_followed.then_some(soon);
             self.renew_later(rival, now);
             self.beat_all(now);
         }

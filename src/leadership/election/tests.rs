@@ -25,7 +25,7 @@ fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> Elec
         from: from.clone(),
         run: 1,
         seq,
-        candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+        candidacy: Candidacy { role: Role::Auto, priority: 100, load: 0, fit: true },
         term: epoch.map_or(0, |epoch| epoch.term),
         epoch: epoch.cloned(),
         hears_you: true,
@@ -258,6 +258,73 @@ fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent()
         "the leader is gone, and it has claimed the lead"
     );
     assert!(now.since(NOW) < std::time::Duration::from_millis(1500));
+}
+
+#[test]
+fn a_resignation_of_a_stranger_neither_mutes_nor_deafens() {
+    let (gauss, mut election) = (NodeName::from_static("gauss"), euclid());
+    election.handle(of_edge(1, 8, beat(1)), NOW);
+    for (seq, term) in [(1, MAX_TERM), (2, 8 + MAX_TERM_STEP / 2)] {
+        let epoch = Epoch::new(8 + MAX_TERM_STEP / 2, gauss.clone());
+        let lie = message(&gauss, seq, None, Body::Resign { epoch, last_round: 0 });
+        election.handle(ElectionInput::Receive { message: ElectionMessage { term, ..lie } }, NOW);
+    }
+    for ms in (50..3000).step_by(50) {
+        for effect in election.handle(of_edge(ms, 8, beat(ms)), NOW + Duration::from_millis(ms)) {
+            if let ElectionEffect::Send { message, .. } = effect {
+                assert!(ElectionMessage::decode(&message.encode(crate::wire::Encoding::Cbor)).is_ok());
+            }
+        }
+        assert_eq!(election.leader(), Some(&NodeName::from_static("edge")));
+    }
+}
+
+#[test]
+fn a_liar_that_waits_for_the_end_of_the_leader_does_not_come_before_the_standby() {
+    let config = ElectionConfig { priority: 120, ..ElectionConfig::default() };
+    let mut election = Election::new(config, NodeName::from_static("euclid"), 7, NOW);
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
+    election.handle(ElectionInput::Health { health }, NOW);
+    election.handle(of_edge(1, 8, beat(1)), NOW);
+    let ElectionInput::Receive { message } = claim_of_gauss(1) else { panic!("no message") };
+    let candidacy = Candidacy { priority: 50, ..message.candidacy };
+    election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, NOW);
+    let mut now = NOW + Duration::from_millis(10);
+    election.handle(ElectionInput::PeerGone { peer: NodeName::from_static("edge") }, now);
+    while election.next_deadline() < NOW + Duration::from_millis(20) {
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    assert!(election.is_leading(), "{:?} {:?}", election.state, election.next_deadline());
+}
+
+#[test]
+fn a_node_that_heard_a_liar_first_follows_the_leader_of_the_others() {
+    let [hopper, noether, leader] = ["hopper", "noether", "v02"].map(NodeName::from_static);
+    let mut election = euclid();
+    election.handle(claim_of_gauss(1), NOW);
+    assert_eq!(election.leader(), Some(&NodeName::from_static("gauss")));
+    let epoch = Epoch::new(10, leader.clone());
+    for from in [&hopper, &noether] {
+        election.handle(received(from, 1, Some(&epoch), Body::Status { over: None }), NOW);
+    }
+    election.handle(received(&leader, 1, Some(&epoch), beat(1)), NOW);
+    assert_eq!(election.leader(), Some(&leader));
+}
+
+#[test]
+fn a_claim_waits_no_longer_for_being_repeated() {
+    let (mut election, mut now) = (euclid(), NOW);
+    let idle = Body::Beat { every_ms: 2500, round: 1, followers: 1, after: None, successors: Vec::new() };
+    election.handle(of_edge(1, 8, idle), now);
+    for seq in 1..25 {
+        now = NOW + Duration::from_millis(20 * seq);
+        while election.next_deadline() <= now {
+            election.tick(election.next_deadline());
+        }
+        election.handle(claim_of_gauss(seq), now);
+    }
+    assert_eq!(election.leader(), Some(&NodeName::from_static("gauss")));
 }
 
 /// One certificate is good for several names: a node's and those of its parts.

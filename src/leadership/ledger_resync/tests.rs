@@ -3,7 +3,7 @@
 use super::growth::MAX_FIRST_VOTES;
 use super::*;
 use crate::leadership::view::Position;
-use crate::reputation::MAX_LANES;
+use crate::reputation::{MAX_LANES, ReputationConfig};
 use crate::wire::LedgerSignature;
 
 fn name(name: &str) -> NodeName {
@@ -369,6 +369,24 @@ fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back()
     let forged = LedgerShare { reset_at_us: Some(far), ..share("other", None, Vec::new()) };
     assert!(!leader.merge(&forged, 7000).unwrap().is_news, "a reset from a far future would be the last");
     assert_eq!(leader.vehicles(), ["gauss"]);
+}
+
+/// Two sides of a split counted. The one that leads on must not count before the other's votes.
+#[test]
+fn the_votes_after_a_heal_are_the_latest() {
+    let config = ReputationConfig::default();
+    let mut edge = Candidate::new("edge");
+    let vote = |correct| Evidence { node: name("euclid"), label: "cup".into(), correct };
+    edge.lead(2);
+    let vote_of = |edge: &mut Candidate, term, correct| {
+        edge.resync.record(&Epoch::new(term, name("edge")), &[vote(correct)], &mut edge.ledger);
+    };
+    (0..10).for_each(|_| vote_of(&mut edge, 2, true));
+    (0..600).for_each(|_| edge.ledger.record(3, &name("gauss"), &vote(true)));
+    edge.lead(4);
+    let before = edge.ledger.reputations(&config)[&name("euclid")].score;
+    (0..600).for_each(|_| vote_of(&mut edge, 4, false));
+    assert!(edge.ledger.reputations(&config)[&name("euclid")].score < before);
 }
 
 /// A follower that claims a higher term makes the leader renew its own: that costs no older evidence.
