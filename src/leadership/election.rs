@@ -263,23 +263,16 @@ impl Election {
         if message.from == self.id {
             return;
         }
-        if !self.terms.has_own() && message.candidacy.role != Role::Cav && message.term <= MAX_FIRST_TERM {
-            self.peers.note_term(&message.from, message.term);
-        }
-        let limit = self.term_limit(message.candidacy.role, now);
-        self.unlearn_first_term(limit, now);
-        if message.term > limit {
-            self.effects.push(ElectionEffect::CountImplausible { from: message.from.clone() });
-            // A node that was told a wrong term is heard all the same.
-            if message.highest_epoch() > limit {
-                return;
-            }
-            message.term = self.terms.seen.max(message.highest_epoch());
+        if message.term != self.terms.seen && !self.is_plausible(&mut message, now) {
+            return;
         }
         if !self.peers.note(&message, now) {
             return;
         }
         self.learn_term(message.term);
+        if self.terms.window.0 == 0 {
+            self.terms.window = (self.terms.seen, now);
+        }
         self.hear_others(&message, now);
         let ElectionMessage { from, epoch, hears_you, .. } = message;
         match message.body {
@@ -297,6 +290,24 @@ impl Election {
             Body::Yield { last_round } => self.take_yield(&from, epoch.as_ref(), last_round, now),
             Body::Resign { epoch, last_round } => self.take_resign(&epoch, last_round, now),
         }
+    }
+
+    /// Judges the term of a message, and puts a plausible one in its place where only the term is wrong: a node that was told
+    /// a wrong one is heard all the same.
+    fn is_plausible(&mut self, message: &mut ElectionMessage, now: Timestamp) -> bool {
+        if !self.terms.has_own() && message.candidacy.role != Role::Cav && message.term <= MAX_FIRST_TERM {
+            self.peers.note_term(&message.from, message.term);
+        }
+        let limit = self.term_limit(message.candidacy.role, now);
+        self.unlearn_first_term(limit, now);
+        if message.term > limit {
+            self.effects.push(ElectionEffect::CountImplausible { from: message.from.clone() });
+            if message.highest_epoch() > limit {
+                return false;
+            }
+            message.term = self.terms.seen.max(message.highest_epoch());
+        }
+        true
     }
 
     /// Highest term that a node of this role may state now. A node without a term of its own believes the possible leader
