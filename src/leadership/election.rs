@@ -121,7 +121,7 @@ struct Terms {
 }
 
 impl Terms {
-    /// Whether this node has a term of its own. A first run that led alone leaves a 1 on disk, which does not count.
+    /// True if this node has a term of its own. A first run that led alone leaves a 1 on disk, which does not count.
     fn has_own(&self) -> bool {
         self.found > 1
     }
@@ -295,7 +295,8 @@ impl Election {
     /// Judges the term of a message, and puts a plausible one in its place where only the term is wrong: a node that was told
     /// a wrong one is heard all the same.
     fn is_plausible(&mut self, message: &mut ElectionMessage, now: Timestamp) -> bool {
-        if !self.terms.has_own() && message.candidacy.role != Role::Cav && message.term <= MAX_FIRST_TERM {
+        if !self.terms.has_own() && message.candidacy.role != Role::Cav && (1..=MAX_FIRST_TERM).contains(&message.term)
+        {
             self.peers.note_term(&message.from, message.term);
         }
         let limit = self.term_limit(message.candidacy.role, now);

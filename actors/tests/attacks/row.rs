@@ -11,7 +11,7 @@ pub(crate) struct Row {
     /// Name, as in the table.
     pub(crate) attack: &'static str,
     pub(crate) means: Means,
-    /// Whether it is on brokers: then the standby's is attacked, too.
+    /// True for attacks on brokers: the standby's is attacked, too.
     pub(crate) on_brokers: bool,
     /// Least number of deeds, and their unit: without them the attack has not taken place.
     pub(crate) deeds: (u64, &'static str),
@@ -96,7 +96,7 @@ pub(crate) struct Outcome {
 }
 
 impl Row {
-    /// Whether the attack took place and its outcome is good enough.
+    /// True if the attack took place and its outcome is good enough.
     pub(crate) fn is_met(&self, outcome: &Outcome) -> bool {
         self.took_place(outcome) && self.bar.is_met(outcome)
     }

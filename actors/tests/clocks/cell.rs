@@ -52,7 +52,7 @@ pub(crate) struct Cell {
     authority: Option<Authority>,
     /// The maps that a node with the right clock took.
     record: Record,
-    /// Whether each node said that it is ready, with the true time.
+    /// Readiness of each node at each look, with the true time.
     claims: BTreeMap<String, Vec<(Timestamp, bool)>>,
     brokers: BTreeMap<&'static str, SocketAddr>,
 }
@@ -241,7 +241,7 @@ impl Cell {
     }
 }
 
-/// Whether a node is ready, and its reason; nothing while there is no page.
+/// Readiness of a node and its reason; nothing while there is no page.
 fn readiness(page: SocketAddr) -> (bool, String) {
     let Ok(mut stream) = TcpStream::connect(page) else { return (false, String::new()) };
     write!(stream, "GET /readyz HTTP/1.1\r\nHost: {page}\r\nConnection: close\r\n\r\n").unwrap();

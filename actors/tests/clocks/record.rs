@@ -39,7 +39,7 @@ impl Record {
         self.maps.last().map(|(_, received)| received.map.aggregator.as_str())
     }
 
-    /// Whether the last map has the reports of all these vehicles.
+    /// True if the last map has the reports of all these vehicles.
     pub(crate) fn has_lately<const N: usize>(&self, vehicles: [&str; N]) -> bool {
         self.maps.last().is_some_and(|(_, received)| vehicles.iter().all(|name| Entry(received).has(name)))
     }

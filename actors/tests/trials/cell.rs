@@ -166,7 +166,7 @@ impl Cell {
         Ok(())
     }
 
-    /// What the client at each door got.
+    /// Maps of the client at each door.
     pub(crate) fn doors(&self) -> anyhow::Result<Vec<NodeRun>> {
         let opened = self.nodes.iter().filter(|node| node.door.is_some());
         opened.map(|node| Ok(NodeRun { node: node.name.clone(), accepted: logs::at_door(&node.door_log())? })).collect()

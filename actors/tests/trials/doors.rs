@@ -18,7 +18,7 @@ use crate::settings::CELL;
 /// Knows nothing of ECOD: it prints what it gets, and when.
 const CLIENT: &str = "/usr/bin/mosquitto_sub";
 
-/// What programs beside measured vehicles got.
+/// Service of the programs beside measured vehicles.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct DoorVerdict {
     /// The most by which the longest wait for a map at a door exceeds that at its node.

@@ -117,7 +117,7 @@ impl Election {
         }
     }
 
-    /// Whether `name` has a higher rank (role, priority) than `other`. Certificates bound both. False if one is unknown.
+    /// True if `name` has a higher rank (role, priority) than `other`, and both are known. Certificates bound ranks.
     fn outranks(&self, name: &NodeName, other: &NodeName) -> bool {
         let rank = |name: &NodeName| {
             let own = (*name == self.id).then(|| self.candidacy());

@@ -52,8 +52,8 @@ pub(super) struct Following {
     pub(super) indirect_heard_at: Timestamp,
     /// Whether the membership gave the leader up since it was last heard.
     pub(super) given_up: bool,
-    /// Latest claim to lead by another node, and its arrival, since the leader was last heard. It is followed if the leader
-    /// is lost.
+    /// Latest claim to lead by another node, with the time of the first one since the leader was last heard. It is followed
+    /// if the leader is lost.
     pub(super) claim: Option<Box<(Timestamp, Beat)>>,
     /// Time of the first question about it since it was last heard.
     pub(super) asked_at: Option<Timestamp>,

@@ -32,7 +32,7 @@ pub(super) struct Peer {
     pub(super) epoch: Option<Epoch>,
     /// Whether our last message to it said that we hear it.
     pub(super) told: bool,
-    /// Whether it refused this node's leadership, and has not followed it since.
+    /// Set while it refuses this node's leadership.
     refuses: bool,
     /// Leadership of this node that the peer was last told to be over.
     corrected: Option<Epoch>,
@@ -78,7 +78,7 @@ impl Peers {
         self.table.entry(name.clone()).or_default();
     }
 
-    /// Notes a term that a possible leader states.
+    /// Notes a term above 0 that a possible leader states.
     pub(super) fn note_term(&mut self, name: &NodeName, term: u64) {
         let lowest = &mut self.table.entry(name.clone()).or_default().term;
         *lowest = if *lowest == 0 { term } else { term.min(*lowest) };
@@ -122,7 +122,7 @@ impl Peers {
         }
     }
 
-    /// Whether anybody heard lately refuses this node's leadership.
+    /// True if a peer heard lately refuses this node's leadership.
     pub(super) fn any_refuses(&self, now: Timestamp) -> bool {
         self.table.iter().any(|(name, peer)| peer.refuses && self.hears(name, now))
     }

@@ -127,7 +127,9 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
         }
     }
     let (own, next) = (election.epoch().cloned(), Epoch::new(2, gauss.clone()));
-    let ElectionInput::Receive { message } = received(&gauss, 1, Some(&next), beat_after(own.as_ref())) else { return };
+    let ElectionInput::Receive { message } = received(&gauss, 1, Some(&next), beat_after(own.as_ref())) else {
+        panic!("no message")
+    };
     let candidacy = Candidacy { role: Role::Edge, ..message.candidacy };
     election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
     assert_eq!(election.leader(), Some(&gauss));

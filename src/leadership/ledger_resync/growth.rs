@@ -21,7 +21,7 @@ const ALLOWANCE: u64 = 1024;
 /// Votes from one mark to the next.
 const MARK_VOTES: u64 = 32;
 
-/// Whether evidence that this node did not hear of before is plausible: the bounds of the wire, for files.
+/// True for saved evidence within the bounds of evidence that is received for the first time.
 pub fn is_plausible(share: &LedgerShare) -> bool {
     let (unknown, never) = (GrowthLimit::default(), Timestamp::default());
     let mut terms = share.entries.iter().map(|entry| entry.epoch).chain(share.marks.iter().map(|mark| mark.epoch));
