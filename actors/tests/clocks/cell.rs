@@ -193,13 +193,18 @@ impl Cell {
         let deadline = Instant::now() + PATIENCE;
         while !holds(self.record()) {
             assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
-            for (name, node) in &mut self.nodes {
-                assert_eq!(node.child.try_wait().unwrap(), None, "{name} ended");
-                let claim = (true_time(), readiness(node.page).0);
-                self.claims.entry(name.clone()).or_default().push(claim);
-            }
-            std::thread::sleep(Duration::from_millis(50));
+            self.note_readiness();
         }
+    }
+
+    /// Asks all nodes whether they are ready, and waits a moment.
+    fn note_readiness(&mut self) {
+        for (name, node) in &mut self.nodes {
+            assert_eq!(node.child.try_wait().unwrap(), None, "{name} ended");
+            let claim = (true_time(), readiness(node.page).0);
+            self.claims.entry(name.clone()).or_default().push(claim);
+        }
+        std::thread::sleep(Duration::from_millis(50));
     }
 
     /// Waits until a node is not ready for a reason that contains this.
@@ -217,10 +222,17 @@ impl Cell {
         readiness(self.nodes[name].page).1
     }
 
-    /// When a node first said that it is ready.
-    pub(crate) fn first_ready(&self, name: &str, since: Timestamp) -> Timestamp {
-        let ready = |(at, is_ready): &&(Timestamp, bool)| *is_ready && *at >= since;
-        self.claims[name].iter().find(ready).expect("never ready").0
+    /// When a node first says that it is ready; others may use it some moments before.
+    pub(crate) fn first_ready(&mut self, name: &str, since: Timestamp) -> Timestamp {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let ready = |(at, is_ready): &&(Timestamp, bool)| *is_ready && *at >= since;
+            if let Some((at, _)) = self.claims[name].iter().find(ready) {
+                return *at;
+            }
+            assert!(Instant::now() <= deadline, "{name} not ready within {PATIENCE:?}: {}", self.readiness(name));
+            self.note_readiness();
+        }
     }
 
     /// Longest time for which a node said that it is ready while no useful map came.
