@@ -193,12 +193,14 @@ impl Cell {
         let deadline = Instant::now() + PATIENCE;
         while !holds(self.record()) {
             assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
-            self.note_readiness();
+            self.look();
         }
     }
 
-    /// Asks all nodes whether they are ready, and waits a moment.
-    fn note_readiness(&mut self) {
+    /// Notes new maps, and whether the nodes say that they are ready, and waits a moment. A map counts from here on, so
+    /// that all that waits looks.
+    fn look(&mut self) {
+        self.record();
         for (name, node) in &mut self.nodes {
             assert_eq!(node.child.try_wait().unwrap(), None, "{name} ended");
             let claim = (true_time(), readiness(node.page).0);
@@ -212,7 +214,7 @@ impl Cell {
         let deadline = Instant::now() + PATIENCE;
         while readiness(self.nodes[name].page).1.find(reason).is_none() {
             assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {reason}, but {}", self.readiness(name));
-            std::thread::sleep(Duration::from_millis(50));
+            self.look();
         }
         assert!(!readiness(self.nodes[name].page).0, "{name} is ready and says {reason}");
     }
@@ -231,7 +233,7 @@ impl Cell {
                 return *at;
             }
             assert!(Instant::now() <= deadline, "{name} not ready within {PATIENCE:?}: {}", self.readiness(name));
-            self.note_readiness();
+            self.look();
         }
     }
 
