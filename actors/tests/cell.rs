@@ -69,30 +69,30 @@ async fn reported(
     receiver: &NodeHandle,
     make: impl Fn() -> Arc<ObjectReport>,
     wanted: impl Fn(&GlobalMap) -> bool,
-) {
+) -> Arc<GlobalMap> {
     let newest = receiver.newest_map();
     let settled = async {
         loop {
             let message = GatewayMessage::PublishReport { kind: ReportKind::Detections, report: make() };
             reporter.slots().gateway.send(message);
             tokio::time::sleep(Duration::from_millis(50)).await;
-            if newest.borrow().as_ref().is_some_and(|received| wanted(&received.map)) {
-                return;
+            if let Some(received) = newest.borrow().as_ref().filter(|received| wanted(&received.map)) {
+                return Arc::clone(&received.map);
             }
         }
     };
-    timeout(PATIENCE, settled).await.expect("the map never became as wanted");
+    timeout(PATIENCE, settled).await.expect("the map never became as wanted")
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_one_vehicle_sees_reaches_another() {
     let edge = edge().await;
     let (euclid, galileo) = (cav("euclid", &edge).await, cav("galileo", &edge).await);
-    reported(&euclid, &galileo, || report("euclid", "ABC123", 1), |map| label(map, 1) == Some("ABC123")).await;
-    let received = galileo.newest_map().borrow().clone().unwrap();
-    assert_eq!(received.map.aggregator.as_str(), "edge");
-    assert_eq!(received.map.landmarks[1].contributors, [NodeName::from_static("euclid")]);
-    assert_eq!(label(&received.map, 0), None);
+    let sees = || report("euclid", "ABC123", 1);
+    let map = reported(&euclid, &galileo, sees, |map| label(map, 1) == Some("ABC123")).await;
+    assert_eq!(map.aggregator.as_str(), "edge");
+    assert_eq!(map.landmarks[1].contributors, [NodeName::from_static("euclid")]);
+    assert_eq!(label(&map, 0), None);
     for node in [euclid, galileo, edge] {
         node.stop().await;
     }

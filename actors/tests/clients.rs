@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::thread::sleep;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
@@ -70,6 +70,7 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
     let is_installed = found("sh", &["-c", "command -v mosquitto_pub mosquitto_sub"]);
     assert!(is_installed, "mosquitto_pub is missing: install Debian's package mosquitto-clients");
     let (node, broker) = edge().await;
+    let (maps, verdicts) = (node.newest_map(), node.newest_verdicts());
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");
         let [report, receive] = &*scripts else { panic!("{scripts:?}") };
@@ -80,8 +81,18 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
             shell.spawn().unwrap()
         };
         let mut reporter = run(report);
-        // The second script begins when the cell has had time to fuse.
-        sleep(Duration::from_secs(1));
+        // The second script begins when the cell has fused.
+        let has_fused = || {
+            let (map, verdicts) = (maps.borrow(), verdicts.borrow());
+            let seen = map.as_ref().and_then(|newest| newest.map.landmarks[0].label.as_deref());
+            let agreed = verdicts.as_ref().and_then(|newest| newest.message.verdicts[0].label.as_deref());
+            seen == Some("car") && agreed == Some("car")
+        };
+        let deadline = Instant::now() + Duration::from_secs(30);
+        while !has_fused() {
+            assert!(Instant::now() < deadline, "not fused");
+            sleep(Duration::from_millis(20));
+        }
         let output = run(receive).wait_with_output().unwrap();
         reporter.wait().unwrap();
         output

@@ -93,6 +93,12 @@ impl Node {
     fn events(&self) -> Vec<MembershipEvent> {
         self.events.lock().unwrap().clone()
     }
+
+    /// Events but for suspicions, which a busy machine brings about and takes back.
+    fn changes(&self) -> Vec<MembershipEvent> {
+        let is_change = |event: &MembershipEvent| !matches!(event, MembershipEvent::Suspected { .. });
+        self.events().into_iter().filter(is_change).collect()
+    }
 }
 
 async fn all_see_each_other(nodes: &mut [Node]) {
@@ -131,8 +137,6 @@ async fn five_nodes_find_each_other_by_one_seed_and_miss_one_that_dies() {
 async fn datagrams_and_broker_addresses_reach_the_others() {
     let mut nodes = five().await;
     let payload = Bytes::from_static(b"who leads?");
-    let to = nodes[4].name.clone();
-    nodes[1].actor.cast(MembershipMessage::Send { to, payload: payload.clone() }).unwrap();
     let reached = |members: &Vec<Member>| {
         let member = members.iter().find(|member| member.name.as_str() == "node-2");
         member.and_then(|member| member.broker) == Some(SocketAddr::from(([127, 0, 0, 1], 1883)))
@@ -143,8 +147,11 @@ async fn datagrams_and_broker_addresses_reach_the_others() {
         _ => false,
     };
     let arrived = async {
+        // One that waits for a session too long is lost.
         while !nodes[4].events().iter().any(received) {
-            sleep(Duration::from_millis(10)).await;
+            let to = nodes[4].name.clone();
+            nodes[1].actor.cast(MembershipMessage::Send { to, payload: payload.clone() }).unwrap();
+            sleep(Duration::from_millis(50)).await;
         }
     };
     assert!(timeout(SOON, arrived).await.is_ok());
@@ -193,7 +200,7 @@ async fn a_node_with_another_key_is_not_seen_and_counted() {
 #[tokio::test]
 async fn garbage_is_counted_and_changes_nothing() {
     let mut nodes = five().await;
-    let before = nodes[0].events().len();
+    let before = nodes[0].changes();
     let stranger = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
     for n in 0..2000_usize {
         let junk: Vec<u8> = (0..n % 1500).map(|at| (at * n) as u8).collect();
@@ -205,7 +212,7 @@ async fn garbage_is_counted_and_changes_nothing() {
     nodes[0].counts(FrameEvent::Malformed, 500).await;
     nodes[0].counts(FrameEvent::Oversized, 50).await;
     all_see_each_other(&mut nodes).await;
-    assert_eq!(nodes[0].events().len(), before);
+    assert_eq!(nodes[0].changes(), before);
 }
 
 /// Two nodes that see each other only through a recorder, whose recording is then played back to both and to a third.
@@ -230,7 +237,7 @@ async fn recorded_frames_change_nothing() {
     let third = Node::start("node-3", config(&[])).await;
     let taken = recording.lock().unwrap().clone();
     assert!(taken.len() >= 6, "{} frames recorded", taken.len());
-    let events = (first.events(), second.events());
+    let changes = (first.changes(), second.changes());
     for frame in &taken {
         for to in [one, two, third.address] {
             recorder.send_to(frame, to).await.unwrap();
@@ -240,7 +247,7 @@ async fn recorded_frames_change_nothing() {
     first.counts(FrameEvent::Replayed, 2).await;
     second.counts(FrameEvent::Replayed, 2).await;
     sleep(Duration::from_millis(500)).await;
-    assert_eq!((first.events(), second.events()), events);
+    assert_eq!((first.changes(), second.changes()), changes);
     assert!(third.events().is_empty());
     relaying.abort();
 }

@@ -83,7 +83,8 @@ fn run(trial: &Trial) -> Outcome {
         start(&mut cell, name);
     }
     cell.feed(if trial.whose == "feeder" { trial.start } else { Fake::Off });
-    cell.until("a vehicle leads", |record| record.source().is_some());
+    let others = VEHICLES.iter().filter(|name| **name != trial.whose);
+    cell.until("the others are used", |record| others.clone().all(|name| record.has_lately([name])));
     // A vehicle that is to be used at once is used when others are.
     let settled = cell.now() + OWN_LOSS + Duration::from_secs(1);
     cell.until("all run", |record| record.last_at().is_some_and(|at| at > settled));

@@ -4,7 +4,7 @@
 
 mod cell;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ecod::wire::{GlobalMap, Role, decode};
 use ecod_actors::node::NodeHandle;
@@ -20,6 +20,12 @@ fn is_at_east(node: &NodeHandle, x_m: f64, contributor: &str) -> bool {
 fn shows(map: &GlobalMap, x_m: f64, contributor: &str) -> bool {
     let east = &map.landmarks[1];
     (east.x_m - x_m).abs() < 1e-3 && east.contributors.iter().any(|name| name.as_str() == contributor)
+}
+
+/// Whether a program got the last of these maps.
+fn has_last(program: &Program, accepted: &[(Round, Instant)]) -> bool {
+    let (last, _) = accepted.last().unwrap();
+    program.rounds().iter().any(|(round, _)| round == last)
 }
 
 /// Reports until a node's map shows it.
@@ -45,23 +51,25 @@ async fn a_program_gets_what_its_node_accepts_also_when_the_leader_is_killed() {
         programs.push((name, cell.watch(name), program));
     }
     tokio::time::sleep(Duration::from_secs(2)).await;
+    let at_edge = programs[0].1.lock().unwrap().clone();
+    cell.until("the edge's program has its maps", |_| has_last(&programs[0].2, &at_edge)).await;
     cell.kill("edge");
     cell.until("gauss serves all", |cell| cell.sources().iter().all(|source| source.as_deref() == Some("gauss"))).await;
     tokio::time::sleep(Duration::from_secs(2)).await;
     for (name, accepted, program) in &programs {
-        let (accepted, got) = (accepted.lock().unwrap().clone(), program.rounds());
-        let rounds =
-            |list: &[(Round, std::time::Instant)]| list.iter().map(|(round, _)| round.clone()).collect::<Vec<_>>();
+        let accepted = if *name == "edge" { at_edge.clone() } else { accepted.lock().unwrap().clone() };
+        cell.until("the program has its node's maps", |_| has_last(program, &accepted)).await;
+        let got = program.rounds();
+        let rounds = |list: &[(Round, Instant)]| list.iter().map(|(round, _)| round.clone()).collect::<Vec<_>>();
         let (accepted_rounds, got_rounds) = (rounds(&accepted), rounds(&got));
         assert!(got_rounds.windows(2).all(|pair| pair[0] < pair[1]), "{name}: in order, none twice: {got_rounds:?}");
         // The watch may skip a map; it may begin later and end earlier than the client.
-        let missing: Vec<_> =
-            accepted_rounds.iter().rev().skip(1).filter(|round| !got_rounds.contains(round)).collect();
+        let missing: Vec<_> = accepted_rounds.iter().filter(|round| !got_rounds.contains(round)).collect();
         assert!(missing.is_empty(), "{name}: {missing:?}");
         let leaders: Vec<_> = got_rounds.iter().map(|(_, leader, _)| leader.as_str()).collect();
         assert!(leaders.contains(&"edge"), "{name}: {leaders:?}");
         assert!(*name == "edge" || leaders.last() == Some(&"gauss"), "{name}: {leaders:?}");
-        let longest = |list: &[(Round, std::time::Instant)]| list.windows(2).map(|pair| pair[1].1 - pair[0].1).max();
+        let longest = |list: &[(Round, Instant)]| list.windows(2).map(|pair| pair[1].1 - pair[0].1).max();
         let mut behind: Vec<_> = got
             .iter()
             .filter_map(|(round, at)| {
@@ -106,25 +114,32 @@ async fn a_program_sees_statuses_reputations_and_the_reports_of_all() {
     for name in ["euclid", "edge", "noether"] {
         displays.push((name, Program::connect("display", cell.door(name), &filters).await));
     }
-    tokio::time::sleep(Duration::from_millis(500)).await;
+    // A report reaches a door as soon as its node has asked the leader's broker for reports.
+    let heard = |display: &Program, topic: &str| !display.heard_on(topic).is_empty();
+    let probed = async {
+        for seq in 0.. {
+            lidar.report("detections", "gauss--probe", seq, 0.0).await;
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            if displays.iter().all(|(_, display)| heard(display, "detections/gauss--probe")) {
+                return;
+            }
+        }
+    };
+    tokio::time::timeout(PATIENCE, probed).await.expect("reports reach all doors");
     for seq in 0..10 {
         lidar.report("detections", "gauss--lidar", seq, 3.0).await;
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
-    tokio::time::sleep(Duration::from_millis(1500)).await;
+    let seqs = |display: &Program| -> Vec<u64> {
+        let seq = |payload: &[u8]| decode::<ecod::wire::ObjectReport>(payload, &Default::default()).unwrap().seq;
+        display.heard_on("detections/gauss--lidar").iter().map(|heard| seq(&heard.payload)).collect()
+    };
     for (name, display) in &displays {
-        for node in cell.names() {
-            assert!(!display.heard_on(&format!("nodes/{node}")).is_empty(), "{name}: status of {node}");
+        for topic in cell.names().iter().map(|node| format!("nodes/{node}")).chain(["reputations".into()]) {
+            cell.until(&format!("{name}: {topic}"), |_| heard(display, &topic)).await;
         }
-        assert!(!display.heard_on("reputations").is_empty(), "{name}: reputations");
-        let reports: Vec<u64> = display
-            .heard_on("detections/gauss--lidar")
-            .iter()
-            .map(|heard| {
-                let report: ecod::wire::ObjectReport = decode(&heard.payload, &Default::default()).unwrap();
-                report.seq
-            })
-            .collect();
+        cell.until(&format!("{name}: the last report"), |_| seqs(display).contains(&9)).await;
+        let reports = seqs(display);
         assert_eq!(reports, (0..10).collect::<Vec<_>>(), "{name}: each report once");
     }
     drop(displays);

@@ -70,7 +70,7 @@ async fn a_node_comes_back_while_its_own_address_floods() {
 
 #[tokio::test]
 async fn who_takes_its_time_to_log_in_loses_its_place() {
-    let mut cell = Cell::start().await;
+    let mut cell = Cell::start_with(|config| config.handshake_timeout_ms = 700).await;
     let mut silent = Vec::new();
     for _ in 0..20 {
         silent.push(knock(cell.address).await);
@@ -78,8 +78,7 @@ async fn who_takes_its_time_to_log_in_loses_its_place() {
     let mut halfway = knock(cell.address).await;
     // The beginning of a handshake whose rest never comes.
     halfway.write_all(&[22, 3, 1, 2, 0, 1, 0]).await.unwrap();
-    let slow = knock(cell.address).await;
-    let mut slow = secure(&mut cell, slow).await;
+    let mut slow = secure(&mut cell).await;
     slow.write_all(&[0x10, 60, 0, 4]).await.unwrap();
     cell.honest_traffic_goes_on().await;
     for stream in &mut silent {
@@ -107,8 +106,7 @@ async fn what_is_no_mqtt_ends_its_own_connection_only() {
         login.into_iter().chain((0..200).map(|_| rng.random())).chain([0x30, 0xff, 0xff, 0xff, 0xff, 0xff]).collect(),
     ];
     for opening in openings {
-        let stream = knock(cell.address).await;
-        let mut stream = secure(&mut cell, stream).await;
+        let mut stream = secure(&mut cell).await;
         stream.write_all(&opening).await.unwrap();
         closed(&mut stream).await;
         cell.honest_traffic_goes_on().await;

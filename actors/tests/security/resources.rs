@@ -28,8 +28,8 @@ async fn log_in(cell: &mut Cell, name: &str, role: Role, flags: u8) -> TlsStream
 
 async fn log_in_as(cell: &Cell, name: &str, files: &TlsConfig, id: &str, flags: u8) -> TlsStream<TcpStream> {
     let server = ServerName::try_from(BROKER_NAME).unwrap();
-    let stream = knock(cell.address).await;
-    let mut stream = TlsConnector::from(client_config(name, files)).connect(server, stream).await.unwrap();
+    let connector = TlsConnector::from(client_config(name, files));
+    let mut stream = connector.connect(server, knock(cell.address).await).await.unwrap();
     greet(&mut stream, id, flags).await;
     stream
 }

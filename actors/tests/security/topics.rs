@@ -8,7 +8,7 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use crate::fixture::{Cell, SOON, knock, secure};
+use crate::fixture::{Cell, SOON, secure};
 use crate::packets::{packet, text};
 
 const CONNACK: [u8; 4] = [0x20, 2, 0, 0];
@@ -45,8 +45,7 @@ fn too_deep(levels: usize) -> String {
 async fn topics_and_filters_beyond_measure_are_refused() {
     let mut cell = Cell::start().await;
     for topic in [too_deep(15_000), too_deep(40), "a".repeat(60_000)] {
-        let stream = knock(cell.address).await;
-        let mut stream = secure(&mut cell, stream).await;
+        let mut stream = secure(&mut cell).await;
         ask(&mut stream, &login(None), &CONNACK).await;
         subscribe(&mut stream, &topic, &SUBACK_FAILURE).await;
         ask(&mut stream, &packet(0xa2, &[&[0, 2], &text(&topic)]), &UNSUBACK).await;
@@ -54,8 +53,7 @@ async fn topics_and_filters_beyond_measure_are_refused() {
         cell.honest_traffic_goes_on().await;
     }
     for will in [too_deep(7_000), too_deep(40), "a".repeat(15_000)] {
-        let stream = knock(cell.address).await;
-        let mut stream = secure(&mut cell, stream).await;
+        let mut stream = secure(&mut cell).await;
         ask(&mut stream, &login(Some(&will)), &CONNACK_NOT_AUTHORIZED).await;
         cell.honest_traffic_goes_on().await;
     }
@@ -65,8 +63,7 @@ async fn topics_and_filters_beyond_measure_are_refused() {
 #[tokio::test]
 async fn subscriptions_without_number_are_refused() {
     let mut cell = Cell::start().await;
-    let stream = knock(cell.address).await;
-    let mut stream = secure(&mut cell, stream).await;
+    let mut stream = secure(&mut cell).await;
     ask(&mut stream, &login(None), &CONNACK).await;
     for n in 0..256 {
         subscribe(&mut stream, &format!("ecod/v1/lot/nodes/{n}"), &[0x90, 3, 0, 1, 0]).await;

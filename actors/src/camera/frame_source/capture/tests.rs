@@ -42,7 +42,7 @@ fn scripted(openings: Vec<Option<Vec<Step>>>) -> Opener {
 }
 
 fn hasty() -> CaptureConfig {
-    CaptureConfig { stall_timeout_s: 0.2, retry_min_s: 0.001, retry_max_s: 0.01 }
+    CaptureConfig { stall_timeout_s: 20.0, retry_min_s: 0.001, retry_max_s: 0.01 }
 }
 
 async fn wait_for(capture: &Capture, wanted: impl Fn(&CaptureStatus) -> bool) {
@@ -85,7 +85,7 @@ async fn a_failure_is_reported_with_its_reason() {
 #[tokio::test]
 async fn a_blocked_source_counts_as_stalled_and_is_opened_again() {
     let (release, blocked) = mpsc::channel();
-    let config = CaptureConfig { retry_min_s: 0.2, retry_max_s: 0.2, ..hasty() };
+    let config = CaptureConfig { stall_timeout_s: 1.0, retry_min_s: 0.2, retry_max_s: 0.2 };
     let openings = vec![Some(vec![Step::Frame, Step::Block(blocked)]), Some(vec![Step::Frame])];
     let capture = Capture::start(scripted(openings), config).unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
