@@ -49,7 +49,7 @@ const ATTACKERS: [&[Row]; 5] = [stranger::ROWS, key_holder::ROWS, vehicle::ROWS,
 
 /// Duration of an attack, and of a quick one.
 const ATTACK_TIME: Duration = Duration::from_secs(20);
-const QUICK_TIME: Duration = Duration::from_secs(3);
+const QUICK_TIME: Duration = Duration::from_secs(5);
 
 /// Time after the attack in which maps still count.
 const AFTERMATH: Duration = Duration::from_secs(1);

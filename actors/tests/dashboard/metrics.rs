@@ -49,15 +49,14 @@ async fn metrics_say_what_the_node_does() {
         samples[r#"ecod_reports_received_total{kind="detections"}"#] > 20.0
             && samples.contains_key(r#"ecod_reputation_score_ratio{vehicle="ada"}"#)
             && samples.get("ecod_map_capture_to_received_seconds_count").is_some_and(|count| *count > 5.0)
+            // These are looked at from time to time only.
+            && ["ecod_ready", "ecod_broker_up", r#"ecod_mqtt_links{state="up"}"#].iter().all(|name| samples[*name] == 1.0)
     })
     .await;
     let samples = scrape(page).await;
-    assert_eq!(samples["ecod_ready"], 1.0);
-    assert_eq!(samples["ecod_broker_up"], 1.0);
     assert_eq!(samples[r#"ecod_election_state{state="leading"}"#], 1.0);
     assert_eq!(samples[r#"ecod_election_state{state="seeking"}"#], 0.0);
     assert!(samples["ecod_election_epoch"] >= 1.0);
-    assert_eq!(samples[r#"ecod_mqtt_links{state="up"}"#], 1.0);
     assert!(samples[r#"ecod_rounds_accepted_total{kind="map"}"#] > 5.0);
     assert!(samples["process_resident_memory_bytes"] > 1e6);
     assert!(samples["process_cpu_seconds_total"] > 0.0);

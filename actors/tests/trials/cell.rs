@@ -262,6 +262,16 @@ impl Cell {
         self.index(&standby.with_context(|| format!("{} has named no standby", leader.name))?)
     }
 
+    /// Waits until the leader has named one.
+    pub(crate) async fn until_standby(&self) -> anyhow::Result<()> {
+        let started = Instant::now();
+        while let Err(error) = self.standby() {
+            ensure!(started.elapsed() < START_TIMEOUT, error);
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+        Ok(())
+    }
+
     /// Groups of nodes that run and reach each other; none while packets are lost at random.
     pub(crate) fn components(&self) -> Vec<BTreeSet<NodeName>> {
         let runs = |index: &usize| {

@@ -130,6 +130,13 @@ async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> 
 
 async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict> {
     cell.settle().await?;
+    if scenario
+        .script
+        .iter()
+        .any(|step| matches!(step.fault, Fault::Kill(victims) if victims.iter().any(|who| matches!(who, Who::Standby))))
+    {
+        cell.until_standby().await?;
+    }
     cell.open_doors().await?;
     let mut voters = if scenario.votes { Some(Voters::connect(cell.brokers()).await?) } else { None };
     let before = match &mut voters {
@@ -153,8 +160,9 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
     if machine.is_starved() {
         println!("the machine stood still: {}", machine.account());
     }
-    let runs = cell.runs()?;
-    let doors = judge_doors(&runs, &cell.doors()?, &phases);
+    // Doors first: a node has written what its door has sent.
+    let (doors, runs) = (cell.doors()?, cell.runs()?);
+    let doors = judge_doors(&runs, &doors, &phases);
     Ok(Verdict { reputations_changed, is_void: machine.is_starved(), doors, ..judge(&runs, &phases) })
 }
 

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use ecod::model::names::NodeName;
 use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, ReportKind, Reputations, Role, SCHEMA_VERSION};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
@@ -24,6 +24,9 @@ const VOTE_PERIOD: Duration = Duration::from_millis(100);
 
 /// Longer than it takes to settle the last votes, publish what came of them, and tell the other candidates.
 const SETTLING: Duration = Duration::from_secs(4);
+
+/// Longest time for the votes to settle on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A connection to every broker of the cell.
 pub(crate) struct Voters {
@@ -69,12 +72,18 @@ impl Voters {
             }
             tokio::time::sleep(VOTE_PERIOD).await;
         }
-        tokio::time::sleep(SETTLING).await;
-        let reputations = self.newest().context("no reputations are published")?;
-        let told = |node| reputations.reputations.get(&NodeName::from_static(node));
-        let unmasked = told("liar").is_some_and(|r| r.incorrect > 0) && told("euclid").is_some_and(|r| r.correct > 0);
-        ensure!(unmasked, "the votes did not become reputations: {reputations:?}");
-        Ok(reputations)
+        let ended = Instant::now();
+        let mut before = self.newest();
+        loop {
+            tokio::time::sleep(SETTLING).await;
+            let after = self.newest();
+            let has_settled = before.zip(after.as_ref()).is_some_and(|(b, a)| b.reputations == a.reputations);
+            if let Some(reputations) = after.as_ref().filter(|after| has_settled && is_unmasked(after)) {
+                return Ok(reputations.clone());
+            }
+            ensure!(ended.elapsed() < PATIENCE, "the votes did not become reputations: {after:?}");
+            before = after;
+        }
     }
 
     /// The reputations of the latest leadership that has published any.
@@ -87,6 +96,11 @@ impl Drop for Voters {
     fn drop(&mut self) {
         self.gateway.stop(None);
     }
+}
+
+fn is_unmasked(reputations: &Reputations) -> bool {
+    let told = |node| reputations.reputations.get(&NodeName::from_static(node));
+    told("liar").is_some_and(|liar| liar.incorrect > 0) && told("euclid").is_some_and(|euclid| euclid.correct > 0)
 }
 
 fn keep(newest: &mut Option<Arc<Reputations>>, reputations: Arc<Reputations>) {

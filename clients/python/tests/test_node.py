@@ -39,8 +39,13 @@ def test_a_node_takes_reports_and_its_messages_are_read(edge: Callable[..., Serv
         assert (second.label, second.x_m, second.y_m) == (None, 2.5, 0.0)
         assert abs(map.fused_at.timestamp() - time.time()) < 20
         assert (map.aggregator, map.schema) == ("edge", 1)
-        verdict = next(cell.verdicts(timeout=20)).verdicts[0]
-        assert (verdict.landmark, verdict.label, list(verdict.votes)) == ("slot-0", "car", ["car"])
+
+        def is_voted(message: ecod.Verdicts) -> bool:
+            cell.vote([CAR])
+            verdict = message.verdicts[0]
+            return (verdict.landmark, verdict.label, list(verdict.votes)) == ("slot-0", "car", ["car"])
+
+        until(cell.verdicts(timeout=20), is_voted)
         assert next(cell.reputations(timeout=20)).aggregator == "edge"
         status = next(cell.statuses(timeout=20))
         assert (status.node, status.role, status.state) == ("edge", "edge", "aggregating") and len(status.id) == 36
@@ -54,10 +59,11 @@ def test_tracks_of_a_node_are_read(edge: Callable[..., Server], cell_name: str, 
         began = time.time()
 
         def tracks(map: ecod.GlobalMap) -> list[ecod.FusedObject]:
-            x_m = 20 + 5 * (time.time() - began)
+            now = time.time()
+            x_m = 20 + 5 * (now - began)
             position = (x_m, 3.0, (0.01, 0.0, 0.01))
             car = ecod.PerceivedObject("car", 0.9, *position, velocity_mps=(5.0, 0.0), size_m=(5.0, 2.0), scores={"car": 0.9})
-            cell.report([car], pose=(0.0, 0.0, 0.0), view=ecod.FieldOfView(100.0, 6.28))
+            cell.report([car], pose=(0.0, 0.0, 0.0), view=ecod.FieldOfView(100.0, 6.28), captured_at=now)
             return [thing for thing in map.objects if (thing.velocity_mps or (0.0, 0.0))[0] > 3.0]
 
         map = until(cell.maps(timeout=20), tracks)
