@@ -3,6 +3,7 @@
 #[cfg(feature = "camera")]
 mod calibrate;
 mod doctor;
+mod join;
 pub mod lines;
 mod logging;
 mod logs;
@@ -74,7 +75,13 @@ enum Command {
     /// Calibrate a camera from photographs of a chessboard
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
-    /// Make the certificates of a cell: its CA, one per node, and the revocation list
+    /// Make a cell and its first node on this machine: CA, key, certificate, configuration
+    Init(join::InitArguments),
+    /// Let other machines join the cell: prints a token for each, and waits for them
+    Invite(join::InviteArguments),
+    /// Join a cell by a token of `ecod-node invite`, which becomes this machine's node
+    Join(join::JoinArguments),
+    /// Make the certificates of a cell by hand: its CA, one per node, and the revocation list
     #[command(subcommand)]
     Pki(pki::PkiCommand),
     /// Forget the evidence behind the reputations, or the highest term, of a node that is stopped
@@ -131,12 +138,17 @@ fn in_lab(command: &str) -> Failure {
 }
 
 fn run_command(cli: Cli) -> Result<(), Failure> {
-    let level = match &cli.command {
-        None | Some(Command::Record(_)) => "info,rmqtt=warn,rmqtt_net=warn",
-        Some(Command::Top(_)) => "off",
-        Some(_) => "warn",
+    let is_service = match &cli.command {
+        None | Some(Command::Record(_)) => true,
+        Some(Command::Init(arguments)) => arguments.runs_node(),
+        Some(Command::Join(arguments)) => arguments.runs_node(),
+        Some(_) => false,
     };
-    let is_service = matches!(&cli.command, None | Some(Command::Record(_)));
+    let level = match &cli.command {
+        _ if is_service => "info,rmqtt=warn,rmqtt_net=warn",
+        Some(Command::Top(_)) => "off",
+        _ => "warn",
+    };
     let _export = logging::start(cli.log_format, is_service, level);
     match cli.command {
         None => run::run(&cli.run),
@@ -147,6 +159,9 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
         Some(Command::Report(arguments)) => report::run(&arguments),
+        Some(Command::Init(arguments)) => join::init(&arguments),
+        Some(Command::Invite(arguments)) => join::invite(&arguments),
+        Some(Command::Join(arguments)) => join::join(&arguments),
         Some(Command::Pki(command)) => pki::run(&command),
         Some(Command::Reset(arguments)) => reset::run(&arguments),
         Some(Command::Schema) => schema::run(),

@@ -67,11 +67,7 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
         }
         PkiCommand::Issue { ca, node, role, priority, days } => {
             let mut authority = Authority::open(&ca.dir).map_err(failure)?;
-            let role = match role.as_str() {
-                "cav" => Role::Cav,
-                "edge" => Role::Edge,
-                _ => Role::Auto,
-            };
+            let role = role_named(role);
             let valid = Duration::from_secs(u64::from(*days) * 86_400);
             authority.issue(node, Rights { role, priority: *priority }, valid, now).map_err(failure)?;
             configuration(&authority, node)
@@ -84,6 +80,15 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
         }
     };
     Ok(print(&message)?)
+}
+
+/// The role of a flag, whose value is one of the three.
+pub(super) fn role_named(name: &str) -> Role {
+    match name {
+        "cav" => Role::Cav,
+        "edge" => Role::Edge,
+        _ => Role::Auto,
+    }
 }
 
 /// Section of the node's configuration that names these files.

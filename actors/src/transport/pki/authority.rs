@@ -1,5 +1,6 @@
 //! The cell's certificate authority: a directory on one machine, which need not belong to the cell.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 use std::{fs, io};
@@ -9,7 +10,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose, IsCa,
-    Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, RevocationReason, RevokedCertParams, SerialNumber,
+    Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, PublicKeyData, RevocationReason, RevokedCertParams, SerialNumber,
 };
 use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
@@ -127,14 +128,16 @@ impl Authority {
     /// # Errors
     /// [`AuthorityError`] when there is none.
     pub fn open(directory: &Path) -> Result<Self, AuthorityError> {
-        let path = directory.join(REGISTER);
-        if !path.exists() {
-            return Err(AuthorityError::Missing(directory.into()));
-        }
-        let text = read(&path)?;
-        let register = serde_json::from_str(&text)
-            .map_err(|error| AuthorityError::Register { path, reason: error.to_string() })?;
-        Ok(Self { directory: directory.into(), register })
+        Ok(Self { directory: directory.into(), register: read_register(directory)? })
+    }
+
+    /// Lock of the directory for a change, with the register as it is now: another command may have changed it.
+    fn lock(&mut self) -> Result<File, AuthorityError> {
+        let path = self.directory.join(LOCK);
+        let locked = File::create(&path).and_then(|file| file.lock().map(|()| file));
+        let lock = locked.map_err(|source| AuthorityError::File { path, source })?;
+        self.register = read_register(&self.directory)?;
+        Ok(lock)
     }
 
     /// Makes a key and a certificate for a node: `nodes/<node>.key` and `nodes/<node>.pem`. Earlier ones are
@@ -150,6 +153,25 @@ impl Authority {
         valid: Duration,
         now: Timestamp,
     ) -> Result<(), AuthorityError> {
+        let key = KeyPair::generate()?;
+        let certificate = self.certify(node, rights, valid, now, &key)?;
+        let nodes = self.directory.join(NODES);
+        write_secret(&nodes.join(format!("{node}.key")), &key.serialize_pem())?;
+        write(&nodes.join(format!("{node}.pem")), &certificate)
+    }
+
+    /// Certificate in PEM for a key that stays with the node, with the same rights as [`Authority::issue`].
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
+    pub(crate) fn certify(
+        &mut self,
+        node: &NodeName,
+        rights: impl Into<Rights>,
+        valid: Duration,
+        now: Timestamp,
+        key: &impl PublicKeyData,
+    ) -> Result<String, AuthorityError> {
         if node.as_str().contains(OBSERVER_MARK) {
             return Err(AuthorityError::Name(node.clone()));
         }
@@ -167,17 +189,26 @@ impl Authority {
         set_validity(&mut parameters, now, valid);
         let serial = draw_serial()?;
         parameters.serial_number = Some(serial.clone());
-        let key = KeyPair::generate()?;
         let issuer = self.issuer()?;
-        let certificate = parameters.signed_by(&key, &issuer)?;
+        let certificate = parameters.signed_by(key, &issuer)?;
+        let _lock = self.lock()?;
         let serial = hex::encode(serial.as_ref());
         let issued = IssuedCertificate { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
-        // Registered before it exists, so that every valid certificate can be revoked.
+        // Registered before anyone has it, so that every valid certificate can be revoked.
         self.register.issued.push(issued);
         self.save(&issuer, now)?;
-        let nodes = self.directory.join(NODES);
-        write_secret(&nodes.join(format!("{node}.key")), &key.serialize_pem())?;
-        write(&nodes.join(format!("{node}.pem")), &certificate.pem())
+        Ok(certificate.pem())
+    }
+
+    /// Name of the cell.
+    pub fn cell(&self) -> &NodeName {
+        &self.register.cell
+    }
+
+    /// Whether a node has a certificate that is neither revoked nor expired.
+    pub(crate) fn has_certificate(&self, node: &NodeName, now: Timestamp) -> bool {
+        let is_valid = |issued: &IssuedCertificate| issued.revoked_at_us.is_none() && issued.expires_at_us > now;
+        self.register.issued.iter().any(|issued| issued.node == *node && is_valid(issued))
     }
 
     /// Revokes all certificates of a node and rewrites the revocation list; returns their number.
@@ -185,6 +216,7 @@ impl Authority {
     /// # Errors
     /// [`AuthorityError`] when there are none or the list cannot be written.
     pub fn revoke(&mut self, node: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
+        let _lock = self.lock()?;
         let mut revoked = 0;
         for issued in &mut self.register.issued {
             if issued.node == *node && issued.revoked_at_us.is_none() && issued.expires_at_us > now {
@@ -248,7 +280,17 @@ const CA: &str = "ca.pem";
 const CA_KEY: &str = "ca.key";
 const LIST: &str = "revoked.pem";
 const REGISTER: &str = "issued.json";
+const LOCK: &str = "issued.lock";
 const NODES: &str = "nodes";
+
+fn read_register(directory: &Path) -> Result<IssuedCertificates, AuthorityError> {
+    let path = directory.join(REGISTER);
+    if !path.exists() {
+        return Err(AuthorityError::Missing(directory.into()));
+    }
+    let text = read(&path)?;
+    serde_json::from_str(&text).map_err(|error| AuthorityError::Register { path, reason: error.to_string() })
+}
 
 fn days(count: u32) -> Duration {
     Duration::from_secs(u64::from(count) * 86_400)
@@ -320,6 +362,21 @@ mod tests {
         Authority::init(directory.path(), &cell, clock::now()).unwrap();
         let mut authority = Authority::open(directory.path()).unwrap();
         authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
+    }
+
+    #[test]
+    fn commands_that_run_at_once_lose_nothing_of_each_other() {
+        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(NodeName::from_static);
+        let mut long = Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        long.issue(&edge, Role::Edge, days(1), clock::now()).unwrap();
+        let mut short = Authority::open(directory.path()).unwrap();
+        short.issue(&euclid, Role::Auto, days(1), clock::now()).unwrap();
+        short.revoke(&edge, clock::now()).unwrap();
+        long.issue(&gauss, Role::Auto, days(1), clock::now()).unwrap();
+        let mut later = Authority::open(directory.path()).unwrap();
+        let revoked = [edge, euclid, gauss].map(|node| later.revoke(&node, clock::now()).ok());
+        assert_eq!(revoked, [None, Some(1), Some(1)], "the edge's was revoked before");
     }
 
     #[test]

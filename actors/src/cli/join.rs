@@ -1,0 +1,251 @@
+//! `ecod-node init`, `invite` and `join`: a cell from nothing, one machine after the other.
+
+mod files;
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use clap::Args;
+use ecod::leadership::Rights;
+use ecod::leadership::election::ElectionConfig;
+use ecod::model::names::NodeName;
+use ecod::wire::Role;
+use nix::ifaddrs::getifaddrs;
+use nix::net::if_::InterfaceFlags;
+use ring::rand::{SecureRandom, SystemRandom};
+use serde_json::json;
+use tokio::net::TcpListener;
+use tokio::time::Instant;
+
+use super::pki::role_named;
+use super::{Failure, print, run};
+use crate::node::config::NodeConfig;
+use crate::platform::clock;
+use crate::transport::gossip::DEFAULT_PORT;
+use crate::transport::invitation::{Host, Token, Visit, Welcome, redeem};
+use crate::transport::pki::{Authority, DEFAULT_DAYS};
+use files::NodeDirectory;
+
+/// Flags of `init`.
+#[derive(Debug, Args)]
+pub(super) struct InitArguments {
+    /// Name of the cell
+    cell: NodeName,
+    /// Name of this machine's node
+    name: NodeName,
+    /// Role of the node: `edge` leads whenever it can, `auto` without a better candidate
+    #[arg(long, default_value = "auto", value_parser = ["auto", "edge"])]
+    role: String,
+    #[command(flatten)]
+    node: NodeArguments,
+}
+
+/// Flags of `invite`.
+#[derive(Debug, Args)]
+pub(super) struct InviteArguments {
+    /// Names of the nodes that may join, each on the machine that gets its token
+    #[arg(required = true, value_name = "NAME")]
+    names: Vec<NodeName>,
+    /// Highest role of these nodes; with `cav` they can never lead, with `auto` not as an edge
+    #[arg(long, default_value = "auto", value_parser = ["auto", "cav", "edge"])]
+    role: String,
+    /// Hours for which this command waits for them
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=720))]
+    hours: u32,
+    /// Address at which they reach this command. Default: a free port at all addresses of this machine
+    #[arg(long, value_name = "IP:PORT")]
+    listen: Option<SocketAddr>,
+    /// Node that they ask for the cell where multicast does not reach; may be given several times. Default: this machine
+    #[arg(long = "seed", value_name = "HOST:PORT")]
+    seeds: Vec<String>,
+    #[command(flatten)]
+    directory: DirectoryArguments,
+}
+
+/// Flags of `join`.
+#[derive(Debug, Args)]
+pub(super) struct JoinArguments {
+    /// What `ecod-node invite` printed
+    token: Token,
+    #[command(flatten)]
+    node: NodeArguments,
+}
+
+#[derive(Debug, Args)]
+struct NodeArguments {
+    #[command(flatten)]
+    directory: DirectoryArguments,
+    /// Run the node at once, in this terminal
+    #[arg(long)]
+    run: bool,
+}
+
+#[derive(Debug, Args)]
+struct DirectoryArguments {
+    /// Directory of the node's files [default: /etc/ecod for root, else ./ecod]
+    #[arg(long, value_name = "DIR")]
+    dir: Option<PathBuf>,
+}
+
+/// Most addresses in a token.
+const MAX_ADDRESSES: usize = 4;
+
+impl InitArguments {
+    /// Whether the command goes on as a node.
+    pub(super) fn runs_node(&self) -> bool {
+        self.node.run
+    }
+}
+
+impl JoinArguments {
+    /// Whether the command goes on as a node.
+    pub(super) fn runs_node(&self) -> bool {
+        self.node.run
+    }
+}
+
+/// Makes a cell's CA and key, and the files of its first node.
+pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
+    let directory = arguments.node.directory.vacant()?;
+    let InitArguments { cell, name, role, .. } = arguments;
+    let (role, now) = (role_named(role), clock::now());
+    let mut authority = Authority::init(&directory.pki(), cell, now).map_err(|error| anyhow!(error))?;
+    let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
+    authority.issue(name, rights(role), valid, now).map_err(|error| anyhow!(error))?;
+    let (certificate, key) = authority.files_of(name);
+    let read =
+        |path: PathBuf| std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()));
+    let key_text = read(key.clone())?;
+    let welcome = Welcome {
+        cell: cell.clone(),
+        role,
+        certificate: read(certificate)?,
+        ca: read(authority.ca())?,
+        revocation_list: read(authority.revocation_list())?,
+        cell_key: new_cell_key()?,
+        seeds: Vec::new(),
+    };
+    directory.write(name, &welcome, &key_text)?;
+    // It is in the node's own file.
+    std::fs::remove_file(&key).with_context(|| format!("cannot remove {}", key.display()))?;
+    print(&format!(
+        "made the cell {cell} and its node {name} in {directory}\n\
+         keep {}/ca.key safe: whoever has it can let nodes in\n\
+         let others in: {}\n",
+        directory.pki().display(),
+        directory.command("invite NAME")
+    ))?;
+    arguments.node.start(&directory)
+}
+
+/// Lets nodes in until all have joined or the time is over.
+pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
+    let directory = arguments.directory.directory()?;
+    let authority = Authority::open(&directory.pki()).map_err(|error| anyhow!(error))?;
+    for name in arguments.names.iter().filter(|name| authority.has_certificate(name, clock::now())) {
+        eprintln!("{name} has a certificate already, which stays valid; `ecod-node pki revoke` ends it");
+    }
+    let unspecified = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
+    let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
+    let left = runtime.block_on(async {
+        let address = arguments.listen.unwrap_or(unspecified);
+        let listener = TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
+        let bound = listener.local_addr()?;
+        let addresses = if bound.ip().is_unspecified() { own_addresses(bound.port())? } else { vec![bound] };
+        let seeds = if arguments.seeds.is_empty() {
+            addresses.iter().map(|address| SocketAddr::new(address.ip(), DEFAULT_PORT).to_string()).collect()
+        } else {
+            arguments.seeds.clone()
+        };
+        let mut host = Host::new(authority, directory.cell_key()?, seeds)?;
+        let role = role_named(&arguments.role);
+        for name in &arguments.names {
+            let token = host.invite(name, rights(role), addresses.clone())?;
+            print(&format!("on {name}'s machine:\n\n    ecod-node join {token}\n\n"))?;
+        }
+        let reached: Vec<String> = addresses.iter().map(ToString::to_string).collect();
+        eprintln!("waiting at {}; the tokens end with this command", reached.join(", "));
+        let until = Instant::now() + Duration::from_secs(u64::from(arguments.hours) * 3600);
+        let tell = |visit| match visit {
+            Visit::Joined(node) => eprintln!("{node} has joined"),
+            Visit::Failed(from, reason) => eprintln!("{from} has not joined: {reason}"),
+        };
+        anyhow::Ok(host.serve(listener, until, tell).await)
+    })?;
+    if left.is_empty() {
+        return Ok(());
+    }
+    let left: Vec<&str> = left.iter().map(NodeName::as_str).collect();
+    Err(anyhow!("not joined in {} h: {}; their tokens do not work any more", arguments.hours, left.join(", ")).into())
+}
+
+/// Gets and keeps the files of an invited node.
+pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
+    let directory = arguments.node.directory.vacant()?;
+    let node = &arguments.token.node;
+    let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
+    let cell = runtime.block_on(async {
+        let joined = redeem(&arguments.token).await?;
+        directory.write(node, &joined.welcome, &joined.key)?;
+        let cell = joined.welcome.cell.clone();
+        joined.keep().await.context("the files are there, but the host does not know it: it will wait in vain")?;
+        anyhow::Ok(cell)
+    })?;
+    print(&format!("{node} has joined the cell {cell}; its files are in {directory}\n"))?;
+    arguments.node.start(&directory)
+}
+
+impl NodeArguments {
+    /// Runs the node, has the system run it, or tells how to.
+    fn start(&self, directory: &NodeDirectory) -> Result<(), Failure> {
+        if self.run {
+            let config = NodeConfig::load(Some(&directory.configuration()), &json!({})).map_err(Failure::usage)?;
+            return run::run_node(config, false);
+        }
+        if directory.enable_service()? {
+            return Ok(print("the service ecod-node is enabled and runs; `systemctl status ecod-node` tells more\n")?);
+        }
+        let configuration = directory.configuration();
+        Ok(print(&format!("start it: ecod-node --config {}\n", configuration.display()))?)
+    }
+}
+
+impl DirectoryArguments {
+    fn directory(&self) -> Result<NodeDirectory, Failure> {
+        Ok(NodeDirectory::new(self.dir.as_deref())?)
+    }
+
+    /// The directory, in which no node is yet.
+    fn vacant(&self) -> Result<NodeDirectory, Failure> {
+        let directory = self.directory()?;
+        directory.check_vacant().map_err(Failure::usage)?;
+        Ok(directory)
+    }
+}
+
+fn rights(role: Role) -> Rights {
+    Rights { role, priority: ElectionConfig::default().priority }
+}
+
+/// A key of 64 hexadecimal digits.
+fn new_cell_key() -> anyhow::Result<String> {
+    let mut key = [0; 32];
+    SystemRandom::new().fill(&mut key).map_err(|_| anyhow!("the system gives no random numbers"))?;
+    Ok(hex::encode(key) + "\n")
+}
+
+/// Addresses at which other machines may reach a port of this one.
+fn own_addresses(port: u16) -> anyhow::Result<Vec<SocketAddr>> {
+    let is_usable = |flags: InterfaceFlags| {
+        flags.contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING)
+            && !flags.contains(InterfaceFlags::IFF_LOOPBACK)
+    };
+    let interfaces = getifaddrs().context("cannot list this machine's addresses; give one by --listen IP:PORT")?;
+    let addresses = interfaces.filter(|interface| is_usable(interface.flags));
+    let ips = addresses.filter_map(|interface| Some(interface.address?.as_sockaddr_in()?.ip()));
+    let found: Vec<_> = ips.map(|ip| SocketAddr::new(IpAddr::V4(ip), port)).take(MAX_ADDRESSES).collect();
+    anyhow::ensure!(!found.is_empty(), "this machine has no address on a network; give one by --listen IP:PORT");
+    Ok(found)
+}

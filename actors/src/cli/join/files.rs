@@ -1,0 +1,161 @@
+//! Files of one node of a cell, as the service reads them.
+
+use std::fmt;
+use std::fs::{self, DirBuilder};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, chown};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, ensure};
+use ecod::model::names::NodeName;
+use serde::Serialize;
+
+use crate::platform::state_file::replace_file;
+use crate::transport::invitation::Welcome;
+use crate::transport::pki::{Credentials, TlsConfig};
+
+/// Directory from which the service reads its configuration.
+const SERVICE_DIRECTORY: &str = "/etc/ecod";
+
+/// Directory of the service's state; its owner is the service's user.
+const STATE_DIRECTORY: &str = "/var/lib/ecod";
+
+/// A directory with the files of a node; on the machine that has made the cell, also those of the CA.
+pub(super) struct NodeDirectory {
+    path: PathBuf,
+    is_root: bool,
+}
+
+/// `node.toml` as it is first written.
+#[derive(Serialize)]
+struct Configuration<'a> {
+    name: &'a NodeName,
+    cell: &'a NodeName,
+    role: ecod::wire::Role,
+    state_dir: PathBuf,
+    membership: Membership<'a>,
+    tls: &'a TlsConfig,
+}
+
+#[derive(Serialize)]
+struct Membership<'a> {
+    key_file: PathBuf,
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    seeds: &'a [String],
+}
+
+impl NodeDirectory {
+    /// The given directory, or the usual one of this user; it is made if it is missing.
+    pub(super) fn new(given: Option<&Path>) -> anyhow::Result<Self> {
+        let is_root = fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0);
+        let usual = if is_root { SERVICE_DIRECTORY } else { "ecod" };
+        let path = given.unwrap_or(Path::new(usual));
+        let made = DirBuilder::new().recursive(true).mode(0o750).create(path);
+        let path = made.and_then(|()| path.canonicalize()).with_context(|| format!("cannot use {}", path.display()))?;
+        Ok(Self { path, is_root })
+    }
+
+    /// Checks that no node has its files here.
+    pub(super) fn check_vacant(&self) -> anyhow::Result<()> {
+        let taken = [self.path.join("cell.key"), self.path.join("node.key")].into_iter().find(|path| path.exists());
+        match taken {
+            None => Ok(()),
+            Some(path) => anyhow::bail!(
+                "{} is there: {self} belongs to a node already. Choose another --dir, or remove the files of that node",
+                path.display()
+            ),
+        }
+    }
+
+    /// Directory of the cell's CA.
+    pub(super) fn pki(&self) -> PathBuf {
+        self.path.join("pki")
+    }
+
+    pub(super) fn configuration(&self) -> PathBuf {
+        self.path.join("node.toml")
+    }
+
+    pub(super) fn cell_key(&self) -> anyhow::Result<String> {
+        let path = self.path.join("cell.key");
+        fs::read_to_string(&path).with_context(|| format!("cannot read the cell's key {}", path.display()))
+    }
+
+    /// Writes all files of a node, and checks that they fit together. A configuration that is there, such as that of
+    /// the package, is kept as `node.toml.old`.
+    pub(super) fn write(&self, node: &NodeName, welcome: &Welcome, key: &str) -> anyhow::Result<()> {
+        let file = |name: &str| self.path.join(name);
+        let tls = TlsConfig {
+            ca: file("ca.pem"),
+            certificate: file("node.pem"),
+            key: file("node.key"),
+            revocation_list: Some(file("revoked.pem")),
+        };
+        let has_service = self.is_root && self.path == Path::new(SERVICE_DIRECTORY);
+        let state_dir = if has_service { STATE_DIRECTORY.into() } else { file("state") };
+        let configuration = toml::to_string(&Configuration {
+            name: node,
+            cell: &welcome.cell,
+            role: welcome.role,
+            state_dir,
+            membership: Membership { key_file: file("cell.key"), seeds: &welcome.seeds },
+            tls: &tls,
+        })?;
+        let configuration = format!("{HEAD}{configuration}");
+        if self.configuration().exists() {
+            fs::rename(self.configuration(), file("node.toml.old")).context("cannot keep the former node.toml")?;
+        }
+        // The keys last: they are what makes the directory a node's.
+        let files = [
+            ("ca.pem", welcome.ca.as_str(), 0o644),
+            ("node.pem", &welcome.certificate, 0o644),
+            ("revoked.pem", &welcome.revocation_list, 0o644),
+            ("node.toml", &configuration, 0o640),
+            ("node.key", key, 0o600),
+            ("cell.key", &welcome.cell_key, 0o600),
+        ];
+        let owner = fs::metadata(STATE_DIRECTORY).ok().filter(|_| has_service);
+        for (name, text, mode) in files {
+            let path = file(name);
+            replace_file(&path, text.as_bytes(), mode)
+                .and_then(|()| match &owner {
+                    Some(owner) => chown(&path, Some(owner.uid()), Some(owner.gid())),
+                    None => Ok(()),
+                })
+                .with_context(|| format!("cannot write {}", path.display()))?;
+        }
+        Credentials::load(&tls, node).context("the files do not fit together")?;
+        Ok(())
+    }
+
+    /// Has the system run the node from now on, if it is the system's: true if so.
+    pub(super) fn enable_service(&self) -> anyhow::Result<bool> {
+        let is_service = self.is_root && self.path == Path::new(SERVICE_DIRECTORY);
+        let units = ["/lib/systemd/system", "/etc/systemd/system"];
+        let has_unit = units.iter().any(|units| Path::new(units).join("ecod-node.service").exists());
+        if !is_service || !has_unit || !Path::new("/run/systemd/system").exists() {
+            return Ok(false);
+        }
+        let enabled = Command::new("systemctl").args(["enable", "--now", "ecod-node"]).status();
+        ensure!(enabled.context("cannot run systemctl")?.success(), "`systemctl enable --now ecod-node` failed");
+        Ok(true)
+    }
+
+    /// A command that uses this directory.
+    pub(super) fn command(&self, command: &str) -> String {
+        let usual = self.is_root && self.path == Path::new(SERVICE_DIRECTORY);
+        if usual { format!("ecod-node {command}") } else { format!("ecod-node {command} --dir {self}") }
+    }
+}
+
+impl fmt::Display for NodeDirectory {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.path.display().fmt(f)
+    }
+}
+
+/// Comment at the beginning of `node.toml`.
+const HEAD: &str = "\
+# Known locations, pose and camera are yours to add: docs/first-cell.md. `ecod-node --config FILE --print-config` shows
+# every key with its value.
+";

@@ -1,0 +1,177 @@
+//! Invitations: how a machine gets a certificate and the cell's key, while its private key stays on it.
+//!
+//! ```text
+//! host                                                     guest
+//! token: addresses, certificate's SHA-256, secret   ->     carried over by a person
+//!                TLS 1.3; the host's certificate must be the token's
+//!                                                   <-     node, secret, certificate signing request
+//! certificate, CA, revocation list, cell's key      ->
+//!                                                   <-     "kept": all is on disk
+//! ```
+//!
+//! A token is for one node. It works until the guest has kept what it got, or the host ends. A guest that fails before
+//! can come again; the certificate that it lost is revoked. The guest's clock does not matter.
+
+mod guest;
+mod host;
+mod token;
+
+use std::time::Duration;
+
+use ecod::model::names::NodeName;
+use ecod::wire::Role;
+use serde::{Deserialize, Serialize};
+use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+
+pub use guest::{JoinError, Joined, redeem};
+pub use host::{Host, Visit};
+pub use token::{Token, TokenError};
+
+/// Maximum length of a message in bytes. A revocation list is the longest part.
+const MAX_BYTES: u64 = 4 << 20;
+
+/// Maximum time for a conversation; the guest writes its files meanwhile.
+const CONVERSATION_TIME: Duration = Duration::from_secs(10);
+
+/// Name in the host's certificate of one use. The token tells which certificate it is.
+const HOST_NAME: &str = "invitation.ecod.internal";
+
+/// The guest's last message.
+const KEPT: &str = "kept";
+
+/// The guest's wish.
+#[derive(Debug, Serialize, Deserialize)]
+struct Request {
+    node: NodeName,
+    /// Hexadecimal digits.
+    secret: String,
+    /// Certificate signing request in PEM. Of its content, the public key alone counts.
+    request: String,
+}
+
+/// The host's answer.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Reply {
+    Welcome(Box<Welcome>),
+    Refused(String),
+}
+
+/// All that a node needs to take part in a cell, but for its private key.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Welcome {
+    /// Name of the cell.
+    pub cell: NodeName,
+    /// Highest role of the node.
+    pub role: Role,
+    /// The node's certificate in PEM.
+    pub certificate: String,
+    /// The CA's certificate in PEM.
+    pub ca: String,
+    /// The revocation list in PEM.
+    pub revocation_list: String,
+    /// Content of the cell's key file.
+    pub cell_key: String,
+    /// Nodes to ask for the cell, as `host:port`.
+    pub seeds: Vec<String>,
+}
+
+/// Writes one message, a line of JSON.
+async fn write_line(stream: &mut (impl AsyncWrite + Unpin), message: &impl Serialize) -> std::io::Result<()> {
+    let line = serde_json::to_string(message)? + "\n";
+    stream.write_all(line.as_bytes()).await?;
+    stream.flush().await
+}
+
+/// Reads one message, a line of JSON.
+async fn read_line<T: serde::de::DeserializeOwned>(stream: &mut (impl AsyncBufRead + Unpin)) -> std::io::Result<T> {
+    let mut line = String::new();
+    stream.take(MAX_BYTES).read_line(&mut line).await?;
+    Ok(serde_json::from_str(&line)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+    use std::sync::{Arc, Mutex};
+
+    use tempfile::TempDir;
+    use tokio::net::TcpListener;
+    use tokio::task::JoinHandle;
+    use tokio::time::{Instant, timeout};
+
+    use super::*;
+    use crate::platform::clock;
+    use crate::transport::pki::{Authority, CertificateSubject};
+
+    const SOON: Duration = Duration::from_secs(20);
+
+    struct Scene {
+        directory: TempDir,
+        token: Token,
+        visits: Arc<Mutex<Vec<String>>>,
+        serving: JoinHandle<Vec<NodeName>>,
+    }
+
+    /// A host that waits for `gauss`.
+    async fn host(wait: Duration) -> Scene {
+        let directory = tempfile::tempdir().unwrap();
+        let authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
+        let addresses = vec![listener.local_addr().unwrap()];
+        let mut host = Host::new(authority, "a key of the cell".into(), vec!["10.0.0.1:1".into()]).unwrap();
+        let token = host.invite(&NodeName::from_static("gauss"), Role::Cav, addresses).unwrap();
+        let visits = Arc::<Mutex<Vec<String>>>::default();
+        let noted = Arc::clone(&visits);
+        let tell = move |visit| noted.lock().unwrap().push(format!("{visit:?}"));
+        let serving = tokio::spawn(host.serve(listener, Instant::now() + wait, tell));
+        Scene { directory, token, visits, serving }
+    }
+
+    fn revoked(directory: &TempDir) -> usize {
+        std::fs::read_to_string(directory.path().join("issued.json")).unwrap().matches("revoked_at_us").count()
+    }
+
+    #[tokio::test]
+    async fn a_guest_that_loses_what_it_got_comes_again_and_then_no_more() {
+        let Scene { directory, token, serving, .. } = host(SOON).await;
+        let lost = redeem(&token).await.unwrap();
+        drop(lost);
+        assert_eq!(revoked(&directory), 0);
+        let joined = redeem(&token).await.unwrap();
+        assert_eq!(revoked(&directory), 1, "the certificate that was lost");
+        let welcome = &joined.welcome;
+        assert_eq!((welcome.cell.as_str(), welcome.role, &*welcome.cell_key), ("lot", Role::Cav, "a key of the cell"));
+        let certificate = <rustls::pki_types::CertificateDer<'_> as rustls::pki_types::pem::PemObject>::from_pem_slice(
+            welcome.certificate.as_bytes(),
+        );
+        let subject = CertificateSubject::of(&certificate.unwrap()).unwrap();
+        assert!(subject.name().as_str() == "gauss" && !subject.may_serve());
+        joined.keep().await.unwrap();
+        assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), [], "nobody is waited for");
+        assert!(matches!(redeem(&token).await, Err(JoinError::Unreachable { .. })));
+    }
+
+    #[tokio::test]
+    async fn other_names_secrets_and_hosts_get_nothing() {
+        let Scene { token, visits, serving, directory } = host(Duration::from_secs(3)).await;
+        let secret = Token { secret: [0; 16], ..token.clone() };
+        let name = Token { node: NodeName::from_static("edge"), ..token.clone() };
+        for token in [secret, name] {
+            let refused = redeem(&token).await.err();
+            assert!(matches!(refused, Some(JoinError::Refused(_))), "{refused:?}");
+        }
+        let other_host = Token { fingerprint: [0; 32], ..token.clone() };
+        let refused = redeem(&other_host).await.err();
+        assert!(matches!(refused, Some(JoinError::Unreachable { .. })), "{refused:?}");
+        // Strangers that say nothing take no guest's place.
+        let mut silent = Vec::new();
+        for _ in 0..20 {
+            silent.push(tokio::net::TcpStream::connect(token.addresses[0]).await.unwrap());
+        }
+        drop(redeem(&token).await.unwrap());
+        assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), [token.node], "it has not kept it");
+        assert!(visits.lock().unwrap().iter().all(|visit| visit.starts_with("Failed")));
+        assert!(!std::fs::read_to_string(directory.path().join("issued.json")).unwrap().contains("\"edge\""));
+    }
+}

@@ -1,0 +1,155 @@
+//! The side that joins.
+
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use rcgen::{CertificateParams, KeyPair};
+use ring::digest::{SHA256, digest};
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::crypto::{CryptoProvider, ring as provider, verify_tls12_signature, verify_tls13_signature};
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::{CertificateError, ClientConfig, DigitallySignedStruct, SignatureScheme};
+use tokio::io::BufStream;
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+
+use super::{CONVERSATION_TIME, HOST_NAME, KEPT, Reply, Request, Token, Welcome, read_line, write_line};
+
+/// Maximum time for a connection to one address of the host.
+const CONNECT_TIME: Duration = Duration::from_secs(3);
+
+/// A node that was let in. The host counts it as joined after [`Joined::keep`].
+pub struct Joined {
+    /// Certificate, cell's key and the rest.
+    pub welcome: Welcome,
+    /// The node's private key in PEM, which nobody else has.
+    pub key: String,
+    stream: BufStream<TlsStream<TcpStream>>,
+}
+
+/// A failure to join; the token works on.
+#[derive(Debug, thiserror::Error)]
+pub enum JoinError {
+    /// No address of the host can be reached.
+    #[error("no host at {addresses}: is `ecod-node invite` still running there, and the address reachable? ({reason})")]
+    Unreachable {
+        /// All that were tried.
+        addresses: String,
+        /// The last failure.
+        reason: String,
+    },
+    /// The host refuses.
+    #[error("refused: {0}; ask for a new token by `ecod-node invite`")]
+    Refused(String),
+    /// Another program than the host is there, or the conversation broke off.
+    #[error("the host did not answer as it should: {0}")]
+    Conversation(#[from] io::Error),
+    /// No key could be made.
+    #[error("no key could be made: {0}")]
+    Key(#[from] rcgen::Error),
+}
+
+/// Asks the host of a token to be let in.
+///
+/// # Errors
+/// [`JoinError`].
+pub async fn redeem(token: &Token) -> Result<Joined, JoinError> {
+    let key = KeyPair::generate()?;
+    let signing = CertificateParams::default().serialize_request(&key)?.pem()?;
+    let request = Request { node: token.node.clone(), secret: hex::encode(token.secret), request: signing };
+    let conversation = async {
+        let mut stream = BufStream::new(connect(token).await?);
+        write_line(&mut stream, &request).await?;
+        let reply: Reply = read_line(&mut stream).await?;
+        match reply {
+            Reply::Welcome(welcome) => Ok(Joined { welcome: *welcome, key: key.serialize_pem(), stream }),
+            Reply::Refused(reason) => Err(JoinError::Refused(reason)),
+        }
+    };
+    let late = |_| JoinError::Conversation(io::ErrorKind::TimedOut.into());
+    let tries = u32::try_from(token.addresses.len()).unwrap_or(u32::MAX);
+    timeout(CONNECT_TIME.saturating_mul(tries) + CONVERSATION_TIME, conversation).await.map_err(late)?
+}
+
+impl Joined {
+    /// Tells the host that all is on disk, so that the token is used up.
+    ///
+    /// # Errors
+    /// When the host is gone; the certificate is valid all the same.
+    pub async fn keep(mut self) -> io::Result<()> {
+        write_line(&mut self.stream, &KEPT).await?;
+        tokio::io::AsyncWriteExt::shutdown(&mut self.stream).await
+    }
+}
+
+async fn connect(token: &Token) -> Result<TlsStream<TcpStream>, JoinError> {
+    let provider = Arc::new(provider::default_provider());
+    let verifier = PinnedVerifier { fingerprint: token.fingerprint, provider: Arc::clone(&provider) };
+    let config = ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .map_err(io::Error::other)?
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(verifier))
+        .with_no_client_auth();
+    let connector = TlsConnector::from(Arc::new(config));
+    let name = ServerName::try_from(HOST_NAME).map_err(io::Error::other)?;
+    let mut reason = String::from("the token names no address");
+    for address in &token.addresses {
+        let attempt = async { connector.connect(name.clone(), TcpStream::connect(address).await?).await };
+        match timeout(CONNECT_TIME, attempt).await.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into())) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => reason = format!("{address}: {error}"),
+        }
+    }
+    let addresses: Vec<String> = token.addresses.iter().map(ToString::to_string).collect();
+    Err(JoinError::Unreachable { addresses: addresses.join(", "), reason })
+}
+
+/// Trust in one certificate, whatever its names and validity.
+#[derive(Debug)]
+struct PinnedVerifier {
+    fingerprint: [u8; 32],
+    provider: Arc<CryptoProvider>,
+}
+
+impl ServerCertVerifier for PinnedVerifier {
+    fn verify_server_cert(
+        &self,
+        certificate: &CertificateDer<'_>,
+        _: &[CertificateDer<'_>],
+        _: &ServerName<'_>,
+        _: &[u8],
+        _: UnixTime,
+    ) -> Result<ServerCertVerified, rustls::Error> {
+        if digest(&SHA256, certificate).as_ref() == self.fingerprint {
+            Ok(ServerCertVerified::assertion())
+        } else {
+            Err(CertificateError::ApplicationVerificationFailure.into())
+        }
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        verify_tls12_signature(message, certificate, signature, &self.provider.signature_verification_algorithms)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        verify_tls13_signature(message, certificate, signature, &self.provider.signature_verification_algorithms)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.provider.signature_verification_algorithms.supported_schemes()
+    }
+}

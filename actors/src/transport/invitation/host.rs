@@ -1,0 +1,195 @@
+//! The side that has the CA: it lets each guest in once.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::leadership::Rights;
+use ecod::model::names::NodeName;
+use rcgen::{CertificateParams, CertificateSigningRequestParams, KeyPair};
+use ring::digest::{SHA256, digest};
+use ring::rand::{SecureRandom, SystemRandom};
+use rustls::ServerConfig;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer};
+use tokio::io::BufStream;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep_until, timeout};
+use tokio_rustls::TlsAcceptor;
+
+use super::{CONVERSATION_TIME, HOST_NAME, KEPT, Reply, Request, Token, Welcome, read_line, write_line};
+use crate::platform::clock;
+use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, OBSERVER_MARK};
+
+/// A cell's CA and key, and the nodes that it has invited.
+pub struct Host {
+    authority: Authority,
+    cell_key: String,
+    seeds: Vec<String>,
+    guests: BTreeMap<NodeName, Guest>,
+    tls: TlsAcceptor,
+    fingerprint: [u8; 32],
+}
+
+/// A node that may join.
+struct Guest {
+    rights: Rights,
+    secret: [u8; 16],
+    /// Whether it got a certificate that it may have lost.
+    is_issued: bool,
+}
+
+/// End of a conversation.
+#[derive(Debug)]
+pub enum Visit {
+    /// The node has kept its files; its token is used up.
+    Joined(NodeName),
+    /// Nothing was given, or the guest did not say that it has kept it: address and reason.
+    Failed(SocketAddr, String),
+}
+
+/// Conversations at once; more wait.
+const MAX_VISITS: usize = 64;
+
+/// Wait after an error of the listener, such as too many open files.
+const PAUSE: Duration = Duration::from_millis(100);
+
+type Question = (Request, oneshot::Sender<Reply>);
+
+impl Host {
+    /// A host without guests. `seeds` are `host:port` of nodes that a guest asks for the cell.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when the system makes no keys.
+    pub fn new(authority: Authority, cell_key: String, seeds: Vec<String>) -> Result<Self, AuthorityError> {
+        let key = KeyPair::generate()?;
+        let certificate = CertificateParams::new([HOST_NAME.to_owned()])?.self_signed(&key)?;
+        let mut fingerprint = [0; 32];
+        fingerprint.copy_from_slice(digest(&SHA256, certificate.der()).as_ref());
+        let private = PrivateKeyDer::from(PrivatePkcs8KeyDer::from(key.serialize_der()));
+        let chain = vec![CertificateDer::from(certificate.der().to_vec())];
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let tls = ServerConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&rustls::version::TLS13])
+            .and_then(|builder| builder.with_no_client_auth().with_single_cert(chain, private))
+            .map_err(|error| AuthorityError::Crypto(error.to_string()))?;
+        let tls = TlsAcceptor::from(Arc::new(tls));
+        Ok(Self { authority, cell_key, seeds, guests: BTreeMap::new(), tls, fingerprint })
+    }
+
+    /// The token of a node, which finds the host at one of the addresses. A former token of the node does not work
+    /// any more.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when the name cannot have a certificate or the system gives no random numbers.
+    pub fn invite(
+        &mut self,
+        node: &NodeName,
+        rights: impl Into<Rights>,
+        addresses: Vec<SocketAddr>,
+    ) -> Result<Token, AuthorityError> {
+        if node.as_str().contains(OBSERVER_MARK) {
+            return Err(AuthorityError::Name(node.clone()));
+        }
+        let mut secret = [0; 16];
+        let drawn = SystemRandom::new().fill(&mut secret);
+        drawn.map_err(|_| AuthorityError::Crypto("the system gives no random numbers".into()))?;
+        self.guests.insert(node.clone(), Guest { rights: rights.into(), secret, is_issued: false });
+        Ok(Token { node: node.clone(), addresses, fingerprint: self.fingerprint, secret })
+    }
+
+    /// Serves guests until all have joined or the time is over, and tells of each visit; gives those that did not come.
+    pub async fn serve(mut self, listener: TcpListener, until: Instant, tell: impl Fn(Visit)) -> Vec<NodeName> {
+        let mut visits = JoinSet::new();
+        let (ask, mut questions) = mpsc::channel::<Question>(MAX_VISITS);
+        while !self.guests.is_empty() {
+            tokio::select! {
+                accepted = listener.accept(), if visits.len() < MAX_VISITS => match accepted {
+                    Ok((stream, from)) => {
+                        let (tls, ask) = (self.tls.clone(), ask.clone());
+                        visits.spawn(async move {
+                            let visit = timeout(CONVERSATION_TIME, receive(tls, stream, ask)).await;
+                            match visit {
+                                Ok(Ok(node)) => Visit::Joined(node),
+                                Ok(Err(error)) => Visit::Failed(from, error.to_string()),
+                                Err(_) => Visit::Failed(from, "it took too long".into()),
+                            }
+                        });
+                    }
+                    Err(_) => tokio::time::sleep(PAUSE).await,
+                },
+                Some((request, answer)) = questions.recv() => {
+                    // A guest that has left does not wait for it.
+                    let _ = answer.send(self.answer(&request));
+                }
+                Some(Ok(visit)) = visits.join_next() => {
+                    if let Visit::Joined(node) = &visit {
+                        self.guests.remove(node);
+                    }
+                    tell(visit);
+                }
+                () = sleep_until(until) => break,
+            }
+        }
+        self.guests.into_keys().collect()
+    }
+
+    fn answer(&mut self, request: &Request) -> Reply {
+        match self.welcome(request) {
+            Ok(welcome) => Reply::Welcome(Box::new(welcome)),
+            Err(reason) => Reply::Refused(reason),
+        }
+    }
+
+    fn welcome(&mut self, request: &Request) -> Result<Welcome, String> {
+        let unusable = |error: &dyn std::fmt::Display| format!("the host cannot issue a certificate: {error}");
+        // Hashes are compared: the time that it takes tells nothing of the secret.
+        let hash = |secret: &[u8]| digest(&SHA256, secret).as_ref().to_vec();
+        let secret = hex::decode(&request.secret).unwrap_or_default();
+        let guest = self.guests.get_mut(&request.node).filter(|guest| hash(&guest.secret) == hash(&secret));
+        let guest = guest.ok_or("the token was used already, or is of another `ecod-node invite`")?;
+        let signing = CertificateSigningRequestParams::from_pem(&request.request)
+            .map_err(|error| format!("the certificate signing request cannot be used: {error}"))?;
+        let (node, now) = (&request.node, clock::now());
+        if guest.is_issued {
+            match self.authority.revoke(node, now) {
+                Ok(_) | Err(AuthorityError::NotIssued(_)) => guest.is_issued = false,
+                Err(error) => return Err(unusable(&error)),
+            }
+        }
+        let rights = guest.rights;
+        let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
+        let issued = self.authority.certify(node, rights, valid, now, &signing.public_key);
+        let certificate = issued.map_err(|error| unusable(&error))?;
+        guest.is_issued = true;
+        let read = |path| std::fs::read_to_string(path).map_err(|error| unusable(&error));
+        Ok(Welcome {
+            cell: self.authority.cell().clone(),
+            role: rights.role,
+            certificate,
+            ca: read(self.authority.ca())?,
+            revocation_list: read(self.authority.revocation_list())?,
+            cell_key: self.cell_key.clone(),
+            seeds: self.seeds.clone(),
+        })
+    }
+}
+
+/// One conversation; gives the node that has joined.
+async fn receive(tls: TlsAcceptor, stream: TcpStream, ask: mpsc::Sender<Question>) -> anyhow::Result<NodeName> {
+    let mut stream = BufStream::new(tls.accept(stream).await?);
+    let request: Request = read_line(&mut stream).await?;
+    let node = request.node.clone();
+    let (answer, answered) = oneshot::channel();
+    ask.send((request, answer)).await?;
+    let reply = answered.await?;
+    write_line(&mut stream, &reply).await?;
+    if let Reply::Refused(reason) = reply {
+        anyhow::bail!("{node}: {reason}");
+    }
+    let kept: String = read_line(&mut stream).await?;
+    anyhow::ensure!(kept == KEPT, "{node} has not kept its files");
+    Ok(node)
+}

@@ -1,0 +1,83 @@
+//! Text that a person carries from the host to the guest.
+
+use std::fmt;
+use std::net::SocketAddr;
+use std::str::FromStr;
+
+use base64::Engine;
+use base64::prelude::BASE64_URL_SAFE_NO_PAD;
+use ecod::model::names::NodeName;
+use ring::digest::{SHA256, digest};
+use serde::{Deserialize, Serialize};
+
+/// An invitation of one node.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Token {
+    /// The node that may join.
+    pub node: NodeName,
+    /// Addresses of the host, which the guest tries in this order.
+    pub addresses: Vec<SocketAddr>,
+    /// SHA-256 of the host's certificate.
+    pub(super) fingerprint: [u8; 32],
+    pub(super) secret: [u8; 16],
+}
+
+/// A text that is no token, or not a whole one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("this is no token, or not the whole of it; `ecod-node invite NAME` prints one, which begins with `{PREFIX}`")]
+pub struct TokenError;
+
+/// Beginning of each token: kind and version.
+const PREFIX: &str = "ecod1-";
+
+/// Length of the checksum at the end of a token, in bytes.
+const CHECKSUM_BYTES: usize = 4;
+
+impl fmt::Display for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut bytes = postcard::to_allocvec(self).map_err(|_| fmt::Error)?;
+        let hash = digest(&SHA256, &bytes);
+        bytes.extend_from_slice(&hash.as_ref()[..CHECKSUM_BYTES]);
+        write!(f, "{PREFIX}{}", BASE64_URL_SAFE_NO_PAD.encode(bytes))
+    }
+}
+
+impl fmt::Debug for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Token").field("node", &self.node).field("addresses", &self.addresses).finish_non_exhaustive()
+    }
+}
+
+impl FromStr for Token {
+    type Err = TokenError;
+
+    fn from_str(text: &str) -> Result<Self, TokenError> {
+        let encoded = text.trim().strip_prefix(PREFIX).ok_or(TokenError)?;
+        let bytes = BASE64_URL_SAFE_NO_PAD.decode(encoded).map_err(|_| TokenError)?;
+        let (content, checksum) = bytes.split_last_chunk::<CHECKSUM_BYTES>().ok_or(TokenError)?;
+        if !digest(&SHA256, content).as_ref().starts_with(checksum) {
+            return Err(TokenError);
+        }
+        postcard::from_bytes(content).map_err(|_| TokenError)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_is_read_as_it_was_written_and_no_part_of_it_is() {
+        let addresses = vec!["192.168.1.10:40000".parse().unwrap(), "[fe80::1]:40000".parse().unwrap()];
+        let token = Token { node: NodeName::from_static("gauss"), addresses, fingerprint: [7; 32], secret: [0xd3; 16] };
+        let text = token.to_string();
+        assert!(text.len() < 160, "{text}");
+        assert_eq!(format!(" {text}\n").parse(), Ok(token.clone()));
+        assert!(!format!("{token:?}").contains("d3") && !format!("{token:?}").contains("211"), "{token:?}");
+        for cut in 0..text.len() {
+            assert_eq!(text[..cut].parse::<Token>(), Err(TokenError), "{cut} characters");
+        }
+        let swapped = text.replacen('d', "e", 1);
+        assert_eq!(swapped.parse::<Token>(), Err(TokenError));
+    }
+}
