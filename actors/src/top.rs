@@ -265,6 +265,7 @@ mod tests {
                 term: epoch.term,
                 epoch: Some(epoch),
                 standby: Some(name("gauss")),
+                is_deserted: false,
             },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
             members: vec![Member {

@@ -7,6 +7,7 @@ mod data_plane;
 mod evidence;
 mod gaps;
 mod liar;
+mod logins;
 mod node;
 mod random;
 mod world;
@@ -334,7 +335,7 @@ fn start_all(world: &mut World) {
 fn plan_fault(world: &mut World, nodes: usize) {
     let at = world.random.between(SECOND, 9 * SECOND);
     let node = world.random.index(nodes);
-    match world.random.between(0, 9) {
+    match world.random.between(0, 10) {
         0 | 1 => {
             let seen = world.random.chance(50);
             world.plan(at, Fault::Kill { node, seen });
@@ -372,6 +373,12 @@ fn plan_fault(world: &mut World, nodes: usize) {
         8 => {
             world.plan(at, Fault::Gateway { node, works: false });
             world.plan(at + 3 * SECOND, Fault::Gateway { node, works: true });
+        }
+        9 => {
+            for _ in 0..world.random.between(1, nodes as u64) {
+                let barred = world.random.index(nodes);
+                world.plan(at, Fault::NoLogin { node: barred, broker: node });
+            }
         }
         _ => {
             world.plan(at, Fault::Broker { node, works: false });

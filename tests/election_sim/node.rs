@@ -44,6 +44,8 @@ pub(crate) enum Fault {
     Fuser { node: usize, works: bool },
     /// The node's gateway answers nobody, or does again.
     Gateway { node: usize, works: bool },
+    /// A node cannot log in at another's broker, such as by a firewall or a certificate, until all links work again.
+    NoLogin { node: usize, broker: usize },
 }
 
 /// Something that is going to happen.

@@ -41,6 +41,8 @@ pub(crate) struct World {
     pub(crate) history: Vec<String>,
     pub(crate) votes: Votes,
     cuts: BTreeSet<(usize, usize)>,
+    /// Nodes that cannot log in, each with the broker's node.
+    pub(crate) refusals: BTreeSet<(usize, usize)>,
     pub(crate) loss_percent: u64,
     queue: BinaryHeap<Planned>,
     events: u64,
@@ -87,6 +89,7 @@ impl World {
             history: Vec::new(),
             votes: Votes::default(),
             cuts: BTreeSet::new(),
+            refusals: BTreeSet::new(),
             loss_percent: 0,
             queue: BinaryHeap::new(),
             events: 0,
@@ -223,7 +226,17 @@ impl World {
             Fault::Cut { from, to } => {
                 self.cuts.insert((from, to));
             }
-            Fault::Heal => self.cuts.clear(),
+            Fault::Heal => {
+                self.cuts.clear();
+                self.refusals.clear();
+            }
+            Fault::NoLogin { node, broker } => {
+                self.refusals.insert((node, broker));
+                if self.nodes[node].links.contains_key(&broker) {
+                    self.set_link(node, broker, LinkState::Down);
+                    self.plan_connect(node, broker, 0);
+                }
+            }
             Fault::Loss(percent) => self.loss_percent = percent,
             Fault::Broker { node, works } => self.push_to(node, 0, Arrival::Broker { works }),
             Fault::Fuser { node, works } => self.nodes[node].set_fuser(works, self.now),

@@ -236,6 +236,18 @@ pub enum Notice {
         /// The node.
         challenger: NodeName,
     },
+    /// This node cannot log in at brokers that it should use, or it can again.
+    NoLogin {
+        /// Their nodes.
+        at: Vec<NodeName>,
+    },
+    /// This node leads, and more followers than before cannot log in at its broker.
+    Deserted {
+        /// Number of these followers.
+        without_login: usize,
+        /// Number of all followers.
+        followers: usize,
+    },
     /// A node declared more than its certificate allows, or claimed a lead that it may not have.
     Overreached {
         /// The node.

@@ -229,7 +229,7 @@ fn leading_beside_a_ready_challenger(external: Option<SocketAddr>, broker: Optio
             scene.take(Input::LinkChanged { broker: broker.into(), state: LinkState::Up });
         }
         if ms % 50 == 0 {
-            scene.hear_in(epoch.clone(), Body::Status { over: None });
+            scene.hear_in(epoch.clone(), Body::Status { over: None, no_login: Vec::new() });
             scene.hear_in(epoch.clone(), Body::Ready);
         }
         if ms % 100 == 0 {
@@ -325,7 +325,7 @@ fn a_node_that_others_do_not_reach_is_not_fit_and_says_so_once() {
 #[test]
 fn a_machine_started_anew_uses_no_term_that_it_may_have_led_in() {
     let epoch = Some(Epoch::new(9, name("euclid")));
-    let before = Leadership { position: Position::Leading, epoch, standby: None, term: 9 };
+    let before = Leadership { position: Position::Leading, epoch, standby: None, term: 9, is_deserted: false };
     let settings = NodeSettings {
         election: ElectionConfig::default(),
         plane: DataPlane { external: None, embedded: true },
@@ -393,7 +393,10 @@ fn a_declared_role_beyond_the_certificate_takes_no_lead() {
         scene.take(Input::MemberAlive { member: member("zeno", 2) });
         for _ in 0..100 {
             let epoch = scene.machine.election().epoch().unwrap().clone();
-            let message = ElectionMessage { from: name("zeno"), ..scene.message(epoch, Body::Status { over: None }) };
+            let message = ElectionMessage {
+                from: name("zeno"),
+                ..scene.message(epoch, Body::Status { over: None, no_login: Vec::new() })
+            };
             let rights = Rights { role, priority: 100 };
             scene.take(Input::Receive { from: name("zeno"), rights, message });
             scene.run_for(50);

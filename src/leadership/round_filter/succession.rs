@@ -227,7 +227,7 @@ mod tests {
 
     fn led_by(epoch: Epoch, standby: Option<&'static str>) -> Leadership {
         let standby = standby.map(NodeName::from_static);
-        Leadership { position: Position::Following, term: epoch.term, epoch: Some(epoch), standby }
+        Leadership { position: Position::Following, term: epoch.term, epoch: Some(epoch), standby, is_deserted: false }
     }
 
     fn seeking(term: u64) -> Leadership {
