@@ -193,10 +193,12 @@ impl Election {
                 let own = leading.epoch.clone();
                 match &message.epoch {
                     Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
-                        // A leadership ends only on the word of more nodes than follow it, for a known candidate.
+                        // A leadership ends only on the word of more nodes than follow it, for a known candidate. Its own
+                        // followers have time to answer; until then the other leader has to speak for itself.
+                        let is_answered = now.since(leading.since) > self.config.response_timeout();
                         let has_more_followers =
                             self.peers.followers(&other.leader, now) > self.peers.followers(&self.id, now);
-                        if has_more_followers && self.peers.may_lead(&other.leader, now) {
+                        if is_answered && has_more_followers && self.peers.may_lead(&other.leader, now) {
                             let other = other.clone();
                             self.stop_leading(&other.leader);
                             self.adopt(other, now, now);

@@ -180,6 +180,30 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
     assert!(election.is_leading());
 }
 
+/// A leader has no followers yet when it begins. A vehicle that says then that it follows another ends no leadership.
+#[test]
+fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
+    let [edge, hopper] = ["edge", "hopper"].map(NodeName::from_static);
+    let mut election = euclid();
+    // A fit candidate that does not lead.
+    election.handle(of_edge(1, 8, beat(1)), NOW);
+    let resigned = Body::Resign { epoch: epoch_of_edge(), last_round: 1 };
+    election.handle(of_edge(2, 8, resigned), NOW);
+    let mut now = NOW;
+    while !election.is_leading() {
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    let lie = Epoch::new(election.term() + 1, edge.clone());
+    let message = message(&hopper, 1, Some(&lie), Body::Status { over: None, no_login: Vec::new() });
+    let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
+    election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
+    assert!(election.is_leading());
+    // What is true the other leader says itself.
+    election.handle(received(&edge, 3, Some(&lie), beat_after(election.epoch().cloned().as_ref())), now);
+    assert_eq!(election.leader(), Some(&edge));
+}
+
 /// Epochs that euclid led in during the twenty seconds after gauss had refused its first one.
 fn renewals(gauss_follows: bool) -> Vec<Epoch> {
     let gauss = NodeName::from_static("gauss");
