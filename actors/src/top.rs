@@ -266,6 +266,7 @@ mod tests {
                 epoch: Some(epoch),
                 standby: Some(name("gauss")),
                 is_deserted: false,
+                is_yielding: false,
             },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
             members: vec![Member {

@@ -214,6 +214,11 @@ impl Election {
         matches!(self.state, State::Leading(_))
     }
 
+    /// Whether this leader has said that the next round is its standby's.
+    pub fn is_yielding(&self) -> bool {
+        matches!(&self.state, State::Leading(leading) if leading.is_yielding())
+    }
+
     /// The next leader, as named by the leader.
     pub fn standby(&self) -> Option<&NodeName> {
         match &self.state {

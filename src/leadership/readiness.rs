@@ -88,7 +88,14 @@ mod tests {
 
     #[test]
     fn ready_means_fresh_rounds_of_the_leader_and_a_broker_to_lead_with() {
-        let at = |position| Leadership { position, epoch: Some(epoch(4)), standby: None, term: 4, is_deserted: false };
+        let at = |position| Leadership {
+            position,
+            epoch: Some(epoch(4)),
+            standby: None,
+            term: 4,
+            is_deserted: false,
+            is_yielding: false,
+        };
         let (seeking, following, leading) = (at(Position::Seeking), at(Position::Following), at(Position::Leading));
         assert_eq!(reason(&seeking, Some((4, 9)), true), (false, "no leader known".into()));
         assert_eq!(reason(&following, None, false), (false, "no round of edge yet".into()));
@@ -116,6 +123,7 @@ mod tests {
             standby: None,
             term: 4,
             is_deserted: false,
+            is_yielding: false,
         };
         assert!(Readiness::judge(&following, None, false, None, Timestamp(0)).ready);
     }

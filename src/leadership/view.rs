@@ -19,6 +19,8 @@ pub struct Leadership {
     pub term: u64,
     /// Whether this node leads, and no follower can log in at its broker. A change alone wakes nobody.
     pub is_deserted: bool,
+    /// Whether this node leads, and the next round is its standby's. A change alone wakes nobody.
+    pub is_yielding: bool,
 }
 
 /// A node's place in its cell.
@@ -51,6 +53,7 @@ impl Leadership {
             standby: standby.cloned(),
             term: election.term(),
             is_deserted,
+            is_yielding: election.is_yielding(),
         }
     }
 

@@ -113,6 +113,33 @@ fn handing_back_misses_and_repeats_no_round() {
     });
 }
 
+/// A leader that is cut off leads on alone while others follow another. When it is back its maps do not go back in epoch, also
+/// when the election's messages come later than the other's maps.
+#[test]
+fn the_maps_of_a_leader_that_was_cut_off_do_not_go_back_in_epoch() {
+    for_seeds(seeds() / 10, |seed| {
+        let mut world = cell(seed);
+        start_all(&mut world);
+        check(&mut world, seed, |world| {
+            world.run_for(9 * SECOND);
+            let Some(leader) = world.leaders().first().copied() else { return Ok(()) };
+            let mut sides = vec![false; world.nodes.len()];
+            sides[leader] = true;
+            split(world, 0, &sides);
+            let cut_off = world.random.between(100 * MS, 9 * SECOND);
+            world.run_for(cut_off);
+            world.plan(0, Fault::Heal);
+            let loss = world.random.between(0, 30);
+            world.plan(0, Fault::Loss(loss));
+            let micros = world.random.between(0, 1500 * MS);
+            world.plan(0, Fault::Mute { node: leader, micros });
+            world.run_for(5 * SECOND);
+            let back = world.nodes[leader].accepted.windows(2).find(|pair| pair[1].epoch < pair[0].epoch);
+            ensure(back.is_none(), &format!("its maps are {back:?}"))
+        });
+    });
+}
+
 /// One link that works one way only, for good, moves the lead at most twice.
 #[test]
 fn a_one_way_link_does_not_flap() {

@@ -222,6 +222,7 @@ impl World {
                 self.nodes[node].paused_until = self.now + micros;
                 self.push(micros, Event::Resume { node });
             }
+            Fault::Mute { node, micros } => self.nodes[node].mute_until = self.now + micros,
             Fault::SetClock { node, micros } => self.nodes[node].clock += micros,
             Fault::Cut { from, to } => {
                 self.cuts.insert((from, to));
@@ -392,7 +393,8 @@ impl World {
         self.packets += 1;
         let Some(to) = self.nodes.iter().position(|node| node.name == *to) else { return };
         self.nodes[to].packets += 1;
-        if self.cuts.contains(&(from, to)) || self.random.chance(self.loss_percent) {
+        let is_mute = |node: usize| self.nodes[node].mute_until > self.now;
+        if self.cuts.contains(&(from, to)) || is_mute(from) || is_mute(to) || self.random.chance(self.loss_percent) {
             return;
         }
         let bytes = message.encode(Encoding::Cbor);

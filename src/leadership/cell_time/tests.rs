@@ -49,7 +49,7 @@ impl Cell {
             _ if index == (self.leader + 1) % self.nodes.len() => Position::StandingBy,
             _ => Position::Following,
         };
-        Leadership { position, epoch, standby: None, term: 7, is_deserted: false }
+        Leadership { position, epoch, standby: None, term: 7, is_deserted: false, is_yielding: false }
     }
 
     /// A transit of 1 to 4 ms, and seldom 300.

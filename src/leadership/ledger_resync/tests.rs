@@ -64,7 +64,7 @@ impl Candidate {
 /// A leadership that is followed.
 fn following(term: u64, leader: &str) -> Leadership {
     let epoch = Some(Epoch::new(term, name(leader)));
-    Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false }
+    Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false, is_yielding: false }
 }
 
 /// The candidate `euclid`, which follows `edge` in term 7 and has led before.

@@ -325,7 +325,14 @@ fn a_node_that_others_do_not_reach_is_not_fit_and_says_so_once() {
 #[test]
 fn a_machine_started_anew_uses_no_term_that_it_may_have_led_in() {
     let epoch = Some(Epoch::new(9, name("euclid")));
-    let before = Leadership { position: Position::Leading, epoch, standby: None, term: 9, is_deserted: false };
+    let before = Leadership {
+        position: Position::Leading,
+        epoch,
+        standby: None,
+        term: 9,
+        is_deserted: false,
+        is_yielding: false,
+    };
     let settings = NodeSettings {
         election: ElectionConfig::default(),
         plane: DataPlane { external: None, embedded: true },

@@ -60,6 +60,7 @@ mod tests {
             standby: None,
             term: 1,
             is_deserted: false,
+            is_yielding: false,
         };
         let mut filter = PublisherFilter::default();
         let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(|name| NodeName::new(name).unwrap());

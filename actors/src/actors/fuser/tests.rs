@@ -48,6 +48,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         standby: None,
         term: 7,
         is_deserted: false,
+        is_yielding: false,
     };
     let seeking = Leadership { term: 7, ..Leadership::default() };
     for leadership in [elected, seeking] {
