@@ -173,6 +173,7 @@ impl LeadershipNode {
             Input::MemberSuspected { name } => self.feed(ElectionInput::PeerSuspected { peer: name }, now),
             Input::MemberDown { name } => self.part_with(name, now),
             Input::OwnBroker { address } => self.own_broker = address,
+            Input::BrokerProven { broker, node } => self.monitor.note_node(broker, node),
             Input::LinkChanged { broker, state } => self.take_link(&broker, state, now),
             Input::StatusHeard { status } => self.take_status(&status, now),
             Input::RoundAccepted { epoch, round } => self.take_round(epoch, round, now),
@@ -334,12 +335,12 @@ impl LeadershipNode {
     /// Notes whether this node is logged in at the brokers of leader and standby. Beside an external broker it need not be.
     fn check_logins(&mut self, now: Timestamp) {
         let plane = self.links.plane();
-        let is_at = |broker: &BrokerAddress| self.monitor.is_logged_in(broker);
-        let needs_none = !plane.embedded || plane.external.as_ref().is_some_and(is_at);
+        let needs_none = !plane.embedded || plane.external.as_ref().is_some_and(|at| self.monitor.is_logged_in(at));
         let used = [self.leadership.leader(), self.leadership.standby.as_ref()].into_iter().flatten();
         let others = used.chain(self.logins.missing()).filter(|name| *name != self.election.name());
-        let brokers =
-            others.filter_map(|name| Some((name.clone(), needs_none || is_at(&self.members.broker_of(name)?))));
+        let is_at =
+            |name: &NodeName| Some(needs_none || self.monitor.is_logged_in_at(name, &self.members.broker_of(name)?));
+        let brokers = others.filter_map(|name| Some((name.clone(), is_at(name)?)));
         if self.logins.look(&brokers.collect()) {
             self.tell_logins(now);
         }
@@ -392,10 +393,9 @@ impl LeadershipNode {
     /// none admits anybody, handing over would silence the cell. The challenger repeats that it is ready.
     fn is_served_by(&self, challenger: &NodeName) -> bool {
         let plane = self.links.plane();
-        let is_at = |broker: &BrokerAddress| self.monitor.is_logged_in(broker);
         !plane.embedded
-            || plane.external.as_ref().is_some_and(is_at)
-            || self.members.broker_of(challenger).as_ref().is_some_and(is_at)
+            || plane.external.as_ref().is_some_and(|broker| self.monitor.is_logged_in(broker))
+            || self.members.broker_of(challenger).is_some_and(|at| self.monitor.is_logged_in_at(challenger, &at))
     }
 
     /// Whether the members reach the broker that this node would lead with; the first time that they do not is logged.
@@ -441,6 +441,7 @@ impl LeadershipNode {
             None => Brokers { own, ..self.links.brokers().clone() },
         };
         if let Some(links) = self.links.update(brokers, now) {
+            self.monitor.forget_links_but(&links.brokers);
             self.effects.push(Effect::SetLinks { links });
         }
         self.tell_status();

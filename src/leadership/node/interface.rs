@@ -81,6 +81,13 @@ pub enum Input {
         /// Its address.
         address: Option<SocketAddr>,
     },
+    /// A broker has shown the certificate of a node in its last handshake. It comes before the link's new state.
+    BrokerProven {
+        /// The broker.
+        broker: BrokerAddress,
+        /// The node.
+        node: NodeName,
+    },
     /// One of the gateway's links changed.
     LinkChanged {
         /// The broker at its other end.
@@ -231,7 +238,7 @@ pub enum Notice {
         /// The leader that hands over.
         leader: NodeName,
     },
-    /// A node is ready to be handed the lead, and this node is not logged in at its broker.
+    /// A node is ready to be handed the lead, and this node is not logged in at its broker, or another node's is there.
     NotServed {
         /// The node.
         challenger: NodeName,

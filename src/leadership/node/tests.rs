@@ -217,6 +217,11 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
 
 /// A leader to which a better candidate says that it is ready. It can log in at `broker`, if one is given.
 fn leading_beside_a_ready_challenger(external: Option<SocketAddr>, broker: Option<SocketAddr>) -> Scene {
+    leading_beside(external, broker, "edge")
+}
+
+/// The same, where the broker has the certificate of `shown`.
+fn leading_beside(external: Option<SocketAddr>, broker: Option<SocketAddr>, shown: &str) -> Scene {
     let mut scene = Scene::new(Role::Auto, None);
     scene.machine.links = Links::new(DataPlane { external: external.map(Into::into), embedded: true });
     scene.take(Input::MemberAlive { member: member("edge", 2) });
@@ -226,6 +231,9 @@ fn leading_beside_a_ready_challenger(external: Option<SocketAddr>, broker: Optio
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
     for ms in 0..4500 {
         if let Some(broker) = broker.filter(|_| ms == 1000) {
+            if external.is_none() {
+                scene.take(Input::BrokerProven { broker: broker.into(), node: name(shown) });
+            }
             scene.take(Input::LinkChanged { broker: broker.into(), state: LinkState::Up });
         }
         if ms % 50 == 0 {
@@ -264,6 +272,14 @@ fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
     }
     let both = leading_beside_a_ready_challenger(Some(broker(9)), Some(broker(9)));
     assert!(both.position_of(is_yield).is_some(), "all use the external broker");
+}
+
+#[test]
+fn the_lead_is_not_handed_to_a_node_in_whose_place_another_broker_is() {
+    let scene = leading_beside(None, Some(broker(2)), "gauss");
+    assert_eq!(scene.position_of(is_yield), None);
+    assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
+    assert!(scene.notices().contains(&&Notice::NoLogin { at: vec![name("edge")] }));
 }
 
 #[test]
