@@ -68,7 +68,14 @@ impl Ledger {
         let epoch = Epoch::new(2, NodeName::new("edge")?);
         let mut resync = LedgerResync::signed(epoch.leader.clone(), 10);
         resync.lead(epoch.clone());
-        let leadership = Leadership { position: Position::Leading, epoch: Some(epoch), standby: None, term: 2 };
+        let leadership = Leadership {
+            position: Position::Leading,
+            epoch: Some(epoch),
+            standby: None,
+            term: 2,
+            is_deserted: false,
+            is_yielding: false,
+        };
         Ok(Self { resync, ledger: ReputationLedger::default(), leadership })
     }
 

@@ -21,6 +21,7 @@ pub mod election;
 pub mod health;
 pub mod ledger_resync;
 pub mod links;
+mod logins;
 pub mod node;
 pub mod readiness;
 pub mod rights;

@@ -265,6 +265,8 @@ mod tests {
                 term: epoch.term,
                 epoch: Some(epoch),
                 standby: Some(name("gauss")),
+                is_deserted: false,
+                is_yielding: false,
             },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
             members: vec![Member {

@@ -44,7 +44,14 @@ fuzz_target!(|input: &[u8]| {
 
     let candidates = [transplanted.node.clone()];
     let epoch = Some(Epoch::new(7, NodeName::from_static("edge")));
-    let leadership = Leadership { position: Position::Following, epoch, standby: None, term: 1 << 40 };
+    let leadership = Leadership {
+        position: Position::Following,
+        epoch,
+        standby: None,
+        term: 1 << 40,
+        is_deserted: false,
+        is_yielding: false,
+    };
     for new in [LedgerResync::new, LedgerResync::signed] {
         let mut resync = new(NodeName::from_static("gauss"), 10);
         let mut ledger = ReputationLedger::default();

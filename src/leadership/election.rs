@@ -53,6 +53,7 @@ mod handover;
 mod interface;
 mod leading;
 mod liveness;
+mod logins;
 mod message;
 mod peers;
 mod seeking;
@@ -64,7 +65,8 @@ pub use interface::{ElectionEffect, ElectionInput, Health};
 pub(crate) use message::MAX_FIRST_TERM;
 use message::MAX_ROUND_STEP;
 pub use message::{
-    Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP,
+    Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_NO_LOGIN, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM,
+    MAX_TERM_STEP,
 };
 
 use crate::leadership::timers::TERM_WINDOW;
@@ -94,6 +96,8 @@ pub struct Election {
     round: u64,
     health: Health,
     load: u8,
+    /// Other candidates at whose brokers this node cannot log in.
+    no_login: Vec<NodeName>,
     peers: Peers,
     questions: Questions,
     state: State,
@@ -150,6 +154,7 @@ impl Election {
             round: 0,
             health: Health::default(),
             load: 0,
+            no_login: Vec::new(),
             peers: Peers::new(&config),
             questions: Questions::default(),
             state: State::Seeking(Seeking::new(now + join, Vec::new(), now)),
@@ -169,6 +174,7 @@ impl Election {
             ElectionInput::PeerGone { peer } => self.peer_gone(&peer, now),
             ElectionInput::Health { health } => self.set_health(health, now),
             ElectionInput::Round { epoch, round } => self.note_round(&epoch, round, now),
+            ElectionInput::NoLogin { at } => self.set_no_login(at, now),
             ElectionInput::Prepared => self.prepared(now),
             ElectionInput::Leave => self.leave(now),
         }
@@ -206,6 +212,11 @@ impl Election {
     /// Whether this node leads.
     pub fn is_leading(&self) -> bool {
         matches!(self.state, State::Leading(_))
+    }
+
+    /// Whether this leader has said that the next round is its standby's.
+    pub fn is_yielding(&self) -> bool {
+        matches!(&self.state, State::Leading(leading) if leading.is_yielding())
     }
 
     /// The next leader, as named by the leader.
@@ -276,7 +287,7 @@ impl Election {
         self.hear_others(&message, now);
         let ElectionMessage { from, epoch, hears_you, .. } = message;
         match message.body {
-            Body::Status { over } => self.take_status(&from, over.as_ref(), now),
+            Body::Status { over, no_login } => self.take_status(&from, over.as_ref(), no_login, now),
             Body::Ask { ask } => self.answer(&from, ask, now),
             Body::LeaderEvidence { ask, age_ms } => self.take_leader_evidence(&from, epoch, ask, age_ms, now),
             Body::Beat { every_ms, round, followers, after, successors } => {
@@ -422,7 +433,7 @@ impl Election {
     }
 
     fn send_status(&mut self, to: &NodeName, now: Timestamp) {
-        self.send(to, Body::Status { over: self.over.clone() }, now);
+        self.send(to, Body::Status { over: self.over.clone(), no_login: self.no_login.clone() }, now);
     }
 
     fn send(&mut self, to: &NodeName, body: Body, now: Timestamp) {

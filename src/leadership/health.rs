@@ -11,12 +11,15 @@ use crate::leadership::election::{AwakeClock, Health};
 use crate::leadership::links::{Brokers, DataPlane, LinkState};
 use crate::leadership::readiness::round_timeout;
 use crate::leadership::timers::{HEALTH_PERIOD, LOOK_TOLERANCE};
+use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
 /// The latest news of the parts.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct HealthMonitor {
     links: BTreeMap<BrokerAddress, LinkState>,
+    /// Nodes whose certificates brokers have shown.
+    nodes: BTreeMap<BrokerAddress, NodeName>,
     sample: HealthSample,
     /// Time that passed while this node was awake.
     clock: AwakeClock,
@@ -44,6 +47,7 @@ impl HealthMonitor {
     pub fn new(now: Timestamp) -> Self {
         Self {
             links: BTreeMap::new(),
+            nodes: BTreeMap::new(),
             sample: HealthSample::default(),
             clock: AwakeClock::new(now, LOOK_TOLERANCE),
             look_at: now,
@@ -85,9 +89,20 @@ impl HealthMonitor {
         }
     }
 
+    /// Notes whose certificate a broker has shown.
+    pub fn note_node(&mut self, broker: BrokerAddress, node: NodeName) {
+        self.nodes.insert(broker, node);
+    }
+
     /// Forgets all links: the gateway makes them anew.
     pub fn forget_links(&mut self) {
-        self.links.clear();
+        self.forget_links_but(&[]);
+    }
+
+    /// Forgets the links to all other brokers: the gateway ends them, and may make them anew later.
+    pub fn forget_links_but(&mut self, wanted: &[BrokerAddress]) {
+        self.links.retain(|broker, _| wanted.contains(broker));
+        self.nodes.retain(|broker, _| wanted.contains(broker));
     }
 
     /// Notes the answers. They make up for a link that came up before there was anyone to be told.
@@ -144,6 +159,11 @@ impl HealthMonitor {
     /// Whether this node is logged in at a broker.
     pub fn is_logged_in(&self, broker: &BrokerAddress) -> bool {
         matches!(self.links.get(broker), Some(LinkState::Up | LinkState::Stalled))
+    }
+
+    /// Whether this node is logged in at a node's broker, which has shown no other node's certificate.
+    pub fn is_logged_in_at(&self, node: &NodeName, broker: &BrokerAddress) -> bool {
+        self.is_logged_in(broker) && self.nodes.get(broker).is_none_or(|shown| shown == node)
     }
 
     fn is_up(&self, broker: Option<&BrokerAddress>, no_other: bool) -> bool {
@@ -279,6 +299,15 @@ mod tests {
             monitor.note_link(&address(9), state);
             assert_eq!(reaches(&monitor, true), reached, "{state:?}");
         }
+    }
+
+    #[test]
+    fn a_broker_that_is_no_longer_used_is_no_login() {
+        let mut monitor = HealthMonitor::new(Timestamp(0));
+        monitor.note_link(&address(1), LinkState::Up);
+        monitor.note_link(&address(2), LinkState::Up);
+        monitor.forget_links_but(&[address(2)]);
+        assert_eq!((monitor.is_logged_in(&address(1)), monitor.is_logged_in(&address(2))), (false, true));
     }
 
     #[test]

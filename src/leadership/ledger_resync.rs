@@ -204,7 +204,9 @@ impl LedgerResync {
         if is_over || (self.is_signed && !is_whole) {
             (taken.entries, taken.marks) = (Vec::new(), Vec::new());
         }
-        let leader = share.epoch.filter(|term| leadership.knows_term(*term));
+        // A candidate may say that it leads while the election names another. The leader itself says it again.
+        let is_leader = leadership.leader().is_none_or(|leader| *leader == share.node);
+        let leader = share.epoch.filter(|term| is_leader && leadership.knows_term(*term));
         self.hear(leader.map(|term| Epoch::new(term, share.node.clone())), ledger, candidates);
         // The sender has not heard of the reset.
         self.owes_everything |= is_over;

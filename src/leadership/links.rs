@@ -41,6 +41,8 @@ pub struct Brokers {
     pub leader: Option<BrokerAddress>,
     /// The standby's broker.
     pub standby: Option<BrokerAddress>,
+    /// Brokers at which the node could not log in when they were used: it tries on.
+    pub missing: Vec<BrokerAddress>,
 }
 
 /// The links that a gateway is to keep.
@@ -82,8 +84,8 @@ impl Links {
         self.lingering.retain(|(_, until)| *until > now);
         let mut wanted: BTreeSet<_> = self.plane.external.iter().cloned().collect();
         if self.plane.embedded {
-            let Brokers { own, leader, standby } = &self.present;
-            wanted.extend([own, leader, standby].into_iter().flatten().cloned());
+            let Brokers { own, leader, standby, missing } = &self.present;
+            wanted.extend([own, leader, standby].into_iter().flatten().chain(missing).cloned());
             wanted.extend(self.lingering.iter().map(|(broker, _)| broker.clone()));
         }
         if wanted == self.wanted {
@@ -119,7 +121,8 @@ mod tests {
     }
 
     fn brokers(own: u16, leader: u16, standby: u16) -> Brokers {
-        Brokers { own: Some(broker(own)), leader: Some(broker(leader)), standby: Some(broker(standby)) }
+        let [own, leader, standby] = [own, leader, standby].map(broker).map(Some);
+        Brokers { own, leader, standby, missing: Vec::new() }
     }
 
     fn at(ms: u64) -> Timestamp {

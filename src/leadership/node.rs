@@ -30,6 +30,7 @@ use crate::leadership::address::BrokerAddress;
 use crate::leadership::election::{Body, Election, ElectionEffect, ElectionInput, ElectionMessage, Health};
 use crate::leadership::health::HealthMonitor;
 use crate::leadership::links::{Brokers, LinkState, Links};
+use crate::leadership::logins::Logins;
 use crate::leadership::rights::Rights;
 use crate::leadership::timers::{DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME};
 use crate::leadership::view::Leadership;
@@ -55,6 +56,11 @@ pub struct LeadershipNode {
     health: Health,
     was_out_of_reach: bool,
     links: Links,
+    logins: Logins,
+    /// Followers that could not log in at this leader's broker at the last look.
+    without_login: usize,
+    /// Whether these were all of its followers.
+    is_deserted: bool,
     own_broker: Option<SocketAddr>,
     /// Last living run of each node, as brokers tell it.
     runs: BTreeMap<NodeName, Uuid>,
@@ -99,6 +105,9 @@ impl LeadershipNode {
             health: Health::default(),
             was_out_of_reach: false,
             links: Links::new(plane),
+            logins: Logins::default(),
+            without_login: 0,
+            is_deserted: false,
             own_broker: None,
             runs: BTreeMap::new(),
             preparation: None,
@@ -164,6 +173,7 @@ impl LeadershipNode {
             Input::MemberSuspected { name } => self.feed(ElectionInput::PeerSuspected { peer: name }, now),
             Input::MemberDown { name } => self.part_with(name, now),
             Input::OwnBroker { address } => self.own_broker = address,
+            Input::BrokerProven { broker, node } => self.monitor.note_node(broker, node),
             Input::LinkChanged { broker, state } => self.take_link(&broker, state, now),
             Input::StatusHeard { status } => self.take_status(&status, now),
             Input::RoundAccepted { epoch, round } => self.take_round(epoch, round, now),
@@ -198,7 +208,8 @@ impl LeadershipNode {
     fn run_timers(&mut self, now: Timestamp) {
         if self.monitor.is_due(now) {
             self.effects.push(Effect::Look);
-            if !self.is_vehicle_only {
+            // A vehicle asks only whether a login that it has not heard of is there.
+            if !self.is_vehicle_only || self.logins.is_doubtful() {
                 self.effects.push(Effect::AskParts);
             }
         }
@@ -253,12 +264,14 @@ impl LeadershipNode {
     fn meet(&mut self, member: Member, now: Timestamp) {
         let peer = member.name.clone();
         self.members.place(member);
+        self.forget_login(&peer, now);
         self.feed(ElectionInput::PeerAlive { peer }, now);
         self.update_health(now);
     }
 
     fn part_with(&mut self, name: NodeName, now: Timestamp) {
         self.members.part_with(&name, now);
+        self.forget_login(&name, now);
         self.feed(ElectionInput::PeerDown { peer: name }, now);
     }
 
@@ -316,6 +329,40 @@ impl LeadershipNode {
                 self.meet(member, now);
             }
         }
+        self.check_logins(now);
+    }
+
+    /// Notes whether this node is logged in at the brokers of leader and standby. Beside an external broker it need not be.
+    fn check_logins(&mut self, now: Timestamp) {
+        let plane = self.links.plane();
+        let needs_none = !plane.embedded || plane.external.as_ref().is_some_and(|at| self.monitor.is_logged_in(at));
+        let used = [self.leadership.leader(), self.leadership.standby.as_ref()].into_iter().flatten();
+        let others = used.chain(self.logins.missing()).filter(|name| *name != self.election.name());
+        let is_at =
+            |name: &NodeName| Some(needs_none || self.monitor.is_logged_in_at(name, &self.members.broker_of(name)?));
+        let brokers = others.filter_map(|name| Some((name.clone(), is_at(name)?)));
+        if self.logins.look(&brokers.collect()) {
+            self.tell_logins(now);
+        }
+        let (without_login, followers) = self.election.followers_without_login();
+        let without_login = if self.election.is_leading() { without_login } else { 0 };
+        if without_login > self.without_login {
+            self.log(Notice::Deserted { without_login, followers });
+        }
+        self.without_login = without_login;
+        self.is_deserted = without_login > 0 && without_login == followers;
+    }
+
+    fn forget_login(&mut self, name: &NodeName, now: Timestamp) {
+        if self.logins.forget(name) {
+            self.tell_logins(now);
+        }
+    }
+
+    fn tell_logins(&mut self, now: Timestamp) {
+        let at: Vec<_> = self.logins.missing().cloned().collect();
+        self.log(Notice::NoLogin { at: at.clone() });
+        self.feed(ElectionInput::NoLogin { at }, now);
     }
 
     fn check_preparation(&mut self, now: Timestamp) {
@@ -346,10 +393,9 @@ impl LeadershipNode {
     /// none admits anybody, handing over would silence the cell. The challenger repeats that it is ready.
     fn is_served_by(&self, challenger: &NodeName) -> bool {
         let plane = self.links.plane();
-        let is_at = |broker: &BrokerAddress| self.monitor.is_logged_in(broker);
         !plane.embedded
-            || plane.external.as_ref().is_some_and(is_at)
-            || self.members.broker_of(challenger).as_ref().is_some_and(is_at)
+            || plane.external.as_ref().is_some_and(|broker| self.monitor.is_logged_in(broker))
+            || self.members.broker_of(challenger).is_some_and(|at| self.monitor.is_logged_in_at(challenger, &at))
     }
 
     /// Whether the members reach the broker that this node would lead with; the first time that they do not is logged.
@@ -388,18 +434,21 @@ impl LeadershipNode {
         let own = self.own_broker.map(BrokerAddress::from);
         let brokers = match self.leadership.leader() {
             Some(leader) => {
-                Brokers { own, leader: broker(Some(leader)), standby: broker(self.leadership.standby.as_ref()) }
+                let missing = self.logins.missing().filter_map(|name| self.members.broker_of(name)).collect();
+                let standby = broker(self.leadership.standby.as_ref());
+                Brokers { own, leader: broker(Some(leader)), standby, missing }
             }
             None => Brokers { own, ..self.links.brokers().clone() },
         };
         if let Some(links) = self.links.update(brokers, now) {
+            self.monitor.forget_links_but(&links.brokers);
             self.effects.push(Effect::SetLinks { links });
         }
         self.tell_status();
     }
 
     fn tell_leadership(&mut self) {
-        let leadership = Leadership::of(&self.election);
+        let leadership = Leadership::of(&self.election, self.is_deserted);
         if leadership != self.leadership {
             self.leadership = leadership.clone();
             self.effects.push(Effect::TellLeadership { leadership });

@@ -16,6 +16,9 @@ pub struct Readiness {
     pub ready: bool,
     /// The reason in words.
     pub reason: String,
+    /// Whether a start anew may help.
+    #[serde(skip)]
+    pub needs_restart: bool,
 }
 
 /// Maximum age of the newest round of a live aggregator that closes a round each `round_period`.
@@ -26,7 +29,7 @@ pub fn round_timeout(round_period: Duration) -> Duration {
 impl Readiness {
     /// A node that is not ready.
     pub fn not(reason: String) -> Self {
-        Self { ready: false, reason }
+        Self { ready: false, reason, needs_restart: true }
     }
 
     /// Judges from the leadership, the epoch and arrival of the last accepted round, and whether a broker carries what
@@ -45,6 +48,11 @@ impl Readiness {
         if leadership.is_leading() && !broker_works {
             return not("leading without a working broker".into());
         }
+        if leadership.is_leading() && leadership.is_deserted {
+            // By the word of others: it must not restart this node.
+            let reason = "leading, but no follower can log in at this node's broker".into();
+            return Self { ready: false, reason, needs_restart: false };
+        }
         let leader = &epoch.leader;
         if let Some(timeout) = timeout {
             let Some((_, received_at)) = last_round.filter(|(last, _)| last == epoch) else {
@@ -56,7 +64,7 @@ impl Readiness {
             }
         }
         let reason = if leadership.is_leading() { "leading".into() } else { format!("following {leader}") };
-        Self { ready: true, reason }
+        Self { ready: true, reason, needs_restart: false }
     }
 }
 
@@ -80,7 +88,14 @@ mod tests {
 
     #[test]
     fn ready_means_fresh_rounds_of_the_leader_and_a_broker_to_lead_with() {
-        let at = |position| Leadership { position, epoch: Some(epoch(4)), standby: None, term: 4 };
+        let at = |position| Leadership {
+            position,
+            epoch: Some(epoch(4)),
+            standby: None,
+            term: 4,
+            is_deserted: false,
+            is_yielding: false,
+        };
         let (seeking, following, leading) = (at(Position::Seeking), at(Position::Following), at(Position::Leading));
         assert_eq!(reason(&seeking, Some((4, 9)), true), (false, "no leader known".into()));
         assert_eq!(reason(&following, None, false), (false, "no round of edge yet".into()));
@@ -92,8 +107,24 @@ mod tests {
     }
 
     #[test]
+    fn a_leader_that_lets_nobody_in_is_not_ready_and_is_not_restarted_for_it() {
+        let leading = Leadership { position: Position::Leading, epoch: Some(epoch(4)), ..Leadership::default() };
+        let deserted = Leadership { is_deserted: true, ..leading };
+        let readiness = Readiness::judge(&deserted, Some(&(epoch(4), Timestamp(0))), true, None, Timestamp(0));
+        assert_eq!(readiness.reason, "leading, but no follower can log in at this node's broker");
+        assert_eq!((readiness.ready, readiness.needs_restart), (false, false));
+    }
+
+    #[test]
     fn rounds_that_come_with_packets_only_are_not_waited_for() {
-        let following = Leadership { position: Position::Following, epoch: Some(epoch(4)), standby: None, term: 4 };
+        let following = Leadership {
+            position: Position::Following,
+            epoch: Some(epoch(4)),
+            standby: None,
+            term: 4,
+            is_deserted: false,
+            is_yielding: false,
+        };
         assert!(Readiness::judge(&following, None, false, None, Timestamp(0)).ready);
     }
 }

@@ -219,7 +219,7 @@ mod tests {
 
     fn following(term: u64, leader: &'static str) -> Leadership {
         let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
-        Leadership { position: Position::Following, epoch, standby: None, term }
+        Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false, is_yielding: false }
     }
 
     fn map(epoch: u64, round: u64, fused_at: Timestamp) -> GlobalMap {

@@ -29,6 +29,7 @@
 //! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part as long as two looks |
 //! | [`ECHO_TIMEOUT`] | 800 ms | above [`MIN_UNANSWERED`] rounds | both conditions hold at about the same time |
 //! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::aggregator::round::CONNECT_TIME`] | a planned handover waits for everybody |
+//! | [`LOGIN_TIMEOUT`] | 2 s | below `stable`, a multiple of [`HEALTH_PERIOD`] | nobody is handed a lead in vain |
 //! | [`LEDGER_TIMEOUT`] | 1 s | above [`VEHICLE_CONNECT_TIME`], below `handover` | a lost ledger delays a handover and does not end it |
 //! | [`PREPARATION_STEP`] | 50 ms | below [`VEHICLE_CONNECT_TIME`] | it delays a handover by little |
 //! | [`LATE_WAKE`] | 20 ms | below `stall_ms` | messages are read before lateness stops the clock |
@@ -104,6 +105,10 @@ pub const MIN_UNANSWERED: u32 = 6;
 
 /// Time given to vehicles to connect to the broker of a node that is about to be handed the lead.
 pub const VEHICLE_CONNECT_TIME: Duration = Duration::from_millis(300);
+
+/// Time without a login at a broker after which a node says so: a connection that is made anew takes less, also when its
+/// first packet is lost.
+pub const LOGIN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Time for which a node that is about to be handed the lead waits for the old leader's evidence.
 pub const LEDGER_TIMEOUT: Duration = Duration::from_secs(1);
@@ -270,6 +275,7 @@ mod tests {
             (MIN_UNANSWERED * round, ECHO_TIMEOUT, "both conditions hold at once"),
             (CONNECT_TIME, VEHICLE_CONNECT_TIME, "a planned handover waits for everybody"),
             (VEHICLE_CONNECT_TIME, LEDGER_TIMEOUT, "evidence has more time than links"),
+            (LOGIN_TIMEOUT + HEALTH_PERIOD, config.stable(), "nobody is handed a lead in vain"),
             (LEDGER_TIMEOUT, config.handover(), "a lost ledger ends no handover"),
             (PREPARATION_STEP, VEHICLE_CONNECT_TIME, "checks delay a handover by little"),
             (LATE_WAKE, stall, "messages are read before the clock stops"),

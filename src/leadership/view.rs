@@ -17,6 +17,10 @@ pub struct Leadership {
     pub standby: Option<NodeName>,
     /// Highest term that the election knows to have been used.
     pub term: u64,
+    /// Whether this node leads, and no follower can log in at its broker. A change alone wakes nobody.
+    pub is_deserted: bool,
+    /// Whether this node leads, and the next round is its standby's. A change alone wakes nobody.
+    pub is_yielding: bool,
 }
 
 /// A node's place in its cell.
@@ -35,7 +39,7 @@ pub enum Position {
 }
 
 impl Leadership {
-    pub(super) fn of(election: &Election) -> Self {
+    pub(super) fn of(election: &Election, is_deserted: bool) -> Self {
         let standby = election.standby();
         let position = match election.leader() {
             None => Position::Seeking,
@@ -43,7 +47,14 @@ impl Leadership {
             Some(_) if standby == Some(election.name()) => Position::StandingBy,
             Some(_) => Position::Following,
         };
-        Self { position, epoch: election.epoch().cloned(), standby: standby.cloned(), term: election.term() }
+        Self {
+            position,
+            epoch: election.epoch().cloned(),
+            standby: standby.cloned(),
+            term: election.term(),
+            is_deserted,
+            is_yielding: election.is_yielding(),
+        }
     }
 
     /// The leader; none while the node seeks.

@@ -57,7 +57,7 @@ impl World {
     fn reaches(&self, node: usize, broker: usize) -> bool {
         let there = &self.nodes[broker];
         let serves = there.machine.is_some() && there.broker_works && there.paused_until <= self.now;
-        serves && self.linked(node, broker)
+        serves && self.linked(node, broker) && !self.refusals.contains(&(node, broker))
     }
 
     /// Brokers that a node publishes to.

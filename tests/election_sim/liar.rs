@@ -53,19 +53,24 @@ fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
     let own = Epoch::new(present.term + 1, name.clone());
     let of_other = Epoch::new(present.term + 1, world.nodes[other].name.clone());
     let beat = |followers, after| Body::Beat { every_ms: 50, round: 1, followers, after, successors: Vec::new() };
-    let (epoch, hears_you, body) = match world.random.between(0, 7) {
+    let (epoch, hears_you, body) = match world.random.between(0, 8) {
         0 => (Some(own), true, beat(200, None)),
         1 => (Some(own), true, beat(200, Some(present))),
         // A leader that nobody follows makes way for one that does not hear it.
         2 if world.nodes.len() > 2 => (Some(own), false, beat(200, Some(present))),
-        3 => (Some(of_other), true, Body::Status { over: None }),
+        3 => (Some(of_other), true, Body::Status { over: None, no_login: Vec::new() }),
         4 => (Some(of_other.clone()), true, Body::LeaderEvidence { ask: seq % 32, age_ms: 0 }),
         5 => (
             None,
             true,
             Body::Resign { epoch: Epoch::new(present.term + MAX_TERM_STEP / 2, name.clone()), last_round: 0 },
         ),
-        _ => (None, true, Body::Status { over: Some(present) }),
+        6 => {
+            let at = world.random.index(world.nodes.len());
+            let no_login = vec![present.leader.clone(), world.nodes[at].name.clone()];
+            (Some(present), true, Body::Status { over: None, no_login })
+        }
+        _ => (None, true, Body::Status { over: Some(present), no_login: Vec::new() }),
     };
     let run = 1_900_000_000_000_000;
     let candidacy = Candidacy { role: config.role, priority: config.priority, load: 0, fit: true };

@@ -7,6 +7,7 @@ mod data_plane;
 mod evidence;
 mod gaps;
 mod liar;
+mod logins;
 mod node;
 mod random;
 mod world;
@@ -108,6 +109,33 @@ fn handing_back_misses_and_repeats_no_round() {
                 ensure(rounds.windows(2).all(|pair| pair[1] == pair[0] + 1), &format!("{} got {rounds:?}", node.name))?;
             }
             Ok(())
+        });
+    });
+}
+
+/// A leader that is cut off leads on alone while others follow another. When it is back its maps do not go back in epoch, also
+/// when the election's messages come later than the other's maps.
+#[test]
+fn the_maps_of_a_leader_that_was_cut_off_do_not_go_back_in_epoch() {
+    for_seeds(seeds() / 10, |seed| {
+        let mut world = cell(seed);
+        start_all(&mut world);
+        check(&mut world, seed, |world| {
+            world.run_for(9 * SECOND);
+            let Some(leader) = world.leaders().first().copied() else { return Ok(()) };
+            let mut sides = vec![false; world.nodes.len()];
+            sides[leader] = true;
+            split(world, 0, &sides);
+            let cut_off = world.random.between(100 * MS, 9 * SECOND);
+            world.run_for(cut_off);
+            world.plan(0, Fault::Heal);
+            let loss = world.random.between(0, 30);
+            world.plan(0, Fault::Loss(loss));
+            let micros = world.random.between(0, 1500 * MS);
+            world.plan(0, Fault::Mute { node: leader, micros });
+            world.run_for(5 * SECOND);
+            let back = world.nodes[leader].accepted.windows(2).find(|pair| pair[1].epoch < pair[0].epoch);
+            ensure(back.is_none(), &format!("its maps are {back:?}"))
         });
     });
 }
@@ -334,7 +362,7 @@ fn start_all(world: &mut World) {
 fn plan_fault(world: &mut World, nodes: usize) {
     let at = world.random.between(SECOND, 9 * SECOND);
     let node = world.random.index(nodes);
-    match world.random.between(0, 9) {
+    match world.random.between(0, 10) {
         0 | 1 => {
             let seen = world.random.chance(50);
             world.plan(at, Fault::Kill { node, seen });
@@ -372,6 +400,12 @@ fn plan_fault(world: &mut World, nodes: usize) {
         8 => {
             world.plan(at, Fault::Gateway { node, works: false });
             world.plan(at + 3 * SECOND, Fault::Gateway { node, works: true });
+        }
+        9 => {
+            for _ in 0..world.random.between(1, nodes as u64) {
+                let barred = world.random.index(nodes);
+                world.plan(at, Fault::NoLogin { node: barred, broker: node });
+            }
         }
         _ => {
             world.plan(at, Fault::Broker { node, works: false });

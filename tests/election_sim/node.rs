@@ -34,6 +34,8 @@ pub(crate) enum Fault {
     SetClock { node: usize, micros: i64 },
     /// Packets from one node to another are dropped.
     Cut { from: usize, to: usize },
+    /// The node's datagrams, to it and of it, are lost for so many µs; connections work.
+    Mute { node: usize, micros: u64 },
     /// All links work again.
     Heal,
     /// So many percent of all packets are lost.
@@ -44,6 +46,8 @@ pub(crate) enum Fault {
     Fuser { node: usize, works: bool },
     /// The node's gateway answers nobody, or does again.
     Gateway { node: usize, works: bool },
+    /// A node cannot log in at another's broker, such as by a firewall or a certificate, until all links work again.
+    NoLogin { node: usize, broker: usize },
 }
 
 /// Something that is going to happen.
@@ -157,6 +161,7 @@ pub(crate) struct Node {
     pub(crate) steady_clock: i64,
     pub(crate) armed: u64,
     pub(crate) paused_until: u64,
+    pub(crate) mute_until: u64,
     pub(crate) waiting: Vec<Arrival>,
     pub(crate) publishing: Option<(Epoch, u64)>,
     /// The epoch in which its present leadership began: there it counts, also in terms that it renews.
@@ -199,6 +204,7 @@ impl Node {
             steady_clock: 0,
             armed: 0,
             paused_until: 0,
+            mute_until: 0,
             waiting: Vec::new(),
             publishing: None,
             lane: None,

@@ -41,6 +41,8 @@ pub(crate) struct World {
     pub(crate) history: Vec<String>,
     pub(crate) votes: Votes,
     cuts: BTreeSet<(usize, usize)>,
+    /// Nodes that cannot log in, each with the broker's node.
+    pub(crate) refusals: BTreeSet<(usize, usize)>,
     pub(crate) loss_percent: u64,
     queue: BinaryHeap<Planned>,
     events: u64,
@@ -87,6 +89,7 @@ impl World {
             history: Vec::new(),
             votes: Votes::default(),
             cuts: BTreeSet::new(),
+            refusals: BTreeSet::new(),
             loss_percent: 0,
             queue: BinaryHeap::new(),
             events: 0,
@@ -219,11 +222,22 @@ impl World {
                 self.nodes[node].paused_until = self.now + micros;
                 self.push(micros, Event::Resume { node });
             }
+            Fault::Mute { node, micros } => self.nodes[node].mute_until = self.now + micros,
             Fault::SetClock { node, micros } => self.nodes[node].clock += micros,
             Fault::Cut { from, to } => {
                 self.cuts.insert((from, to));
             }
-            Fault::Heal => self.cuts.clear(),
+            Fault::Heal => {
+                self.cuts.clear();
+                self.refusals.clear();
+            }
+            Fault::NoLogin { node, broker } => {
+                self.refusals.insert((node, broker));
+                if self.nodes[node].links.contains_key(&broker) {
+                    self.set_link(node, broker, LinkState::Down);
+                    self.plan_connect(node, broker, 0);
+                }
+            }
             Fault::Loss(percent) => self.loss_percent = percent,
             Fault::Broker { node, works } => self.push_to(node, 0, Arrival::Broker { works }),
             Fault::Fuser { node, works } => self.nodes[node].set_fuser(works, self.now),
@@ -379,7 +393,8 @@ impl World {
         self.packets += 1;
         let Some(to) = self.nodes.iter().position(|node| node.name == *to) else { return };
         self.nodes[to].packets += 1;
-        if self.cuts.contains(&(from, to)) || self.random.chance(self.loss_percent) {
+        let is_mute = |node: usize| self.nodes[node].mute_until > self.now;
+        if self.cuts.contains(&(from, to)) || is_mute(from) || is_mute(to) || self.random.chance(self.loss_percent) {
             return;
         }
         let bytes = message.encode(Encoding::Cbor);

@@ -33,7 +33,7 @@ use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::connection::{LastWill, Retention, offline_payload};
-use crate::transport::mqtt::inbox::Inbox;
+use crate::transport::mqtt::inbox::{Inbox, Via};
 use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink};
 use crate::transport::mqtt::subscription_role::REPORTS;
 use crate::transport::mqtt::{
@@ -308,16 +308,16 @@ impl GatewayState {
 
     fn link_changed(&mut self, LinkEvent { link: id, change }: LinkEvent) {
         let filters = match &change {
-            LinkChange::Accepted(_) => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
+            LinkChange::Accepted { .. } => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
             _ => Vec::new(),
         };
         let Some(link) = self.links.get_mut(&id) else { return };
         let state = match change {
-            LinkChange::Accepted(client) => {
+            LinkChange::Accepted { client, node } => {
                 // The queue of a new connection is empty, so that both fit.
                 client.publish(&self.status_topic, &self.status_payload, Retention::Retained);
                 client.subscribe(&filters);
-                link.client = Some(client);
+                (link.client, link.node) = (Some(client), node);
                 LinkState::Up
             }
             LinkChange::DeclaredOffline => {
@@ -358,7 +358,7 @@ fn events_to(gateway: &ActorRef<GatewayMessage>) -> LinkSink {
 fn tell_state(inbox: &Inbox, link: &Link) {
     let (broker, state) = (link.broker.clone(), link.state);
     tracing::info!(%broker, ?state, "link changed");
-    inbox.deliver_local(Incoming::Link { broker, state });
+    inbox.deliver_link(Via { address: &broker, node: link.node.as_ref() }, state);
 }
 
 /// Maximum runs with this node's name that are logged.

@@ -2,7 +2,8 @@
 //!
 //! `READY=1` once all parts run, `STATUS=` whenever the node's readiness changes, `STOPPING=1` at the end. The watchdog is
 //! fed only while rounds flow: a node that follows a live aggregator whose rounds arrive, or that leads with a working
-//! broker. One that does neither for as long as the watchdog waits is started anew.
+//! broker. A leader at whose broker nobody can log in feeds it, too: its way to the others is broken, and a start anew would
+//! mend nothing. One that does none of this for as long as the watchdog waits is started anew.
 
 use std::io;
 use std::time::Duration;
@@ -40,9 +41,9 @@ impl ServiceManager {
         self.tell(&[NotifyState::Ready]);
     }
 
-    /// How the node is now; feeds the watchdog if it is ready.
+    /// How the node is now; feeds the watchdog unless a start anew may help.
     pub fn beat(&mut self, readiness: Readiness) {
-        if readiness.ready && self.watchdog.is_some() {
+        if !readiness.needs_restart && self.watchdog.is_some() {
             self.tell(&[NotifyState::Watchdog]);
         }
         if self.told.as_ref() != Some(&readiness.reason) {

@@ -75,7 +75,7 @@ async fn join(target: &Target) -> anyhow::Result<Insider> {
 }
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {
-    join(&target).await?.repeat(MAX_TERM, None, Body::Status { over: None }).await
+    join(&target).await?.repeat(MAX_TERM, None, Body::Status { over: None, no_login: Vec::new() }).await
 }
 
 async fn largest_round(target: Target) -> anyhow::Result<()> {

@@ -35,7 +35,8 @@ pub(crate) const NAME: &str = "mallory";
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {
     let insider = Insider::join(&target, (NAME, Role::Cav), None).await?;
-    tokio::try_join!(insider.repeat(MAX_TERM, None, Body::Status { over: None }), insider.knock()).map(drop)
+    tokio::try_join!(insider.repeat(MAX_TERM, None, Body::Status { over: None, no_login: Vec::new() }), insider.knock())
+        .map(drop)
 }
 
 async fn claims(target: Target) -> anyhow::Result<()> {

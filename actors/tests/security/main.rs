@@ -10,6 +10,7 @@ mod floods;
 mod frames;
 mod hung;
 mod identity;
+mod logins;
 mod nodes;
 mod packets;
 mod payloads;

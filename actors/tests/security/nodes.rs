@@ -14,6 +14,17 @@ use crate::fixture::{SOON, node as name};
 
 /// Starts a node that greets another one.
 pub(crate) async fn start(node: &str, role: Role, tls: TlsConfig, seed: Option<SocketAddr>) -> NodeHandle {
+    start_with(node, role, tls, seed, |_| ()).await
+}
+
+/// The same with other settings.
+pub(crate) async fn start_with(
+    node: &str,
+    role: Role,
+    tls: TlsConfig,
+    seed: Option<SocketAddr>,
+    adjust: impl FnOnce(&mut NodeConfig),
+) -> NodeHandle {
     let mut config = NodeConfig {
         name: Some(name(node)),
         cell: name("lot"),
@@ -26,6 +37,7 @@ pub(crate) async fn start(node: &str, role: Role, tls: TlsConfig, seed: Option<S
     config.membership.multicast.enabled = false;
     config.membership.seeds = seed.iter().map(ToString::to_string).collect();
     config.dashboard.enabled = false;
+    adjust(&mut config);
     node::start(config).await.unwrap()
 }
 

@@ -49,7 +49,7 @@ impl Cell {
             _ if index == (self.leader + 1) % self.nodes.len() => Position::StandingBy,
             _ => Position::Following,
         };
-        Leadership { position, epoch, standby: None, term: 7 }
+        Leadership { position, epoch, standby: None, term: 7, is_deserted: false, is_yielding: false }
     }
 
     /// A transit of 1 to 4 ms, and seldom 300.
@@ -72,7 +72,7 @@ impl Cell {
             term: 7,
             epoch: None,
             hears_you: true,
-            body: Body::Status { over: None },
+            body: Body::Status { over: None, no_login: Vec::new() },
             clock: Some(Box::new(sender.time.stamps(&self.nodes[to].name, sender_now))),
         };
         self.now = self.now + transit;
@@ -207,7 +207,7 @@ fn stamps_of_a_liar_are_survived() {
                     term: 7,
                     epoch: None,
                     hears_you: true,
-                    body: Body::Status { over: None },
+                    body: Body::Status { over: None, no_login: Vec::new() },
                     clock: Some(Box::new(clock)),
                 };
                 let now = cell.now;

@@ -84,12 +84,13 @@ impl Election {
             // It is lower than what was followed last: that one is lost, and has to be outdone.
             State::Seeking(_) => {
                 let over = self.epoch.clone().max(self.over.clone());
-                self.send(&beat.epoch.leader, Body::Status { over }, now);
+                let no_login = self.no_login.clone();
+                self.send(&beat.epoch.leader, Body::Status { over, no_login }, now);
             }
         }
     }
 
-    /// Decides whether this node stops for another leader of a higher epoch. It stops for one that outranks it, unless only
+    /// Decides whether this node stops for another leader of a higher epoch. It stops for the one to which it has yielded. It stops for one that outranks it, unless only
     /// this node has followers. It stops for one of its own rank unless that one has fewer followers, and for one of a lower
     /// rank only if that one has more. Followers are counted by their own word. Otherwise it goes on in a term above both.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
@@ -100,7 +101,9 @@ impl Election {
             return;
         }
         let followers = self.peers.followers(&self.id, now);
-        let stays = if !beat.hears_us {
+        let stays = if leading.has_yielded_to(&other) && beat.after.as_ref() == Some(&own) {
+            false
+        } else if !beat.hears_us {
             // It does not hear us. An edge that nobody else hears either serves nobody; a vehicle serves itself.
             followers > 0 || self.config.role != Role::Edge
         } else if self.outranks(&other, &self.id) {
@@ -190,10 +193,12 @@ impl Election {
                 let own = leading.epoch.clone();
                 match &message.epoch {
                     Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
-                        // A leadership ends only on the word of more nodes than follow it, for a known candidate.
+                        // A leadership ends only on the word of more nodes than follow it, for a known candidate. Its own
+                        // followers have time to answer; until then the other leader has to speak for itself.
+                        let is_answered = now.since(leading.since) > self.config.response_timeout();
                         let has_more_followers =
                             self.peers.followers(&other.leader, now) > self.peers.followers(&self.id, now);
-                        if has_more_followers && self.peers.may_lead(&other.leader, now) {
+                        if is_answered && has_more_followers && self.peers.may_lead(&other.leader, now) {
                             let other = other.clone();
                             self.stop_leading(&other.leader);
                             self.adopt(other, now, now);
@@ -211,7 +216,14 @@ impl Election {
         }
     }
 
-    pub(super) fn take_status(&mut self, from: &NodeName, over: Option<&Epoch>, now: Timestamp) {
+    pub(super) fn take_status(
+        &mut self,
+        from: &NodeName,
+        over: Option<&Epoch>,
+        no_login: Vec<NodeName>,
+        now: Timestamp,
+    ) {
+        self.peers.note_no_login(from, no_login);
         if let State::Leading(leading) = &self.state
             && over.is_some_and(|over| *over >= leading.epoch)
         {

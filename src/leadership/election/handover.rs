@@ -5,6 +5,7 @@
 //! are lost for a period, the old leader publishes that round too, and yields again after it.
 
 use crate::leadership::election::interface::ElectionEffect;
+use crate::leadership::election::leading::Leading;
 use crate::leadership::election::message::Body;
 use crate::leadership::election::{Election, State};
 use crate::model::epoch::Epoch;
@@ -19,16 +20,21 @@ pub(super) struct Handover {
     pub(super) retry_at: Timestamp,
     started_at: Timestamp,
     ready_at: Option<Timestamp>,
-    yielded: bool,
+    pub(super) yielded: bool,
 }
 
 impl Election {
     /// Starts a handover when a better candidate has been there long enough.
     pub(super) fn start_handover(&mut self, now: Timestamp) {
         let ours = self.candidacy().class();
+        if !matches!(&self.state, State::Leading(leading) if leading.handover.is_none()) {
+            return;
+        }
+        let out_of_reach = |name: &NodeName| self.is_out_of_reach(name, now);
+        let challenger = self.peers.challenger(ours, self.config.stable(), out_of_reach, now);
+        let challenger = challenger.filter(|(_, from)| now >= *from).map(|(to, _)| to);
+        let Some(to) = challenger.or_else(|| self.relief(now)) else { return };
         let State::Leading(leading) = &mut self.state else { return };
-        let challenger = self.peers.challenger(ours, self.config.stable(), now);
-        let Some((to, _)) = challenger.filter(|(_, from)| leading.handover.is_none() && now >= *from) else { return };
         leading.handover =
             Some(Handover { to: to.clone(), retry_at: now, started_at: now, ready_at: None, yielded: false });
         self.name_successors(now);
@@ -39,10 +45,11 @@ impl Election {
     /// Repeats offers and yields, or gives the handover up.
     pub(super) fn drive_handover(&mut self, now: Timestamp) {
         let limit = self.config.handover();
+        let State::Leading(Leading { handover: Some(handover), .. }) = &self.state else { return };
+        let to = handover.to.clone();
+        let fit = self.peers.hears(&to, now) && self.peers.may_lead(&to, now) && !self.is_out_of_reach(&to, now);
         let State::Leading(leading) = &mut self.state else { return };
         let Some(handover) = &mut leading.handover else { return };
-        let to = handover.to.clone();
-        let fit = self.peers.hears(&to, now) && self.peers.may_lead(&to, now);
         if !fit || now.since(handover.started_at) > limit {
             leading.handover = None;
             self.peers.restart_trial(&to, now);

@@ -45,6 +45,11 @@ pub enum ElectionInput {
         /// The round's number.
         round: u64,
     },
+    /// The candidates at whose brokers this node cannot log in, although it should, have changed.
+    NoLogin {
+        /// All of them, at most [`MAX_NO_LOGIN`](crate::leadership::election::MAX_NO_LOGIN).
+        at: Vec<NodeName>,
+    },
     /// The preparation that [`ElectionEffect::Prepare`] asked for is complete.
     Prepared,
     /// The node is about to stop: a leader resigns, a follower tells its leader that it is no candidate any more.

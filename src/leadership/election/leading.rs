@@ -51,6 +51,16 @@ impl Leading {
         self.pause = if is_calm { least } else { (before.pause * 2).clamp(least, RENEWAL_PAUSE) };
     }
 
+    /// Whether this leader has said that the next round is another node's.
+    pub(super) fn is_yielding(&self) -> bool {
+        self.handover.as_ref().is_some_and(|handover| handover.yielded)
+    }
+
+    /// Whether this leader has said to a node that the next round is that node's.
+    pub(super) fn has_yielded_to(&self, name: &NodeName) -> bool {
+        self.handover.as_ref().is_some_and(|handover| handover.yielded && handover.to == *name)
+    }
+
     pub(super) fn deadline(&self) -> Timestamp {
         self.handover.as_ref().map_or(self.beat_at, |handover| handover.retry_at.min(self.beat_at))
     }
@@ -146,8 +156,11 @@ impl Election {
 
     /// Chooses the successors, and tells all when they changed.
     pub(super) fn name_successors(&mut self, now: Timestamp) {
+        if !self.is_leading() {
+            return;
+        }
+        let mut next = self.successors(now);
         let State::Leading(leading) = &mut self.state else { return };
-        let mut next = self.peers.successors(MAX_SUCCESSORS, now);
         if let Some(handover) = &leading.handover {
             next.retain(|name| *name != handover.to);
             next.insert(0, handover.to.clone());

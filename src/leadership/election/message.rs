@@ -12,6 +12,9 @@ use crate::wire::{self, Encoding, Limits, RejectReason, Role};
 /// Most successors that a leader names, the standby first.
 pub const MAX_SUCCESSORS: usize = 3;
 
+/// Most nodes that a message names at whose brokers its sender cannot log in.
+pub const MAX_NO_LOGIN: usize = 4;
+
 /// Largest term taken from the wire: the largest integer that every JSON reader keeps exactly.
 pub const MAX_TERM: u64 = (1 << 53) - 1;
 
@@ -127,6 +130,10 @@ pub enum Body {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[n(0)]
         over: Option<Epoch>,
+        /// Leader and standby, now or before, at whose brokers the sender cannot log in; at most [`MAX_NO_LOGIN`].
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        #[cbor(n(1), default)]
+        no_login: Vec<NodeName>,
     },
     /// "Who leads, and who hears it?"
     #[n(1)]
@@ -217,7 +224,7 @@ impl ElectionMessage {
     /// The highest term of an epoch in the message.
     pub(super) fn highest_epoch(&self) -> u64 {
         let of_body = match &self.body {
-            Body::Status { over } => over.as_ref(),
+            Body::Status { over, .. } => over.as_ref(),
             Body::Beat { after, .. } => after.as_ref(),
             Body::Resign { epoch, .. } => Some(epoch),
             Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready | Body::Yield { .. } => None,
@@ -228,7 +235,7 @@ impl ElectionMessage {
     fn is_plausible(&self) -> bool {
         let known = |epoch: &Option<Epoch>| epoch.as_ref().is_none_or(|epoch| epoch.term <= self.term);
         let body = match &self.body {
-            Body::Status { over } => known(over),
+            Body::Status { over, no_login } => known(over) && no_login.len() <= MAX_NO_LOGIN,
             Body::Beat { every_ms, after, successors, round, .. } => {
                 let leads = self.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.from);
                 leads
@@ -294,7 +301,14 @@ mod tests {
     fn the_wire_keeps_its_names() {
         let epoch = || Epoch::new(4, NodeName::from_static("edge"));
         for (body, expected) in [
-            (Body::Status { over: Some(epoch()) }, r#"{"status":{"over":{"term":4,"leader":"edge"}}}"#),
+            (
+                Body::Status { over: Some(epoch()), no_login: Vec::new() },
+                r#"{"status":{"over":{"term":4,"leader":"edge"}}}"#,
+            ),
+            (
+                Body::Status { over: None, no_login: vec![NodeName::from_static("edge")] },
+                r#"{"status":{"no_login":["edge"]}}"#,
+            ),
             (Body::Ask { ask: 7 }, r#"{"ask":{"ask":7}}"#),
             (Body::LeaderEvidence { ask: 7, age_ms: 12 }, r#"{"vouch":{"ask":7,"age_ms":12}}"#),
             (

@@ -34,6 +34,8 @@ pub(super) struct Peer {
     pub(super) told: bool,
     /// Set while it refuses this node's leadership.
     refuses: bool,
+    /// Candidates at whose brokers it cannot log in, by its own word.
+    no_login: Vec<NodeName>,
     /// Leadership of this node that the peer was last told to be over.
     corrected: Option<Epoch>,
     /// Lowest term that it stated, if it may lead; 0 before any.
@@ -53,6 +55,8 @@ pub(super) struct Peer {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Peers {
     table: BTreeMap<NodeName, Peer>,
+    /// Whether any peer cannot log in somewhere.
+    lacks_logins: bool,
     contact_timeout: Duration,
     response_timeout: Duration,
     given_up_timeout: Duration,
@@ -66,6 +70,7 @@ impl Peers {
     pub(super) fn new(config: &ElectionConfig) -> Self {
         Self {
             table: BTreeMap::new(),
+            lacks_logins: false,
             contact_timeout: config.contact_timeout(),
             response_timeout: config.response_timeout(),
             given_up_timeout: config.given_up_timeout(),
@@ -127,6 +132,33 @@ impl Peers {
         self.table.iter().any(|(name, peer)| peer.refuses && self.hears(name, now))
     }
 
+    /// Notes at whose brokers a peer cannot log in.
+    pub(super) fn note_no_login(&mut self, name: &NodeName, at: Vec<NodeName>) {
+        if at.is_empty() && !self.lacks_logins {
+            return;
+        }
+        if let Some(peer) = self.table.get_mut(name) {
+            peer.no_login = at;
+        }
+        self.lacks_logins = self.table.values().any(|peer| !peer.no_login.is_empty());
+    }
+
+    /// Whether any peer cannot log in somewhere.
+    pub(super) fn lacks_logins(&self) -> bool {
+        self.lacks_logins
+    }
+
+    /// Number of followers of `leader`, without `at`, that cannot log in at the broker of `at`, and number of all.
+    pub(super) fn without_login(&self, leader: &NodeName, at: &NodeName, now: Timestamp) -> (usize, usize) {
+        let concerned = || self.followers_of(leader, now).filter(|(name, _)| *name != at);
+        (concerned().filter(|(_, peer)| peer.no_login.contains(at)).count(), concerned().count())
+    }
+
+    /// Whether a peer cannot log in at the broker of `at`.
+    pub(super) fn has_no_login(&self, name: &NodeName, at: &NodeName) -> bool {
+        self.table.get(name).is_some_and(|peer| peer.no_login.contains(at))
+    }
+
     /// Notes what every message says about its sender; false for one that is repeated or overtaken.
     pub(super) fn note(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
         let contact_timeout = self.contact_timeout;
@@ -183,6 +215,12 @@ impl Peers {
         self.forget_at = self.table.values().filter_map(|peer| peer.given_up_at).min().map(|at| at + wait);
     }
 
+    /// Whether a peer has been heard and fit for `stable`.
+    pub(super) fn is_stable(&self, name: &NodeName, stable: Duration, now: Timestamp) -> bool {
+        let since = self.table.get(name).and_then(|peer| peer.fit_since);
+        self.hears(name, now) && since.is_some_and(|since| now >= since + stable)
+    }
+
     /// Lets a peer prove itself anew before it is handed the lead.
     pub(super) fn restart_trial(&mut self, name: &NodeName, now: Timestamp) {
         if let Some(peer) = self.table.get_mut(name) {
@@ -203,9 +241,13 @@ impl Peers {
     /// How many nodes heard lately follow a leader, by their own word. Parts share the certificate of their node, which
     /// counts once.
     pub(super) fn followers(&self, leader: &NodeName, now: Timestamp) -> usize {
-        let follows = |peer: &Peer| peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == *leader);
-        let is_node = |name: &NodeName| name != leader && name.vehicle() == *name;
-        self.table.iter().filter(|(name, peer)| follows(peer) && is_node(name) && self.hears(name, now)).count()
+        self.followers_of(leader, now).count()
+    }
+
+    fn followers_of(&self, leader: &NodeName, now: Timestamp) -> impl Iterator<Item = (&NodeName, &Peer)> {
+        let follows = move |peer: &Peer| peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == *leader);
+        let is_node = move |name: &NodeName| name != leader && name.vehicle() == *name;
+        self.table.iter().filter(move |(name, peer)| follows(peer) && is_node(name) && self.hears(name, now))
     }
 
     /// Whether a peer could lead, as far as is known without having heard it lately.
@@ -233,8 +275,14 @@ impl Peers {
     }
 
     /// The leader's successors: heard lately and fit, the best first. The membership may hear less than the election does.
-    /// So a peer that it gave up remains a successor if it was heard within the beats that a standby may miss.
-    pub(super) fn successors(&self, limit: usize, now: Timestamp) -> Vec<NodeName> {
+    /// So a peer that it gave up remains a successor if it was heard within the beats that a standby may miss. Those that
+    /// are `out_of_reach` come last.
+    pub(super) fn successors(
+        &self,
+        limit: usize,
+        out_of_reach: impl Fn(&NodeName) -> bool,
+        now: Timestamp,
+    ) -> Vec<NodeName> {
         let silence = self.standby_silence;
         let given_up = |name: &NodeName| {
             self.table.get(name).is_some_and(|peer| peer.given_up_at.is_some())
@@ -243,6 +291,9 @@ impl Peers {
         let mut fit: Vec<_> =
             self.candidates(now).filter(|(name, _)| self.hears(name, now) && !given_up(name)).collect();
         fit.sort_by_key(|&(name, candidacy)| (candidacy.class(), candidacy.load, name.clone()));
+        if self.lacks_logins {
+            fit.sort_by_cached_key(|(name, _)| out_of_reach(name));
+        }
         fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
     }
 
@@ -250,9 +301,15 @@ impl Peers {
     ///
     /// Neither load nor name takes the lead from a living leader: leading is load, and a move among equals serves nobody.
     /// Waits for a better candidate that is more than halfway through `stable`; otherwise the lead moves twice.
-    pub(super) fn challenger(&self, ours: Class, stable: Duration, now: Timestamp) -> Option<(NodeName, Timestamp)> {
+    pub(super) fn challenger(
+        &self,
+        ours: Class,
+        stable: Duration,
+        out_of_reach: impl Fn(&NodeName) -> bool,
+        now: Timestamp,
+    ) -> Option<(NodeName, Timestamp)> {
         self.candidates(now)
-            .filter(|(name, other)| self.hears(name, now) && other.class() < ours)
+            .filter(|(name, other)| self.hears(name, now) && other.class() < ours && !out_of_reach(name))
             .filter_map(|(name, other)| Some((name, other, self.table.get(name)?.fit_since? + stable)))
             .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.class(), name.clone()))
             .map(|(name, _, from)| (name.clone(), from))

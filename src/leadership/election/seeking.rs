@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::aggregator::round::FirstRound;
 use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::leading::Leading;
-use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
+use crate::leadership::election::message::{Body, Candidacy};
 use crate::leadership::election::{Election, State};
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -152,7 +152,7 @@ impl Election {
         (self.terms.seen, self.terms.found) = (term, term);
         let epoch = Epoch::new(term, self.id.clone());
         self.epoch = Some(epoch.clone());
-        let successors = self.peers.successors(MAX_SUCCESSORS, now);
+        let successors = self.successors(now);
         let first = match &self.state {
             State::Seeking(seeking) if seeking.order.first() == Some(&self.id) => FirstRound::Overdue,
             State::Seeking(_) => FirstRound::AfterConnects,

@@ -65,7 +65,7 @@ fn is_counted(effects: &[ElectionEffect]) -> bool {
 fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
     let mut election = euclid();
     let mut hear = |seq, term| {
-        let effects = election.handle(of_edge(seq, term, Body::Status { over: None }), NOW);
+        let effects = election.handle(of_edge(seq, term, Body::Status { over: None, no_login: Vec::new() }), NOW);
         let forged = Epoch::new(term, NodeName::from_static("edge"));
         election.handle(ElectionInput::Round { epoch: forged, round: 1 }, NOW);
         (election.term(), is_counted(&effects))
@@ -81,10 +81,14 @@ fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
 fn a_node_without_a_term_joins_a_cell_of_any_age() {
     let mut election = euclid_after(0);
     let old = 1_800_000_000;
-    assert!(!is_counted(&election.handle(of_edge(1, old, Body::Status { over: None }), NOW)));
-    assert!(is_counted(&election.handle(of_edge(2, MAX_FIRST_TERM, Body::Status { over: None }), NOW)));
+    assert!(!is_counted(&election.handle(of_edge(1, old, Body::Status { over: None, no_login: Vec::new() }), NOW)));
+    assert!(is_counted(
+        &election.handle(of_edge(2, MAX_FIRST_TERM, Body::Status { over: None, no_login: Vec::new() }), NOW)
+    ));
     assert_eq!(election.term(), old);
-    assert!(is_counted(&euclid_after(0).handle(of_edge(1, MAX_FIRST_TERM + 1, Body::Status { over: None }), NOW)));
+    assert!(is_counted(
+        &euclid_after(0).handle(of_edge(1, MAX_FIRST_TERM + 1, Body::Status { over: None, no_login: Vec::new() }), NOW)
+    ));
 }
 
 /// First round of euclid's own leadership after the leader's beats with these rounds, and the beats that were counted.
@@ -117,7 +121,7 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
     let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
     let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
     election.handle(ElectionInput::Health { health }, now);
-    let status = || Body::Status { over: None };
+    let status = || Body::Status { over: None, no_login: Vec::new() };
     for seq in 1.. {
         election.handle(received(&hopper, seq, None, status()), now);
         now = election.next_deadline();
@@ -145,10 +149,10 @@ fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
     let now = Timestamp(1_000_000);
     let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, now);
     election.handle(received(&edge, 1, Some(&before), beat_after(None)), now);
-    election.handle(received(&edge, 2, Some(&next), Body::Status { over: None }), now);
+    election.handle(received(&edge, 2, Some(&next), Body::Status { over: None, no_login: Vec::new() }), now);
     assert_eq!(election.leader(), Some(&gauss));
     election.handle(ElectionInput::Round { epoch: next, round: 2 }, now);
-    election.handle(received(&gauss, 1, Some(&before), Body::Status { over: None }), now);
+    election.handle(received(&gauss, 1, Some(&before), Body::Status { over: None, no_login: Vec::new() }), now);
     assert_eq!(election.leader(), Some(&gauss));
 }
 
@@ -159,7 +163,7 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
     let mut now = NOW;
     let hopper = NodeName::from_static("hopper");
     let of_hopper = |seq, epoch: Option<&Epoch>| {
-        let message = message(&hopper, seq, epoch, Body::Status { over: None });
+        let message = message(&hopper, seq, epoch, Body::Status { over: None, no_login: Vec::new() });
         let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
         ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }
     };
@@ -176,13 +180,37 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
     assert!(election.is_leading());
 }
 
+/// A leader has no followers yet when it begins. A vehicle that says then that it follows another ends no leadership.
+#[test]
+fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
+    let [edge, hopper] = ["edge", "hopper"].map(NodeName::from_static);
+    let mut election = euclid();
+    // A fit candidate that does not lead.
+    election.handle(of_edge(1, 8, beat(1)), NOW);
+    let resigned = Body::Resign { epoch: epoch_of_edge(), last_round: 1 };
+    election.handle(of_edge(2, 8, resigned), NOW);
+    let mut now = NOW;
+    while !election.is_leading() {
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    let lie = Epoch::new(election.term() + 1, edge.clone());
+    let message = message(&hopper, 1, Some(&lie), Body::Status { over: None, no_login: Vec::new() });
+    let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
+    election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
+    assert!(election.is_leading());
+    // What is true the other leader says itself.
+    election.handle(received(&edge, 3, Some(&lie), beat_after(election.epoch().cloned().as_ref())), now);
+    assert_eq!(election.leader(), Some(&edge));
+}
+
 /// Epochs that euclid led in during the twenty seconds after gauss had refused its first one.
 fn renewals(gauss_follows: bool) -> Vec<Epoch> {
     let gauss = NodeName::from_static("gauss");
     let (mut election, mut now, mut seq) = (euclid(), NOW, 0);
     let mut status = |election: &mut Election, epoch: Option<&Epoch>, over: Option<Epoch>, now| {
         seq += 1;
-        election.handle(received(&gauss, seq, epoch, Body::Status { over }), now);
+        election.handle(received(&gauss, seq, epoch, Body::Status { over, no_login: Vec::new() }), now);
     };
     while !election.is_leading() {
         status(&mut election, None, None, now);
@@ -218,7 +246,7 @@ fn a_leader_whom_all_follow_again_does_not_lead_on_in_another_term() {
 #[test]
 fn a_term_rises_by_a_bounded_step_in_an_hour_however_many_messages_state_more() {
     let mut election = euclid();
-    let status = || Body::Status { over: None };
+    let status = || Body::Status { over: None, no_login: Vec::new() };
     for seq in 1..100 {
         election.handle(of_edge(seq, 8 + seq * (MAX_TERM_STEP / 2), status()), NOW);
     }
@@ -308,7 +336,7 @@ fn a_node_that_heard_a_liar_first_follows_the_leader_of_the_others() {
     assert_eq!(election.leader(), Some(&NodeName::from_static("gauss")));
     let epoch = Epoch::new(10, leader.clone());
     for from in [&hopper, &noether] {
-        election.handle(received(from, 1, Some(&epoch), Body::Status { over: None }), NOW);
+        election.handle(received(from, 1, Some(&epoch), Body::Status { over: None, no_login: Vec::new() }), NOW);
     }
     election.handle(received(&leader, 1, Some(&epoch), beat(1)), NOW);
     assert_eq!(election.leader(), Some(&leader));
@@ -337,7 +365,7 @@ fn the_parts_of_a_node_depose_no_leader() {
     let mut seq = 0;
     let mut status = |election: &mut Election, from: &NodeName, epoch: Option<&Epoch>, now| {
         seq += 1;
-        election.handle(received(from, seq, epoch, Body::Status { over: None }), now);
+        election.handle(received(from, seq, epoch, Body::Status { over: None, no_login: Vec::new() }), now);
     };
     while !election.is_leading() {
         status(&mut election, &gauss, None, now);

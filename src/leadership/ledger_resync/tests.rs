@@ -64,7 +64,7 @@ impl Candidate {
 /// A leadership that is followed.
 fn following(term: u64, leader: &str) -> Leadership {
     let epoch = Some(Epoch::new(term, name(leader)));
-    Leadership { position: Position::Following, epoch, standby: None, term }
+    Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false, is_yielding: false }
 }
 
 /// The candidate `euclid`, which follows `edge` in term 7 and has led before.
@@ -157,13 +157,29 @@ fn leaders_that_change_with_every_share_are_not_answered_each_time() {
     let mut euclid = euclid();
     let mut sent = Vec::new();
     for at_ms in 0..1000 {
+        euclid.leadership = Leadership { term: 7, ..following(1 + at_ms % 7, "gauss") };
         sent.extend(euclid.merge(&share("gauss", Some(1 + at_ms % 7), Vec::new()), at_ms).unwrap().shares);
     }
     for (from, term, at_ms) in [("gauss", u64::MAX, 1000), ("edge", 7, 6000), ("edge", 7, 20_000)] {
+        euclid.leadership = following(7, from);
         sent.extend(euclid.merge(&share(from, Some(term), Vec::new()), at_ms).unwrap().shares);
     }
     assert_eq!(sent.len(), 2, "at once, and when some time has passed");
     assert!(sent.iter().flat_map(|share| &share.entries).all(|entry| entry.aggregator == name("euclid")));
+}
+
+#[test]
+fn a_candidate_that_says_it_leads_does_not_have_others_send_all_evidence() {
+    let mut euclid = euclid();
+    assert_eq!(euclid.merge(&share("edge", Some(7), Vec::new()), 0).unwrap().shares.len(), 1, "it has led");
+    for at_s in 1..600 {
+        for (from, term) in [("gauss", at_s % 8), ("edge", 7)] {
+            let merged = euclid.merge(&share(from, Some(term), Vec::new()), at_s * 1000).unwrap();
+            assert_eq!(merged.shares, [], "{from} after {at_s} s");
+        }
+    }
+    euclid.leadership = following(8, "gauss");
+    assert_eq!(euclid.merge(&share("gauss", Some(8), Vec::new()), 600_000).unwrap().shares.len(), 1, "it leads now");
 }
 
 #[test]

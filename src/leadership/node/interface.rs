@@ -81,6 +81,13 @@ pub enum Input {
         /// Its address.
         address: Option<SocketAddr>,
     },
+    /// A broker has shown the certificate of a node in its last handshake. It comes before the link's new state.
+    BrokerProven {
+        /// The broker.
+        broker: BrokerAddress,
+        /// The node.
+        node: NodeName,
+    },
     /// One of the gateway's links changed.
     LinkChanged {
         /// The broker at its other end.
@@ -231,10 +238,22 @@ pub enum Notice {
         /// The leader that hands over.
         leader: NodeName,
     },
-    /// A node is ready to be handed the lead, and this node is not logged in at its broker.
+    /// A node is ready to be handed the lead, and this node is not logged in at its broker, or another node's is there.
     NotServed {
         /// The node.
         challenger: NodeName,
+    },
+    /// This node cannot log in at brokers that it should use, or it can again.
+    NoLogin {
+        /// Their nodes.
+        at: Vec<NodeName>,
+    },
+    /// This node leads, and more followers than before cannot log in at its broker.
+    Deserted {
+        /// Number of these followers.
+        without_login: usize,
+        /// Number of all followers.
+        followers: usize,
     },
     /// A node declared more than its certificate allows, or claimed a lead that it may not have.
     Overreached {

@@ -217,6 +217,11 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
 
 /// A leader to which a better candidate says that it is ready. It can log in at `broker`, if one is given.
 fn leading_beside_a_ready_challenger(external: Option<SocketAddr>, broker: Option<SocketAddr>) -> Scene {
+    leading_beside(external, broker, "edge")
+}
+
+/// The same, where the broker has the certificate of `shown`.
+fn leading_beside(external: Option<SocketAddr>, broker: Option<SocketAddr>, shown: &str) -> Scene {
     let mut scene = Scene::new(Role::Auto, None);
     scene.machine.links = Links::new(DataPlane { external: external.map(Into::into), embedded: true });
     scene.take(Input::MemberAlive { member: member("edge", 2) });
@@ -226,10 +231,13 @@ fn leading_beside_a_ready_challenger(external: Option<SocketAddr>, broker: Optio
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
     for ms in 0..4500 {
         if let Some(broker) = broker.filter(|_| ms == 1000) {
+            if external.is_none() {
+                scene.take(Input::BrokerProven { broker: broker.into(), node: name(shown) });
+            }
             scene.take(Input::LinkChanged { broker: broker.into(), state: LinkState::Up });
         }
         if ms % 50 == 0 {
-            scene.hear_in(epoch.clone(), Body::Status { over: None });
+            scene.hear_in(epoch.clone(), Body::Status { over: None, no_login: Vec::new() });
             scene.hear_in(epoch.clone(), Body::Ready);
         }
         if ms % 100 == 0 {
@@ -264,6 +272,14 @@ fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
     }
     let both = leading_beside_a_ready_challenger(Some(broker(9)), Some(broker(9)));
     assert!(both.position_of(is_yield).is_some(), "all use the external broker");
+}
+
+#[test]
+fn the_lead_is_not_handed_to_a_node_in_whose_place_another_broker_is() {
+    let scene = leading_beside(None, Some(broker(2)), "gauss");
+    assert_eq!(scene.position_of(is_yield), None);
+    assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
+    assert!(scene.notices().contains(&&Notice::NoLogin { at: vec![name("edge")] }));
 }
 
 #[test]
@@ -325,7 +341,14 @@ fn a_node_that_others_do_not_reach_is_not_fit_and_says_so_once() {
 #[test]
 fn a_machine_started_anew_uses_no_term_that_it_may_have_led_in() {
     let epoch = Some(Epoch::new(9, name("euclid")));
-    let before = Leadership { position: Position::Leading, epoch, standby: None, term: 9 };
+    let before = Leadership {
+        position: Position::Leading,
+        epoch,
+        standby: None,
+        term: 9,
+        is_deserted: false,
+        is_yielding: false,
+    };
     let settings = NodeSettings {
         election: ElectionConfig::default(),
         plane: DataPlane { external: None, embedded: true },
@@ -393,7 +416,10 @@ fn a_declared_role_beyond_the_certificate_takes_no_lead() {
         scene.take(Input::MemberAlive { member: member("zeno", 2) });
         for _ in 0..100 {
             let epoch = scene.machine.election().epoch().unwrap().clone();
-            let message = ElectionMessage { from: name("zeno"), ..scene.message(epoch, Body::Status { over: None }) };
+            let message = ElectionMessage {
+                from: name("zeno"),
+                ..scene.message(epoch, Body::Status { over: None, no_login: Vec::new() })
+            };
             let rights = Rights { role, priority: 100 };
             scene.take(Input::Receive { from: name("zeno"), rights, message });
             scene.run_for(50);

@@ -59,6 +59,8 @@ mod tests {
             epoch: Some(Epoch::new(1, NodeName::new(leader).unwrap())),
             standby: None,
             term: 1,
+            is_deserted: false,
+            is_yielding: false,
         };
         let mut filter = PublisherFilter::default();
         let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(|name| NodeName::new(name).unwrap());

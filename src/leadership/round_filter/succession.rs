@@ -108,7 +108,13 @@ impl SuccessionFilter {
         }
         match elected {
             Some(elected) if elected == epoch => self.admit_elected(epoch, round, received_at),
-            Some(elected) => self.admit_other(epoch, round, received_at, elected, leadership.standby.as_ref()),
+            Some(elected) => {
+                // A leader has no successor before it yields. It is to hear of a later leadership by the election: its own
+                // rounds go on until then, and would go back in epoch.
+                let is_staying = leadership.is_leading() && !leadership.is_yielding;
+                let standby = leadership.standby.as_ref().filter(|_| !is_staying);
+                self.admit_other(epoch, round, received_at, elected, standby)
+            }
             None if self.is_strange(epoch, leadership.term, received_at) => Err(Refusal::NotElected),
             None => self.admit_in_order(epoch, round, received_at, true),
         }
@@ -227,7 +233,14 @@ mod tests {
 
     fn led_by(epoch: Epoch, standby: Option<&'static str>) -> Leadership {
         let standby = standby.map(NodeName::from_static);
-        Leadership { position: Position::Following, term: epoch.term, epoch: Some(epoch), standby }
+        Leadership {
+            position: Position::Following,
+            term: epoch.term,
+            epoch: Some(epoch),
+            standby,
+            is_deserted: false,
+            is_yielding: false,
+        }
     }
 
     fn seeking(term: u64) -> Leadership {
@@ -277,6 +290,21 @@ mod tests {
         let unknown = epoch(9, "gauss");
         assert_eq!(filter.admit(&unknown, 4, at(300), &after), Err(Refusal::NotElected));
         assert_eq!(filter.admit(&unknown, 5, at(500), &after), Ok(()), "the elected has fallen silent");
+    }
+
+    /// The standby took over while the leader was cut off. Its rounds come again before word of its election.
+    #[test]
+    fn a_leader_takes_no_round_of_another_beside_its_own_before_it_yields() {
+        let (own, next) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let leading = Leadership { position: Position::Leading, ..led_by(own.clone(), Some("euclid")) };
+        let mut filter = SuccessionFilter::new(0);
+        for round in 1..20 {
+            assert_eq!(filter.admit(&own, round, at(100 * round), &leading), Ok(()), "round {round}");
+            let refused = filter.admit(&next, round + 1, at(100 * round + 50), &leading);
+            assert_eq!(refused, Err(Refusal::NotElected));
+        }
+        let yielding = Leadership { is_yielding: true, ..leading };
+        assert_eq!(filter.admit(&next, 20, at(2000), &yielding), Ok(()));
     }
 
     #[test]

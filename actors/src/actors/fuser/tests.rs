@@ -42,7 +42,14 @@ fn map(epoch: Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
 
 #[tokio::test]
 async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
-    let elected = Leadership { position: Position::Following, epoch: Some(epoch(7, "edge")), standby: None, term: 7 };
+    let elected = Leadership {
+        position: Position::Following,
+        epoch: Some(epoch(7, "edge")),
+        standby: None,
+        term: 7,
+        is_deserted: false,
+        is_yielding: false,
+    };
     let seeking = Leadership { term: 7, ..Leadership::default() };
     for leadership in [elected, seeking] {
         let ((fuser, mut told), newest) = (listening::slot().await, Newest::default());

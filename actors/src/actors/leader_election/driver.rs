@@ -252,6 +252,18 @@ fn log(notice: Notice) {
         Notice::NotServed { challenger } => {
             tracing::debug!(%challenger, "the lead is not handed over yet: no login at the challenger's broker");
         }
+        Notice::NoLogin { at } if at.is_empty() => tracing::info!("logged in at all brokers in use again"),
+        Notice::NoLogin { at } => tracing::warn!(
+            ?at,
+            "no login at the brokers of these nodes, which lead or are next: check the way to them (address, firewall) \
+             and the certificates on both sides; the leader is told, and makes way if most cannot log in"
+        ),
+        Notice::Deserted { without_login, followers } => tracing::warn!(
+            without_login,
+            followers,
+            "followers cannot log in at this node's broker: check its certificate, `listen` and the firewall; if they \
+             are more than half, the lead goes to another candidate"
+        ),
         Notice::Overreached { .. } => {}
         Notice::Misattributed { from, claimed } => {
             tracing::debug!(%from, %claimed, "election message in another's name dropped");

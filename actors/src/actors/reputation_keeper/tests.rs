@@ -51,7 +51,14 @@ fn arguments(gateway: &ActorSlot<GatewayMessage>, counters: &Arc<Counters>) -> R
     let roles = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)];
     let members = roles.map(|(node, role)| member(node, role)).to_vec();
     let epoch = Some(Epoch::new(7, name("edge")));
-    let leadership = Leadership { position: Position::Following, epoch, standby: None, term: 7 };
+    let leadership = Leadership {
+        position: Position::Following,
+        epoch,
+        standby: None,
+        term: 7,
+        is_deserted: false,
+        is_yielding: false,
+    };
     ReputationKeeperArguments {
         name: name("euclid"),
         cell: name("lot"),

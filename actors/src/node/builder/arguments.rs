@@ -167,6 +167,10 @@ impl NodeBuilder {
                 }
                 Incoming::Link { broker, state } => {
                     recording.send(at, LogItem::Link(broker.clone(), *state));
+                    if let Some(node) = delivery.broker.clone() {
+                        let input = Input::BrokerProven { broker: broker.clone(), node };
+                        election.send(LeaderElectionMessage::Note { input });
+                    }
                     let input = Input::LinkChanged { broker: broker.clone(), state: *state };
                     election.send(LeaderElectionMessage::Note { input })
                 }

@@ -146,7 +146,7 @@ mod tests {
 
     fn led_by(leader: &'static str, term: u64) -> Leadership {
         let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
-        Leadership { position: Position::Following, epoch, standby: None, term }
+        Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false, is_yielding: false }
     }
 
     fn seconds(n: u64) -> Timestamp {

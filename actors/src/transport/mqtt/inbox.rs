@@ -69,7 +69,8 @@ pub struct Delivery<T = Incoming> {
     pub received_at: Timestamp,
     /// Proof of a round's aggregator; of other messages nothing is asked.
     pub origin: Origin,
-    /// The node whose certificate the broker has proven; `None` without certificates, and for messages of this node.
+    /// The node whose certificate the broker has proven, of a link in its last handshake; `None` without certificates, and
+    /// for messages of this node.
     pub broker: Option<NodeName>,
     _place: Option<OwnedSemaphorePermit>,
 }
@@ -174,6 +175,12 @@ impl Inbox {
     /// Delivers a message that this node itself publishes or observes.
     pub(crate) fn deliver_local(&self, message: Incoming) {
         self.hand_over(Delivery::local(message, clock::now()));
+    }
+
+    /// Delivers the state of a link to a broker.
+    pub(crate) fn deliver_link(&self, via: Via<'_>, state: LinkState) {
+        let message = Incoming::Link { broker: via.address.clone(), state };
+        self.hand_over(Delivery { broker: via.node.cloned(), ..Delivery::local(message, clock::now()) });
     }
 
     /// Delivers a message of a broker. Dropped and counted when receivers are too far behind.

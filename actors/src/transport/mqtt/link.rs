@@ -7,6 +7,7 @@ use bytes::Bytes;
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::echo::EchoMonitor;
 use ecod::leadership::links::LinkState;
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::RejectReason;
 use rand::{RngExt, SeedableRng};
@@ -37,8 +38,8 @@ pub struct LinkEvent {
 
 #[derive(Debug)]
 pub(crate) enum LinkChange {
-    /// The broker accepted the connection; nothing is subscribed yet.
-    Accepted(Client),
+    /// The broker accepted the connection; nothing is subscribed yet. `node` is the one whose certificate it has, if any.
+    Accepted { client: Client, node: Option<NodeName> },
     /// The broker published this node's last will, although it is alive.
     DeclaredOffline,
     /// Another run with this node's name is alive.
@@ -71,6 +72,8 @@ pub(crate) struct Link {
     pub(crate) broker: BrokerAddress,
     pub(crate) state: LinkState,
     pub(crate) client: Option<Client>,
+    /// The node whose certificate the broker has proven in the last handshake.
+    pub(crate) node: Option<NodeName>,
     hearing: Arc<Hearing>,
     echo: EchoMonitor,
     task: Option<JoinHandle<()>>,
@@ -94,7 +97,7 @@ impl Link {
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
         let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
-        Self { broker, state: LinkState::Down, client: None, hearing, echo, abort, task: Some(task) }
+        Self { broker, state: LinkState::Down, client: None, node: None, hearing, echo, abort, task: Some(task) }
     }
 
     /// Queues a message; false when there is no connection or no room.
@@ -227,7 +230,7 @@ impl LinkTask {
         let node = identity.and_then(|identity| identity.node());
         self.hearing.note();
         self.reported_refusal.take_if(|reported_refusal| reported_refusal.starts_with(NOT_ADMITTED));
-        if !self.tell(LinkChange::Accepted(client)) {
+        if !self.tell(LinkChange::Accepted { client, node: node.clone() }) {
             return Ok(());
         }
         // A working connection receives at least the answers to pings. Sent packets are no sign of life. A poll that

@@ -1,0 +1,98 @@
+//! Brokers at which this node should be logged in and is not.
+
+use std::collections::BTreeMap;
+
+use crate::leadership::election::MAX_NO_LOGIN;
+use crate::leadership::timers::{HEALTH_PERIOD, LOGIN_TIMEOUT};
+use crate::model::names::NodeName;
+
+/// Looks in a row after which a login counts as missing, or no longer does. Looks are counted instead of time: a node that
+/// was held up itself blames no broker.
+const LOOKS: u128 = LOGIN_TIMEOUT.as_millis() / HEALTH_PERIOD.as_millis();
+
+/// The nodes whose brokers are used, and those at whose brokers a login is missing until there is one again.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+pub(super) struct Logins {
+    nodes: BTreeMap<NodeName, Login>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
+struct Login {
+    is_missing: bool,
+    /// Number of latest looks that found the contrary.
+    contrary_looks: u128,
+}
+
+impl Logins {
+    /// Notes a look at the used brokers and at those of [`Self::missing`]: whether this node is logged in at each. True if
+    /// the missing logins changed.
+    pub(super) fn look(&mut self, brokers: &BTreeMap<NodeName, bool>) -> bool {
+        self.nodes.retain(|name, login| login.is_missing || brokers.contains_key(name));
+        let mut missing = self.missing().count();
+        let mut has_changed = false;
+        for (name, is_logged_in) in brokers {
+            let login = self.nodes.entry(name.clone()).or_default();
+            login.contrary_looks = if *is_logged_in == login.is_missing { login.contrary_looks + 1 } else { 0 };
+            if login.contrary_looks >= LOOKS && (login.is_missing || missing < MAX_NO_LOGIN) {
+                *login = Login { is_missing: !login.is_missing, contrary_looks: 0 };
+                missing = if login.is_missing { missing + 1 } else { missing - 1 };
+                has_changed = true;
+            }
+        }
+        has_changed
+    }
+
+    /// Forgets a node that is gone, or has started anew. True if its login was missing.
+    pub(super) fn forget(&mut self, name: &NodeName) -> bool {
+        self.nodes.remove(name).is_some_and(|login| login.is_missing)
+    }
+
+    /// Nodes at whose brokers a login is missing.
+    pub(super) fn missing(&self) -> impl Iterator<Item = &NodeName> {
+        self.nodes.iter().filter(|(_, login)| login.is_missing).map(|(name, _)| name)
+    }
+
+    /// Whether some broker was last seen without a login that is not known to be missing.
+    pub(super) fn is_doubtful(&self) -> bool {
+        self.nodes.values().any(|login| login.contrary_looks > 0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Looks at the broker of `edge` until they change something.
+    fn looks(logins: &mut Logins, is_logged_in: bool) -> Option<u128> {
+        let brokers = BTreeMap::from([(NodeName::from_static("edge"), is_logged_in)]);
+        (1..100).find(|_| logins.look(&brokers))
+    }
+
+    #[test]
+    fn a_login_is_missing_after_two_seconds_and_back_after_as_many() {
+        let mut logins = Logins::default();
+        assert_eq!(looks(&mut logins, false), Some(8));
+        assert_eq!(logins.missing().count(), 1);
+        logins.look(&BTreeMap::new());
+        assert_eq!(logins.missing().count(), 1, "it is tried on");
+        assert_eq!(looks(&mut logins, true), Some(8));
+        assert_eq!(looks(&mut logins, true), None);
+    }
+
+    #[test]
+    fn a_broker_that_is_reached_now_and_then_is_not_missing() {
+        let mut logins = Logins::default();
+        let look = |look: usize| BTreeMap::from([(NodeName::from_static("edge"), look.is_multiple_of(7))]);
+        assert!((0..100).all(|number| !logins.look(&look(number))));
+    }
+
+    #[test]
+    fn no_more_logins_are_missing_than_a_message_holds() {
+        let mut logins = Logins::default();
+        let names = (0..10).map(|number| (NodeName::new(format!("n{number}")).unwrap(), false));
+        let brokers = names.collect();
+        assert_eq!((0..20).filter(|_| logins.look(&brokers)).count(), 1);
+        assert_eq!(logins.missing().count(), MAX_NO_LOGIN);
+        assert!(logins.forget(&NodeName::from_static("n0")));
+    }
+}
