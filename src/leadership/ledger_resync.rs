@@ -105,6 +105,11 @@ impl LedgerResync {
         }
     }
 
+    /// Takes over what earlier runs knew: counts go on from there, and leap no further than before.
+    pub fn resume(&mut self, ledger: &ReputationLedger, now: Timestamp) {
+        self.growth = GrowthLimit::of(ledger, now);
+    }
+
     /// The node's own leadership, while it leads.
     pub fn leads(&self) -> Option<&Epoch> {
         self.leads.as_ref()

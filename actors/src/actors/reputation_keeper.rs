@@ -115,7 +115,7 @@ impl Actor for ReputationKeeper {
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let mut state = ReputationKeeperState::new(arguments);
-        store::restore(&state.arguments, state.signer.as_mut());
+        state.restore();
         myself.send_interval(state.arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
         if state.signer.is_some() {
             // Certificates may have been revoked while the actor did not run.
@@ -185,6 +185,12 @@ impl ReputationKeeperState {
             disk_failed: false,
             tasks: JoinSet::new(),
         }
+    }
+
+    /// Takes over what earlier runs knew, and what is saved.
+    fn restore(&mut self) {
+        store::restore(&self.arguments, self.signer.as_mut());
+        self.resync.resume(&self.arguments.reputations.open().ledger, clock::now());
     }
 
     fn lead(&mut self, epoch: Epoch, last_round: u64) {

@@ -39,6 +39,18 @@ pub(super) struct GrowthLimit {
 }
 
 impl GrowthLimit {
+    /// The limit of a node that starts with a ledger: what it missed meanwhile may come at the rate of the fastest votes.
+    /// No clock says how long it was down.
+    pub(super) fn of(ledger: &ReputationLedger, now: Timestamp) -> Self {
+        let mut first: BTreeMap<_, _> =
+            ledger.entries().map(|entry| (key_of(&entry), (now, entry.correct + entry.incorrect))).collect();
+        for mark in ledger.marks() {
+            let (_, votes) = first.entry(key_of_mark(&mark)).or_insert((now, 0));
+            *votes = (*votes).max(mark.correct + mark.incorrect);
+        }
+        Self { first }
+    }
+
     /// Whether a count is plausible. The first one of a vehicle and label is noted by [`Self::note`].
     pub(super) fn admits(&self, entry: &LedgerEntry, now: Timestamp) -> bool {
         self.admits_votes(&key_of(entry), entry.correct.saturating_add(entry.incorrect), now)
