@@ -184,7 +184,6 @@ impl Vehicle {
     }
 
     fn merge(&mut self, share: &LedgerShare, now: Timestamp) {
-        self.handle(Input::EvidenceReceived { from: share.node.clone() }, now);
         let candidates: Vec<_> = self.members.keys().cloned().collect();
         let Ok(merged) = self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, now, now) else {
             return;
@@ -193,6 +192,7 @@ impl Vehicle {
             self.aggregator.adopt(&self.ledger);
         }
         self.share(&merged.shares);
+        self.handle(Input::EvidenceReceived { from: share.node.clone() }, now);
     }
 
     fn share(&mut self, shares: &[LedgerShare]) {

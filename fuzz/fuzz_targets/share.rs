@@ -33,16 +33,23 @@ static EDGE: LazyLock<(Mutex<EvidenceSigner>, LedgerShare)> = LazyLock::new(|| {
     (Mutex::new(signer), honest)
 });
 
-fuzz_target!(|input: &[u8]| {
-    let Ok(share) = decode::<LedgerShare>(input, &Limits::default()) else { return };
-    let (signer, honest) = &*EDGE;
-    let mut signer = signer.lock().unwrap_or_else(PoisonError::into_inner);
-    assert!(signer.verify(&share).is_err(), "no fuzzer has the key");
-    let transplanted = LedgerShare { signed: honest.signed.clone(), ..share };
-    let is_honest = transplanted.entries == honest.entries && transplanted.marks == honest.marks;
-    assert_eq!(signer.verify(&transplanted).is_ok(), is_honest);
+/// The share with all counts and marks in one lane of `edge`, under its signature: `edge` may be the attacker.
+fn signed_by_edge(signer: &EvidenceSigner, share: &LedgerShare) -> LedgerShare {
+    let (mut share, edge) = (LedgerShare { signed: None, ..share.clone() }, NodeName::from_static("edge"));
+    let terms = share.entries.iter().map(|entry| entry.epoch).chain(share.marks.iter().map(|mark| mark.epoch));
+    let term = terms.min().unwrap_or_default();
+    for entry in &mut share.entries {
+        (entry.epoch, entry.aggregator) = (term, edge.clone());
+    }
+    for mark in &mut share.marks {
+        (mark.epoch, mark.aggregator) = (term, edge.clone());
+    }
+    signer.sign(share).expect("a key of the right kind")
+}
 
-    let candidates = [transplanted.node.clone()];
+/// `gauss` takes the share twice, and again after a restart.
+fn take(mut resync: LedgerResync, share: &LedgerShare) -> ReputationLedger {
+    let candidates = [share.node.clone()];
     let epoch = Some(Epoch::new(7, NodeName::from_static("edge")));
     let leadership = Leadership {
         position: Position::Following,
@@ -52,17 +59,35 @@ fuzz_target!(|input: &[u8]| {
         is_deserted: false,
         is_yielding: false,
     };
-    for new in [LedgerResync::new, LedgerResync::signed] {
-        let mut resync = new(NodeName::from_static("gauss"), 10);
-        let mut ledger = ReputationLedger::default();
-        for at in [1_000_000, 2_000_000] {
-            let _merged =
-                resync.merge(&transplanted, &mut ledger, &candidates, &leadership, Timestamp(at), Timestamp(at));
-            let _shares = resync.tick(&ledger, &leadership, Timestamp(at));
-        }
-        assert!(ledger.lanes() <= MAX_LANES && ledger.entries().count() <= MAX_ENTRIES);
-        let reputations = ledger.reputations(&ReputationConfig::default());
-        assert!(reputations.values().all(|reputation| (0.3..=1.0).contains(&reputation.score)));
-        ledger.retain_statements(|_| false);
+    let mut ledger = ReputationLedger::default();
+    for at in [1_000_000, 2_000_000, 3_000_000].map(Timestamp) {
+        let before = ledger.clone();
+        let merged = resync.merge(share, &mut ledger, &candidates, &leadership, at, at);
+        assert!(before.totals().is_empty() || before.totals() == ledger.totals(), "the same again changes nothing");
+        assert!(merged.is_ok() || before == ledger, "what is refused changes nothing");
+        let _shares = resync.tick(&ledger, &leadership, at);
+        resync.resume(&ledger, at);
     }
+    assert!(ledger.lanes() <= MAX_LANES && ledger.entries().count() <= MAX_ENTRIES);
+    let reputations = ledger.reputations(&ReputationConfig::default());
+    assert!(reputations.values().all(|reputation| (0.3..=1.0).contains(&reputation.score)));
+    ledger
+}
+
+fuzz_target!(|input: &[u8]| {
+    let Ok(share) = decode::<LedgerShare>(input, &Limits::default()) else { return };
+    let (signer, honest) = &*EDGE;
+    let mut signer = signer.lock().unwrap_or_else(PoisonError::into_inner);
+    assert!(signer.verify(&share).is_err(), "no fuzzer has the key");
+    let transplanted = LedgerShare { signed: honest.signed.clone(), ..share };
+    let is_honest = transplanted.entries == honest.entries && transplanted.marks == honest.marks;
+    assert_eq!(signer.verify(&transplanted).is_ok(), is_honest);
+    let _unsigned = take(LedgerResync::new(NodeName::from_static("gauss"), 10), &transplanted);
+
+    let signed = signed_by_edge(&signer, &transplanted);
+    assert_eq!(signer.verify(&signed).is_ok(), !signed.is_empty(), "whatever edge says, it is the one who said it");
+    let mut ledger = take(LedgerResync::signed(NodeName::from_static("gauss"), 10), &signed);
+    assert!(ledger.statements().all(|statement| signer.is_trusted(statement)));
+    ledger.retain_statements(|_| false);
+    assert_eq!(ledger.totals().len(), 0, "all that came by a certificate goes with it");
 });

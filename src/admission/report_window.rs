@@ -148,7 +148,7 @@ fn parts_beside(vehicles: &BTreeMap<NodeName, VehicleClock>, name: &NodeName) ->
 }
 
 /// Maximum parts of a vehicle at a time: a vehicle that invents names takes nobody else's room.
-const MAX_PARTS: usize = 16;
+pub const MAX_PARTS: usize = 16;
 
 /// Time after which a silent vehicle's clock is forgotten when room is short.
 const RETENTION: Duration = Duration::from_secs(10);

@@ -105,6 +105,11 @@ impl LedgerResync {
         }
     }
 
+    /// Takes over what earlier runs knew: counts go on from there, and leap no further than before.
+    pub fn resume(&mut self, ledger: &ReputationLedger, now: Timestamp) {
+        self.growth = GrowthLimit::of(ledger, now);
+    }
+
     /// The node's own leadership, while it leads.
     pub fn leads(&self) -> Option<&Epoch> {
         self.leads.as_ref()
@@ -149,10 +154,16 @@ impl LedgerResync {
         self.shares(ledger, &changed, &reached)
     }
 
-    /// Checks the way on which a share came. `broker` is the node whose certificate the broker has proven, if any.
-    ///
-    /// A broker can let anybody publish in any name. So evidence that its sender has not signed itself is taken over the
-    /// sender's broker, this node's, and that of a leader that is followed or was a moment ago.
+    /// Whether a broker vouches for the senders of shares: its own node's, this node's, and that of a leader that is
+    /// followed or was a moment ago. `broker` is the node whose certificate it has proven, if any.
+    pub fn is_vouched_for(&self, broker: Option<&NodeName>, share: &LedgerShare, leadership: &Leadership) -> bool {
+        let is_of_leader =
+            |broker: &NodeName| leadership.leader() == Some(broker) || self.followed.contains_key(broker);
+        broker.is_none_or(|broker| [&share.node, &self.name].contains(&broker) || is_of_leader(broker))
+    }
+
+    /// Checks the way on which a share came. A broker can let anybody publish in any name. So evidence that its sender has
+    /// not signed itself is taken only over a broker that vouches for the sender.
     ///
     /// # Errors
     /// The share is not to be used. [`RejectReason::Unattested`] if it has news, `None` if all of it is known.
@@ -163,9 +174,8 @@ impl LedgerResync {
         ledger: &ReputationLedger,
         leadership: &Leadership,
     ) -> Result<(), Option<RejectReason>> {
-        let Some(broker) = broker.filter(|broker| ![&share.node, &self.name].contains(broker)) else { return Ok(()) };
-        let is_of_leader = leadership.leader() == Some(broker) || self.followed.contains_key(broker);
-        if is_of_leader || share.is_empty() || share.lane().is_some_and(|lane| lane.leader == share.node) {
+        let is_signed_by_sender = share.lane().is_some_and(|lane| lane.leader == share.node);
+        if share.is_empty() || is_signed_by_sender || self.is_vouched_for(broker, share, leadership) {
             return Ok(());
         }
         let is_news = share.entries.iter().any(|entry| ledger.lacks_entry(entry))

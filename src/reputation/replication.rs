@@ -62,6 +62,11 @@ impl ReputationLedger {
         record.is_none_or(|record| record.marks.would_keep(mark.number) && !record.marks.has(mark.number))
     }
 
+    /// Number of votes that are known of a mark's vehicle in its lane.
+    pub fn votes_of(&self, mark: &LedgerMark) -> u64 {
+        self.record_of(mark.epoch, &mark.aggregator, &mark.node).map_or(0, |record| record.sum.total())
+    }
+
     fn record_of(&self, term: u64, aggregator: &NodeName, node: &NodeName) -> Option<&Record> {
         self.lanes.get(&Epoch::new(term, aggregator.clone()))?.get(node)
     }

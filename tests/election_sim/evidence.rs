@@ -86,13 +86,13 @@ impl World {
         if self.nodes[to].config.role == Role::Cav {
             return;
         }
-        self.handle(to, Input::EvidenceReceived { from: share.node.clone() });
         let candidates = self.candidates(to);
         let now = Timestamp(self.now).shifted(self.nodes[to].steady_clock);
         let node = &mut self.nodes[to];
         if let Ok(merged) = node.resync.merge(share, &mut node.ledger, &candidates, &node.leadership, now, now) {
             self.judge_merge(to, share);
             self.share(to, merged.shares);
+            self.handle(to, Input::EvidenceReceived { from: share.node.clone() });
         }
     }
 

@@ -238,6 +238,7 @@ impl Node {
             self.saved = ReputationLedger::default();
         }
         self.ledger = self.saved.clone();
+        self.resync.resume(&self.ledger, Timestamp(now).shifted(self.clock));
         (self.known, self.members, self.links) = Default::default();
         self.leadership = Leadership::default();
         self.filter = RoundFilter::new(self.persisted, Timestamp(now).shifted(self.clock));

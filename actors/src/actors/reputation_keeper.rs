@@ -4,6 +4,7 @@
 //! Fuser ── Lead, Record, StepDown ─> ReputationKeeper ── PublishReputations, PublishShare ──> Gateway
 //! Gateway ── Merge ────────────────>   │ ▲      │ └──── Adopt, Resume ──> Fuser
 //! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
+//!          └ <── EvidenceReceived ──
 //! ```
 //!
 //! With certificates, this actor signs the counts of its node, and verifies those of others. When a certificate is revoked,
@@ -20,6 +21,7 @@ use std::sync::Arc;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::ledger_resync::LedgerResync;
+use ecod::leadership::node::Input;
 use ecod::leadership::timers::DISK_TIMEOUT;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
@@ -37,6 +39,7 @@ pub use store::{ReputationStore, SharedReputations, reset_saved};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::Received;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::cell_clock::CellClock;
@@ -74,6 +77,8 @@ pub struct ReputationKeeperArguments {
     pub gateway: ActorSlot<GatewayMessage>,
     /// Starts from evidence of others.
     pub fuser: ActorSlot<FuserMessage>,
+    /// Is told whose evidence was taken.
+    pub election: ActorSlot<LeaderElectionMessage>,
     /// The cell's time, by which resets are judged.
     pub clock: CellClock,
     /// The node's counters.
@@ -110,7 +115,7 @@ impl Actor for ReputationKeeper {
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let mut state = ReputationKeeperState::new(arguments);
-        store::restore(&state.arguments, state.signer.as_mut());
+        state.restore();
         myself.send_interval(state.arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
         if state.signer.is_some() {
             // Certificates may have been revoked while the actor did not run.
@@ -182,6 +187,12 @@ impl ReputationKeeperState {
         }
     }
 
+    /// Takes over what earlier runs knew, and what is saved.
+    fn restore(&mut self) {
+        store::restore(&self.arguments, self.signer.as_mut());
+        self.resync.resume(&self.arguments.reputations.open().ledger, clock::now());
+    }
+
     fn lead(&mut self, epoch: Epoch, last_round: u64) {
         let newest = self.arguments.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.message));
         let mut store = self.arguments.reputations.open();
@@ -239,6 +250,10 @@ impl ReputationKeeperState {
                 return self.arguments.counters.reject(reason, share.node.as_str());
             }
         };
+        if self.resync.is_vouched_for(broker, share, &leadership) {
+            let input = Input::EvidenceReceived { from: share.node.clone() };
+            self.arguments.election.send(LeaderElectionMessage::Note { input });
+        }
         for reason in merged.refused {
             tracing::debug!(node = %share.node, %reason, term = leadership.term, "part of the evidence not used");
             self.arguments.counters.reject(reason, share.node.as_str());

@@ -98,7 +98,7 @@ async fn largest_round(target: Target) -> anyhow::Result<()> {
 /// Publishes the same again and again, over a new connection whenever one ends.
 async fn publish_for_ever(target: &Target, packets: &[Vec<u8>]) -> anyhow::Result<()> {
     loop {
-        if let Ok(mut stream) = log_in(target.broker, &target.candidate, CANDIDATE).await {
+        if let Ok(mut stream) = log_in(target, &target.candidate, CANDIDATE).await {
             while stream.write_all(&packets.concat()).await.is_ok() {
                 target.did(packets.len());
                 sleep(PAUSE).await;

@@ -16,9 +16,11 @@ use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
 use rustls::ClientConfig;
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 use tempfile::TempDir;
 
 use crate::key_holder;
+use crate::network::{self, Bridged};
 use crate::ports::Ports;
 use crate::process::{Process, command};
 use crate::row::Outcome;
@@ -49,8 +51,12 @@ const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_
 "#;
 const FRAME_SIZE: (usize, usize) = (160, 120);
 
-/// Where the object is.
+/// What it is and where.
+const LABEL: &str = "car";
 const LANDMARK: &str = "\n[[landmarks]]\nid = \"ahead\"\nx_m = 6.6\ny_m = 0.0\n";
+
+/// Where attackers are on loopback.
+const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
 
 /// Time between two maps.
 const ROUND: Duration = Duration::from_millis(100);
@@ -58,6 +64,8 @@ const ROUND: Duration = Duration::from_millis(100);
 /// Running nodes with their files; all end with it.
 pub(crate) struct Cell {
     nodes: Vec<Node>,
+    /// The nodes' network namespaces; without any, all are on loopback.
+    network: Option<Bridged>,
     vehicle: TlsConfig,
     candidate: TlsConfig,
     foreign: TlsConfig,
@@ -93,6 +101,8 @@ pub(crate) struct Target {
     pub(crate) broker: SocketAddr,
     /// Where the nodes gossip.
     pub(crate) gossip: Vec<SocketAddr>,
+    /// The attacker's own address, another than the cell's.
+    pub(crate) from: Ipv4Addr,
     /// The cell's key.
     pub(crate) key: &'static str,
     /// TLS with the certificate of a vehicle, [`VEHICLE`].
@@ -128,15 +138,17 @@ impl Cell {
         let mut elsewhere = Authority::init(&home.join("elsewhere"), &NodeName::new(CELL)?, clock::now())?;
         let foreign = issue(&mut elsewhere, key_holder::NAME, Role::Edge)?;
         let foreign = TlsConfig { ca: authority.ca(), revocation_list: None, ..foreign };
+        let network = network::has_namespaces().then(|| Bridged::new(NODES.len())).transpose()?;
         let mut ports = Ports::new();
         let mut addresses = Vec::new();
-        for _ in NODES {
-            let [broker, gossip] = [ports.free()?, ports.free()?];
-            addresses.push((SocketAddr::from((Ipv4Addr::LOCALHOST, broker)), (Ipv4Addr::LOCALHOST, gossip).into()));
+        for index in 0..NODES.len() {
+            let ip = network.as_ref().map_or(Ipv4Addr::LOCALHOST, |_| network::address(index));
+            let [broker, gossip] = [ports.free()?, ports.free()?].map(|port| SocketAddr::from((ip, port)));
+            addresses.push((broker, gossip));
         }
         let seeds: Vec<SocketAddr> = addresses.iter().map(|(_, gossip)| *gossip).collect();
         let mut nodes = Vec::new();
-        for ((name, role), (broker, gossip)) in NODES.into_iter().zip(addresses) {
+        for (index, ((name, role), (broker, gossip))) in NODES.into_iter().zip(addresses).enumerate() {
             let mut tls = issue(&mut authority, name, role)?;
             let directory = home.join(name);
             fs::create_dir(&directory)?;
@@ -149,7 +161,8 @@ impl Cell {
             let text = configuration(name, role, broker, gossip, &seeds, &tls, home);
             fs::write(directory.join("node.toml"), text)?;
             let program = std::env::var("PROGRAM").unwrap_or_else(|_| PROGRAM.to_owned());
-            let mut command = command(Path::new(&program), None);
+            let namespace = network.as_ref().map(|_| network::namespace(index));
+            let mut command = command(Path::new(&program), namespace.as_deref());
             command
                 .env_clear()
                 .envs(std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")));
@@ -157,7 +170,7 @@ impl Cell {
             command.stderr(File::create(directory.join("node.log"))?).current_dir(&directory);
             nodes.push(Node { name, broker, gossip, process: Process::start(&mut command)? });
         }
-        Ok(Self { nodes, vehicle, candidate, foreign, directory })
+        Ok(Self { nodes, network, vehicle, candidate, foreign, directory })
     }
 
     /// Waits until maps hold the reports of all honest vehicles, and have done so for a while.
@@ -188,6 +201,7 @@ impl Cell {
             deeds: Arc::default(),
             broker: self.nodes[usize::from(victim == Victim::Standby)].broker,
             gossip: self.nodes.iter().map(|node| node.gossip).collect(),
+            from: self.network.as_ref().map_or(ELSEWHERE, |_| network::HARNESS),
             key: KEY,
             vehicle: client(&self.vehicle, VEHICLE)?,
             candidate: client(&self.candidate, CANDIDATE)?,
@@ -218,7 +232,7 @@ impl Cell {
             longest_gap_ms: longest_gap_ms(&maps, from),
             is_replaced: maps.last().is_some_and(|line| line.map.aggregator != LEADER),
             rss_mb: if ended.is_empty() { self.peak_memory_mb()? } else { 0 },
-            false_verdicts: None,
+            false_maps: maps.iter().filter(|line| !line.map.is_true()).count(),
             ended,
             deeds: 0,
             fault: None,
@@ -272,14 +286,25 @@ struct Line {
 struct Map {
     aggregator: String,
     landmarks: Vec<Landmark>,
+    objects: Vec<IgnoredAny>,
 }
 
 #[derive(Deserialize)]
 struct Landmark {
+    label: Option<String>,
     contributors: BTreeSet<String>,
 }
 
 impl Map {
+    /// Whether the cell made it of the reports of honest vehicles: the object that is there, or none, and nothing else.
+    fn is_true(&self) -> bool {
+        let [landmark] = &self.landmarks[..] else { return false };
+        NODES.iter().any(|(name, role)| *name == self.aggregator && *role != Role::Cav)
+            && landmark.label.as_deref().is_none_or(|label| label == LABEL)
+            && self.reporters().is_subset(&honest())
+            && self.objects.is_empty()
+    }
+
     fn reporters(&self) -> BTreeSet<&str> {
         self.landmarks.iter().flat_map(|landmark| &landmark.contributors).map(String::as_str).collect()
     }
@@ -345,4 +370,20 @@ fn configuration(
         );
     }
     text + LANDMARK
+}
+
+#[test]
+fn a_map_is_false_that_says_more_than_honest_vehicles_have_seen() {
+    let map = |aggregator: &str, label: &str, contributors: &str, objects: &str| {
+        let text = format!(
+            r#"{{"aggregator":"{aggregator}","landmarks":[{{"label":{label},"contributors":[{contributors}]}}],"objects":[{objects}]}}"#
+        );
+        serde_json::from_str::<Map>(&text).unwrap().is_true()
+    };
+    assert!(map("edge", r#""car""#, r#""v01","v02""#, "") && map("v01", "null", "", ""));
+    assert!(!map("gauss", r#""car""#, r#""v01""#, ""), "made by another");
+    assert!(!map("edge", r#""bus""#, r#""v01""#, ""), "another object");
+    assert!(!map("edge", r#""car""#, r#""gauss""#, ""), "seen by another");
+    assert!(!map("edge", r#""car""#, r#""v01""#, "{}"), "one object more");
+    assert!(!serde_json::from_str::<Map>(r#"{"aggregator":"edge","landmarks":[],"objects":[]}"#).unwrap().is_true());
 }

@@ -1,6 +1,5 @@
 //! An attacker's connection: TLS, a login, and then any bytes.
 
-use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -18,40 +17,37 @@ use uuid::Uuid;
 use crate::cell::Target;
 use crate::packets::{packet, text};
 
-/// The attacker's address, another than the cell's.
-const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
-
 /// A connection without a login.
-pub(crate) async fn knock(broker: SocketAddr) -> anyhow::Result<TcpStream> {
+pub(crate) async fn knock(target: &Target) -> anyhow::Result<TcpStream> {
     let socket = TcpSocket::new_v4()?;
-    socket.bind((ELSEWHERE, 0).into())?;
-    Ok(socket.connect(broker).await?)
+    socket.bind((target.from, 0).into())?;
+    Ok(socket.connect(target.broker).await?)
 }
 
 /// A connection with a certificate and without a login.
-pub(crate) async fn secure(broker: SocketAddr, tls: &Arc<ClientConfig>) -> anyhow::Result<TlsStream<TcpStream>> {
-    let stream = knock(broker).await?;
+pub(crate) async fn secure(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<TlsStream<TcpStream>> {
+    let stream = knock(target).await?;
     let server = ServerName::try_from(BROKER_NAME)?;
     Ok(TlsConnector::from(Arc::clone(tls)).connect(server, stream).await?)
 }
 
 /// A connection that has logged in under a node's name.
 pub(crate) async fn log_in(
-    broker: SocketAddr,
+    target: &Target,
     tls: &Arc<ClientConfig>,
     name: &str,
 ) -> anyhow::Result<TlsStream<TcpStream>> {
     let client_id = format!("{name}-{}", Uuid::now_v7().simple());
-    log_in_as(broker, tls, &client_id).await
+    log_in_as(target, tls, &client_id).await
 }
 
 /// The same with any client id. The keep-alive is off.
 pub(crate) async fn log_in_as(
-    broker: SocketAddr,
+    target: &Target,
     tls: &Arc<ClientConfig>,
     client_id: &str,
 ) -> anyhow::Result<TlsStream<TcpStream>> {
-    let mut stream = secure(broker, tls).await?;
+    let mut stream = secure(target, tls).await?;
     stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x02\0\0", &text(client_id)])).await?;
     let mut answer = [0; 4];
     stream.read_exact(&mut answer).await.context("no answer to the login")?;
@@ -69,7 +65,7 @@ pub(crate) async fn send_for_ever(
     packet: &[u8],
 ) {
     loop {
-        if let Ok(mut stream) = log_in(target.broker, tls, name).await
+        if let Ok(mut stream) = log_in(target, tls, name).await
             && stream.write_all(opening).await.is_ok()
         {
             while stream.write_all(packet).await.is_ok() {

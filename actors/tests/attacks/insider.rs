@@ -1,6 +1,6 @@
 //! An attacker that takes part in the membership, as far as it is admitted, and says anything there.
 
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -45,7 +45,7 @@ impl Insider {
     ) -> anyhow::Result<Self> {
         let mut config = MembershipConfig {
             key: Some(Secret::new(target.key)),
-            bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
+            bind: Some(SocketAddr::from((target.from, 0))),
             seeds: target.gossip.iter().map(ToString::to_string).collect(),
             ..MembershipConfig::default()
         };

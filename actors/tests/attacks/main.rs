@@ -6,6 +6,9 @@
 //!    └────── reads ──>  map logs, memory of the edge ──> the row's line in the table
 //! ```
 //!
+//! Each node has a network namespace, joined by a bridge, and attackers an address of their own there. Where namespaces
+//! cannot be made, all are on loopback, and the harness says so.
+//!
 //! Each kind of attacker has a file with its rows. Those on brokers run against the leader's, then against the standby's. `ROWS=a,b` runs those whose names contain `a` or `b`;
 //! `ATTACK=quick` runs only those for every change, `PROGRAM=file` attacks another build. A row that missed its bar
 //! while the machine stood still is repeated.
@@ -23,6 +26,9 @@ mod vehicle;
 #[allow(dead_code, reason = "shared with the trials")]
 #[path = "../trials/machine.rs"]
 mod machine;
+#[allow(dead_code, reason = "shared with the trials")]
+#[path = "../trials/network.rs"]
+mod network;
 #[path = "../security/packets.rs"]
 mod packets;
 #[path = "../trials/ports.rs"]
@@ -75,6 +81,9 @@ async fn run_all() -> anyhow::Result<()> {
         is_named && (row.quick || !is_quick)
     };
     let time = if is_quick { QUICK_TIME } else { ATTACK_TIME };
+    if !network::has_namespaces() {
+        println!("on loopback: network namespaces cannot be made here");
+    }
     let mut lines = Vec::new();
     for row in ATTACKERS.into_iter().flatten().filter(is_wanted) {
         for victim in [Victim::Leader, Victim::Standby] {

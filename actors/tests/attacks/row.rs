@@ -86,8 +86,8 @@ pub(crate) struct Outcome {
     pub(crate) longest_gap_ms: u64,
     /// Whether the last map is of another node than the leader of the beginning.
     pub(crate) is_replaced: bool,
-    /// Wrong verdicts, where the cell votes.
-    pub(crate) false_verdicts: Option<usize>,
+    /// Maps that say what no honest vehicle has seen, or that no node of the cell made.
+    pub(crate) false_maps: usize,
     /// Nodes that ended.
     pub(crate) ended: Vec<String>,
     /// Deeds of the attacker, and the reason for which the attack ended early.
@@ -114,7 +114,7 @@ impl Bar {
             && outcome.rss_mb <= self.rss_mb
             && self.longest_gap_ms.is_none_or(|most| outcome.longest_gap_ms <= most)
             && outcome.is_replaced == self.is_replaced
-            && outcome.false_verdicts.unwrap_or_default() == 0
+            && outcome.false_maps == 0
             && outcome.ended.is_empty()
     }
 }
@@ -135,6 +135,9 @@ impl fmt::Display for Outcome {
         )?;
         write!(f, ", {} deeds", self.deeds)?;
         self.fault.iter().try_for_each(|fault| write!(f, ", attack ended: {fault}"))?;
+        if self.false_maps > 0 {
+            write!(f, ", {} false maps", self.false_maps)?;
+        }
         if self.is_replaced {
             write!(f, ", another leader")?;
         }
@@ -154,7 +157,7 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
     );
     for (row, victim, outcome) in lines {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
-        let wrong = outcome.false_verdicts.map_or_else(|| "-".to_owned(), |count| count.to_string());
+        let wrong = outcome.false_maps;
         let verdict = match (row.took_place(outcome), row.bar.is_met(outcome)) {
             (false, _) => outcome
                 .fault

@@ -25,7 +25,7 @@ async fn connections(target: Target) -> anyhow::Result<()> {
     let mut ticks = interval(Duration::from_millis(2));
     loop {
         ticks.tick().await;
-        held.extend(knock(target.broker).await.inspect(|_| target.did(1)));
+        held.extend(knock(&target).await.inspect(|_| target.did(1)));
         if held.len() > 1000 {
             held.pop_front();
         }

@@ -106,7 +106,7 @@ async fn unfinished_packets(target: Target) -> anyhow::Result<()> {
     let packet = publish(&detections(VEHICLE), &vec![b'x'; 8 * 1024 * 1024]);
     let send = |_| async {
         loop {
-            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+            if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
                 let mut parts = packet[..packet.len() - 1].chunks(64 * 1024);
                 while let Some(part) = parts.next()
                     && stream.write_all(part).await.is_ok()
@@ -125,7 +125,7 @@ async fn unfinished_packets(target: Target) -> anyhow::Result<()> {
 
 /// Fills the places for retained statuses, and subscribes to all of them as often as one packet can.
 async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
-    let mut stream = log_in(target.broker, &target.vehicle, VEHICLE).await?;
+    let mut stream = log_in(&target, &target.vehicle, VEHICLE).await?;
     for observer in 0..64 {
         let topic = format!("ecod/v1/{CELL}/nodes/{VEHICLE}--{observer}");
         stream.write_all(&packet(0x31, &[&text(&topic), &vec![b'x'; 16 * 1024]])).await?;
@@ -134,7 +134,7 @@ async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
     let packet = packet(0x82, &[&[0, 1], &filter.repeat(10_000)]);
     let ask = |_| async {
         loop {
-            if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+            if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
                 while stream.write_all(&packet).await.is_ok() {
                     target.did(packet.len());
                 }
@@ -160,7 +160,7 @@ async fn abandoned_sessions(target: Target) -> anyhow::Result<()> {
 }
 
 async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<()> {
-    let mut stream = crate::client::secure(target.broker, tls).await?;
+    let mut stream = crate::client::secure(target, tls).await?;
     let id = format!("{VEHICLE}-{}", uuid::Uuid::now_v7().simple());
     // Not a clean session.
     stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x00\0\0", &text(&id)])).await?;
@@ -172,7 +172,7 @@ async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Resu
 async fn deep_filters(target: Target) -> anyhow::Result<()> {
     let filter = vec!["a"; 15_000].join("/");
     loop {
-        if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+        if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
             for packet in [subscribe(&filter), publish(&filter, b"payload")] {
                 target.did(usize::from(stream.write_all(&packet).await.is_ok()));
             }
@@ -186,12 +186,12 @@ async fn claims(target: Target) -> anyhow::Result<()> {
     loop {
         let run = uuid::Uuid::now_v7().simple().to_string();
         for name in ["edge", "v01", "v02"] {
-            match log_in_as(target.broker, &target.vehicle, &format!("{name}-{run}")).await {
+            match log_in_as(&target, &target.vehicle, &format!("{name}-{run}")).await {
                 Ok(_) => anyhow::bail!("logged in as {name}"),
                 Err(error) => target.did(usize::from(error.to_string().contains("login"))),
             }
         }
-        if let Ok(mut stream) = log_in(target.broker, &target.vehicle, VEHICLE).await {
+        if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
             for topic in ["detections/v01", "nodes/v01", "global_detections", "reputations", "ledger/v01"] {
                 stream.write_all(&publish(&format!("ecod/v1/{CELL}/{topic}"), b"{}")).await.ok();
             }

@@ -12,7 +12,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, bail};
 
 /// Where the harness itself is on the first bridge.
-const HARNESS: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 254);
+pub(crate) const HARNESS: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 254);
 
 /// Namespaces and bridges; removed when dropped.
 #[derive(Debug)]

@@ -39,6 +39,15 @@ pub(super) struct GrowthLimit {
 }
 
 impl GrowthLimit {
+    /// The limit of a node that starts with a ledger: what it missed meanwhile may come at the rate of the fastest votes.
+    /// No clock says how long it was down.
+    pub(super) fn of(ledger: &ReputationLedger, now: Timestamp) -> Self {
+        let mut limit = Self::default();
+        ledger.entries().for_each(|entry| limit.note_entry(&entry, now));
+        ledger.marks().for_each(|mark| limit.note_mark(&mark, ledger, now));
+        limit
+    }
+
     /// Whether a count is plausible. The first one of a vehicle and label is noted by [`Self::note`].
     pub(super) fn admits(&self, entry: &LedgerEntry, now: Timestamp) -> bool {
         self.admits_votes(&key_of(entry), entry.correct.saturating_add(entry.incorrect), now)
@@ -53,11 +62,21 @@ impl GrowthLimit {
     /// Notes the counts of a share that the ledger has now.
     pub(super) fn note(&mut self, share: &LedgerShare, ledger: &ReputationLedger, now: Timestamp) {
         for entry in share.entries.iter().filter(|entry| !ledger.lacks_entry(entry)) {
-            self.first.entry(key_of(entry)).or_insert((now, entry.correct + entry.incorrect));
+            self.note_entry(entry, now);
         }
         for mark in share.marks.iter().filter(|mark| !ledger.lacks_mark(mark)) {
-            self.first.entry(key_of_mark(mark)).or_insert((now, mark.correct + mark.incorrect));
+            self.note_mark(mark, ledger, now);
         }
+    }
+
+    fn note_entry(&mut self, entry: &LedgerEntry, now: Timestamp) {
+        self.first.entry(key_of(entry)).or_insert((now, entry.correct.saturating_add(entry.incorrect)));
+    }
+
+    /// Notes a mark with the counts beside it: a lane that is heard of late has marks of long ago.
+    fn note_mark(&mut self, mark: &LedgerMark, ledger: &ReputationLedger, now: Timestamp) {
+        let votes = mark.correct.saturating_add(mark.incorrect).max(ledger.votes_of(mark));
+        self.first.entry(key_of_mark(mark)).or_insert((now, votes));
     }
 
     /// Forgets the lanes that are not `known`.

@@ -237,6 +237,17 @@ fn what_a_round_says_is_shared_at_once_and_that_there_is_nothing_too() {
     assert_eq!((share.entries.len(), share.entries[0].correct), (1, 1));
 }
 
+#[test]
+fn a_leader_that_has_counted_much_is_believed_in_its_next_rounds() {
+    let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("euclid", 7, "edge"));
+    edge.lead(7);
+    (0..100_000).for_each(|_| drop(edge.record(7, "gauss")));
+    euclid.hear(&sign(edge.resync.snapshot(&edge.ledger)));
+    let later = (0..32).flat_map(|_| sign(edge.record(7, "gauss")));
+    let refused: Vec<_> = later.flat_map(|share| euclid.merge(&share, 3000).unwrap().refused).collect();
+    assert_eq!((refused, euclid.ledger.totals()), (Vec::new(), edge.ledger.totals()));
+}
+
 /// A candidate of a cell with certificates that follows.
 fn signing(node: &str, term: u64, leader: &str) -> Candidate {
     let leadership = following(term, leader);

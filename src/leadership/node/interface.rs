@@ -107,7 +107,7 @@ pub enum Input {
         /// Its number.
         round: u64,
     },
-    /// Evidence about vehicles came from another candidate.
+    /// Evidence about vehicles came from another candidate, and was verified.
     EvidenceReceived {
         /// The candidate.
         from: NodeName,

@@ -22,10 +22,13 @@ pub struct StalenessFilter {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct LeadersDelay {
     least: MinimumDelay,
-    /// Delay on which rounds that seem to have waited agree: the leader's clock may have been set.
+    /// Delay on which rounds agree that seem to have waited, or of which nobody knows: the leader's clock may have been
+    /// set.
     candidate: Option<LiveStream>,
     /// Whether the least delay is that of rounds that did not wait.
     is_learnt: bool,
+    /// Whether the least delay is only a bound, until the rounds prove to be live.
+    is_bound: bool,
     /// Time for which rounds have arrived no faster than they were made.
     live_for: Duration,
     /// Fusion and arrival of the last round.
@@ -41,6 +44,7 @@ impl LeadersDelay {
             least,
             candidate: None,
             is_learnt,
+            is_bound: false,
             live_for: Duration::ZERO,
             last: (fused_at, received_at),
             last_waited: Duration::ZERO,
@@ -56,21 +60,23 @@ impl LeadersDelay {
         // A later round with an earlier stamp: the leader's clock was set back. It was made after the last one, so it has
         // waited for no longer than that, and the time since.
         let longest_wait = self.last_waited + came_in;
-        let is_set_back = fused_at < last_fused_at && longest_wait <= MAX_ROUND_WAIT;
-        if is_set_back {
-            self.least = MinimumDelay::new(received_at);
-        }
         let delay_us = received_at.micros_from(fused_at);
+        if fused_at < last_fused_at && longest_wait <= MAX_ROUND_WAIT {
+            self.least = MinimumDelay::new(received_at);
+            self.least.observe(delay_us.saturating_sub(longest_wait.as_micros() as i64), received_at);
+            (self.is_bound, self.candidate) = (true, None);
+        }
         self.least.observe(delay_us, received_at);
         let mut waited = Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs());
-        if waited <= MAX_ROUND_WAIT {
+        if waited <= MAX_ROUND_WAIT && !self.is_bound {
             self.candidate = None;
         } else if let Some(least_us) = LiveStream::observe(&mut self.candidate, fused_at, received_at, TOLERANCE_US) {
             self.least = MinimumDelay::new(received_at);
             self.least.observe(least_us, received_at);
+            self.is_bound = false;
             waited = Duration::from_micros(delay_us.saturating_sub(least_us).unsigned_abs());
         }
-        self.last_waited = if is_set_back { longest_wait } else { waited };
+        self.last_waited = waited;
         waited
     }
 }
@@ -187,5 +193,31 @@ mod tests {
         assert!((0..10).all(|n| is_fresh(n, &mut filter)));
         assert!(!is_fresh(10, &mut filter));
         assert_eq!((11..250).map(|n| is_fresh(n, &mut filter)).last(), Some(true));
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_makes_no_older_rounds_fresh() {
+        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
+            filter.is_fresh(&epoch, ms(made_ms).shifted(-1_000_000 * set_back_s), ms(made_ms + waited_ms))
+        };
+        assert!((0..20).all(|n| is_fresh(100 * n, 0, 2)));
+        assert!(is_fresh(2000, 0, 800) && is_fresh(2100, 5, 790), "in time");
+        assert!(
+            !is_fresh(2200, 5, 1600),
+            "too late, though it waited for only 810 ms more than the first by this clock"
+        );
+    }
+
+    #[test]
+    fn rounds_go_on_after_a_silence_in_which_the_leaders_clock_was_set_back() {
+        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
+            filter.is_fresh(&epoch, ms(made_ms).shifted(-1_000_000 * set_back_s), ms(made_ms + waited_ms))
+        };
+        assert!((0..20).all(|n| is_fresh(100 * n, 0, 2)));
+        // Nothing tells how long the first of them waited. Once they are known to be live, they may be late again.
+        assert!((27..40).all(|n| is_fresh(100 * n, 5, 2)));
+        assert!((40..60).all(|n| is_fresh(100 * n, 5, 2 + 600 * (n % 2))));
     }
 }

@@ -72,6 +72,7 @@ fn arguments(gateway: &ActorSlot<GatewayMessage>, counters: &Arc<Counters>) -> R
         leadership: watch::channel(leadership).1,
         gateway: gateway.clone(),
         fuser: ActorSlot::default(),
+        election: ActorSlot::default(),
         clock: CellClock::default(),
         counters: Arc::clone(counters),
     }
@@ -331,4 +332,64 @@ async fn a_saved_ledger_with_any_byte_changed_is_set_aside() {
             assert!(!file.path().exists() && file.path().with_extension("set-aside").exists());
         }
     }
+}
+
+/// Whoever signs evidence may make counts leap, and waits for its receivers to restart.
+#[tokio::test]
+async fn counts_leap_no_further_after_a_restart_than_before() {
+    let (gateway, _published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let directory = tempfile::tempdir().unwrap();
+    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let with = || ReputationKeeperArguments { file: Some(file.clone()), ..arguments(&gateway, &counters) };
+    let said = |incorrect| {
+        let entries = vec![LedgerEntry { incorrect, ..counted(7, "edge") }];
+        let mut share = share("edge", Some(7), entries);
+        share.received_at = clock::now();
+        share
+    };
+    let mut keeper = ReputationKeeperState::new(with());
+    keeper.merge(&said(10));
+    keeper.save().await;
+
+    let mut again = ReputationKeeperState::new(with());
+    again.restore();
+    let votes = |keeper: &ReputationKeeperState| keeper.arguments.reputations.open().ledger.totals()[&name("gauss")];
+    again.merge(&said(90_000_000));
+    assert_eq!((votes(&again), counters.rejects(RejectReason::Implausible)), ((0, 10), 1));
+    again.merge(&said(1000));
+    assert_eq!((votes(&again), counters.rejects(RejectReason::Implausible)), ((0, 1000), 1), "it was down for a while");
+}
+
+/// A standby that takes over waits for the leader's evidence, and for nothing that others say in its name.
+#[tokio::test]
+async fn the_election_is_told_of_evidence_that_was_verified_and_of_no_other() {
+    let (gateway, _published) = listening::slot().await;
+    let (election, mut told) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let mut certificates = Certificates::new();
+    let credentials = Some(certificates.of("euclid"));
+    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments {
+        credentials,
+        election: election.clone(),
+        ..arguments(&gateway, &counters)
+    });
+    let over = |broker: &str, mut share: Delivery<Arc<LedgerShare>>| {
+        share.broker = Some(name(broker));
+        share
+    };
+    let said = share("edge", Some(7), vec![counted(7, "edge")]);
+    keeper.merge(&said);
+    keeper.merge(&certificates.signed("gauss", &said));
+    keeper.merge(&share("mallory", None, Vec::new()));
+    keeper.merge(&over("gauss", share("edge", Some(7), Vec::new())));
+    keeper.merge(&over("gauss", certificates.signed("edge", &said)));
+    keeper.merge(&over("gauss", share("gauss", None, Vec::new())));
+    keeper.merge(&over("edge", share("edge", Some(7), Vec::new())));
+    election.get().unwrap().drain_and_wait(None).await.unwrap();
+    let mut senders = Vec::new();
+    while let Ok(LeaderElectionMessage::Note { input: Input::EvidenceReceived { from } }) = told.try_recv() {
+        senders.push(from.to_string());
+    }
+    assert_eq!(senders, ["gauss", "edge"], "a signature alone may be an old one");
 }

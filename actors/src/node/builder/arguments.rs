@@ -160,8 +160,6 @@ impl NodeBuilder {
                 }
                 Incoming::Ledger(share) => {
                     recording.send(at, LogItem::Share(Arc::clone(share)));
-                    let input = Input::EvidenceReceived { from: share.node.clone() };
-                    election.send(LeaderElectionMessage::Note { input });
                     let share = Arc::clone(share);
                     keeper.send(ReputationKeeperMessage::Merge { delivery: delivery.map(|_| share) })
                 }
@@ -213,6 +211,7 @@ impl NodeBuilder {
             leadership: self.leadership(),
             gateway: self.slots.gateway.clone(),
             fuser: self.slots.fuser.clone(),
+            election: self.slots.election.clone(),
             clock: self.clock.clone(),
             counters: self.counters(),
         }

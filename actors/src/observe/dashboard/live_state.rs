@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind};
@@ -50,7 +51,8 @@ pub struct LatestReport {
     pub report: Arc<ObjectReport>,
 }
 
-/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or long silent nodes.
+/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or long silent nodes. Of
+/// the parts of one node [`MAX_PARTS`] are kept: further ones replace parts of the same node.
 pub const MAX_SHOWN: usize = 256;
 
 /// Silence after which a vehicle may be replaced by another.
@@ -64,19 +66,18 @@ impl LiveState {
             Incoming::Report { kind, report } => {
                 self.reports[*kind as usize].fetch_add(1, Relaxed);
                 let entry = LatestReport { kind: *kind, received_at, report: Arc::clone(report) };
-                insert(&mut latest.reports, (report.node.clone(), *kind), entry, |all| {
-                    let (key, oldest) = all.iter().min_by_key(|(_, old)| old.received_at)?;
-                    (received_at.since(oldest.received_at) > SILENCE).then(|| key.clone())
-                });
+                let is_beside = |(name, of): &(NodeName, ReportKind)| of == kind && are_parts(name, &report.node);
+                let rank = |entry: &LatestReport| entry.received_at;
+                let gives_way = |oldest: &LatestReport| received_at.since(oldest.received_at) > SILENCE;
+                insert(&mut latest.reports, ((report.node.clone(), *kind), entry), is_beside, rank, gives_way);
             }
             Incoming::Status { status, via: broker } => {
                 let mut via = latest.statuses.remove(&status.node).map(|before| before.via).unwrap_or_default();
                 via.insert(broker.clone());
                 let entry = ReportedStatus { status: Arc::clone(status), via, at: received_at };
-                insert(&mut latest.statuses, status.node.clone(), entry, |all| {
-                    let rank = |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
-                    all.iter().min_by_key(|(_, entry)| rank(entry)).map(|(name, _)| name.clone())
-                });
+                let is_beside = |name: &NodeName| are_parts(name, &status.node);
+                let rank = |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
+                insert(&mut latest.statuses, (status.node.clone(), entry), is_beside, rank, |_| true);
             }
             Incoming::Link { broker, state: LinkState::Down | LinkState::Refused } => {
                 for entry in latest.statuses.values_mut() {
@@ -123,17 +124,38 @@ impl LiveState {
     }
 }
 
-/// Inserts a value. A full map first drops the key that `evict` names, or else keeps what it has.
-fn insert<K: Ord, T>(map: &mut BTreeMap<K, T>, key: K, value: T, evict: impl FnOnce(&BTreeMap<K, T>) -> Option<K>) {
-    if map.len() >= MAX_SHOWN
-        && !map.contains_key(&key)
-        && let Some(evicted) = evict(map)
-    {
-        map.remove(&evicted);
+/// Whether two names are of parts of one node.
+fn are_parts(one: &NodeName, other: &NodeName) -> bool {
+    let node = other.vehicle();
+    node != *other && node != *one && one.vehicle() == node
+}
+
+/// Inserts a value. Where there are too many entries beside it, or in all, the one of the least rank is dropped first. A
+/// full map keeps what it has if that one does not give way.
+fn insert<K: Ord + Clone, T, R: Ord>(
+    map: &mut BTreeMap<K, T>,
+    (key, value): (K, T),
+    is_beside: impl Fn(&K) -> bool,
+    rank: impl Fn(&T) -> R,
+    gives_way: impl FnOnce(&T) -> bool,
+) {
+    if !map.contains_key(&key) {
+        let beside = map.iter().filter(|(other, _)| is_beside(other));
+        let evicted = if beside.clone().count() >= MAX_PARTS {
+            beside.min_by_key(|(_, entry)| rank(entry))
+        } else if map.len() >= MAX_SHOWN {
+            map.iter().min_by_key(|(_, entry)| rank(entry)).filter(|(_, entry)| gives_way(entry))
+        } else {
+            None
+        };
+        if let Some(evicted) = evicted.map(|(other, _)| other.clone()) {
+            map.remove(&evicted);
+        }
+        if map.len() >= MAX_SHOWN {
+            return;
+        }
     }
-    if map.len() < MAX_SHOWN || map.contains_key(&key) {
-        map.insert(key, value);
-    }
+    map.insert(key, value);
 }
 
 /// First level of the topic of this kind of report.
@@ -197,5 +219,34 @@ mod tests {
         let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
         assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
         assert_eq!((statuses.len(), live_state.reports_since(later).len()), (MAX_SHOWN, 1));
+    }
+
+    /// A stolen certificate may speak in the names of any number of parts.
+    #[test]
+    fn the_parts_of_one_node_leave_room_for_other_nodes() {
+        let live_state = LiveState::default();
+        let status = |node: &str, state| {
+            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
+            Incoming::Status { status: Arc::new(NodeStatus { state, ..starting }), via: broker("10.0.0.2:1883") }
+        };
+        for honest in ["edge", "edge--lidar", "gauss"] {
+            live_state.update(&status(honest, NodeState::Following), Timestamp(1));
+            live_state.update(&report(honest, 1), Timestamp(1));
+        }
+        for part in 0..4 * MAX_SHOWN as u64 {
+            let (name, at) = (format!("gauss--{part}"), Timestamp(2 + part));
+            live_state.update(&status(&name, NodeState::Following), at);
+            live_state.update(&report(&name, 1), at);
+        }
+        let (statuses, end) = (live_state.statuses(), Timestamp(2 + 4 * MAX_SHOWN as u64));
+        live_state.update(&report("late", 1), end);
+        let reports = live_state.reports_since(Timestamp(0));
+        let reported: BTreeSet<_> = reports.iter().map(|latest| latest.report.node.as_str()).collect();
+        for honest in ["edge", "edge--lidar", "gauss", "late"] {
+            assert!(reported.contains(honest), "{honest}: {reported:?}");
+            assert!(honest == "late" || statuses.contains_key(&NodeName::from_static(honest)), "{honest}");
+        }
+        assert!(reported.contains(format!("gauss--{}", 4 * MAX_SHOWN - 1).as_str()), "the latest parts are shown");
+        assert_eq!((statuses.len(), reported.len()), (2 + MAX_PARTS + 1, 3 + MAX_PARTS + 1));
     }
 }

@@ -4,8 +4,9 @@
 //! cookies and its own ephemeral key; the accepter's transcript includes the prover's. The frame keys depend on the
 //! accepter's transcript. So two nodes with the same keys agree on everything in it, and on each other's certificate.
 
-use std::collections::HashMap;
-use std::net::SocketAddr;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashMap};
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -24,6 +25,7 @@ use super::key::{CellKey, Cookie, SessionId, SessionNonce, session_of};
 use super::refusals::Refusals;
 use super::replay_window::ReplayWindow;
 use super::session_keys::KeySet;
+use crate::platform::throttle::host_network;
 use crate::transport::pki::{CertificateSubject, Distrust, LoadedCredentials, is_signed_by};
 
 /// Certificates of this node, and the time at which others' are verified.
@@ -183,10 +185,11 @@ impl Prover {
     pub(crate) fn wants_proof(&mut self, key: &PendingKey, now: Timestamp) -> bool {
         self.pending.retain(|_, proof| now.since(proof.since) < PROOF_TIMEOUT);
         let repeated = |proof: &PendingProof| now.since(proof.since) >= PROOF_RETRY;
-        self.pending.len() < MAX_PENDING_PROOFS && self.pending.get(key).is_none_or(repeated)
+        self.pending.get(key).is_none_or(repeated)
     }
 
-    /// Remembers a proof that is sent.
+    /// Remembers a proof that is sent. When all places are taken, the oldest of the host that has most gives way: forged
+    /// challenges take no other host's place.
     pub(crate) fn expect_accept(
         &mut self,
         key: PendingKey,
@@ -195,6 +198,13 @@ impl Prover {
         now: Timestamp,
     ) {
         self.pending.insert(key, PendingProof { since: now, private, transcript, accepter });
+        if self.pending.len() > MAX_PENDING_PROOFS {
+            let mut counts: BTreeMap<IpAddr, usize> = BTreeMap::new();
+            self.pending.keys().for_each(|key| *counts.entry(host_of(key)).or_default() += 1);
+            let most = self.pending.iter().max_by_key(|(key, proof)| (counts.get(&host_of(key)), Reverse(proof.since)));
+            let most = most.map(|(key, _)| *key);
+            most.and_then(|key| self.pending.remove(&key));
+        }
     }
 
     /// Proofs to a session at an address that wait for an accept.
@@ -261,6 +271,10 @@ pub(crate) fn agree(
     });
     let (to, from) = agreed.map_err(|_| FrameEvent::Untrusted)?;
     Ok(KeySet { to, from, window: ReplayWindow::after(0), is_confirmed })
+}
+
+fn host_of((_, address, _): &PendingKey) -> IpAddr {
+    host_network(address.ip())
 }
 
 fn proven(subject: &CertificateSubject, name: &NodeName, certificate: &[u8]) -> Proven {

@@ -266,3 +266,32 @@ fn two_handshakes_at_once_leave_both_understood() {
         assert_both_heard(&mut a, &mut b);
     }
 }
+
+/// The cell's key forges challenges without end, from made-up addresses and from those of nodes.
+#[test]
+fn forged_challenges_leave_room_for_nodes_that_were_met() {
+    let mut authority = TrialAuthority::new();
+    let [mut a, mut b, mut c] = [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));
+    introduce(&mut a, &mut b);
+    introduce(&mut a, &mut c);
+    let (key, receiver) = (cell_key(), a.sessions.own);
+    for number in 1..=2000_u64 {
+        let head = FrameHeader {
+            version: Version::Certificate,
+            kind: FrameKind::Handshake,
+            sender: (u128::from(number) << 64).to_be_bytes(),
+            counter: number,
+        };
+        let challenge = Handshake::Challenge { cookie: Default::default(), name: NodeName::from_static("mallory") };
+        let forged = head.write(key.tag(), &encode(&challenge), &key.seal(&head.sender, &receiver));
+        let from = if number % 2 == 0 { b.address } else { SocketAddr::from(([10, 1, (number % 256) as u8, 1], 1)) };
+        let _ = a.open(&forged, from, NOW + Duration::from_micros(450 * number));
+    }
+    let mut again = node(&mut authority, "c", 3);
+    again.id.run = 2;
+    let later = NOW + Duration::from_millis(950);
+    let challenge = answer(again.open(&a.hello(), a.address, later));
+    let proof = answer(a.open(&challenge, c.address, later));
+    let accept = answer(again.open(&proof, a.address, later));
+    assert!(matches!(a.open(&accept, c.address, later), Ok(FrameContent::Met { .. })));
+}
