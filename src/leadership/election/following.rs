@@ -124,7 +124,7 @@ impl Election {
     fn outranks(&self, name: &NodeName, other: &NodeName) -> bool {
         let rank = |name: &NodeName| {
             let own = (*name == self.id).then(|| self.candidacy());
-            Some(own.or_else(|| self.peers.get(name)?.candidacy)?.class())
+            Some(own.or_else(|| self.peers.get(name)?.candidacy)?.rank())
         };
         rank(name).zip(rank(other)).is_some_and(|(name, other)| name < other)
     }
@@ -208,7 +208,7 @@ impl Election {
                     }
                     Some(other) if *other != own => {}
                     _ if message.term > own.term => self.renew_later(&message.from, now),
-                    Some(_) => self.peers.refuses(&message.from, false),
+                    Some(_) => self.peers.note_refusal(&message.from, false),
                     None => {}
                 }
             }

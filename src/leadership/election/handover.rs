@@ -26,7 +26,7 @@ pub(super) struct Handover {
 impl Election {
     /// Starts a handover when a better candidate has been there long enough.
     pub(super) fn start_handover(&mut self, now: Timestamp) {
-        let ours = self.candidacy().class();
+        let ours = self.candidacy().rank();
         if !matches!(&self.state, State::Leading(leading) if leading.handover.is_none()) {
             return;
         }

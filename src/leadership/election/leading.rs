@@ -101,7 +101,7 @@ impl Election {
     /// Plans to lead on in a term that a peer cannot refuse: it knows a later term, or believes this epoch to have ended.
     /// A newer leader that is just taking over is heard before.
     pub(super) fn renew_later(&mut self, refused_by: &NodeName, now: Timestamp) {
-        self.peers.refuses(refused_by, true);
+        self.peers.note_refusal(refused_by, true);
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
             leading.renew_at.get_or_insert(at.max(leading.since + leading.pause));
@@ -141,7 +141,7 @@ impl Election {
     /// Time between two beats to a peer. A better candidate that is not yet fit is to be heard soon when it is.
     fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
         let outranks =
-            |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.class() < self.candidacy().class();
+            |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.rank() < self.candidacy().rank();
         match leading.successors.iter().position(|name| name == to) {
             Some(0) => self.config.beat(),
             Some(_) => self.config.near_beat(),

@@ -57,7 +57,7 @@ impl Election {
         let (without, followers) = self.peers.without_login(&self.id, &self.id, now);
         let is_equal = || {
             let candidacy = self.peers.get(next).and_then(|peer| peer.candidacy);
-            candidacy.is_some_and(|other| other.class() <= self.candidacy().class())
+            candidacy.is_some_and(|other| other.rank() <= self.candidacy().rank())
         };
         2 * without > followers && (without > 1 || self.peers.has_no_login(next, &self.id) && is_equal())
     }

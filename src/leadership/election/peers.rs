@@ -11,11 +11,11 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::Role;
 
-/// Rank that is worth a handover: edge before auto, then the higher priority.
-pub(super) type Class = (bool, Reverse<u8>);
+/// Rank of a candidate; the lesser value is the higher rank: edge before auto, then the higher priority.
+pub(super) type Rank = (bool, Reverse<u8>);
 
 impl Candidacy {
-    pub(super) fn class(&self) -> Class {
+    pub(super) fn rank(&self) -> Rank {
         (self.role != Role::Edge, Reverse(self.priority))
     }
 
@@ -43,7 +43,7 @@ pub(super) struct Peer {
     run: u64,
     seq: u64,
     heard_at: Option<Timestamp>,
-    /// Time since when it has been heard without a gap, fit, and of one class.
+    /// Time since when it has been heard without a gap, fit, and of one rank.
     fit_since: Option<Timestamp>,
     /// Time until which it counts as gone although its messages may still be under way.
     gone_until: Option<Timestamp>,
@@ -121,7 +121,7 @@ impl Peers {
     }
 
     /// Notes whether a peer refuses this node's leadership.
-    pub(super) fn refuses(&mut self, name: &NodeName, refuses: bool) {
+    pub(super) fn note_refusal(&mut self, name: &NodeName, refuses: bool) {
         if let Some(peer) = self.table.get_mut(name) {
             peer.refuses = refuses;
         }
@@ -168,7 +168,7 @@ impl Peers {
         if !newer && (message.run == peer.run || !silent) {
             return false;
         }
-        let same = peer.candidacy.is_some_and(|candidacy| candidacy.class() == message.candidacy.class());
+        let same = peer.candidacy.is_some_and(|candidacy| candidacy.rank() == message.candidacy.rank());
         if !message.candidacy.fit {
             peer.fit_since = None;
         } else if silent || !same || message.run != peer.run || peer.fit_since.is_none() {
@@ -290,28 +290,28 @@ impl Peers {
         };
         let mut fit: Vec<_> =
             self.candidates(now).filter(|(name, _)| self.hears(name, now) && !given_up(name)).collect();
-        fit.sort_by_key(|&(name, candidacy)| (candidacy.class(), candidacy.load, name.clone()));
+        fit.sort_by_key(|&(name, candidacy)| (candidacy.rank(), candidacy.load, name.clone()));
         if self.lacks_logins {
             fit.sort_by_cached_key(|(name, _)| out_of_reach(name));
         }
         fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
     }
 
-    /// The best peer of a better class than `ours`, and the time at which it has been fit for `stable`.
+    /// The best peer of a higher rank than `ours`, and the time at which it has been fit for `stable`.
     ///
     /// Neither load nor name takes the lead from a living leader: leading is load, and a move among equals serves nobody.
     /// Waits for a better candidate that is more than halfway through `stable`; otherwise the lead moves twice.
     pub(super) fn challenger(
         &self,
-        ours: Class,
+        ours: Rank,
         stable: Duration,
         out_of_reach: impl Fn(&NodeName) -> bool,
         now: Timestamp,
     ) -> Option<(NodeName, Timestamp)> {
         self.candidates(now)
-            .filter(|(name, other)| self.hears(name, now) && other.class() < ours && !out_of_reach(name))
+            .filter(|(name, other)| self.hears(name, now) && other.rank() < ours && !out_of_reach(name))
             .filter_map(|(name, other)| Some((name, other, self.table.get(name)?.fit_since? + stable)))
-            .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.class(), name.clone()))
+            .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.rank(), name.clone()))
             .map(|(name, _, from)| (name.clone(), from))
     }
 }

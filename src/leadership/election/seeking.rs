@@ -200,7 +200,7 @@ impl Election {
         let there = |name: &&NodeName| **name == self.id || self.peers.may_succeed(name, now) && present(name);
         let named: Vec<&NodeName> = order.iter().filter(there).collect();
         let before = named.iter().position(|name| **name == self.id).unwrap_or_else(|| {
-            let place = |name: &NodeName, candidacy: Candidacy| (candidacy.class(), candidacy.load, name.clone());
+            let place = |name: &NodeName, candidacy: Candidacy| (candidacy.rank(), candidacy.load, name.clone());
             let own = place(&self.id, self.candidacy());
             let others = self.peers.candidates(now).filter(|(name, _)| !named.contains(name) && present(name));
             named.len() + others.filter(|&(name, other)| place(name, other) < own).count()
