@@ -25,7 +25,7 @@
 //!    One exception: a node without a term of its own drops a first term that the other candidates never reached.
 //! 3. A component whose links all work both ways, left alone, has exactly one leader: the best candidate by role and
 //!    priority, if one is fit.
-//! 4. Only a better candidate replaces a leader that is there and fit, by handover.
+//! 4. Only a better candidate replaces a leader that is there, fit, and reached by its followers, by handover.
 //! 5. Time that a node was stalled is no silence of others.
 //! 6. A node whose broker, fuser or gateway is broken does not lead.
 //!

@@ -90,9 +90,10 @@ impl Election {
         }
     }
 
-    /// Decides whether this node stops for another leader of a higher epoch. It stops for the one to which it has yielded. It stops for one that outranks it, unless only
-    /// this node has followers. It stops for one of its own rank unless that one has fewer followers, and for one of a lower
-    /// rank only if that one has more. Followers are counted by their own word. Otherwise it goes on in a term above both.
+    /// Decides whether this node stops for another leader of a higher epoch. It stops for the one to which it has yielded, and
+    /// for one that outranks it, unless only this node has followers. It stops for one of its own rank unless that one has
+    /// fewer followers, and for one of a lower rank only if that one has more. Followers are counted by their own word.
+    /// Otherwise it goes on in a term above both.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else { return };
         let (own, other) = (leading.epoch.clone(), beat.epoch.leader.clone());

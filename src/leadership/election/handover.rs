@@ -1,4 +1,4 @@
-//! Handover of the lead to a better candidate, make before break.
+//! Handover of the lead, make before break: to a better candidate, or to the standby of a leader that most cannot reach.
 //!
 //! The old leader publishes until it hears that the new one leads. It yields right after a round, so that nearly a whole
 //! period is left for the few packets that this takes. The new leader goes on with the next round. If all of these packets
