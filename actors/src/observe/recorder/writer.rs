@@ -3,7 +3,7 @@
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use ecod::aggregator::Command;
+use ecod::aggregator::{Command, FusionConfig};
 use ecod::replay::JournalEvent;
 use mcap::{McapError, McapResult};
 
@@ -142,8 +142,8 @@ impl LogWriter {
         Ok(file)
     }
 
-    /// Follows the state of the aggregator, for files that begin in the middle of its run.
-    fn track_aggregator(&self, item: &LogItem) {
+    /// Follows the state and settings of the aggregator, for files that begin in the middle of its run.
+    fn track_aggregator(&mut self, item: &LogItem) {
         let mut aggregator_state = self.recording.aggregator_state();
         match item {
             LogItem::Journal(JournalEvent::Start { .. }) => {
@@ -151,6 +151,9 @@ impl LogWriter {
             }
             LogItem::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
                 (aggregator_state.leads, aggregator_state.next_round) = (Some(epoch.clone()), *first_round);
+            }
+            LogItem::Journal(JournalEvent::Command(Command::Configure { fusion, landmarks })) => {
+                (self.identity.fusion, self.identity.landmarks) = (FusionConfig::clone(fusion), landmarks.clone());
             }
             LogItem::Journal(JournalEvent::Command(Command::StepDown)) => aggregator_state.leads = None,
             LogItem::Round(round) => aggregator_state.next_round = round.saturating_add(1),
