@@ -31,8 +31,11 @@ pub const MAX_VERSION_STEP: u64 = 1 << 20;
 /// Largest version that a node without a description takes from others.
 pub const MAX_FIRST_VERSION: u64 = 1 << 40;
 
-/// Minimum time between two publications of one description.
+/// Minimum time between the first two publications of one description; it doubles with each further one.
 pub const PUBLISH_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Maximum number of doublings: a node that never has the description costs the others little.
+const MAX_DOUBLINGS: u32 = 5;
 
 /// Maximum number of bodies that wait for the word of a candidate; the oldest gives way.
 const MAX_UNPROVEN: usize = 4;
@@ -91,7 +94,8 @@ pub struct DescriptionExchange {
     leader: Leader,
     /// Whether brokers may lack the description.
     is_due: bool,
-    published_at: Option<Timestamp>,
+    /// Time of the last publication, and the number of those since the description or the leader changed.
+    published: Option<(Timestamp, u32)>,
     effects: Vec<DescriptionEffect>,
 }
 
@@ -106,7 +110,7 @@ impl DescriptionExchange {
             unproven: VecDeque::new(),
             leader: Leader::Unknown,
             is_due: false,
-            published_at: None,
+            published: None,
             effects: Vec::new(),
         }
     }
@@ -192,7 +196,7 @@ impl DescriptionExchange {
         if leader != self.leader {
             self.leader = leader;
             self.is_due = true;
-            self.published_at = None;
+            self.published = None;
         }
         self.finish(now)
     }
@@ -224,13 +228,13 @@ impl DescriptionExchange {
         let stamp = description.stamp();
         self.current = Some(Arc::clone(&description));
         self.unproven.retain(|body| body.stamp() > stamp);
-        self.published_at = None;
+        self.published = None;
         self.effects.push(DescriptionEffect::Adopt { description, stated_by });
     }
 
     fn publish(&mut self, description: Arc<CellDescription>, now: Timestamp) {
         self.is_due = false;
-        self.published_at = Some(now);
+        self.published = Some((now, self.published.map_or(0, |(_, times)| times) + 1));
         self.effects.push(DescriptionEffect::Publish { description });
     }
 
@@ -239,7 +243,7 @@ impl DescriptionExchange {
         if let Some(description) = self.current.clone()
             && self.may_lead
             && self.is_lacking(description.stamp())
-            && self.published_at.is_none_or(|at| now.since(at) >= PUBLISH_INTERVAL)
+            && self.published.is_none_or(|(at, times)| now.since(at) >= interval_after(times))
         {
             self.publish(description, now);
         }
@@ -254,6 +258,11 @@ impl DescriptionExchange {
             Leader::Other(leader) => self.statements.get(leader).is_some_and(is_behind),
         }
     }
+}
+
+/// Time from a publication to the next, by its number.
+fn interval_after(times: u32) -> Duration {
+    PUBLISH_INTERVAL * (1 << times.saturating_sub(1).min(MAX_DOUBLINGS))
 }
 
 #[cfg(test)]

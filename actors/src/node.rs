@@ -263,7 +263,7 @@ impl Actor for Node {
                 state.manager = Some(manager);
             }
             NodeMessage::Describe { description } => {
-                state.builder.describe(description);
+                state.builder.describe(&description);
                 // Settings may want a part that there was no use for.
                 for part in state.builder.parts() {
                     if !state.running.values().any(|running| *running == part) {

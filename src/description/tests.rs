@@ -92,11 +92,22 @@ fn the_leader_repeats_it_while_somebody_lacks_it_and_no_longer() {
     assert!(publishes(&edge.lead(Some(&name("edge")), at(0))), "its brokers may not have it");
     assert!(!publishes(&edge.tick(at(1500))));
     assert!(publishes(&edge.hear(&name("euclid"), false, DescriptionStamp::default(), at(1600))));
-    assert!(!publishes(&edge.tick(at(2000))), "not that often");
-    assert!(publishes(&edge.tick(at(2600))));
-    edge.hear(&name("euclid"), false, held.stamp(), at(2700));
+    assert!(!publishes(&edge.tick(at(3500))), "not that often");
+    assert!(publishes(&edge.tick(at(3600))));
+    edge.hear(&name("euclid"), false, held.stamp(), at(3700));
     assert!(!publishes(&edge.tick(at(9000))));
     assert!(publishes(&edge.take(described(2, "displaced"), at(9100))), "an earlier one took its place");
+}
+
+#[test]
+fn a_node_that_never_has_it_costs_the_others_little() {
+    let mut edge = DescriptionExchange::new(name("edge"), true, Some(described(3, "held")));
+    edge.lead(Some(&name("edge")), at(0));
+    let is_repeated = |ms: &u64| publishes(&edge.hear(&name("liar"), false, DescriptionStamp::default(), at(*ms)));
+    let times = (0..600_000).step_by(500).filter(is_repeated).count();
+    assert!((15..=25).contains(&times), "{times} in ten minutes");
+    edge.set("new".into(), ContentHash([7; 32]), at(600_000));
+    assert!(publishes(&edge.tick(at(601_000))), "a new one is repeated soon");
 }
 
 #[test]

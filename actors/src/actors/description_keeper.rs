@@ -121,7 +121,7 @@ impl Actor for DescriptionKeeper {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let now = clock::now();
+        let (now, is_tick) = (clock::now(), matches!(message, DescriptionKeeperMessage::Tick));
         if state.leadership.has_changed().unwrap_or(false) {
             let leadership = state.leadership.borrow_and_update().clone();
             let effects = state.exchange.lead(leadership.leader(), now);
@@ -152,8 +152,12 @@ impl Actor for DescriptionKeeper {
                 state.exchange.tick(now)
             }
         };
+        let has_adopted = effects.iter().any(|effect| matches!(effect, DescriptionEffect::Adopt { .. }));
         state.carry_out(effects);
-        state.save().await;
+        // A disk that hangs holds up one message, and no other.
+        if has_adopted || is_tick && state.writing.as_ref().is_none_or(JoinHandle::is_finished) {
+            state.save().await;
+        }
         Ok(())
     }
 }

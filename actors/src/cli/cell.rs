@@ -196,18 +196,18 @@ impl DoorClient {
 
     /// The description as a file, with the nodes that know one in comments.
     async fn show(&mut self) -> Result<String, anyhow::Error> {
-        let (mut description, mut nodes, mut waiting) = (None, BTreeMap::new(), None);
+        let (mut description, mut nodes) = (None, BTreeMap::new());
         loop {
             let next = if description.is_none() { Some(self.expect().await?) } else { self.next(SILENCE).await? };
             match next {
                 Some(DoorMessage::Description(present)) => description = Some(present),
-                Some(DoorMessage::Status(status)) => waiting = Some(status),
+                Some(DoorMessage::Status(status)) => {
+                    nodes.insert(status.node.clone(), status);
+                }
                 None => break,
             }
-            let is_node =
-                |status: &NodeStatus| status.state != NodeState::Offline && status.node.vehicle() == status.node;
-            nodes.extend(waiting.take().filter(is_node).map(|status| (status.node.clone(), status)));
         }
+        nodes.retain(|node, status| status.state != NodeState::Offline && node.vehicle() == *node);
         let cell = &self.config.cell;
         let mut shown = match &description {
             Some(CellDescription { version: version @ 1.., hash, set_by, .. }) => {

@@ -1,6 +1,7 @@
 //! How the parts of a node are made, connected, started and stopped.
 
 mod arguments;
+mod describe;
 
 use std::fs::File;
 use std::io;
@@ -59,11 +60,11 @@ use crate::transport::mqtt::Security;
 /// What the parts are made from; kept to make them again.
 pub(super) struct NodeBuilder {
     /// The node's own configuration.
-    pub(super) own_config: NodeConfig,
+    own_config: NodeConfig,
     /// The same with the cell's description, as it is used.
-    pub(super) config: NodeConfig,
-    pub(super) held: HeldDescription,
-    pub(super) shared: watch::Sender<SharedFacts>,
+    config: NodeConfig,
+    held: HeldDescription,
+    shared: watch::Sender<SharedFacts>,
     security: Security,
     name: NodeName,
     run: Uuid,
@@ -72,7 +73,7 @@ pub(super) struct NodeBuilder {
     slots: ActorSlots,
     counters: Arc<Counters>,
     newest: Newest,
-    pub(super) reputations: SharedReputations,
+    reputations: SharedReputations,
     /// Keeps `ecod-node reset` away while the node runs.
     _state_lock: Option<File>,
     recording: LogSender,
@@ -81,7 +82,7 @@ pub(super) struct NodeBuilder {
     broker_address: watch::Sender<Option<SocketAddr>>,
     /// Address of the broker, whoever may use it.
     listens_at: watch::Sender<Option<SocketAddr>>,
-    pub(super) door: Door,
+    door: Door,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
@@ -173,7 +174,7 @@ impl NodeBuilder {
     }
 
     /// Longest time between two rounds.
-    pub(super) fn round_period(&self) -> Duration {
+    fn round_period(&self) -> Duration {
         Duration::from_secs_f64(self.config.fusion.round.period_s)
     }
 

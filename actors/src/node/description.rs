@@ -1,25 +1,15 @@
-//! The cell's description at a node: with which one it starts, and what a change means for its parts.
+//! The cell's description at a node: with which one it starts, and what follows from it.
 
 use std::sync::Arc;
 
-use ecod::leadership::node::Input;
 use ecod::vote::VoteMode;
 use ecod::wire::{CellDescription, DescriptionStatus, Limits, Payload, SCHEMA_VERSION};
 
-use super::builder::NodeBuilder;
+use super::NodeError;
 use super::config::NodeConfig;
-use super::{ActorKind, NodeError};
-use crate::messages::fuser::FuserMessage;
-use crate::messages::leader_election::LeaderElectionMessage;
-#[cfg(feature = "camera")]
-use crate::messages::projector::ProjectorMessage;
-use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::observe::readiness::{SharedFacts, patience};
 use crate::platform::content_hash::{content_hash, is_intact};
 use crate::platform::state_file::StateFile;
-
-/// Longest reason in a status, in bytes.
-const MAX_PROBLEM_BYTES: usize = 1024;
 
 /// The description that a node has.
 #[derive(Debug, Clone, Default)]
@@ -83,69 +73,5 @@ pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> Share
         round_period_s: config.fusion.round.period_s,
         landmarks: config.landmarks.clone().into(),
         problem: held.problem.clone(),
-    }
-}
-
-impl NodeBuilder {
-    /// Uses a description from now on. One that contradicts the node's own configuration, or that this version cannot read,
-    /// is kept and passed on, and the node goes on with the settings that it has.
-    pub(super) fn describe(&mut self, description: Arc<CellDescription>) {
-        let stamp = description.stamp();
-        let described = self.own_config.described(&description.text);
-        let problem = described.as_ref().err().map(|error| {
-            let text = format!("description {stamp} of the cell is not used: {error}");
-            text.chars()
-                .scan(0, |bytes, c| {
-                    *bytes += c.len_utf8();
-                    (*bytes <= MAX_PROBLEM_BYTES).then_some(c)
-                })
-                .collect::<String>()
-        });
-        self.held = HeldDescription { description: Some(Arc::clone(&description)), problem };
-        match described {
-            Ok(config) => {
-                let before = std::mem::replace(&mut self.config, config);
-                self.configure_parts(&before);
-                tracing::info!(%stamp, "the description of the cell is used");
-            }
-            Err(error) => tracing::error!(%stamp, %error, "the description of the cell is not used"),
-        }
-        self.door.publish_description(&description);
-        self.shared.send_replace(shared_facts(&self.config, &self.held));
-        let input = Input::Described {
-            description: self.held.status(),
-            round_period: self.round_period(),
-            keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
-        };
-        self.slots().election.send(LeaderElectionMessage::Note { input });
-    }
-
-    /// Tells the parts of settings that are others than `before`.
-    fn configure_parts(&self, before: &NodeConfig) {
-        let (config, slots) = (&self.config, self.slots());
-        self.reputations.set_by_evidence(rates_by_evidence(config));
-        if before.fusion.reputation != config.fusion.reputation {
-            let reputation = config.fusion.reputation.clone();
-            slots.keeper.send(ReputationKeeperMessage::Configure { reputation });
-        }
-        if (&before.fusion, &before.landmarks) != (&config.fusion, &config.landmarks) {
-            let (fusion, landmarks) = (Box::new(config.fusion.clone()), config.landmarks.clone());
-            slots.fuser.send(FuserMessage::Configure { fusion, landmarks });
-            // What was switched on starts with the evidence that there is.
-            let ledger = Arc::new(self.reputations.open().ledger.clone());
-            slots.fuser.send(FuserMessage::Adopt { ledger });
-        }
-        #[cfg(feature = "camera")]
-        if config.camera.is_some() {
-            match super::camera::perception(config) {
-                Ok(perception) => {
-                    let (perception, algorithms) = (Box::new(perception), super::camera::algorithms(config));
-                    slots.projector.send(ProjectorMessage::Configure { perception, algorithms });
-                }
-                Err(error) => {
-                    tracing::error!(error = format!("{error:#}"), "the camera goes on with the settings before")
-                }
-            }
-        }
     }
 }

@@ -209,6 +209,7 @@ mod tests {
 
     use ecod::model::names::NodeName;
     use ecod::model::time::Timestamp;
+    use ecod::perception::landmark::LandmarkConfig;
     use ecod::replay::JournalEntry;
     use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
     use uuid::Uuid;
@@ -216,7 +217,6 @@ mod tests {
     use super::*;
     use crate::observe::recorder::{LogEvent, LogMessage, LogReader, SchemaName, files};
     use crate::telemetry::counters::Counters;
-    use ecod::aggregator::FusionConfig;
 
     const NODE: NodeName = NodeName::from_static("cav");
 
@@ -277,6 +277,26 @@ mod tests {
             let bytes: u64 = kept().iter().map(|path| path.metadata().unwrap().len()).sum();
             assert!(bytes <= 3_000_000, "{bytes} bytes after {starts} starts");
         }
+    }
+
+    #[test]
+    fn a_file_that_begins_after_a_change_of_settings_has_those_of_then() {
+        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let mut writer = writer(in_directory(directory.path()), &counters);
+        let landmarks = vec![LandmarkConfig::at("slot-0", 1.0, 2.0)];
+        let change = Command::Configure { fusion: Box::default(), landmarks: landmarks.clone() };
+        writer.write(&second(1, LogItem::Journal(JournalEvent::Command(change))));
+        writer.flush();
+        writer.file.take().map(LogFile::finish).unwrap().unwrap();
+        writer.write(&second(2, LogItem::Counters(counters.snapshot())));
+        writer.flush();
+        let known = |path: &Path| {
+            let identity =
+                |event| if let Ok(LogEvent::Identity(identity)) = event { Some(identity.landmarks) } else { None };
+            LogReader::open(path).unwrap().find_map(identity).unwrap()
+        };
+        let files = files(directory.path()).unwrap();
+        assert_eq!([known(&files[0]), known(&files[1])], [vec![], landmarks]);
     }
 
     #[test]
