@@ -120,6 +120,30 @@ impl Aggregator {
         aggregator
     }
 
+    /// Goes on under other settings, taken as valid. Reports, votes, tracks and trust stay as far as they still apply: known
+    /// locations are told apart by their ids. An algorithm, or a mode of one, that was not used before starts anew.
+    pub fn configure(&mut self, config: FusionConfig, landmarks: Vec<Landmark>) {
+        let is_tracking = config.tracks_objects(!landmarks.is_empty());
+        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
+        self.windows.iter_mut().for_each(|known| known.configure(window.clone()));
+        self.rounds.configure(round);
+        self.by_packets = vote.mode == VoteMode::Paper;
+        self.vote = algorithms.vote().then(|| match self.vote.take() {
+            Some(known) => known.configured(vote, landmarks.clone()),
+            None => Vote::new(vote, landmarks.clone()),
+        });
+        self.tracks_open_cell = tracks.mode == TracksMode::Auto;
+        self.tracks = is_tracking.then(|| match self.tracks.take() {
+            Some(known) => known.configured(tracks, reputation),
+            None => Tracker::new(tracks, reputation),
+        });
+        let landmarks = Arc::new(LandmarkIndex::new(landmarks, pace.gate_m));
+        self.pace = algorithms.pace().then(|| match self.pace.take() {
+            Some(known) => known.configured(pace, landmarks),
+            None => Pace::new(pace, landmarks),
+        });
+    }
+
     /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says. Only later reports
     /// yield evidence: earlier ones may have counted in another lane, and no vote counts twice.
     pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {

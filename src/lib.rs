@@ -11,6 +11,7 @@ pub mod admission;
 pub mod aggregator;
 pub mod association;
 pub mod config;
+pub mod description;
 pub mod leadership;
 pub mod model;
 pub mod pace;

@@ -4,4 +4,5 @@ pub mod detection;
 pub mod epoch;
 pub mod geometry;
 pub mod names;
+pub mod origin;
 pub mod time;

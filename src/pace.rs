@@ -119,6 +119,16 @@ impl Pace {
         }
     }
 
+    /// The same evidence under other settings and for other locations, matched by id. Another mode starts without any.
+    #[must_use]
+    pub(crate) fn configured(self, config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
+        match (self, config.mode) {
+            (Self::Paper(pace), PaceMode::Paper) => Self::Paper(pace.configured(&config, landmarks)),
+            (Self::Bayes(pace), PaceMode::Bayes) => Self::Bayes(pace.configured(config, landmarks)),
+            _ => Self::new(config, landmarks),
+        }
+    }
+
     /// Adds known locations after those there are; evidence stays.
     pub fn add_landmarks(&mut self, added: Vec<Landmark>) {
         match self {

@@ -112,6 +112,27 @@ impl Vote {
         }
     }
 
+    /// The same votes and trust under other settings and for other landmarks. Another mode starts without votes.
+    #[must_use]
+    pub(crate) fn configured(mut self, config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
+        if config.mode != self.config.mode {
+            return Self { last_reports: self.last_reports, ..Self::new(config, landmarks) };
+        }
+        let method = self.method.get_mut();
+        method.configure(&config);
+        let is_open = landmarks.is_empty();
+        let mut known: BTreeMap<_, _> = landmarks.into_iter().map(|l| (l.id.clone(), Some(l))).collect();
+        if is_open {
+            self.arrivals.extend(self.landmarks.keys().filter(|_| !self.open).cloned());
+            known.extend(self.landmarks.into_keys().map(|id| (id, None)));
+        } else {
+            self.arrivals.clear();
+            known.keys().for_each(|id| method.add_landmark(id.clone()));
+            self.landmarks.keys().filter(|id| !known.contains_key(*id)).for_each(|id| method.remove_landmark(id));
+        }
+        Self { config, open: is_open, landmarks: known, ..self }
+    }
+
     /// Counts the votes of a report that was received at `received_at`.
     ///
     /// # Errors

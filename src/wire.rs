@@ -8,6 +8,7 @@
 //! aggregator  -> global_detections        GlobalMap
 //! aggregator  -> global_verdicts          Verdicts
 //! aggregator  -> reputations              Reputations    retained
+//! candidate   -> cell                     CellDescription  retained: the settings that all nodes share
 //! candidate   -> ledger/<node>            LedgerShare    evidence behind the reputations, for the next aggregator
 //! every node  -> nodes/<node>             NodeStatus     retained, with last will
 //! broker      -> nodes/<node>/clients     ClientRefusals retained, at that node's broker alone
@@ -20,6 +21,7 @@
 mod client_refusals;
 mod codec;
 mod compact;
+mod description;
 mod ledger;
 mod object;
 mod reject;
@@ -35,6 +37,7 @@ use uuid::Uuid;
 
 pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_report, decode_share, encode};
+pub use description::{CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash};
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
@@ -318,6 +321,10 @@ pub struct NodeStatus {
     /// Version of the software.
     #[n(8)]
     pub version: String,
+    /// The description of the cell that it knows; absent without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(9)]
+    pub description: Option<DescriptionStatus>,
 }
 
 impl NodeStatus {
@@ -333,6 +340,7 @@ impl NodeStatus {
             aggregator: None,
             fit: None,
             version: version.to_owned(),
+            description: None,
         }
     }
 }
@@ -375,6 +383,7 @@ pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
         ("ObjectReport", schemars::schema_for!(ObjectReport)),
         ("GlobalMap", schemars::schema_for!(GlobalMap)),
         ("Verdicts", schemars::schema_for!(Verdicts)),
+        ("CellDescription", schemars::schema_for!(CellDescription)),
         ("Reputations", schemars::schema_for!(Reputations)),
         ("LedgerShare", schemars::schema_for!(LedgerShare)),
         ("NodeStatus", schemars::schema_for!(NodeStatus)),

@@ -2,6 +2,7 @@
 
 pub mod broker;
 pub mod dashboard;
+pub mod description_keeper;
 #[cfg(feature = "camera")]
 pub mod detector;
 pub mod follower;

@@ -2,6 +2,7 @@
 
 #[cfg(feature = "camera")]
 mod calibrate;
+mod cell;
 mod doctor;
 mod join;
 pub mod lines;
@@ -84,7 +85,10 @@ enum Command {
     /// Make the certificates of a cell by hand: its CA, one per node, and the revocation list
     #[command(subcommand)]
     Pki(pki::PkiCommand),
-    /// Forget the evidence behind the reputations, or the highest term, of a node that is stopped
+    /// The settings that all nodes of a cell share: set, show, compare
+    #[command(subcommand)]
+    Cell(cell::CellCommand),
+    /// Forget the evidence behind the reputations, the highest term, or the cell's description, of a node that is stopped
     Reset(reset::ResetArguments),
     /// Print the JSON Schemas of every payload
     Schema,
@@ -163,6 +167,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         Some(Command::Invite(arguments)) => join::invite(&arguments),
         Some(Command::Join(arguments)) => join::join(&arguments),
         Some(Command::Pki(command)) => pki::run(&command),
+        Some(Command::Cell(command)) => cell::run(&command),
         Some(Command::Reset(arguments)) => reset::run(&arguments),
         Some(Command::Schema) => schema::run(),
         Some(Command::Completions(arguments)) => shell::completions(&arguments, Cli::command()),

@@ -3,6 +3,7 @@
 pub mod actor_slot;
 pub mod broker;
 pub mod dashboard;
+pub mod description_keeper;
 #[cfg(feature = "camera")]
 pub mod detector;
 pub mod follower;

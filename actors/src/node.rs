@@ -5,6 +5,7 @@
 //! ├─ Recorder          writes the log                     if configured
 //! ├─ Broker            embedded MQTT broker               unless switched off where it is only a door
 //! ├─ Membership        who is there, datagrams            always
+//! ├─ DescriptionKeeper newest settings of the cell        always
 //! ├─ Gateway           the only owner of MQTT clients     always
 //! ├─ Follower          takes maps, verdicts, reputations  always
 //! ├─ ReputationKeeper  publishes and keeps reputations    may lead, in a cell that votes or tracks
@@ -22,6 +23,7 @@ mod builder;
 #[cfg(feature = "camera")]
 pub mod camera;
 pub mod config;
+mod description;
 mod restarts;
 pub mod service;
 mod slots;
@@ -33,7 +35,7 @@ use std::time::Duration;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::Readiness;
-use ecod::wire::{Reputations, Verdicts};
+use ecod::wire::{CellDescription, Reputations, Verdicts};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -50,6 +52,7 @@ use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::Member;
 use builder::{NodeBuilder, cause};
+use description::HeldDescription;
 use restarts::Restarts;
 
 /// What the supervisor is asked to do; it stops by [`NodeHandle::stop`].
@@ -61,6 +64,11 @@ pub enum NodeMessage {
     ReportTo {
         /// The manager.
         manager: ServiceManager,
+    },
+    /// Use this description of the cell.
+    Describe {
+        /// The description.
+        description: Arc<CellDescription>,
     },
     /// This is how the node is.
     NoteReadiness {
@@ -119,7 +127,8 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
         checked.map_err(|error| NodeError::Failed(error.to_string()))?;
     }
     let (failed, failure) = watch::channel(None);
-    let builder = NodeBuilder::new(config, security, failed);
+    let held = HeldDescription::at_start(&config)?;
+    let builder = NodeBuilder::new(config, security, held, failed)?;
     let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
@@ -252,6 +261,15 @@ impl Actor for Node {
                 manager.started();
                 tokio::spawn(watch_readiness(state.builder.vitals(), manager.period(), myself));
                 state.manager = Some(manager);
+            }
+            NodeMessage::Describe { description } => {
+                state.builder.describe(&description);
+                // Settings may want a part that there was no use for.
+                for part in state.builder.parts() {
+                    if !state.running.values().any(|running| *running == part) {
+                        state.start(part, &myself.get_cell()).await?;
+                    }
+                }
             }
             NodeMessage::NoteReadiness { readiness } => {
                 if let Some(manager) = &mut state.manager {

@@ -2,6 +2,7 @@
 
 pub mod cell_clock;
 pub mod clock;
+pub mod content_hash;
 pub mod latest_slot;
 pub mod secret;
 pub mod state_file;

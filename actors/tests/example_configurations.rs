@@ -3,13 +3,17 @@
 use std::collections::BTreeMap;
 #[cfg(feature = "camera")]
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 
+fn example(name: &str) -> PathBuf {
+    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/node")).join(name)
+}
+
 fn load(name: &str) -> NodeConfig {
-    let file = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/node")).join(name);
+    let file = example(name);
     NodeConfig::load(Some(&file), &BTreeMap::<(), ()>::new())
         .unwrap_or_else(|error| panic!("{}: {error}", file.display()))
 }
@@ -42,8 +46,12 @@ fn the_example_vehicles_fit_the_example_edge() {
         assert_eq!(vehicle.role, role);
         assert_eq!(vehicle.cell, edge.cell);
         assert_eq!(vehicle.membership, edge.membership);
-        assert_eq!(vehicle.landmarks, edge.landmarks);
-        assert_eq!(vehicle.fusion.pace.gate_m, edge.fusion.pace.gate_m);
+        let description = std::fs::read_to_string(example("cell.toml")).unwrap();
+        let (described, edge) = (vehicle.described(&description).unwrap(), edge.described(&description).unwrap());
+        assert_eq!((&described.landmarks, &described.fusion), (&edge.landmarks, &edge.fusion));
+        assert!(described.landmarks.len() == 3 && described.origin == edge.origin && edge.origin.is_some());
+        assert!(described.camera.unwrap().projection.sizes.of("car").is_some());
+        assert_eq!(vehicle.landmarks, [], "a node's own file shares nothing");
         assert!(vehicle.broker_listen().ip().is_unspecified(), "the others reach its broker");
         assert!(vehicle.camera.is_some());
     }
@@ -73,7 +81,8 @@ fn configurations_in_the_documentation_can_be_used() {
 #[test]
 fn the_documentation_names_every_key() {
     let manual = page("docs/configuration.md") + &page("docs/cameras.md");
-    let config = toml::to_string(&load("cav.toml")).unwrap();
+    let description = std::fs::read_to_string(example("cell.toml")).unwrap();
+    let config = toml::to_string(&load("cav.toml").described(&description).unwrap()).unwrap();
     let keys = config.lines().filter_map(|line| Some(line.split_once(" = ")?.0.trim()));
     for key in keys {
         let named =

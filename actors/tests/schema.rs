@@ -47,6 +47,7 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
         Topic::GlobalDetections,
         Topic::GlobalVerdicts,
         Topic::Reputations,
+        Topic::Cell,
         Topic::Ledger(node.clone()),
         Topic::Nodes(node.clone()),
     ];

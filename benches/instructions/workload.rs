@@ -108,6 +108,7 @@ fn beat(seq: u64) -> ElectionInput {
         hears_you: true,
         body: Body::Beat { every_ms: 50, round: seq, followers: 1, after: None, successors },
         clock: None,
+        description: None,
     };
     ElectionInput::Receive { message }
 }

@@ -66,6 +66,11 @@ impl ReportWindow {
         Self { config, cell_offset_us: 0, offset_before_us: None, vehicles: BTreeMap::new() }
     }
 
+    /// Goes on under other settings.
+    pub(crate) fn configure(&mut self, config: WindowConfig) {
+        self.config = config;
+    }
+
     /// Notes the cell's time less the aggregator's clock in microseconds. After a jump, vehicles that have not heard of it
     /// are still understood.
     pub fn set_cell_offset(&mut self, offset_us: i64) {

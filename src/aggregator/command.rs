@@ -7,11 +7,12 @@ use std::sync::Arc;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{Aggregator, Fused};
+use super::{Aggregator, Fused, FusionConfig};
 use crate::aggregator::round::FirstRound;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
+use crate::perception::landmark::{Landmark, LandmarkConfig};
 use crate::reputation::ReputationLedger;
 use crate::wire::{GlobalMap, Reputation};
 
@@ -53,6 +54,15 @@ pub enum Command {
         /// The reputations.
         reputations: BTreeMap<NodeName, Reputation>,
     },
+    /// [`Aggregator::configure`].
+    Configure {
+        /// Settings of fusion.
+        #[schemars(with = "serde_json::Value")]
+        fusion: Box<FusionConfig>,
+        /// Known locations.
+        #[schemars(with = "serde_json::Value")]
+        landmarks: Vec<LandmarkConfig>,
+    },
     /// [`Aggregator::set_cell_offset`].
     SetCellOffset {
         /// The cell's time less the aggregator's clock in microseconds.
@@ -71,6 +81,9 @@ impl Aggregator {
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::Resume { reputations } => self.resume(reputations),
+            Command::Configure { fusion, landmarks } => {
+                self.configure(FusionConfig::clone(fusion), landmarks.iter().map(Landmark::from).collect());
+            }
             Command::SetCellOffset { offset_us } => self.set_cell_offset(*offset_us),
         }
         None

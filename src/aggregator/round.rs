@@ -132,6 +132,12 @@ impl RoundTrigger {
         }
     }
 
+    /// Goes on with another interval; the present round lasts no longer than either.
+    pub(super) fn configure(&mut self, config: RoundConfig) {
+        self.length = self.length.min(config.period());
+        self.config = config;
+    }
+
     /// Takes a report; true when it closes the round as the last missing one. [`Self::tick`] alone closes a round whose
     /// period is over, so that it includes all reports that come at its end.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {

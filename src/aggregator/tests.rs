@@ -1,3 +1,5 @@
+mod configure;
+
 use ReportKind::{Detections, VoteDetections};
 use nalgebra::Point2;
 

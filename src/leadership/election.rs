@@ -176,6 +176,7 @@ impl Election {
             ElectionInput::Round { epoch, round } => self.note_round(&epoch, round, now),
             ElectionInput::NoLogin { at } => self.set_no_login(at, now),
             ElectionInput::Prepared => self.prepared(now),
+            ElectionInput::Greet => self.greet(now),
             ElectionInput::Leave => self.leave(now),
         }
         self.run_timers(now);
@@ -432,6 +433,14 @@ impl Election {
         self.over = self.over.take().max(Some(epoch));
     }
 
+    fn greet(&mut self, now: Timestamp) {
+        let leader = self.leader().filter(|leader| **leader != self.id).cloned();
+        match leader {
+            Some(leader) if self.config.role == Role::Cav => self.send_status(&leader, now),
+            _ => self.send_all(&Body::Status { over: self.over.clone() }, now),
+        }
+    }
+
     fn send_status(&mut self, to: &NodeName, now: Timestamp) {
         self.send(to, Body::Status { over: self.over.clone(), no_login: self.no_login.clone() }, now);
     }
@@ -451,6 +460,7 @@ impl Election {
             hears_you,
             body,
             clock: None,
+            description: None,
         };
         self.effects.push(ElectionEffect::Send { to: to.clone(), message });
     }

@@ -37,7 +37,7 @@ use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
-use crate::wire::{NodeState, NodeStatus};
+use crate::wire::{DescriptionStamp, DescriptionStatus, NodeState, NodeStatus};
 use members::Members;
 
 /// Most nodes whose runs are remembered: brokers may tell of any number of names.
@@ -150,6 +150,11 @@ impl LeadershipNode {
         self.deadline
     }
 
+    /// Stamp of the cell's description that the node has; version 0 without one.
+    pub fn description(&self) -> DescriptionStamp {
+        self.status.description.as_ref().map(DescriptionStatus::stamp).unwrap_or_default()
+    }
+
     /// The election, to be asked.
     pub fn election(&self) -> &Election {
         &self.election
@@ -200,6 +205,14 @@ impl LeadershipNode {
                 self.monitor.forget_links();
                 self.is_status_told = false;
                 self.update_health(now);
+            }
+            Input::Described { description, round_period, keeps_reputations } => {
+                (self.round_period, self.keeps_reputations) = (round_period, keeps_reputations);
+                if self.status.description != description {
+                    self.status.description = description;
+                    self.is_status_told = false;
+                    self.feed(ElectionInput::Greet, now);
+                }
             }
             Input::Leave => self.feed(ElectionInput::Leave, now),
         }

@@ -27,7 +27,7 @@ use smallvec::SmallVec;
 use self::belief::{Belief, Increments, Observation, VehicleBelief};
 use self::consensus::{LabelScores, NamedBelief, WeightedMean};
 use super::assignment::{Pairing, one_to_one};
-use super::grouping::{ByPlace, Grouping, Place};
+use super::grouping::{ByPlace, Grouping, Place, places_after};
 use super::{PaceConfig, PaceRound};
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
@@ -58,6 +58,14 @@ impl BayesPace {
             vehicles: BTreeMap::new(),
             grouping: Grouping::default(),
         }
+    }
+
+    pub(super) fn configured(mut self, config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
+        let place_now = places_after(Arc::clone(&self.landmarks), Arc::clone(&landmarks), 2);
+        self.vehicles.values_mut().for_each(|vehicle| vehicle.move_places(&place_now));
+        let published = |landmark: &Landmark| self.published.get(self.landmarks.position_of(&landmark.id)?)?.clone();
+        let published = landmarks.landmarks().iter().map(published).collect();
+        Self { increments: Increments::new(&config), config, published, landmarks, ..self }
     }
 
     pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {

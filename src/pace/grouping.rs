@@ -1,6 +1,9 @@
 //! Regrouping of items from vehicles to places.
 
+use std::sync::Arc;
+
 use crate::model::names::NodeName;
+use crate::perception::landmark::LandmarkIndex;
 
 /// Index of something that vehicles observe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -9,6 +12,19 @@ pub(super) struct Place(pub(super) u32);
 impl Place {
     fn index(self) -> usize {
         self.0 as usize
+    }
+}
+
+/// The present number of each place that belongs to a landmark which is still there, of `per_landmark` places each.
+pub(super) fn places_after(
+    before: Arc<LandmarkIndex>,
+    after: Arc<LandmarkIndex>,
+    per_landmark: u32,
+) -> impl Fn(Place) -> Option<Place> {
+    move |Place(place)| {
+        let landmark = before.landmarks().get((place / per_landmark) as usize)?;
+        let now = u32::try_from(after.position_of(&landmark.id)?).ok()?;
+        Some(Place(now * per_landmark + place % per_landmark))
     }
 }
 

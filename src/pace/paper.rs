@@ -11,7 +11,7 @@ use std::time::Duration;
 use nalgebra::{Point2, Vector2};
 use smallvec::SmallVec;
 
-use super::grouping::{Grouping, Place, VehicleItems};
+use super::grouping::{Grouping, Place, VehicleItems, places_after};
 use super::{PaceConfig, PaceRound};
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
@@ -53,6 +53,16 @@ impl PaperPace {
             vehicles: BTreeMap::new(),
             grouping: Grouping::default(),
         }
+    }
+
+    pub(super) fn configured(mut self, config: &PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
+        let place_now = places_after(Arc::clone(&self.landmarks), Arc::clone(&landmarks), 1);
+        for latest in self.vehicles.values_mut() {
+            let known = std::mem::take(&mut latest.places).into_iter().zip(std::mem::take(&mut latest.objects));
+            (latest.places, latest.objects) =
+                known.filter_map(|(place, object)| Some((place_now(place)?, object))).unzip();
+        }
+        Self { gate_m: config.gate_m, max_age: config.max_age(), landmarks, ..self }
     }
 
     pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {

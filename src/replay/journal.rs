@@ -111,6 +111,11 @@ impl JournalReplay {
                 Vec::new()
             }
             JournalEvent::Command(command) => {
+                if let Command::Configure { fusion, landmarks } = command {
+                    // A later run of the aggregator starts with them.
+                    self.fusion = FusionConfig::clone(fusion);
+                    self.landmarks = landmarks.iter().map(Landmark::from).collect();
+                }
                 let fused = self.running(at).command(command, at);
                 self.lines(fused)
             }

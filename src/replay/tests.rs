@@ -345,3 +345,57 @@ fn neither_labels_nor_objects_of_one_report_are_too_many_for_a_recording() {
         assert!(names.iter().all(|(item, label)| labels[item].as_ref() == Some(label)));
     }
 }
+
+#[test]
+fn a_journal_with_a_change_of_settings_is_replayed_exactly_also_beyond_a_new_start() {
+    use crate::aggregator::{Aggregator, Command};
+    use crate::reputation::ReputationLedger;
+    let (_, reports) = drive();
+    let places = |ids: &[&str]| -> Vec<LandmarkConfig> {
+        ids.iter().enumerate().map(|(n, id)| LandmarkConfig::at(*id, 5.0 * n as f64, 0.0)).collect()
+    };
+    let (before, after) = (places(&["slot-0"]), places(&["slot-1", "slot-0", "slot-2"]));
+    let known = |places: &[LandmarkConfig]| places.iter().map(Landmark::from).collect::<Vec<_>>();
+    let fusion = FusionConfig::default();
+    let mut changed = fusion.clone();
+    changed.round.period_s = 0.2;
+    let start = reports[0].2;
+    let mut live = Aggregator::new_standby(fusion.clone(), known(&before), start);
+    let mut journal = JournalReplay::new(fusion, known(&before));
+    let (mut made, mut again) = (Vec::new(), Vec::new());
+    let begin =
+        |at_us| JournalEntry { at_us, event: JournalEvent::Start { ledger: Arc::new(ReputationLedger::default()) } };
+    journal.entry(&begin(start));
+    let epoch = crate::model::epoch::Epoch::new(1, NodeName::from_static("edge"));
+    let first = crate::aggregator::round::FirstRound::OnTime;
+    let lead = Command::Lead { epoch, first_round: 1, first };
+    let change = Command::Configure { fusion: Box::new(changed.clone()), landmarks: after.clone() };
+    for (index, (kind, report, at)) in reports.iter().enumerate() {
+        let (report, at) = (Arc::new(report.clone()), *at);
+        if index == reports.len() * 3 / 4 {
+            // The aggregator is started anew, under the settings that hold by then.
+            live = Aggregator::new_standby(changed.clone(), known(&after), at);
+            journal.entry(&begin(at));
+        }
+        let mut commands = vec![Command::Tick];
+        commands.extend((index % (reports.len() / 4) == 0).then(|| lead.clone()));
+        commands.extend((index == reports.len() / 2).then(|| change.clone()));
+        for command in commands {
+            made.extend(live.command(&command, at));
+            let json = serde_json::to_vec(&JournalEntry { at_us: at, event: JournalEvent::Command(command) }).unwrap();
+            again.extend(journal.entry(&serde_json::from_slice(&json).unwrap()));
+        }
+        made.extend(live.report(*kind, &report, at).ok().flatten());
+        again.extend(journal.report(*kind, &report, at));
+    }
+    let made: Vec<_> = made
+        .into_iter()
+        .flat_map(|fused| {
+            fused.map.map(FusedLine::Map).into_iter().chain(fused.verdicts.map(FusedLine::Verdicts)).collect::<Vec<_>>()
+        })
+        .collect();
+    assert!(made.len() > 20 && matches!(&made[made.len() - 1], FusedLine::Map(_) | FusedLine::Verdicts(_)));
+    let locations = |line: &FusedLine| if let FusedLine::Map(map) = line { map.landmarks.len() } else { 0 };
+    assert_eq!(made.iter().map(locations).max(), Some(3), "the change is in it");
+    assert_eq!(again, made);
+}

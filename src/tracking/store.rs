@@ -61,6 +61,13 @@ impl TrackStore {
         }
     }
 
+    /// Goes on with other limits. Tracks stay, also more than there is room for.
+    pub(super) fn configure(&mut self, config: &TracksConfig) {
+        let Self { max_tracks, max_density, gate_m, grid, .. } = Self::new(config);
+        (self.max_tracks, self.max_density, self.gate_m, self.grid) = (max_tracks, max_density, gate_m, grid);
+        self.reindex(self.indexed_at);
+    }
+
     /// Number of tracks.
     pub(super) fn len(&self) -> usize {
         self.tracks.len()

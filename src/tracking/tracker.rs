@@ -44,6 +44,14 @@ impl Tracker {
         }
     }
 
+    /// The same tracks and trust under other settings, taken as valid.
+    #[must_use]
+    pub(crate) fn configured(mut self, config: TracksConfig, reputation: ReputationConfig) -> Self {
+        self.tracks.configure(&config);
+        self.sensors.fleet.configure(reputation);
+        Self { config, ..self }
+    }
+
     /// Takes one admitted report, captured at `captured_at` on the aggregator's clock; false if it came too late.
     pub fn observe(&mut self, report: impl Into<Arc<ObjectReport>>, captured_at: Timestamp) -> bool {
         self.observe_only(report.into(), captured_at, |_| true)

@@ -177,6 +177,11 @@ impl Fleet {
         Self { reputation, trust: Vec::new(), detections: vec![(0.0, 1.0); Self::BINS] }
     }
 
+    /// Goes on with other parameters of reputations.
+    pub(super) fn configure(&mut self, reputation: ReputationConfig) {
+        self.reputation = reputation;
+    }
+
     /// Parameters of reputations.
     pub(super) fn reputation(&self) -> &ReputationConfig {
         &self.reputation

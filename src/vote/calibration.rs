@@ -71,6 +71,11 @@ impl Calibration {
         Self { prior_votes, ..Self::default() }
     }
 
+    /// Goes on with another weight of stated confidences.
+    pub(super) fn configure(&mut self, prior_votes: f64) {
+        self.prior_votes = prior_votes;
+    }
+
     /// Counts that a vehicle stated a confidence.
     pub(super) fn record_confidence(&mut self, vehicle: usize, confidence: f64) {
         if self.histograms.len() <= vehicle {

@@ -86,6 +86,11 @@ impl DawidSkene {
         Self { config, ..Self::default() }
     }
 
+    /// Goes on under other settings.
+    pub(super) fn configure(&mut self, config: WeightedConfig) {
+        self.config = config;
+    }
+
     /// Makes room for a label.
     pub(super) fn add_label(&mut self) {
         self.labels += 1;

@@ -94,6 +94,11 @@ impl Dependence {
         Self { memory, max_compared: MAX_COMPARED, significance: SIGNIFICANCE, ..Self::default() }
     }
 
+    /// Goes on with another memory.
+    pub(super) fn configure(&mut self, memory: f64) {
+        self.memory = memory;
+    }
+
     /// As [`Self::new`], for all stored votes together: nothing fades.
     pub(super) fn of_stored() -> Self {
         let (max_compared, significance) = (MAX_COMPARED_STORED, SIGNIFICANCE_STORED);

@@ -22,6 +22,9 @@ pub(super) struct NewVote<'a> {
 
 /// A voting method. What a method does without keeps the default, which does nothing.
 pub(super) trait VotingMethod {
+    /// Goes on under other settings of the same mode.
+    fn configure(&mut self, config: &VoteConfig);
+
     /// Makes a landmark known, so that it has a verdict even without votes.
     fn add_landmark(&mut self, landmark: LandmarkId);
 

@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use hashbrown::HashMap;
 
-use super::config::PaperConfig;
+use super::config::{PaperConfig, VoteConfig};
 use super::method::{self, NewVote, VotingMethod};
 use super::visibility;
 use crate::model::names::{Label, LandmarkId, NodeName};
@@ -58,6 +58,10 @@ impl PaperVoting {
 }
 
 impl VotingMethod for PaperVoting {
+    fn configure(&mut self, config: &VoteConfig) {
+        self.config = config.paper.clone();
+    }
+
     fn add_landmark(&mut self, landmark: LandmarkId) {
         self.landmarks.entry(landmark).or_default();
     }

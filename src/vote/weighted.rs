@@ -155,6 +155,13 @@ impl WeightedVoting {
 }
 
 impl VotingMethod for WeightedVoting {
+    fn configure(&mut self, config: &VoteConfig) {
+        self.config = config.weighted.clone();
+        self.model.configure(self.config.clone());
+        self.calibration.configure(self.config.calibration_votes);
+        self.dependence.configure(self.config.pair_memory_votes);
+    }
+
     fn add_landmark(&mut self, landmark: LandmarkId) {
         self.landmarks.entry(landmark).or_default();
     }

@@ -19,6 +19,8 @@ pub enum Topic {
     GlobalVerdicts,
     /// Reputations, retained.
     Reputations,
+    /// The description of the cell, retained.
+    Cell,
     /// A candidate's shares of the evidence behind the reputations.
     Ledger(NodeName),
     /// A node's status, retained.
@@ -91,6 +93,7 @@ impl Topics {
             ("global_detections", None) => Some(Topic::GlobalDetections),
             ("global_verdicts", None) => Some(Topic::GlobalVerdicts),
             ("reputations", None) => Some(Topic::Reputations),
+            ("cell", None) => Some(Topic::Cell),
             _ => None,
         }
     }
@@ -104,6 +107,7 @@ impl fmt::Display for Topic {
             Self::GlobalDetections => f.write_str("global_detections"),
             Self::GlobalVerdicts => f.write_str("global_verdicts"),
             Self::Reputations => f.write_str("reputations"),
+            Self::Cell => f.write_str("cell"),
             Self::Ledger(node) => write!(f, "ledger/{node}"),
             Self::Nodes(node) => write!(f, "nodes/{node}"),
         }
@@ -124,6 +128,7 @@ mod tests {
             Topic::GlobalDetections,
             Topic::GlobalVerdicts,
             Topic::Reputations,
+            Topic::Cell,
             Topic::Ledger(node.clone()),
             Topic::Nodes(node),
         ] {

@@ -7,8 +7,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, NodeStatus, ObjectReport, PerceivedObject,
-    PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
+    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, NodeStatus, ObjectReport,
+    PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, is_label};
@@ -104,6 +104,7 @@ payloads! {
     GlobalMap: at most map_bytes, checked by check_map;
     Verdicts: at most map_bytes, checked by check_verdicts;
     Reputations: at most map_bytes, checked by check_reputations;
+    CellDescription: at most map_bytes, checked by check_description;
     LedgerShare: at most payload_bytes, checked by check_share;
     NodeStatus: at most payload_bytes, checked by check_status;
 }
@@ -195,7 +196,16 @@ fn check_share(share: &LedgerShare, _: &Limits) -> Result<(), RejectReason> {
 
 fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
     check_integers([status.epoch])?;
+    let described = status.description.as_ref();
+    check_integers(described.map(|described| described.version))?;
+    if described.and_then(|described| described.problem.as_ref()).is_some_and(|problem| problem.len() > MAX_TEXT) {
+        return Err(RejectReason::TooLarge);
+    }
     check_labels([&*status.version])
+}
+
+fn check_description(description: &CellDescription, _: &Limits) -> Result<(), RejectReason> {
+    check_integers([description.version])
 }
 
 fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {

@@ -128,6 +128,7 @@ impl Actor for Fuser {
                 state.command(Command::StepDown);
                 state.keeper.send(ReputationKeeperMessage::StepDown);
             }
+            FuserMessage::Configure { fusion, landmarks } => state.command(Command::Configure { fusion, landmarks }),
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
             FuserMessage::Timeliness { reply } => {

@@ -134,6 +134,9 @@ impl Actor for Gateway {
                 state.publish(&Topic::Reputations, &*reputations, Retention::Retained);
                 inbox.deliver_local(Incoming::Reputations(reputations));
             }
+            GatewayMessage::PublishDescription { description } => {
+                state.publish(&Topic::Cell, &*description, Retention::Retained);
+            }
             GatewayMessage::PublishShare { share } => {
                 state.publish(&Topic::Ledger(share.node.clone()), &share, Retention::Transient);
             }

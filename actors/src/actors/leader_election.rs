@@ -29,6 +29,7 @@ pub use term_writer::saved_term;
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
+use crate::messages::description_keeper::DescriptionKeeperMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
@@ -51,6 +52,8 @@ pub struct Parts {
     pub fuser: ActorSlot<FuserMessage>,
     /// Holds the reputations.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
+    /// Keeps the cell's description.
+    pub description: ActorSlot<DescriptionKeeperMessage>,
     /// The node's own broker.
     pub broker: ActorSlot<BrokerMessage>,
     /// Shows the node's status to programs.

@@ -86,6 +86,10 @@ impl Actor for Projector {
     ) -> Result<(), ActorProcessingErr> {
         match message {
             ProjectorMessage::Report { detections, captured_at } => state.report(detections, captured_at),
+            ProjectorMessage::Configure { perception, algorithms } => {
+                state.perception = perception.continuing(&state.perception);
+                state.algorithms = algorithms;
+            }
             ProjectorMessage::TakePose { at, pose } => {
                 if state.poses.as_mut().is_some_and(|poses| !poses.push(at, pose)) {
                     state.counters.count(Event::PoseRejected);

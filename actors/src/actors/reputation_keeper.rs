@@ -143,6 +143,7 @@ impl Actor for ReputationKeeper {
             ReputationKeeperMessage::Record { epoch, round, evidence, reputations } => {
                 state.record(&epoch, round, &evidence, reputations);
             }
+            ReputationKeeperMessage::Configure { reputation } => state.arguments.reputation = reputation,
             ReputationKeeperMessage::StepDown => state.resync.step_down(),
             ReputationKeeperMessage::Merge { delivery } => state.merge(&delivery),
             ReputationKeeperMessage::SendSnapshot { to } => {

@@ -75,6 +75,13 @@ impl Perception {
         Self { vehicle_camera, camera, projection, view, gate, seq: 0, discarded: DiscardCounts::default() }
     }
 
+    /// The same producer with the pose, the numbers of reports and the counts of an earlier one.
+    #[must_use]
+    pub fn continuing(mut self, earlier: &Self) -> Self {
+        self.set_pose(earlier.vehicle_camera.pose);
+        Self { seq: earlier.seq, discarded: earlier.discarded.clone(), ..self }
+    }
+
     /// Sets the pose of the vehicle.
     pub fn set_pose(&mut self, pose: Pose) {
         self.vehicle_camera.pose = pose;

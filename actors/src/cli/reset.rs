@@ -25,6 +25,9 @@ pub(super) struct ResetArguments {
     /// Forget the highest term of leadership
     #[arg(long, group = "what")]
     term: bool,
+    /// Forget the description of the cell. The node learns it again from others that have it
+    #[arg(long, group = "what")]
+    description: bool,
 }
 
 /// Resets the files; the node must not run.
@@ -48,8 +51,9 @@ pub(super) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
         reset_saved(&file, &config.cell, name, clock::now()).with_context(|| file.path().display().to_string())?;
         done += &format!("reset {}\n", file.path().display());
     }
-    if arguments.term {
-        let file = file("term");
+    let forgotten = [(arguments.term, "term"), (arguments.description, "description")];
+    for (_, what) in forgotten.into_iter().filter(|(is_asked, _)| *is_asked) {
+        let file = file(what);
         file.delete().with_context(|| file.path().display().to_string())?;
         done += &format!("removed {}\n", file.path().display());
     }

@@ -34,6 +34,9 @@ pub(super) struct RunArguments {
     /// Directory for state that survives a restart
     #[arg(long, value_name = "DIR")]
     state_dir: Option<String>,
+    /// Description of the cell (TOML) with which this node starts a cell that has none
+    #[arg(long, value_name = "FILE")]
+    description: Option<String>,
     /// Append every accepted map with its time of receipt to this file, one JSON object per line
     #[arg(long, value_name = "FILE")]
     map_log: Option<String>,
@@ -106,7 +109,7 @@ impl RunArguments {
 
     /// The flags that were given, as keys of the configuration.
     fn overrides(&self) -> Value {
-        let Self { role, join, listen, state_dir, map_log, dashboard, no_dashboard, record, .. } = self;
+        let Self { role, join, listen, state_dir, description, map_log, dashboard, no_dashboard, record, .. } = self;
         let seeds = Some(&join.seeds).filter(|seeds| !seeds.is_empty());
         let enabled = if *no_dashboard { Some(false) } else { dashboard.map(|_| true) };
         let mut keys = json!({
@@ -115,6 +118,7 @@ impl RunArguments {
             "cell": join.cell,
             "listen": listen,
             "state_dir": state_dir,
+            "description": description,
             "map_log": map_log,
             "record": record,
             "mqtt": { "broker": join.broker },

@@ -4,10 +4,12 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ecod::admission::timeliness::Timeliness;
+use ecod::aggregator::FusionConfig;
 use ecod::aggregator::round::FirstRound;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::reputation::ReputationLedger;
 use ecod::wire::{GlobalMap, Reputation};
 use ractor::RpcReplyPort;
@@ -39,6 +41,13 @@ pub enum FuserMessage {
     HoldRound,
     /// Publish nothing more; go on fusing, to be ready.
     StopPublishing,
+    /// Go on under other settings.
+    Configure {
+        /// Settings of fusion.
+        fusion: Box<FusionConfig>,
+        /// Known locations.
+        landmarks: Vec<LandmarkConfig>,
+    },
     /// Start from evidence that came from elsewhere.
     Adopt {
         /// All evidence that is known.

@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ecod::wire::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
+use ecod::wire::{
+    CellDescription, GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts,
+};
 use ractor::RpcReplyPort;
 
 use crate::transport::mqtt::{BrokerAddress, LinkEvent, LinkState, Subscriber};
@@ -52,6 +54,11 @@ pub enum GatewayMessage {
     PublishReputations {
         /// The reputations.
         reputations: Arc<Reputations>,
+    },
+    /// Publish the cell's description, retained.
+    PublishDescription {
+        /// The description.
+        description: Arc<CellDescription>,
     },
     /// Publish evidence to the other candidates.
     PublishShare {

@@ -1,8 +1,11 @@
 //! Messages to the projector.
 
+use ecod::aggregator::Algorithms;
 use ecod::model::detection::Detection;
 use ecod::model::geometry::Pose;
 use ecod::model::time::Timestamp;
+
+use crate::camera::perception::Perception;
 
 /// Requests to the projector.
 #[derive(Debug)]
@@ -13,6 +16,13 @@ pub enum ProjectorMessage {
         detections: Vec<Detection>,
         /// Time of capture.
         captured_at: Timestamp,
+    },
+    /// Go on under other settings.
+    Configure {
+        /// Camera, pose and known locations.
+        perception: Box<Perception>,
+        /// Algorithms to report for.
+        algorithms: Algorithms,
     },
     /// Take a pose of the vehicle.
     TakePose {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
-use ecod::reputation::Evidence;
+use ecod::reputation::{Evidence, ReputationConfig};
 use ecod::wire::{LedgerShare, Reputation};
 
 use crate::transport::mqtt::Delivery;
@@ -33,6 +33,11 @@ pub enum ReputationKeeperMessage {
     },
     /// Publish nothing more.
     StepDown,
+    /// Go on with other parameters of reputations.
+    Configure {
+        /// The parameters.
+        reputation: ReputationConfig,
+    },
     /// Take in another candidate's evidence.
     Merge {
         /// The share and when it came.

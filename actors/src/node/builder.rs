@@ -1,6 +1,7 @@
 //! How the parts of a node are made, connected, started and stopped.
 
 mod arguments;
+mod describe;
 
 use std::fs::File;
 use std::io;
@@ -14,15 +15,17 @@ use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::PublisherFilter;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::vote::VoteMode;
-use ecod::wire::Topics;
+use ecod::wire::{CellDescription, ContentHash, SCHEMA_VERSION, Topics};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
 use tokio::sync::watch;
 use uuid::Uuid;
 
+use super::NodeError;
+use super::description::{HeldDescription, rates_by_evidence, shared_facts};
 use super::slots::{ActorKind, ActorSlots};
 use crate::actors::broker::Broker;
 use crate::actors::dashboard::Dashboard;
+use crate::actors::description_keeper::DescriptionKeeper;
 #[cfg(feature = "camera")]
 use crate::actors::detector::Detector;
 use crate::actors::follower::Follower;
@@ -41,6 +44,7 @@ use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::LiveState;
+use crate::observe::readiness::SharedFacts;
 #[cfg(feature = "camera")]
 use crate::observe::recorder::ImageRecorder;
 use crate::observe::recorder::LogSender;
@@ -55,7 +59,12 @@ use crate::transport::mqtt::Security;
 
 /// What the parts are made from; kept to make them again.
 pub(super) struct NodeBuilder {
+    /// The node's own configuration.
+    own_config: NodeConfig,
+    /// The same with the cell's description, as it is used.
     config: NodeConfig,
+    held: HeldDescription,
+    shared: watch::Sender<SharedFacts>,
     security: Security,
     name: NodeName,
     run: Uuid,
@@ -103,14 +112,33 @@ const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl NodeBuilder {
-    pub(super) fn new(config: NodeConfig, security: Security, failed: watch::Sender<Option<String>>) -> Self {
-        let by_evidence = config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote();
+    /// What the parts are made from, under the settings of `held`.
+    ///
+    /// # Errors
+    /// When the node's own configuration contradicts the cell's description.
+    pub(super) fn new(
+        own_config: NodeConfig,
+        security: Security,
+        held: HeldDescription,
+        failed: watch::Sender<Option<String>>,
+    ) -> Result<Self, NodeError> {
+        let config = match &held.description {
+            Some(description) => own_config.described(&description.text).map_err(|error| {
+                let (stamp, set_by) = (description.stamp(), &description.set_by);
+                NodeError::Failed(format!("description {stamp} of the cell, set at {set_by}: {error}"))
+            })?,
+            None => own_config.clone(),
+        };
         let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
         let mut builder = Self {
             _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
+            reputations: SharedReputations::new(rates_by_evidence(&config)),
+            shared: watch::Sender::new(shared_facts(&config, &held)),
+            own_config,
+            held,
             config,
             security,
             run: Uuid::now_v7(),
@@ -121,7 +149,6 @@ impl NodeBuilder {
             counters,
             newest: Newest::default(),
             report_queue: LatestReportQueue::default(),
-            reputations: SharedReputations::new(by_evidence),
             broker_address: watch::Sender::new(None),
             listens_at: watch::Sender::new(None),
             door: Door::default(),
@@ -134,7 +161,8 @@ impl NodeBuilder {
             failed,
         };
         builder.door = builder.new_door();
-        builder
+        builder.door.publish_description(&builder.present_description());
+        Ok(builder)
     }
 
     pub(super) fn slots(&self) -> &ActorSlots {
@@ -143,6 +171,23 @@ impl NodeBuilder {
 
     pub(super) fn counters(&self) -> Arc<Counters> {
         Arc::clone(&self.counters)
+    }
+
+    /// Longest time between two rounds.
+    fn round_period(&self) -> Duration {
+        Duration::from_secs_f64(self.config.fusion.round.period_s)
+    }
+
+    /// The cell's description for programs: version 0 without one.
+    fn present_description(&self) -> CellDescription {
+        let none = || CellDescription {
+            schema: SCHEMA_VERSION,
+            version: 0,
+            hash: ContentHash::default(),
+            set_by: self.name.clone(),
+            text: String::new(),
+        };
+        self.held.description.as_deref().cloned().unwrap_or_else(none)
     }
 
     fn spans(&self) -> Spans {
@@ -191,7 +236,7 @@ impl NodeBuilder {
         let mut parts = Vec::new();
         parts.extend(self.config.record.is_some().then_some(ActorKind::Recorder));
         parts.extend(self.config.has_broker().then_some(ActorKind::Broker));
-        parts.extend([ActorKind::Membership, ActorKind::Gateway, ActorKind::Follower]);
+        parts.extend([ActorKind::Membership, ActorKind::DescriptionKeeper, ActorKind::Gateway, ActorKind::Follower]);
         if leads {
             let rates = self.config.fusion.rates_vehicles(!self.config.landmarks.is_empty());
             parts.extend(rates.then_some(ActorKind::ReputationKeeper));
@@ -216,6 +261,11 @@ impl NodeBuilder {
             ActorKind::Recorder => self.start_recorder(supervisor).await,
             ActorKind::Broker => self.start_broker(supervisor).await,
             ActorKind::Membership => self.start_membership(supervisor).await,
+            ActorKind::DescriptionKeeper => {
+                let arguments = self.description_arguments(supervisor.clone());
+                let started = Actor::spawn_linked(None, DescriptionKeeper, arguments, supervisor).await;
+                slot(&self.slots.description, started)
+            }
             ActorKind::Gateway => {
                 let started = Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
                 let id = slot(&self.slots.gateway, started)?;
@@ -282,6 +332,7 @@ impl NodeBuilder {
         stop(&self.slots.keeper).await;
         stop(&self.slots.follower).await;
         stop(&self.slots.gateway).await;
+        stop(&self.slots.description).await;
         stop(&self.slots.membership).await;
         stop(&self.slots.broker).await;
         stop(&self.slots.recorder).await;

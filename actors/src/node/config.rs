@@ -3,6 +3,7 @@
 //! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
 
 mod extraction;
+mod shared;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -11,6 +12,7 @@ use ecod::aggregator::FusionConfig;
 use ecod::config::ConfigError;
 use ecod::leadership::election::ElectionConfig;
 use ecod::model::names::NodeName;
+use ecod::model::origin::GeographicOrigin;
 use ecod::perception::landmark::{Landmark, LandmarkConfig};
 use ecod::wire::Role;
 use figment::Figment;
@@ -18,6 +20,7 @@ use figment::providers::{Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
 use self::extraction::{environment, extract};
+pub use self::shared::{DescriptionError, SharedConfig, StatedKeys};
 use crate::actors::reputation_keeper::ReputationKeeperConfig;
 #[cfg(feature = "camera")]
 use crate::camera::config::CameraConfig;
@@ -47,6 +50,9 @@ pub struct NodeConfig {
     /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
     /// others.
     pub state_dir: Option<PathBuf>,
+    /// The description of the cell with which a node that may lead starts a cell that has none. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub description: Option<PathBuf>,
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line. Default none.
     pub map_log: Option<PathBuf>,
@@ -75,8 +81,14 @@ pub struct NodeConfig {
     /// The log of what the node takes. Default none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub record: Option<RecordConfig>,
+    /// The place of the cell's frame on Earth, the same on every node. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub origin: Option<GeographicOrigin>,
     /// The cell's known locations, the same on every node. Default none.
     pub landmarks: Vec<LandmarkConfig>,
+    /// Shared keys that are stated here, and not only by default: the cell's description may not contradict them.
+    #[serde(skip)]
+    pub stated: StatedKeys,
 }
 
 impl Default for NodeConfig {
@@ -87,6 +99,7 @@ impl Default for NodeConfig {
             role: Role::Auto,
             listen: None,
             state_dir: None,
+            description: None,
             map_log: None,
             pose: PoseConfig::default(),
             membership: MembershipConfig::default(),
@@ -100,7 +113,9 @@ impl Default for NodeConfig {
             #[cfg(feature = "camera")]
             camera: None,
             record: None,
+            origin: None,
             landmarks: Vec::new(),
+            stated: StatedKeys::default(),
         }
     }
 }
@@ -130,13 +145,14 @@ impl NodeConfig {
     /// # Errors
     /// [`LoadError`] naming the file, or the key, the value and what is allowed.
     pub fn load(file: Option<&std::path::Path>, flags: &impl Serialize) -> Result<Self, LoadError> {
-        let mut figment = Figment::from(Serialized::defaults(Self::default()));
+        let mut stated = Figment::new();
         if let Some(path) = file {
             std::fs::metadata(path).map_err(|source| LoadError::Unreadable { path: path.into(), source })?;
-            figment = figment.merge(Toml::file_exact(path));
+            stated = stated.merge(Toml::file_exact(path));
         }
-        let figment = figment.merge(environment()).merge(Serialized::defaults(flags));
-        let mut config = extract(figment)?;
+        let stated = stated.merge(environment()).merge(Serialized::defaults(flags));
+        let mut config = extract(Figment::from(Serialized::defaults(Self::default())).merge(&stated))?;
+        config.stated = stated.extract().map(|stated| StatedKeys::of(&stated)).unwrap_or_default();
         if config.name.is_none() {
             let edge = (config.role == Role::Edge).then_some(NodeName::from_static("edge"));
             config.name = edge.or_else(host_name);
@@ -148,13 +164,19 @@ impl NodeConfig {
         Ok(config)
     }
 
-    /// Reads what a file says about a cell: all keys of a node are known, none is required, and neither the environment
-    /// nor flags play a part. Fusion and locations are checked.
+    /// Reads what a file says about a cell, be it a description or a node's configuration: all keys are known, none is
+    /// required, and neither the environment nor flags play a part. Fusion and locations are checked.
     ///
     /// # Errors
     /// [`LoadError`] naming the file, or the key, the value and what is allowed.
     pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
-        std::fs::metadata(file).map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
+        let text = std::fs::read_to_string(file);
+        let text = text.map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
+        if let Ok(shared) = SharedConfig::parse(&text) {
+            let mut config = Self::default();
+            shared.put_into(&mut config);
+            return Ok(config);
+        }
         let config = extract(Figment::from(Serialized::defaults(Self::default())).merge(Toml::file_exact(file)))?;
         config.fusion.validate().map_err(|error| error.within("fusion"))?;
         LandmarkConfig::validate_all(&config.landmarks)?;
@@ -210,6 +232,9 @@ impl NodeConfig {
         }
         if let Some(record) = &self.record {
             record.validate().map_err(|error| error.within("record"))?;
+        }
+        if let Some(origin) = &self.origin {
+            origin.validate().map_err(|error| error.within("origin"))?;
         }
         LandmarkConfig::validate_all(&self.landmarks)
     }

@@ -3,6 +3,7 @@
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::dashboard::DashboardMessage;
+use crate::messages::description_keeper::DescriptionKeeperMessage;
 #[cfg(feature = "camera")]
 use crate::messages::detector::DetectorMessage;
 use crate::messages::follower::FollowerMessage;
@@ -24,6 +25,8 @@ pub enum ActorKind {
     Broker,
     /// The gossip with the other nodes.
     Membership,
+    /// The keeper of the cell's description.
+    DescriptionKeeper,
     /// The MQTT connections.
     Gateway,
     /// The taker of maps.
@@ -53,6 +56,8 @@ pub struct ActorSlots {
     pub broker: ActorSlot<BrokerMessage>,
     /// The membership's.
     pub membership: ActorSlot<MembershipMessage>,
+    /// The keeper's of the cell's description.
+    pub description: ActorSlot<DescriptionKeeperMessage>,
     /// The gateway's.
     pub gateway: ActorSlot<GatewayMessage>,
     /// The follower's.

@@ -1,6 +1,7 @@
 //! Readiness of a running node, for its dashboard and for the service manager.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::admission::timeliness::Timeliness;
@@ -10,6 +11,7 @@ use ecod::leadership::readiness::{Readiness, round_timeout};
 use ecod::leadership::timers::READINESS_STEPS;
 use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::vote::VoteMode;
 use ecod::wire::Verdicts;
 use tokio::sync::watch;
@@ -35,8 +37,8 @@ pub struct Vitals {
     pub clock: CellClock,
     /// Which brokers carry the data.
     pub plane: DataPlane,
-    /// How old the newest round of a live aggregator may be; none where rounds come only with reports.
-    pub patience: Option<Duration>,
+    /// The settings that the nodes of the cell share.
+    pub shared: watch::Receiver<SharedFacts>,
     /// The node's certificates, which are valid at certain times only.
     pub security: Security,
     /// Tells how reports are.
@@ -45,6 +47,19 @@ pub struct Vitals {
     pub gateway: ActorSlot<GatewayMessage>,
     /// Tells whether the node's own broker serves.
     pub broker: ActorSlot<BrokerMessage>,
+}
+
+/// Settings that the nodes of a cell share, as far as pages and readiness go by them.
+#[derive(Debug, Clone, Default)]
+pub struct SharedFacts {
+    /// Maximum age of the newest round of a live aggregator; none where rounds come only with reports.
+    pub patience: Option<Duration>,
+    /// Maximum time between two rounds of a live aggregator, in seconds.
+    pub round_period_s: f64,
+    /// Known locations.
+    pub landmarks: Arc<[LandmarkConfig]>,
+    /// The reason why the node does not use the cell's description.
+    pub problem: Option<String>,
 }
 
 /// What the gateway and the broker answered.
@@ -90,7 +105,11 @@ impl Vitals {
                 "leading, but the times of {untimely} of {vehicles} vehicles' reports are unusable"
             ));
         }
-        Readiness::judge(&leadership, self.last_round().as_ref(), self.broker_works(probe), self.patience, clock::now())
+        let SharedFacts { patience, problem, .. } = self.shared.borrow().clone();
+        if let Some(problem) = problem {
+            return Readiness::not(problem);
+        }
+        Readiness::judge(&leadership, self.last_round().as_ref(), self.broker_works(probe), patience, clock::now())
     }
 
     /// Whether a broker carries what this node publishes.

@@ -103,6 +103,7 @@ impl Insider {
                 epoch: epoch.clone(),
                 hears_you: true,
                 clock: None,
+                description: None,
                 body: body.clone(),
             };
             let payload = Bytes::from(message.encode(Encoding::Cbor));

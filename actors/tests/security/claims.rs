@@ -39,13 +39,15 @@ async fn one_certificate_is_one_vehicle() {
 }
 
 #[tokio::test]
-async fn a_vehicle_that_never_leads_has_no_evidence_to_share() {
+async fn a_vehicle_that_never_leads_shares_no_evidence_and_describes_no_cell() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Cav, DAY);
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
     gauss.log_in().await.unwrap();
-    gauss.publish_and_wait("ecod/v1/lot/ledger/gauss", false).await.unwrap();
-    assert_eq!(cell.counters.events(Event::ClientDenied), 1);
+    for (denied, topic) in (1..).zip(["ledger/gauss", "cell"]) {
+        gauss.publish_and_wait(&format!("ecod/v1/lot/{topic}"), false).await.unwrap();
+        assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
+    }
     cell.honest_traffic_goes_on().await;
 }
 

@@ -78,6 +78,9 @@ def test_compact_cbor_is_read() -> None:
     assert read(cbor2.dumps(compact)) == replace(read(MAP), landmarks=[replace(read(MAP).landmarks[0], x_m=0.2), read(MAP).landmarks[1]])
     status = decode(ecod.NodeStatus, cbor2.dumps([1, "edge", ident, 2, 1, 7, None, True, "0.1.0"]))
     assert (status.role, status.state, status.aggregator, status.fit) == ("edge", "aggregating", None, True)
+    assert status.description is None
+    status = decode(ecod.NodeStatus, cbor2.dumps([1, "edge", ident, 2, 1, 7, None, True, "0.1.0", [3, bytes(32)]]))
+    assert status.description == ecod.DescriptionStatus(3, "00" * 32, None)
 
 
 def spoilt(**changes: Any) -> dict[str, Any]:

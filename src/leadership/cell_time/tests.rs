@@ -74,6 +74,7 @@ impl Cell {
             hears_you: true,
             body: Body::Status { over: None, no_login: Vec::new() },
             clock: Some(Box::new(sender.time.stamps(&self.nodes[to].name, sender_now))),
+            description: None,
         };
         self.now = self.now + transit;
         let (leadership, now) = (self.leadership(to), self.now);
@@ -209,6 +210,7 @@ fn stamps_of_a_liar_are_survived() {
                     hears_you: true,
                     body: Body::Status { over: None, no_login: Vec::new() },
                     clock: Some(Box::new(clock)),
+                    description: None,
                 };
                 let now = cell.now;
                 cell.nodes[0].time.receive(&message, Rights::default(), now);

@@ -52,6 +52,8 @@ pub enum ElectionInput {
     },
     /// The preparation that [`ElectionEffect::Prepare`] asked for is complete.
     Prepared,
+    /// Others are to hear of this node at once: all of them from a node that may lead, from others the leader.
+    Greet,
     /// The node is about to stop: a leader resigns, a follower tells its leader that it is no candidate any more.
     Leave,
 }

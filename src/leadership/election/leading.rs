@@ -140,8 +140,7 @@ impl Election {
 
     /// Time between two beats to a peer. A better candidate that is not yet fit is to be heard soon when it is.
     fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
-        let outranks =
-            |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.rank() < self.candidacy().rank();
+        let outranks = |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.rank() < self.candidacy().rank();
         match leading.successors.iter().position(|name| name == to) {
             Some(0) => self.config.beat(),
             Some(_) => self.config.near_beat(),

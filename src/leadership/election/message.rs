@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::leadership::election::clock_stamps::ClockStamps;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
-use crate::wire::{self, Encoding, Limits, RejectReason, Role};
+use crate::wire::{self, DescriptionStamp, Encoding, Limits, RejectReason, Role};
 
 /// Most successors that a leader names, the standby first.
 pub const MAX_SUCCESSORS: usize = 3;
@@ -73,6 +73,10 @@ pub struct ElectionMessage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(9)]
     pub clock: Option<Box<ClockStamps>>,
+    /// The description of the cell that the sender has, version 0 without one; absent from nodes of earlier versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(10)]
+    pub description: Option<Box<DescriptionStamp>>,
 }
 
 /// A node as a candidate: its rank among possible leaders.
@@ -260,7 +264,7 @@ mod tests {
     use super::*;
     use crate::leadership::election::AnsweredStamps;
     use crate::model::time::Timestamp;
-    use crate::wire::SCHEMA_VERSION;
+    use crate::wire::{ContentHash, SCHEMA_VERSION};
 
     fn beat(term: u64, leader: &str) -> ElectionMessage {
         ElectionMessage {
@@ -274,6 +278,7 @@ mod tests {
             hears_you: true,
             body: Body::Beat { every_ms: 40, round: 88, followers: 31, after: None, successors: vec![] },
             clock: None,
+            description: None,
         }
     }
 
@@ -289,6 +294,8 @@ mod tests {
         let answers = Some(AnsweredStamps { sent_us: latest, received_us: latest });
         message.clock =
             Some(ClockStamps { sent_us: latest, answers, wall_us: Some(latest), cell_us: Some(latest) }.into());
+        let hash = ContentHash([u8::MAX; 32]);
+        message.description = Some(DescriptionStamp { version: wire::MAX_INTEGER, hash }.into());
         for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
             let bytes = message.encode(encoding);
             assert!(bytes.len() <= MAX_MESSAGE_BYTES, "{}", bytes.len());

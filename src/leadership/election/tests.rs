@@ -31,6 +31,7 @@ fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> Elec
         hears_you: true,
         body,
         clock: None,
+        description: None,
     }
 }
 

@@ -12,7 +12,7 @@ use crate::leadership::rights::Rights;
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
-use crate::wire::{NodeStatus, Role};
+use crate::wire::{DescriptionStatus, NodeStatus, Role};
 
 /// Settings of one node's leadership.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -130,6 +130,15 @@ pub enum Input {
     FuserRestarted,
     /// The gateway was started anew and has no links.
     GatewayRestarted,
+    /// The settings that all nodes of the cell share have changed.
+    Described {
+        /// The description that the node has; `None` without one.
+        description: Option<DescriptionStatus>,
+        /// Longest time between two rounds.
+        round_period: Duration,
+        /// Whether the node keeps reputations.
+        keeps_reputations: bool,
+    },
     /// The node is about to stop.
     Leave,
 }

@@ -114,6 +114,7 @@ impl Scene {
             hears_you: true,
             body,
             clock: None,
+            description: None,
         }
     }
 

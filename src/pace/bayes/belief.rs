@@ -83,6 +83,15 @@ impl Increments {
 }
 
 impl VehicleBelief {
+    /// Keeps the beliefs about places that there still are, under their present numbers.
+    pub(super) fn move_places(&mut self, place_now: impl Fn(Place) -> Option<Place>) {
+        let known = std::mem::take(&mut self.places).into_iter().zip(std::mem::take(&mut self.beliefs));
+        let mut kept: Vec<_> = known.filter_map(|(place, belief)| Some((place_now(place)?, belief))).collect();
+        kept.sort_by_key(|(place, _)| *place);
+        (self.places, self.beliefs) = kept.into_iter().unzip();
+        self.oldest_seen = self.beliefs.iter().map(|belief| belief.last_seen).min();
+    }
+
     /// Takes one frame's observations, ascending by place.
     pub(super) fn observe(
         &mut self,

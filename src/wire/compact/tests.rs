@@ -1,8 +1,8 @@
 use super::*;
 use crate::wire::{
-    Encoding, FieldOfView, FusedObject, GlobalMap, LandmarkState, Limits, NodeState, NodeStatus, ObjectReport, Payload,
-    PerceivedObject, PoseCorrection, Reputation, Reputations, Role, SCHEMA_VERSION, Verdict, Verdicts, WirePose,
-    decode, encode,
+    CellDescription, ContentHash, DescriptionStatus, Encoding, FieldOfView, FusedObject, GlobalMap, LandmarkState,
+    Limits, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject, PoseCorrection, Reputation, Reputations,
+    Role, SCHEMA_VERSION, Verdict, Verdicts, WirePose, decode, encode,
 };
 
 fn report() -> ObjectReport {
@@ -110,11 +110,20 @@ fn every_field_of_every_payload_survives() {
     let reputation = Reputation { score: 0.625, correct: 410, incorrect: 22 };
     let reputations = [(node("euclid"), reputation)].into();
     survives(&Reputations { schema: SCHEMA_VERSION, aggregator: Some(node("edge")), epoch: 3, round: 88, reputations });
+    let text = "[[landmarks]]\n".to_owned();
+    survives(&CellDescription {
+        schema: SCHEMA_VERSION,
+        version: 7,
+        hash: ContentHash([9; 32]),
+        set_by: node("edge"),
+        text,
+    });
     survives(&NodeStatus {
         state: NodeState::Aggregating,
         epoch: 3,
         aggregator: Some(node("edge")),
         fit: Some(true),
+        description: Some(DescriptionStatus { version: 7, hash: ContentHash([9; 32]), problem: Some("no".into()) }),
         ..NodeStatus::starting(node("edge"), Uuid::from_u128(7), Role::Edge, "0.1.0")
     });
 }

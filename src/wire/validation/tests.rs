@@ -84,6 +84,7 @@ fn status() -> NodeStatus {
         aggregator: Some(edge()),
         fit: Some(true),
         version: "0.1.0".into(),
+        description: None,
     }
 }
 

@@ -10,7 +10,7 @@ use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{Encoding, RejectReason};
+use ecod::wire::{Encoding, RejectReason, Role};
 use ractor::ActorRef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -18,6 +18,7 @@ use tracing::field::display;
 
 use super::term_writer::{TermWriter, saved_term};
 use super::{LeaderElectionArguments, Parts, probe};
+use crate::messages::description_keeper::DescriptionKeeperMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
@@ -89,6 +90,11 @@ impl ElectionDriver {
             MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
                 Ok(message) => {
                     if message.from == from {
+                        if let Some(stamp) = message.description.as_deref().copied() {
+                            let may_lead = rights.limit_role(message.candidacy.role) != Role::Cav;
+                            let from = from.clone();
+                            self.parts.description.send(DescriptionKeeperMessage::Hear { from, may_lead, stamp });
+                        }
                         self.cell_time.receive(&message, rights, clock::now());
                     }
                     Input::Receive { from, rights, message }
@@ -135,6 +141,7 @@ impl ElectionDriver {
         match effect {
             Effect::PersistTerm { term } => self.terms.save(term),
             Effect::Send { to, mut message } => {
+                message.description = Some(Box::new(self.machine.description()));
                 message.clock = Some(Box::new(self.cell_time.stamps(&to, clock::now())));
                 let payload = message.encode(Encoding::Cbor).into();
                 self.parts.membership.send(MembershipMessage::Send { to, payload });

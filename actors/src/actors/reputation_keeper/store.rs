@@ -93,6 +93,11 @@ impl SharedReputations {
         Self(Arc::new(Mutex::new(store)))
     }
 
+    /// Changes whether reputations follow from the evidence.
+    pub fn set_by_evidence(&self, by_evidence: bool) {
+        self.open().by_evidence = by_evidence;
+    }
+
     /// Locks the store.
     pub fn open(&self) -> MutexGuard<'_, ReputationStore> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)

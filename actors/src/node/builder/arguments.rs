@@ -1,19 +1,19 @@
 //! What each part is given at its start.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use ecod::aggregator::Aggregator;
 use ecod::leadership::Position;
 use ecod::leadership::election::ElectionConfig;
 use ecod::leadership::node::{Input, NodeSettings};
 use ecod::model::epoch::Epoch;
-use ecod::perception::landmark::Landmark;
 use ecod::replay::JournalEvent;
 use ecod::wire::{NodeState as NodeCondition, NodeStatus, Topics};
+use ractor::{ActorCell, ActorRef};
 
 use super::NodeBuilder;
 use crate::actors::dashboard::DashboardArguments;
+use crate::actors::description_keeper::DescriptionKeeperArguments;
 use crate::actors::follower::FollowerArguments;
 use crate::actors::fuser::{FuserArguments, QueuedReport};
 use crate::actors::gateway::GatewayArguments;
@@ -23,23 +23,24 @@ use crate::actors::recorder::RecorderArguments;
 use crate::actors::reputation_keeper::ReputationKeeperArguments;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
+use crate::messages::description_keeper::DescriptionKeeperMessage;
 use crate::messages::follower::FollowerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
-use crate::node::ActorSlots;
 use crate::node::config::NodeConfig;
 use crate::node::slots::ActorKind;
-use crate::observe::dashboard::{LandmarkFacts, NodeFacts, NodeSources};
-use crate::observe::readiness::{Vitals, patience};
+use crate::node::{ActorSlots, NodeMessage};
+use crate::observe::dashboard::{NodeFacts, NodeSources};
+use crate::observe::readiness::Vitals;
 use crate::observe::recorder::{LogIdentity, LogItem};
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
 use crate::transport::broker::{Door, DoorSetup};
 use crate::transport::gossip::{EventSink, MembershipConfig};
-use crate::transport::mqtt::{Incoming, Subscriber, SubscriptionRole};
+use crate::transport::mqtt::{Incoming, LinkState, Subscriber, SubscriptionRole};
 
 impl NodeBuilder {
     pub(super) fn membership_arguments(&self) -> MembershipArguments {
@@ -108,7 +109,7 @@ impl NodeBuilder {
     /// Takes what comes in to the part that deals with it. Reports are recorded by the fuser where there is one: in the
     /// order in which they are fused.
     fn subscriber(&self) -> Subscriber {
-        let ActorSlots { fuser, follower, keeper, election, .. } = self.slots.clone();
+        let ActorSlots { fuser, follower, keeper, election, description, .. } = self.slots.clone();
         let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
         let (report_queue, counters, door) = (self.report_queue.clone(), self.counters(), self.door.clone());
@@ -154,6 +155,10 @@ impl NodeBuilder {
                     let reputations = Arc::clone(reputations);
                     follower.send(FollowerMessage::TakeReputations { delivery: delivery.map(|_| reputations) })
                 }
+                Incoming::Description(body) => {
+                    let body = Arc::clone(body);
+                    description.send(DescriptionKeeperMessage::Take { delivery: delivery.map(|_| body) })
+                }
                 Incoming::Ledger(share) if !fuses => {
                     recording.send(at, LogItem::Share(Arc::clone(share)));
                     true
@@ -165,6 +170,9 @@ impl NodeBuilder {
                 }
                 Incoming::Link { broker, state } => {
                     recording.send(at, LogItem::Link(broker.clone(), *state));
+                    if *state == LinkState::Up {
+                        description.send(DescriptionKeeperMessage::Connected);
+                    }
                     if let Some(node) = delivery.broker.clone() {
                         let input = Input::BrokerProven { broker: broker.clone(), node };
                         election.send(LeaderElectionMessage::Note { input });
@@ -194,6 +202,22 @@ impl NodeBuilder {
             clock: self.clock.clone(),
             counters: self.counters(),
             spans: self.spans(),
+        }
+    }
+
+    pub(super) fn description_arguments(&self, supervisor: ActorCell) -> DescriptionKeeperArguments {
+        let supervisor = ActorRef::<NodeMessage>::from(supervisor);
+        DescriptionKeeperArguments {
+            name: self.name.clone(),
+            may_lead: self.config.may_lead(),
+            held: self.held.description.clone(),
+            file: self.state_file("description"),
+            // A supervisor that has ended needs no settings.
+            apply: Arc::new(move |description| _ = supervisor.cast(NodeMessage::Describe { description })),
+            members: self.members(),
+            leadership: self.leadership(),
+            gateway: self.slots.gateway.clone(),
+            counters: self.counters(),
         }
     }
 
@@ -238,20 +262,20 @@ impl NodeBuilder {
     }
 
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
-        let ActorSlots { membership, gateway, fuser, keeper, .. } = self.slots.clone();
+        let ActorSlots { membership, gateway, fuser, keeper, description, .. } = self.slots.clone();
         let (broker, door) = (self.cell_broker(), self.door.clone());
         LeaderElectionArguments {
             settings: NodeSettings {
                 election: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
                 plane: self.config.data_plane(),
-                round_period: Duration::from_secs_f64(self.config.fusion.round.period_s),
+                round_period: self.round_period(),
                 keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
                 status: self.status(),
             },
             term_file: self.state_file("term"),
             own_broker: self.broker_address(),
             members: self.members(),
-            parts: Parts { membership, gateway, fuser, keeper, broker, door },
+            parts: Parts { membership, gateway, fuser, keeper, description, broker, door },
             leadership: self.leadership.clone(),
             clock: self.clock.clone(),
             counters: self.counters(),
@@ -259,12 +283,6 @@ impl NodeBuilder {
     }
 
     pub(super) fn dashboard_arguments(&self) -> DashboardArguments {
-        let landmark = |landmark: Landmark| LandmarkFacts {
-            id: landmark.id,
-            x_m: landmark.position.x,
-            y_m: landmark.position.y,
-            facing_rad: landmark.facing_rad,
-        };
         let node = NodeFacts {
             name: self.name.clone(),
             cell: self.config.cell.clone(),
@@ -275,7 +293,6 @@ impl NodeBuilder {
         };
         let sources = NodeSources {
             node,
-            landmarks: self.config.landmarks().into_iter().map(landmark).collect(),
             vitals: self.vitals(),
             members: self.members(),
             counters: self.counters(),
@@ -292,7 +309,7 @@ impl NodeBuilder {
             leadership: self.leadership(),
             clock: self.clock.clone(),
             plane: self.config.data_plane(),
-            patience: patience(&self.config.fusion),
+            shared: self.shared.subscribe(),
             security: self.security.clone(),
             fuser: self.slots.fuser.clone(),
             gateway: self.slots.gateway.clone(),
@@ -311,6 +328,7 @@ impl NodeBuilder {
             return Door::default();
         }
         let (leadership, members) = (self.leadership(), self.members());
+        let (own_config, description) = (self.own_config.clone(), self.slots.description.clone());
         let (gateway, to_watch, live_state) =
             (self.slots.gateway.clone(), self.slots.gateway.clone(), Arc::clone(&self.live_state));
         Door::new(DoorSetup {
@@ -327,6 +345,14 @@ impl NodeBuilder {
             is_member: Arc::new(move |name| members.borrow().iter().any(|member| member.name == *name)),
             report: Arc::new(move |kind, report| {
                 gateway.send(GatewayMessage::PublishReport { kind, report });
+            }),
+            describe: Arc::new(move |text| {
+                if !own_config.may_lead() {
+                    return Err("this node never leads and only follows: set the description at one that may".into());
+                }
+                own_config.described(&text).map_err(|error| error.to_string())?;
+                let is_sent = description.send(DescriptionKeeperMessage::Set { text });
+                if is_sent { Ok(()) } else { Err("the node is just starting: try again".into()) }
             }),
             watch_reports: Arc::new(move |wanted| {
                 live_state.set_programs_want_reports(wanted);
@@ -352,6 +378,7 @@ impl NodeBuilder {
             epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
             aggregator: epoch.map(|epoch| epoch.leader),
             fit: self.config.may_lead().then_some(false),
+            description: self.held.status(),
             ..NodeStatus::starting(self.name.clone(), self.run, self.config.role, env!("CARGO_PKG_VERSION"))
         }
     }
@@ -368,6 +395,7 @@ mod tests {
     use super::*;
     use crate::messages::newest::ReceivedMap;
     use crate::node::config::NodeConfig;
+    use crate::node::description::HeldDescription;
     use crate::transport::mqtt::Security;
 
     #[test]
@@ -383,7 +411,9 @@ mod tests {
         ] {
             let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
             (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
-            let builder = NodeBuilder::new(config, Security::default(), watch::Sender::new(None));
+            let builder =
+                NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None))
+                    .unwrap();
             let keeps = builder.parts().contains(&crate::node::slots::ActorKind::ReputationKeeper);
             assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
         }
@@ -392,7 +422,9 @@ mod tests {
     #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
-        let builder = NodeBuilder::new(config, Security::default(), watch::Sender::new(None));
+        let builder =
+            NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None))
+                .unwrap();
         assert_eq!((builder.status().epoch, builder.status().aggregator), (0, None));
         let map = GlobalMap {
             schema: SCHEMA_VERSION,

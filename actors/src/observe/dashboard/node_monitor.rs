@@ -120,7 +120,7 @@ impl NodeMonitor {
         Snapshot {
             schema: API_VERSION,
             now_us: now,
-            node: sources.node.clone(),
+            node: sources.node_facts(),
             readiness,
             leadership: LeadershipFacts {
                 position: leadership.position,

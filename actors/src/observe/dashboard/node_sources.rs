@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use ecod::model::names::{LandmarkId, NodeName};
 use ecod::model::time::Timestamp;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::Role;
 use serde::Serialize;
 use tokio::sync::watch;
@@ -18,8 +19,6 @@ use crate::transport::gossip::{FrameCounters, Member};
 pub struct NodeSources {
     /// The node.
     pub node: NodeFacts,
-    /// Known locations of the cell.
-    pub landmarks: Vec<LandmarkFacts>,
     /// Newest messages, leadership, links and broker.
     pub vitals: Vitals,
     /// The other nodes.
@@ -32,7 +31,7 @@ pub struct NodeSources {
     pub live_state: Arc<LiveState>,
 }
 
-/// Facts that stay the same while a node runs.
+/// Facts about a node.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NodeFacts {
     /// Name of the node.
@@ -47,6 +46,25 @@ pub struct NodeFacts {
     pub started_at_us: Timestamp,
     /// Maximum time between two rounds of a live aggregator, in seconds.
     pub round_period_s: f64,
+}
+
+impl NodeSources {
+    /// The node as it is now.
+    pub(crate) fn node_facts(&self) -> NodeFacts {
+        NodeFacts { round_period_s: self.vitals.shared.borrow().round_period_s, ..self.node.clone() }
+    }
+
+    /// Known locations of the cell.
+    pub(crate) fn landmarks(&self) -> Vec<LandmarkFacts> {
+        let landmarks = Arc::clone(&self.vitals.shared.borrow().landmarks);
+        let facts = |landmark: &LandmarkConfig| LandmarkFacts {
+            id: landmark.id.clone(),
+            x_m: landmark.x_m,
+            y_m: landmark.y_m,
+            facing_rad: landmark.facing_deg.map(f64::to_radians),
+        };
+        landmarks.iter().map(facts).collect()
+    }
 }
 
 /// A known location.

@@ -35,7 +35,6 @@ pub(crate) struct HttpApi {
     /// Separate, so that requests without access leave the rate of those with access alone.
     refusals: Mutex<TokenBucket>,
     metrics: ResponseCache<Result<Bytes, fmt::Error>>,
-    landmarks: Bytes,
     max_viewers: usize,
 }
 
@@ -57,7 +56,6 @@ impl HttpApi {
             answers: throttle(),
             refusals: throttle(),
             metrics: ResponseCache::new(METRICS_MIN_AGE),
-            landmarks: json(&monitor.sources.landmarks).into(),
             max_viewers: max_connections / 2,
             monitor,
         }
@@ -156,7 +154,7 @@ async fn show_history(State(api): Api, uri: Uri) -> Response {
 }
 
 async fn show_landmarks(State(api): Api) -> Response {
-    typed(JSON, api.landmarks.clone())
+    typed(JSON, json(&api.monitor.sources.landmarks()))
 }
 
 /// Snapshots as they are taken. A browser that is too slow for one gets the next.

@@ -3,7 +3,7 @@
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use ecod::aggregator::Command;
+use ecod::aggregator::{Command, FusionConfig};
 use ecod::replay::JournalEvent;
 use mcap::{McapError, McapResult};
 
@@ -142,8 +142,8 @@ impl LogWriter {
         Ok(file)
     }
 
-    /// Follows the state of the aggregator, for files that begin in the middle of its run.
-    fn track_aggregator(&self, item: &LogItem) {
+    /// Follows the state and settings of the aggregator, for files that begin in the middle of its run.
+    fn track_aggregator(&mut self, item: &LogItem) {
         let mut aggregator_state = self.recording.aggregator_state();
         match item {
             LogItem::Journal(JournalEvent::Start { .. }) => {
@@ -151,6 +151,9 @@ impl LogWriter {
             }
             LogItem::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
                 (aggregator_state.leads, aggregator_state.next_round) = (Some(epoch.clone()), *first_round);
+            }
+            LogItem::Journal(JournalEvent::Command(Command::Configure { fusion, landmarks })) => {
+                (self.identity.fusion, self.identity.landmarks) = (FusionConfig::clone(fusion), landmarks.clone());
             }
             LogItem::Journal(JournalEvent::Command(Command::StepDown)) => aggregator_state.leads = None,
             LogItem::Round(round) => aggregator_state.next_round = round.saturating_add(1),
@@ -206,6 +209,7 @@ mod tests {
 
     use ecod::model::names::NodeName;
     use ecod::model::time::Timestamp;
+    use ecod::perception::landmark::LandmarkConfig;
     use ecod::replay::JournalEntry;
     use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
     use uuid::Uuid;
@@ -213,7 +217,6 @@ mod tests {
     use super::*;
     use crate::observe::recorder::{LogEvent, LogMessage, LogReader, SchemaName, files};
     use crate::telemetry::counters::Counters;
-    use ecod::aggregator::FusionConfig;
 
     const NODE: NodeName = NodeName::from_static("cav");
 
@@ -274,6 +277,26 @@ mod tests {
             let bytes: u64 = kept().iter().map(|path| path.metadata().unwrap().len()).sum();
             assert!(bytes <= 3_000_000, "{bytes} bytes after {starts} starts");
         }
+    }
+
+    #[test]
+    fn a_file_that_begins_after_a_change_of_settings_has_those_of_then() {
+        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let mut writer = writer(in_directory(directory.path()), &counters);
+        let landmarks = vec![LandmarkConfig::at("slot-0", 1.0, 2.0)];
+        let change = Command::Configure { fusion: Box::default(), landmarks: landmarks.clone() };
+        writer.write(&second(1, LogItem::Journal(JournalEvent::Command(change))));
+        writer.flush();
+        writer.file.take().map(LogFile::finish).unwrap().unwrap();
+        writer.write(&second(2, LogItem::Counters(counters.snapshot())));
+        writer.flush();
+        let known = |path: &Path| {
+            let identity =
+                |event| if let Ok(LogEvent::Identity(identity)) = event { Some(identity.landmarks) } else { None };
+            LogReader::open(path).unwrap().find_map(identity).unwrap()
+        };
+        let files = files(directory.path()).unwrap();
+        assert_eq!([known(&files[0]), known(&files[1])], [vec![], landmarks]);
     }
 
     #[test]

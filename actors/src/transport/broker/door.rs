@@ -20,7 +20,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use ecod::model::names::NodeName;
-use ecod::wire::{Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind, Reputations, Topic, Topics, encode};
+use ecod::wire::{
+    CellDescription, Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind, Reputations, Topic, Topics,
+    encode,
+};
 use rmqtt::context::ServerContext;
 use rmqtt::session::SessionState;
 use rmqtt::types::{ClientId, CodecPublish, From, Id, QoS, TopicFilter};
@@ -57,6 +60,8 @@ pub struct DoorSetup {
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
     /// Takes a program's report for the cell.
     pub report: Arc<dyn Fn(ReportKind, Arc<ObjectReport>) + Send + Sync>,
+    /// Sets the cell's description, given as TOML, or says why not.
+    pub describe: Arc<dyn Fn(String) -> Result<(), String> + Send + Sync>,
     /// Has the node receive the reports of all vehicles, or ends that.
     pub watch_reports: Arc<dyn Fn(bool) + Send + Sync>,
     /// The node's counters.
@@ -127,6 +132,11 @@ impl Door {
     /// Passes on reputations that the node accepted; the last are retained.
     pub fn publish_reputations(&self, reputations: &Reputations) {
         self.publish_state(&Topic::Reputations, reputations);
+    }
+
+    /// Passes on the cell's description as the node has it; the last is retained.
+    pub fn publish_description(&self, description: &CellDescription) {
+        self.publish_state(&Topic::Cell, description);
     }
 
     /// Passes on the status of a node; the last of each is retained.

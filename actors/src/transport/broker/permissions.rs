@@ -5,10 +5,11 @@
 //! | `detections/N`, `detections/N--…`, `vote_detections/N`, `vote_detections/N--…` | the certificate of `N` |
 //! | `ledger/N` | the same, if `N` may lead |
 //! | `nodes/N`, `nodes/N--…` | the certificate of `N`, which its observers share |
+//! | `cell` | nodes that may lead |
 //! | `global_detections`, `global_verdicts`, `reputations` | the leader; without a leader, nodes that may lead |
 //! | anything else | nobody |
 //!
-//! Only statuses and reputations may be retained: other messages are worthless when late. Everyone with a certificate
+//! Only statuses, reputations and the cell's description may be retained: other messages are worthless when late. Everyone with a certificate
 //! of the cell may read everything. Topics and filters are bounded in length and in levels.
 
 use std::sync::Arc;
@@ -200,13 +201,13 @@ fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     match topic {
         Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) => limits.payload_bytes,
         Topic::Nodes(_) => limits.payload_bytes.min(MAX_STATUS_BYTES),
-        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations | Topic::Cell => limits.map_bytes,
     }
 }
 
 /// Whether the topic's last message may be retained.
 fn is_state(topic: &Topic) -> bool {
-    matches!(topic, Topic::Nodes(_) | Topic::Reputations)
+    matches!(topic, Topic::Nodes(_) | Topic::Reputations | Topic::Cell)
 }
 
 fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderCheck) -> bool {
@@ -214,6 +215,7 @@ fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderChe
         Topic::Detections(node) | Topic::VoteDetections(node) => identity.may_act_as(node.as_str()),
         Topic::Ledger(node) => identity.may_serve() && identity.name() == node,
         Topic::Nodes(node) => identity.may_act_as(node.as_str()),
+        Topic::Cell => identity.may_serve(),
         Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => {
             identity.may_serve() && elected(identity.name())
         }
@@ -292,6 +294,7 @@ mod tests {
             assert!(allows(&edge, topic) && !allows(&euclid, topic), "{topic}");
             assert!(!allows(&identity("edge", Role::Cav), topic), "a vehicle that cannot lead");
         }
+        assert!(allows(&edge, "cell") && allows(&euclid, "cell") && !allows(&vehicle, "cell"));
         assert!(!allows(&euclid, "nodes/euclid-2") && !allows(&euclid, "nodes/euclid/x"));
         assert!(!permissions.allows(&with(&euclid), "ecod/v1/lot-2/detections/euclid", false, 0));
         assert!(!permissions.allows(&with(&euclid), "$SYS/x", false, 0));

@@ -9,6 +9,7 @@ use bytes::Bytes;
 use ecod::leadership::BrokerAddress;
 use ecod::wire::{Encoding, NodeState, NodeStatus, encode};
 use rumqttc::v5::mqttbytes::QoS as QoS5;
+use rumqttc::v5::mqttbytes::v5::PubAckReason;
 use rumqttc::{QoS as QoS4, TlsConfiguration, Transport, v5};
 use rustls::ClientConfig;
 
@@ -20,6 +21,8 @@ use crate::transport::pki::CredentialsError;
 pub(crate) enum Retention {
     /// QoS 0, not retained: the next message replaces it.
     Transient,
+    /// QoS 1, not retained: the sender waits for the answer.
+    Acknowledged,
     /// QoS 1, retained: new subscribers need it.
     Retained,
 }
@@ -47,6 +50,8 @@ pub(crate) enum Packet {
     Disconnected,
     /// The broker refused filters of a subscription: index of each filter and reason.
     SubscriptionRefused(Vec<(usize, String)>),
+    /// The broker refused a message of QoS 1, with its reason if it gave one; MQTT 5 alone tells.
+    PublishRefused(String),
     /// A packet was sent.
     Sent,
     /// Another packet of the protocol arrived.
@@ -207,14 +212,14 @@ pub(crate) fn open(
 impl Client {
     /// Queues a message; false when there is no room or the connection has ended.
     pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
-        let retain = retention == Retention::Retained;
+        let (retain, is_acknowledged) = (retention == Retention::Retained, retention != Retention::Transient);
         match self {
             Self::V311(client) => {
-                let qos = if retain { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
+                let qos = if is_acknowledged { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
                 client.try_publish(topic, qos, retain, payload.clone()).is_ok()
             }
             Self::V5(client) => {
-                let qos = if retain { QoS5::AtLeastOnce } else { QoS5::AtMostOnce };
+                let qos = if is_acknowledged { QoS5::AtLeastOnce } else { QoS5::AtMostOnce };
                 client.try_publish(topic, qos, retain, payload.clone()).is_ok()
             }
         }
@@ -283,6 +288,13 @@ impl Connection {
                 v5::Event::Incoming(v5::Incoming::SubAck(answer)) => refused_filters(answer.return_codes, |code| {
                     matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
                 }),
+                v5::Event::Incoming(v5::Incoming::PubAck(answer)) => match answer.reason {
+                    PubAckReason::Success | PubAckReason::NoMatchingSubscribers => Packet::Other,
+                    code => {
+                        let text = answer.properties.and_then(|properties| properties.reason_string);
+                        Packet::PublishRefused(text.unwrap_or_else(|| format!("{code:?}")))
+                    }
+                },
                 v5::Event::Outgoing(rumqttc::Outgoing::Disconnect) => Packet::Disconnected,
                 v5::Event::Outgoing(_) => Packet::Sent,
                 v5::Event::Incoming(_) => Packet::Other,

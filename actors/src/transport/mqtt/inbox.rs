@@ -10,8 +10,8 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind, Reputations, Topic,
-    Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
+    CellDescription, GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind,
+    Reputations, Topic, Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
@@ -42,6 +42,8 @@ pub enum Incoming {
     Verdicts(Arc<Verdicts>),
     /// Reputations, right after connecting if the broker retains some.
     Reputations(Arc<Reputations>),
+    /// A description of the cell, right after connecting if the broker retains one.
+    Description(Arc<CellDescription>),
     /// A share of another candidate's evidence; for candidates only.
     Ledger(Arc<LedgerShare>),
     /// The status of another node, from itself or from its last will.
@@ -245,7 +247,8 @@ impl Inbox {
                 let origin = origin(Some(&verdicts.aggregator))?;
                 (Incoming::Verdicts(Arc::new(verdicts)), origin)
             }
-            Topic::Reputations if payload.is_empty() => return Ok(PacketOutcome::Done),
+            Topic::Cell | Topic::Reputations if payload.is_empty() => return Ok(PacketOutcome::Done),
+            Topic::Cell => (Incoming::Description(Arc::new(decode(payload, &self.limits)?)), Origin::Claimed),
             Topic::Reputations => {
                 let reputations: Reputations = decode(payload, &self.limits)?;
                 if reputations.aggregator.as_ref() == Some(&self.node) {

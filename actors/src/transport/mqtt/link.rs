@@ -276,7 +276,8 @@ impl LinkTask {
                     self.report_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
                 Packet::Disconnected => return Ok(()),
-                Packet::Accepted | Packet::Sent | Packet::Other => {}
+                // What counts is whether the node's own status comes back.
+                Packet::Accepted | Packet::Sent | Packet::PublishRefused(_) | Packet::Other => {}
             }
             if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.reported_refusal.is_none() {
                 self.report_refusal(NOT_HEARD.to_owned());

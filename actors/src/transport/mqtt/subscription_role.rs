@@ -3,7 +3,7 @@
 /// Role of a node as a subscriber.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SubscriptionRole {
-    /// Maps, verdicts, reputations and statuses.
+    /// Maps, verdicts, reputations, the cell's description and statuses.
     Follower,
     /// Also reports and evidence: the node records them.
     Observer,
@@ -19,13 +19,20 @@ impl SubscriptionRole {
     /// index, by which a SUBACK refers to them.
     pub(crate) fn filters(self) -> &'static [&'static str] {
         match self {
-            Self::Follower => {
-                &["global_detections", "global_verdicts", "reputations", "nodes/+", "detections/+", "vote_detections/+"]
-            }
+            Self::Follower => &[
+                "global_detections",
+                "global_verdicts",
+                "reputations",
+                "cell",
+                "nodes/+",
+                "detections/+",
+                "vote_detections/+",
+            ],
             Self::Observer | Self::Candidate => &[
                 "global_detections",
                 "global_verdicts",
                 "reputations",
+                "cell",
                 "nodes/+",
                 "ledger/+",
                 "detections/+",

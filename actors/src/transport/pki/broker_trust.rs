@@ -10,7 +10,7 @@ use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
 use tokio::time::{sleep, timeout};
 
-use super::{CertificateSubject, Credentials, LoadedCredentials};
+use super::{CertificateSubject, Credentials, DOOR_NAME, LoadedCredentials};
 
 /// TLS of one connection to a broker, and the repeated verification of its certificate.
 #[derive(Debug)]
@@ -57,6 +57,14 @@ impl BrokerTrust {
         let current = credentials.current();
         let trust = Self::new(&current.client, Arc::clone(&current.brokers), Some(current.broker_name.clone()));
         Self { reloaded_from: Some((Arc::clone(credentials), current)), ..trust }
+    }
+
+    /// Trust in the door of the node whose certificates these are.
+    ///
+    /// The certificate is verified in the handshake alone: programs connect for a moment.
+    pub fn of_door(credentials: &Credentials) -> Self {
+        let current = credentials.current();
+        Self::new(&current.client, Arc::clone(&current.brokers), ServerName::try_from(DOOR_NAME).ok())
     }
 
     /// TLS configuration for one connection.

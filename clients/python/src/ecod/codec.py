@@ -126,6 +126,8 @@ def _int(value: Any, _is_compact: bool) -> Any:
 def _text(value: Any, _is_compact: bool) -> Any:
     if isinstance(value, bytes) and len(value) == 16:  # an id in CBOR
         return str(uuid.UUID(bytes=value))
+    if isinstance(value, bytes) and len(value) == 32:  # a hash in CBOR
+        return value.hex()
     return str(value) if isinstance(value, str) else _fail(value, "must be text")
 
 

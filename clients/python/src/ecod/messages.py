@@ -62,6 +62,7 @@ Count = Annotated[int, Rule(lambda value: 0 <= value < 2**53, "must be from 0 to
 Name = Annotated[str, Rule(is_name, "must be 1 to 64 of A-Z a-z 0-9 _ -")]
 Label = Annotated[str, Rule(_is_label, "must have 1 to 64 bytes and no control characters")]
 Uuid = Annotated[str, Rule(_is_uuid, "must be a UUID")]
+Hash = Annotated[str, Rule(lambda text: re.fullmatch("[0-9a-f]{64}", text) is not None, "must be 64 hexadecimal digits")]
 Fraction = Annotated[float, _between(0, 1)]
 Metres = Annotated[float, _between(-1e8, 1e8), MILLIMETRES]
 Size = Annotated[float, _between(0, 1e5)]
@@ -246,6 +247,15 @@ class Reputations:
 
 
 @dataclass(frozen=True)
+class DescriptionStatus:
+    """A node's description of its cell; `problem` says why the node does not use it."""
+
+    version: Count
+    hash: Hash
+    problem: Optional[str]
+
+
+@dataclass(frozen=True)
 class NodeStatus:
     """A node's status, published by itself, or `offline` by its broker."""
 
@@ -258,3 +268,4 @@ class NodeStatus:
     aggregator: Optional[Name]
     fit: Optional[bool]
     version: Label
+    description: Optional[DescriptionStatus]

@@ -3,6 +3,7 @@
 //! | topic | a program of the node `euclid` |
 //! |---|---|
 //! | `detections/euclid`, `detections/euclid--…`, `vote_detections/…` | is taken for the cell |
+//! | `cell` | is the cell's new description, if `euclid` may lead |
 //! | `nodes/euclid--…` | reaches the programs at this door |
 //! | other topics of the cell | is refused |
 //! | anything else | without certificates reaches the programs at this door |
@@ -15,13 +16,13 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use bytes::Bytes;
 use ecod::model::names::NodeName;
-use ecod::wire::{RejectReason, ReportKind, Topic, decode_report};
+use ecod::wire::{CellDescription, RejectReason, ReportKind, Topic, decode, decode_report};
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
 
 use super::refusals::RefusalReason;
-use super::{Door, DoorState, Publication, Refusal, lock};
+use super::{Door, DoorSetup, DoorState, Publication, Refusal, lock};
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
 use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
@@ -97,6 +98,9 @@ impl Door {
         match place {
             Place::Cell => Ok(()),
             Place::Door => door.may_say(principal, topic),
+            Place::Inbound if door.setup.topics.parse(topic) == Some(Topic::Cell) => {
+                door.take_description(principal, payload)
+            }
             Place::Inbound => door.take_report(principal, topic, payload),
         }
     }
@@ -131,7 +135,7 @@ impl Door {
                 Place::Cell
             }
             Some(Topic::Nodes(name)) if door.is_nodeless_name(principal, &name) => Place::Cell,
-            Some(Topic::Detections(_) | Topic::VoteDetections(_)) => Place::Inbound,
+            Some(Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Cell) => Place::Inbound,
             _ => Place::Door,
         }
     }
@@ -190,6 +194,18 @@ impl DoorState {
         })?;
         (setup.report)(kind, Arc::new(report));
         Ok(())
+    }
+
+    /// Takes the cell's description from a program that may act as the node.
+    fn take_description(&self, principal: &Principal, payload: &Bytes) -> Result<(), Refusal> {
+        let DoorSetup { node, limits, .. } = &self.setup;
+        if !principal.is_of(node) {
+            let text = format!("only programs on the machine of {node}, or with its certificate, set the description");
+            return Err(Refusal::not_permitted(text));
+        }
+        let malformed = |text| Refusal { reason: RefusalReason::Rejected(RejectReason::Malformed), text };
+        let request: CellDescription = decode(payload, limits).map_err(|reason| malformed(reason.to_string()))?;
+        (self.setup.describe)(request.text).map_err(malformed)
     }
 
     /// Whether a filter of a program matches reports.

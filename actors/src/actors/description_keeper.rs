@@ -1,0 +1,210 @@
+//! The actor that keeps the cell's description: takes, saves and passes on the newest.
+//!
+//! ```text
+//! program ── door ── Set ──────────> DescriptionKeeper ── PublishDescription ──> Gateway
+//! LeaderElection ── Hear ──────────>   │ ▲        └── Describe ──> Node ──> the parts that use its settings
+//! Gateway ── Take, Connected ──────>   └─┘ Tick
+//! ```
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::description::{DescriptionEffect, DescriptionExchange, PUBLISH_INTERVAL};
+use ecod::leadership::Leadership;
+use ecod::leadership::timers::DISK_TIMEOUT;
+use ecod::model::names::NodeName;
+use ecod::wire::{CellDescription, RejectReason};
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::description_keeper::DescriptionKeeperMessage;
+use crate::messages::gateway::GatewayMessage;
+use crate::platform::clock;
+use crate::platform::content_hash::{content_hash, is_intact};
+use crate::platform::state_file::StateFile;
+use crate::telemetry::counters::{Counters, OTHERS};
+use crate::transport::gossip::Member;
+
+/// Callback that has a node use a description. It must not block.
+pub type DescriptionSink = Arc<dyn Fn(Arc<CellDescription>) + Send + Sync>;
+
+/// What a keeper needs at its start.
+pub struct DescriptionKeeperArguments {
+    /// The node's name.
+    pub name: NodeName,
+    /// Whether it may lead, and so set and publish descriptions.
+    pub may_lead: bool,
+    /// The description that the node uses, or knows and cannot use.
+    pub held: Option<Arc<CellDescription>>,
+    /// Where it is saved, if anywhere.
+    pub file: Option<StateFile>,
+    /// Has the node use a description.
+    pub apply: DescriptionSink,
+    /// The other nodes.
+    pub members: watch::Receiver<Vec<Member>>,
+    /// Who leads.
+    pub leadership: watch::Receiver<Leadership>,
+    /// Publishes descriptions.
+    pub gateway: ActorSlot<GatewayMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+}
+
+/// Keeps the description.
+#[derive(Debug, Default)]
+pub struct DescriptionKeeper;
+
+/// The exchange, and what the disk lacks.
+pub struct DescriptionKeeperState {
+    exchange: DescriptionExchange,
+    name: NodeName,
+    file: Option<StateFile>,
+    is_unsaved: bool,
+    writing: Option<JoinHandle<std::io::Result<()>>>,
+    has_disk_failed: bool,
+    apply: DescriptionSink,
+    members: watch::Receiver<Vec<Member>>,
+    leadership: watch::Receiver<Leadership>,
+    gateway: ActorSlot<GatewayMessage>,
+    counters: Arc<Counters>,
+}
+
+/// Time between two looks at what others lack.
+const TICK: Duration = Duration::from_millis(500);
+
+const _: () = assert!(TICK.as_millis() < PUBLISH_INTERVAL.as_millis());
+
+impl Actor for DescriptionKeeper {
+    type Msg = DescriptionKeeperMessage;
+    type State = DescriptionKeeperState;
+    type Arguments = DescriptionKeeperArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let DescriptionKeeperArguments {
+            name,
+            may_lead,
+            held,
+            file,
+            apply,
+            members,
+            mut leadership,
+            gateway,
+            counters,
+        } = arguments;
+        leadership.mark_changed();
+        myself.send_interval(TICK, || DescriptionKeeperMessage::Tick);
+        Ok(DescriptionKeeperState {
+            // One that the node was started with is not on the disk yet.
+            is_unsaved: held.is_some(),
+            exchange: DescriptionExchange::new(name.clone(), may_lead, held),
+            name,
+            file,
+            writing: None,
+            has_disk_failed: false,
+            apply,
+            members,
+            leadership,
+            gateway,
+            counters,
+        })
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let (now, is_tick) = (clock::now(), matches!(message, DescriptionKeeperMessage::Tick));
+        if state.leadership.has_changed().unwrap_or(false) {
+            let leadership = state.leadership.borrow_and_update().clone();
+            let effects = state.exchange.lead(leadership.leader(), now);
+            state.carry_out(effects);
+        }
+        let effects = match message {
+            DescriptionKeeperMessage::Hear { from, may_lead, stamp } => {
+                state.exchange.hear(&from, may_lead, stamp, now)
+            }
+            DescriptionKeeperMessage::Take { delivery } if is_intact(&delivery.message) => {
+                state.exchange.take(Arc::clone(&delivery.message), now)
+            }
+            DescriptionKeeperMessage::Take { delivery } => {
+                let broker = delivery.broker.as_ref().map_or(OTHERS, NodeName::as_str);
+                state.counters.reject(RejectReason::Malformed, broker);
+                tracing::debug!(broker, "description not used: its hash is not that of its content");
+                Vec::new()
+            }
+            DescriptionKeeperMessage::Set { text } => {
+                let hash = content_hash(&state.name, &text);
+                state.exchange.set(text, hash, now)
+            }
+            DescriptionKeeperMessage::Connected => state.exchange.connect(now),
+            DescriptionKeeperMessage::Tick => {
+                let members = state.members.borrow();
+                state.exchange.retain(|name| members.iter().any(|member| member.name == *name));
+                drop(members);
+                state.exchange.tick(now)
+            }
+        };
+        let has_adopted = effects.iter().any(|effect| matches!(effect, DescriptionEffect::Adopt { .. }));
+        state.carry_out(effects);
+        // A disk that hangs holds up one message, and no other.
+        if has_adopted || is_tick && state.writing.as_ref().is_none_or(JoinHandle::is_finished) {
+            state.save().await;
+        }
+        Ok(())
+    }
+}
+
+impl DescriptionKeeperState {
+    fn carry_out(&mut self, effects: Vec<DescriptionEffect>) {
+        for effect in effects {
+            match effect {
+                DescriptionEffect::Adopt { description, stated_by } => {
+                    let (stamp, set_by) = (description.stamp(), &description.set_by);
+                    tracing::info!(%stamp, %set_by, %stated_by, "the cell has a new description");
+                    self.is_unsaved = true;
+                    (self.apply)(description);
+                }
+                DescriptionEffect::Publish { description } => {
+                    self.gateway.send(GatewayMessage::PublishDescription { description });
+                }
+                DescriptionEffect::CountImplausible { from } => {
+                    self.counters.reject(RejectReason::OutOfRange, from.as_str());
+                }
+            }
+        }
+    }
+
+    /// Saves what has changed; a disk that fails or hangs is warned of, and the node goes on.
+    async fn save(&mut self) {
+        let (Some(file), Some(held)) = (self.file.clone(), self.exchange.current()) else { return };
+        if self.is_unsaved && self.writing.is_none() {
+            let held = Arc::clone(held);
+            self.is_unsaved = false;
+            self.writing = Some(tokio::task::spawn_blocking(move || file.save(&*held)));
+        }
+        let Some(writing) = &mut self.writing else { return };
+        let written = match tokio::time::timeout(DISK_TIMEOUT, writing).await {
+            Ok(written) => {
+                self.writing = None;
+                written.map_err(std::io::Error::other).flatten()
+            }
+            Err(elapsed) => Err(elapsed.into()),
+        };
+        self.is_unsaved |= written.is_err();
+        let has_failed = std::mem::replace(&mut self.has_disk_failed, written.is_err());
+        if let Err(error) = written
+            && !has_failed
+        {
+            let path = self.file.as_ref().map(|file| file.path().display().to_string());
+            tracing::warn!(path, %error, "description of the cell not saved, tried again");
+        }
+    }
+}

@@ -1,0 +1,303 @@
+//! `ecod-node cell`: the settings that all nodes of a cell share, at the door of one of them.
+
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use clap::{Args, Subcommand};
+use ecod::leadership::BrokerAddress;
+use ecod::model::names::NodeName;
+use ecod::wire::{CellDescription, ContentHash, Encoding, NodeState, NodeStatus, SCHEMA_VERSION, Topic, Topics};
+use ecod::wire::{decode, encode};
+use serde_json::{Map, Value, json};
+use uuid::Uuid;
+
+use super::{Failure, print};
+use crate::node::config::{NodeConfig, SharedConfig};
+use crate::transport::mqtt::MqttVersion;
+use crate::transport::mqtt::connection::{Client, Connection, Packet, Retention, open};
+use crate::transport::pki::{BrokerTrust, OBSERVER_MARK};
+
+/// Commands of `cell`.
+#[derive(Debug, Subcommand)]
+pub(super) enum CellCommand {
+    /// Give a description to a node that may lead; it reaches all nodes
+    Set {
+        /// The description (TOML)
+        file: PathBuf,
+        #[command(flatten)]
+        door: DoorArguments,
+    },
+    /// Print the description that the cell has, and which nodes use it
+    Show {
+        #[command(flatten)]
+        door: DoorArguments,
+    },
+    /// Compare a file with the description that the cell has; ends with 1 if they differ
+    Diff {
+        /// The description (TOML)
+        file: PathBuf,
+        #[command(flatten)]
+        door: DoorArguments,
+    },
+}
+
+/// Flags that name a node of this machine.
+#[derive(Debug, Args)]
+pub(super) struct DoorArguments {
+    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Name of the cell
+    #[arg(long)]
+    cell: Option<NodeName>,
+    /// Address where the node listens, if it is not the configured one; the node's log names it
+    #[arg(long, value_name = "IP:PORT")]
+    door: Option<SocketAddr>,
+}
+
+/// Maximum time for the node's answer.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Silence after which no more statuses of nodes are waited for.
+const SILENCE: Duration = Duration::from_millis(300);
+
+pub(super) fn run(command: &CellCommand) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start")?;
+    runtime.block_on(carry_out(command))
+}
+
+async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
+    match command {
+        CellCommand::Set { file, door } => {
+            let text = read(file)?;
+            let described = DoorClient::open(door).await?.set(&text).await?;
+            let CellDescription { version, hash, set_by, .. } = described;
+            Ok(print(&format!("version {version}, hash {hash}, set by {set_by}\n"))?)
+        }
+        CellCommand::Show { door } => Ok(print(&DoorClient::open(door).await?.show().await?)?),
+        CellCommand::Diff { file, door } => {
+            let text = read(file)?;
+            let described = DoorClient::open(door).await?.present().await?;
+            let lines = differences(&settings(&described.text)?, &settings(&text)?);
+            let (file, version) = (file.display(), described.version);
+            if lines.is_empty() {
+                return Ok(print(&format!("no difference to version {version}\n"))?);
+            }
+            print(&lines)?;
+            Err(anyhow!("{file} differs from version {version} of the cell's description").into())
+        }
+    }
+}
+
+/// The text of a description, whose values are checked.
+fn read(file: &Path) -> Result<String, Failure> {
+    let text = std::fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()));
+    let text = text.map_err(Failure::usage)?;
+    SharedConfig::parse(&text).with_context(|| file.display().to_string()).map_err(Failure::usage)?;
+    Ok(text)
+}
+
+/// A program's connection to a node.
+struct DoorClient {
+    client: Client,
+    connection: Connection,
+    config: NodeConfig,
+    topics: Topics,
+}
+
+impl DoorClient {
+    async fn open(arguments: &DoorArguments) -> Result<Self, Failure> {
+        let mut flags = Map::new();
+        flags.extend(arguments.cell.as_ref().map(|cell| ("cell".to_owned(), json!(cell))));
+        let mut config = NodeConfig::load(arguments.config.as_deref(), &flags).map_err(Failure::usage)?;
+        // Version 5 has reasons for refusals; the door asks for no password.
+        config.mqtt.version = MqttVersion::V5;
+        (config.mqtt.user, config.mqtt.password) = (None, None);
+        let address = here(arguments.door.unwrap_or(config.broker_listen()));
+        let credentials = config.security().map_err(Failure::usage)?.credentials;
+        let tls = credentials.as_ref().map(|credentials| BrokerTrust::of_door(credentials).client());
+        let (process, run) = (std::process::id(), Uuid::new_v4().simple());
+        let client_id = match config.name.as_ref().filter(|_| tls.is_some()) {
+            Some(name) => format!("{name}{OBSERVER_MARK}cell-{process}-{run}"),
+            None => format!("ecod-cell-{process}"),
+        };
+        let (client, connection) = open(&BrokerAddress::from(address), &client_id, None, &config.mqtt, tls);
+        let topics = Topics::new(&config.cell);
+        let mut door = Self { client, connection, config, topics };
+        let accepted = door.connection.next(PATIENCE).await;
+        accepted.with_context(|| {
+            format!("no node at {address}: it must run on this machine; `--door` names another address of it")
+        })?;
+        door.client.subscribe(&[door.topics.path(&Topic::Cell), door.topics.filter("nodes/+")]);
+        Ok(door)
+    }
+
+    /// The next description or status, if one comes in time.
+    async fn next(&mut self, patience: Duration) -> Result<Option<DoorMessage>, anyhow::Error> {
+        let limits = self.config.mqtt.limits();
+        let next = async {
+            loop {
+                let (topic, payload) = match self.connection.next(PATIENCE).await? {
+                    Packet::Message { topic, payload } => (topic, payload),
+                    Packet::PublishRefused(text) => return Err(anyhow!("refused: {text}")),
+                    _ => continue,
+                };
+                let topic = std::str::from_utf8(&topic).ok().and_then(|topic| self.topics.parse(topic));
+                let message = match topic {
+                    Some(Topic::Cell) => decode(&payload, &limits).ok().map(DoorMessage::Description),
+                    Some(Topic::Nodes(_)) => decode(&payload, &limits).ok().map(DoorMessage::Status),
+                    _ => None,
+                };
+                if message.is_some() {
+                    return Ok(message);
+                }
+            }
+        };
+        tokio::time::timeout(patience, next).await.unwrap_or(Ok(None))
+    }
+
+    /// The next description or status; a node that has none to tell is none of this cell.
+    async fn expect(&mut self) -> Result<DoorMessage, anyhow::Error> {
+        let cell = self.config.cell.clone();
+        let silent = || anyhow!("no answer of a node of cell {cell}: check the cell's name, and the node's version");
+        self.next(PATIENCE - SILENCE).await?.ok_or_else(silent)
+    }
+
+    /// The description that the node has now; version 0 without one.
+    async fn present(&mut self) -> Result<CellDescription, anyhow::Error> {
+        loop {
+            if let DoorMessage::Description(description) = self.expect().await? {
+                return Ok(description);
+            }
+        }
+    }
+
+    /// Sets a description; returns it as the node has numbered it.
+    async fn set(&mut self, text: &str) -> Result<CellDescription, anyhow::Error> {
+        let (node, text) = (NodeName::from_static("node"), text.to_owned());
+        let set_by = self.config.name.clone().unwrap_or(node);
+        let (schema, hash) = (SCHEMA_VERSION, ContentHash::default());
+        let request = CellDescription { schema, version: 0, hash, set_by, text };
+        let payload = encode(&request, Encoding::Json).into();
+        self.present().await?;
+        self.client.publish(&self.topics.path(&Topic::Cell), &payload, Retention::Acknowledged);
+        // One that is the present one already is not published anew.
+        self.client.subscribe(&[self.topics.path(&Topic::Cell)]);
+        loop {
+            let description = self.present().await?;
+            if description.version > 0 && description.text == request.text {
+                return Ok(description);
+            }
+        }
+    }
+
+    /// The description as a file, with the nodes that know one in comments.
+    async fn show(&mut self) -> Result<String, anyhow::Error> {
+        let (mut description, mut nodes) = (None, BTreeMap::new());
+        loop {
+            let next = if description.is_none() { Some(self.expect().await?) } else { self.next(SILENCE).await? };
+            match next {
+                Some(DoorMessage::Description(present)) => description = Some(present),
+                Some(DoorMessage::Status(status)) => {
+                    nodes.insert(status.node.clone(), status);
+                }
+                None => break,
+            }
+        }
+        nodes.retain(|node, status| status.state != NodeState::Offline && node.vehicle() == *node);
+        let cell = &self.config.cell;
+        let mut shown = match &description {
+            Some(CellDescription { version: version @ 1.., hash, set_by, .. }) => {
+                format!("# cell {cell}: version {version}, hash {hash}, set by {set_by}\n")
+            }
+            _ => format!("# cell {cell}: no description\n"),
+        };
+        for (node, status) in nodes {
+            shown += &match status.description {
+                Some(held) => {
+                    let problem = held.problem.map_or_else(String::new, |problem| format!(", not used: {problem}"));
+                    format!("# {node}: version {}, hash {}{}\n", held.version, held.hash, problem.replace('\n', " "))
+                }
+                None => format!("# {node}: none\n"),
+            };
+        }
+        Ok(shown + &description.map_or_else(String::new, |description| description.text))
+    }
+}
+
+/// A message of a node to its programs.
+enum DoorMessage {
+    Description(CellDescription),
+    Status(NodeStatus),
+}
+
+/// The address at which a program of this machine reaches a node that listens there.
+fn here(mut listen: SocketAddr) -> SocketAddr {
+    match listen {
+        SocketAddr::V4(v4) if v4.ip().is_unspecified() => listen.set_ip(Ipv4Addr::LOCALHOST.into()),
+        SocketAddr::V6(v6) if v6.ip().is_unspecified() => listen.set_ip(Ipv6Addr::LOCALHOST.into()),
+        _ => {}
+    }
+    listen
+}
+
+/// The settings of a description with all defaults; locations by id.
+fn settings(text: &str) -> Result<Value, anyhow::Error> {
+    let mut settings = serde_json::to_value(SharedConfig::parse(text)?)?;
+    if let Some(landmarks) = settings.get_mut("landmarks")
+        && let Value::Array(list) = landmarks.take()
+    {
+        let id = |landmark: &Value| landmark.get("id").and_then(Value::as_str).unwrap_or_default().to_owned();
+        *landmarks = list.into_iter().map(|landmark| (id(&landmark), landmark)).collect();
+    }
+    Ok(settings)
+}
+
+/// One line for each value that differs.
+fn differences(cell: &Value, file: &Value) -> String {
+    let mut lines = String::new();
+    compare("", cell, file, &mut lines);
+    lines
+}
+
+fn compare(key: &str, cell: &Value, file: &Value, lines: &mut String) {
+    match (cell, file) {
+        (Value::Object(in_cell), Value::Object(in_file)) => {
+            let keys: std::collections::BTreeSet<_> = in_cell.keys().chain(in_file.keys()).collect();
+            for name in keys {
+                let below = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
+                let of = |table: &Map<String, Value>| table.get(name).cloned().unwrap_or_default();
+                compare(&below, &of(in_cell), &of(in_file), lines);
+            }
+        }
+        _ if cell == file => {}
+        _ => {
+            let text = |value: &Value| if value.is_null() { "nothing".to_owned() } else { value.to_string() };
+            *lines += &format!("{key}: cell {}, file {}\n", text(cell), text(file));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_difference_is_a_value_and_neither_order_nor_spelling() {
+        let cell = "[fusion.pace]\ngate_m = 1\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"b\"\nx_m = 1\ny_m = 0";
+        let same = "# ours\n[[landmarks]]\nid = \"b\"\nx_m = 1.0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[fusion.pace]\ngate_m = 1.0\ngate_sigmas = 4.0";
+        let other = "[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 2\n[[landmarks]]\nid = \"c\"\nx_m = 0\ny_m = 0";
+        let compared = |file| differences(&settings(cell).unwrap(), &settings(file).unwrap());
+        assert_eq!(compared(same), "");
+        let lines = compared(other);
+        for line in
+            ["fusion.pace.gate_m: cell 1.0, file 0.5", "landmarks.a.y_m: cell 0.0, file 2.0", "landmarks.b: cell {"]
+        {
+            assert!(lines.contains(line), "{lines}");
+        }
+        assert!(lines.contains("landmarks.c: cell nothing, file {"), "{lines}");
+    }
+}

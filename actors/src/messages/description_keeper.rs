@@ -1,0 +1,36 @@
+//! Messages to the actor of this name.
+
+use std::sync::Arc;
+
+use ecod::model::names::NodeName;
+use ecod::wire::{CellDescription, DescriptionStamp};
+
+use crate::transport::mqtt::Delivery;
+
+/// Requests to the keeper of the cell's description.
+#[derive(Debug)]
+pub enum DescriptionKeeperMessage {
+    /// Take the authenticated word of a node about its description.
+    Hear {
+        /// The node.
+        from: NodeName,
+        /// Whether it may lead.
+        may_lead: bool,
+        /// The version and hash that it has.
+        stamp: DescriptionStamp,
+    },
+    /// Take a description from a broker.
+    Take {
+        /// The description and the way that it came.
+        delivery: Delivery<Arc<CellDescription>>,
+    },
+    /// Set the cell's description, which was checked.
+    Set {
+        /// The settings, as TOML.
+        text: String,
+    },
+    /// Publish to a broker that has just accepted a link.
+    Connected,
+    /// Repeat what others lack, and try the disk again.
+    Tick,
+}

@@ -1,0 +1,77 @@
+//! What a change of the cell's description means for the parts of a node.
+
+use std::sync::Arc;
+
+use ecod::leadership::node::Input;
+use ecod::wire::CellDescription;
+
+use super::NodeBuilder;
+use crate::messages::fuser::FuserMessage;
+use crate::messages::leader_election::LeaderElectionMessage;
+#[cfg(feature = "camera")]
+use crate::messages::projector::ProjectorMessage;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::node::config::NodeConfig;
+use crate::node::description::{HeldDescription, rates_by_evidence, shared_facts};
+use crate::node::slots::ActorKind;
+
+/// Longest reason in a status, in characters.
+const MAX_PROBLEM: usize = 500;
+
+impl NodeBuilder {
+    /// Uses a description from now on. One that contradicts the node's own configuration, or that this version cannot read,
+    /// is kept and passed on, and the node goes on with the settings that it has.
+    pub(in crate::node) fn describe(&mut self, description: &Arc<CellDescription>) {
+        let stamp = description.stamp();
+        let described = self.own_config.described(&description.text);
+        let problem = described.as_ref().err().map(|error| {
+            format!("description {stamp} of the cell is not used: {error}").chars().take(MAX_PROBLEM).collect()
+        });
+        self.held = HeldDescription { description: Some(Arc::clone(description)), problem };
+        match described {
+            Ok(config) => {
+                let before = std::mem::replace(&mut self.config, config);
+                self.configure_parts(&before);
+                tracing::info!(%stamp, "the description of the cell is used");
+            }
+            Err(error) => tracing::error!(%stamp, %error, "the description of the cell is not used"),
+        }
+        self.door.publish_description(description);
+        self.shared.send_replace(shared_facts(&self.config, &self.held));
+        let input = Input::Described {
+            description: self.held.status(),
+            round_period: self.round_period(),
+            keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
+        };
+        self.slots().election.send(LeaderElectionMessage::Note { input });
+    }
+
+    /// Tells the parts of settings that are others than `before`.
+    fn configure_parts(&self, before: &NodeConfig) {
+        let (config, slots) = (&self.config, self.slots());
+        self.reputations.set_by_evidence(rates_by_evidence(config));
+        if before.fusion.reputation != config.fusion.reputation {
+            let reputation = config.fusion.reputation.clone();
+            slots.keeper.send(ReputationKeeperMessage::Configure { reputation });
+        }
+        if (&before.fusion, &before.landmarks) != (&config.fusion, &config.landmarks) {
+            let (fusion, landmarks) = (Box::new(config.fusion.clone()), config.landmarks.clone());
+            slots.fuser.send(FuserMessage::Configure { fusion, landmarks });
+            // What was switched on starts with the evidence that there is.
+            let ledger = Arc::new(self.reputations.open().ledger.clone());
+            slots.fuser.send(FuserMessage::Adopt { ledger });
+        }
+        #[cfg(feature = "camera")]
+        if config.camera.is_some() {
+            match crate::node::camera::perception(config) {
+                Ok(perception) => {
+                    let (perception, algorithms) = (Box::new(perception), crate::node::camera::algorithms(config));
+                    slots.projector.send(ProjectorMessage::Configure { perception, algorithms });
+                }
+                Err(error) => {
+                    tracing::error!(error = format!("{error:#}"), "the camera goes on with the settings before");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,310 @@
+//! Settings that all nodes of a cell share: those of the cell's description, and their place in a node's configuration.
+
+use ecod::aggregator::FusionConfig;
+use ecod::config::ConfigError;
+use ecod::model::origin::GeographicOrigin;
+use ecod::perception::landmark::LandmarkConfig;
+use ecod::perception::projection::ObjectSizes;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use super::NodeConfig;
+
+/// The settings of a description. Keys are those of a node's configuration.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SharedConfig {
+    /// How reports are fused.
+    pub fusion: FusionConfig,
+    /// The known locations.
+    pub landmarks: Vec<LandmarkConfig>,
+    /// The place of the cell's frame on Earth. Default none.
+    pub origin: Option<GeographicOrigin>,
+    /// Settings of all cameras.
+    pub camera: SharedCamera,
+}
+
+/// Settings of all cameras of a cell.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SharedCamera {
+    /// Settings of projection.
+    pub projection: SharedProjection,
+}
+
+/// Settings of projection of all cameras of a cell.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SharedProjection {
+    /// True sizes of objects by label.
+    pub sizes: ObjectSizes,
+}
+
+/// A description that a node cannot use.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DescriptionError {
+    /// It is no TOML, or has unknown keys or values of the wrong kind.
+    #[error("the description cannot be read: {0}")]
+    Malformed(String),
+    /// A value is out of its range.
+    #[error("in the description, {0}")]
+    OutOfRange(#[from] ConfigError),
+    /// The node's own configuration says something else.
+    #[error(
+        "configuration key `{key}`: this node's own configuration says {own}, the description of the cell says \
+         {described}; remove the key from the node's configuration, or change the description by `ecod-node cell set`"
+    )]
+    Contradicts {
+        /// The key.
+        key: String,
+        /// The node's own value.
+        own: String,
+        /// The value of the description.
+        described: String,
+    },
+}
+
+/// Shared keys that a node's own configuration states, by file, environment or flags. They are no part of a
+/// configuration's value: two configurations may be equal and state their values in different places.
+#[derive(Debug, Clone, Default)]
+pub struct StatedKeys(Value);
+
+impl PartialEq for StatedKeys {
+    fn eq(&self, _: &Self) -> bool {
+        true
+    }
+}
+
+impl StatedKeys {
+    /// The shared ones of all keys that are stated.
+    pub(super) fn of(stated: &Value) -> Self {
+        let mut shared = Map::new();
+        for key in ["fusion", "landmarks", "origin"] {
+            shared.extend(stated.get(key).map(|value| (key.to_owned(), value.clone())));
+        }
+        if let Some(sizes) = stated.pointer("/camera/projection/sizes") {
+            shared.insert("camera".into(), serde_json::json!({ "projection": { "sizes": sizes } }));
+        }
+        Self(Value::Object(shared))
+    }
+}
+
+impl SharedConfig {
+    /// Reads the text of a description and checks every value.
+    ///
+    /// # Errors
+    /// [`DescriptionError`] naming the line, or the key, the value and what is allowed.
+    pub fn parse(text: &str) -> Result<Self, DescriptionError> {
+        let shared: Self = toml::from_str(text).map_err(|error| DescriptionError::Malformed(error.to_string()))?;
+        shared.fusion.validate().map_err(|error| error.within("fusion"))?;
+        LandmarkConfig::validate_all(&shared.landmarks)?;
+        if let Some(origin) = &shared.origin {
+            origin.validate().map_err(|error| error.within("origin"))?;
+        }
+        shared.camera.projection.sizes.validate().map_err(|error| error.within("camera.projection.sizes"))?;
+        Ok(shared)
+    }
+
+    /// The shared settings of a node's configuration.
+    fn of(config: &NodeConfig) -> Self {
+        #[cfg(feature = "camera")]
+        let sizes = config.camera.as_ref().map(|camera| camera.projection.sizes.clone()).unwrap_or_default();
+        #[cfg(not(feature = "camera"))]
+        let sizes = ObjectSizes::default();
+        Self {
+            fusion: config.fusion.clone(),
+            landmarks: config.landmarks.clone(),
+            origin: config.origin,
+            camera: SharedCamera { projection: SharedProjection { sizes } },
+        }
+    }
+
+    pub(super) fn put_into(self, config: &mut NodeConfig) {
+        let Self { fusion, landmarks, origin, camera: SharedCamera { projection: SharedProjection { sizes } } } = self;
+        (config.fusion, config.landmarks, config.origin) = (fusion, landmarks, origin);
+        #[cfg(feature = "camera")]
+        if let Some(camera) = &mut config.camera {
+            camera.projection.sizes = sizes;
+        }
+        #[cfg(not(feature = "camera"))]
+        drop(sizes);
+    }
+}
+
+impl NodeConfig {
+    /// The configuration with the values of a cell's description.
+    ///
+    /// # Errors
+    /// [`DescriptionError`], also where the node's own configuration states another value.
+    pub fn described(&self, text: &str) -> Result<Self, DescriptionError> {
+        let malformed = |error: &dyn std::fmt::Display| DescriptionError::Malformed(error.to_string());
+        let described = serde_json::to_value(SharedConfig::parse(text)?).map_err(|error| malformed(&error))?;
+        let keys = toml::from_str::<toml::Table>(text).map_err(|error| malformed(&error))?;
+        let keys = serde_json::to_value(keys).map_err(|error| malformed(&error))?;
+        let mut shared = serde_json::to_value(SharedConfig::of(self)).map_err(|error| malformed(&error))?;
+        for path in leaves(&keys) {
+            let Some(value) = at(&described, &path) else { continue };
+            if at(&self.stated.0, &path).is_some()
+                && let Some((within, own, described)) = at(&shared, &path).and_then(|own| difference(own, value))
+            {
+                return Err(DescriptionError::Contradicts { key: path.join(".") + &within, own, described });
+            }
+            put(&mut shared, &path, value.clone());
+        }
+        let shared: SharedConfig = serde_json::from_value(shared).map_err(|error| malformed(&error))?;
+        let mut config = self.clone();
+        shared.put_into(&mut config);
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+/// Paths of all values that are no tables.
+fn leaves(value: &Value) -> Vec<Vec<String>> {
+    let Value::Object(table) = value else { return vec![Vec::new()] };
+    let below = |(key, value): (&String, &Value)| {
+        leaves(value).into_iter().map(|path| [vec![key.clone()], path].concat()).collect::<Vec<_>>()
+    };
+    table.iter().flat_map(below).collect()
+}
+
+fn at<'a>(value: &'a Value, path: &[String]) -> Option<&'a Value> {
+    path.iter().try_fold(value, |value, key| value.get(key))
+}
+
+fn put(value: &mut Value, path: &[String], leaf: Value) {
+    let Some((key, rest)) = path.split_first() else { return *value = leaf };
+    if !value.is_object() {
+        *value = Value::Object(Map::new());
+    }
+    if let Value::Object(table) = value {
+        put(table.entry(key.clone()).or_insert(Value::Null), rest, leaf);
+    }
+}
+
+/// Where two values first differ, with both as text: a place in a list, or the whole.
+fn difference(own: &Value, described: &Value) -> Option<(String, String, String)> {
+    match (own, described) {
+        _ if own == described => None,
+        (Value::Array(own), Value::Array(described)) if own.len() == described.len() => {
+            let mut pairs = own.iter().zip(described).enumerate();
+            pairs.find_map(|(index, (own, described))| {
+                difference(own, described)
+                    .map(|(within, own, described)| (format!("[{index}]{within}"), own, described))
+            })
+        }
+        (Value::Array(own), Value::Array(described)) => {
+            Some((String::new(), format!("{} entries", own.len()), format!("{} entries", described.len())))
+        }
+        (Value::Object(own_table), Value::Object(table)) => own_table
+            .iter()
+            .find_map(|(key, own)| {
+                let (within, own, described) = difference(own, table.get(key).unwrap_or(&Value::Null))?;
+                Some((format!(".{key}{within}"), own, described))
+            })
+            .or_else(|| Some((String::new(), own.to_string(), described.to_string()))),
+        _ => Some((String::new(), own.to_string(), described.to_string())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use serde_json::json;
+
+    use super::*;
+
+    fn own(toml: &str) -> NodeConfig {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(toml.as_bytes()).unwrap();
+        NodeConfig::load(Some(file.path()), &json!({ "name": "euclid" })).unwrap()
+    }
+
+    const CELL: &str = r#"
+        [origin]
+        latitude_deg = 52.2
+        longitude_deg = 21.0
+        rotation_deg = 12
+        [fusion.pace]
+        gate_m = 1
+        [fusion.vote.synonyms]
+        vase = "sports ball"
+        [[landmarks]]
+        id = "slot-0"
+        x_m = 0
+        y_m = 0.5
+        [[landmarks]]
+        id = "slot-1"
+        x_m = 2.5
+        y_m = 0
+    "#;
+
+    #[test]
+    fn a_description_fills_in_what_a_nodes_own_file_leaves_open() {
+        let config =
+            own("[fusion.round]\nperiod_s = 0.2\n[fusion.vote.synonyms]\nmug = \"cup\"").described(CELL).unwrap();
+        assert_eq!((config.fusion.pace.gate_m, config.fusion.round.period_s), (1.0, 0.2));
+        assert_eq!(config.landmarks.iter().map(|l| &*l.id).collect::<Vec<_>>(), ["slot-0", "slot-1"]);
+        assert_eq!(config.fusion.vote.synonyms.len(), 2, "labels of both");
+        let origin = config.origin.unwrap();
+        assert_eq!((origin.latitude_deg, origin.height_m, origin.rotation_deg), (52.2, 0.0, 12.0));
+    }
+
+    #[test]
+    fn equal_values_in_both_are_no_contradiction() {
+        let same = own("[fusion.pace]\ngate_m = 1.0\n[[landmarks]]\nid = \"slot-0\"\nx_m = 0.0\ny_m = 0.5\n\
+                        [[landmarks]]\nid = \"slot-1\"\nx_m = 2.5\ny_m = 0.0");
+        assert_eq!(same.described(CELL).unwrap().landmarks, same.landmarks);
+    }
+
+    #[test]
+    fn a_contradiction_names_the_key_and_both_values() {
+        for (toml, parts) in [
+            // The default, and yet stated.
+            ("[fusion.pace]\ngate_m = 0.5", ["`fusion.pace.gate_m`", "0.5", "1.0"]),
+            ("[[landmarks]]\nid = \"slot-0\"\nx_m = 0\ny_m = 0", ["`landmarks`", "1 entries", "2 entries"]),
+            (
+                "[[landmarks]]\nid = \"slot-0\"\nx_m = 0\ny_m = 0.5\n[[landmarks]]\nid = \"slot-1\"\nx_m = 2.6\ny_m = 0",
+                ["`landmarks[1].x_m`", "2.6", "2.5"],
+            ),
+            ("[fusion.vote.synonyms]\nvase = \"cup\"", ["`fusion.vote.synonyms.vase`", "\"cup\"", "\"sports ball\""]),
+            ("[origin]\nlatitude_deg = 1\nlongitude_deg = 2", ["`origin.latitude_deg`", "1.0", "52.2"]),
+        ] {
+            let error = own(toml).described(CELL).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_description_has_shared_keys_alone_and_values_within_their_ranges() {
+        for (toml, parts) in [
+            ("name = \"edge\"", ["line 1", "unknown field", "name"]),
+            ("[fusion.pace]\ngate = 1", ["line 2", "unknown field", "gate_m"]),
+            ("[fusion.pace]\ngate_m = -1", ["`fusion.pace.gate_m`", "-1", "0.001"]),
+            ("[origin]\nlatitude_deg = 91\nlongitude_deg = 0", ["`origin.latitude_deg`", "91", "-90 to 90"]),
+            ("[camera.projection]\npixel_sigma_px = 3", ["line 2", "unknown field", "sizes"]),
+            (
+                "[camera.projection.sizes.labels]\ncar = { width_m = 0, height_m = 1 }",
+                ["sizes.labels.car", "0", "0.0001"],
+            ),
+        ] {
+            let error = own("").described(toml).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[cfg(feature = "camera")]
+    #[test]
+    fn sizes_of_labels_are_those_of_the_cell_where_there_is_a_camera() {
+        let sizes = "[camera.projection.sizes.labels]\ncar = { width_m = 1.8, height_m = 1.5 }";
+        let camera =
+            "[camera.source]\nkind = \"v4l2\"\nwidth = 640\nheight = 480\n[camera.detector]\nkind = \"placard\"\n";
+        let described = own(camera).described(sizes).unwrap();
+        assert_eq!(described.camera.unwrap().projection.sizes.of("car").unwrap().width_m, 1.8);
+        assert_eq!(own("").described(sizes).unwrap(), own(""), "an edge has no camera");
+        let other = own(&format!("{camera}[camera.projection.sizes.labels]\ncar = {{ width_m = 2, height_m = 1.5 }}"));
+        let error = other.described(sizes).unwrap_err().to_string();
+        assert!(error.contains("`camera.projection.sizes.labels.car.width_m`"), "{error}");
+    }
+}

@@ -1,0 +1,77 @@
+//! The cell's description at a node: with which one it starts, and what follows from it.
+
+use std::sync::Arc;
+
+use ecod::vote::VoteMode;
+use ecod::wire::{CellDescription, DescriptionStatus, Limits, Payload, SCHEMA_VERSION};
+
+use super::NodeError;
+use super::config::NodeConfig;
+use crate::observe::readiness::{SharedFacts, patience};
+use crate::platform::content_hash::{content_hash, is_intact};
+use crate::platform::state_file::StateFile;
+
+/// The description that a node has.
+#[derive(Debug, Clone, Default)]
+pub(super) struct HeldDescription {
+    pub(super) description: Option<Arc<CellDescription>>,
+    /// The reason why the node does not use it.
+    pub(super) problem: Option<String>,
+}
+
+impl HeldDescription {
+    /// The one of an earlier run, or else of the file with which a node that may lead starts its cell.
+    ///
+    /// # Errors
+    /// When that file cannot be used.
+    pub(super) fn at_start(config: &NodeConfig) -> Result<Self, NodeError> {
+        let saved = description_file(config).and_then(|file| {
+            file.load(|saved: &CellDescription| {
+                saved.schema == SCHEMA_VERSION && saved.check(&Limits::default()).is_ok() && is_intact(saved)
+            })
+        });
+        let Some(path) = config.description.as_ref().filter(|_| config.may_lead()) else {
+            return Ok(Self { description: saved.map(Arc::new), problem: None });
+        };
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| NodeError::Failed(format!("key `description`: {}: {error}", path.display())))?;
+        if let Some(saved) = saved {
+            if saved.text != text {
+                let (path, version) = (path.display(), saved.version);
+                tracing::info!(%path, version, "the cell has a description, and not that file's: see `ecod-node cell diff`");
+            }
+            return Ok(Self { description: Some(Arc::new(saved)), problem: None });
+        }
+        let Some(set_by) = config.name.clone() else { return Ok(Self::default()) };
+        let hash = content_hash(&set_by, &text);
+        let description = CellDescription { schema: SCHEMA_VERSION, version: 1, hash, set_by, text };
+        Ok(Self { description: Some(Arc::new(description)), problem: None })
+    }
+
+    /// Its entry in the node's status.
+    pub(super) fn status(&self) -> Option<DescriptionStatus> {
+        let held = self.description.as_ref()?;
+        Some(DescriptionStatus { version: held.version, hash: held.hash, problem: self.problem.clone() })
+    }
+}
+
+/// Where a node keeps the cell's description, if it keeps anything.
+pub(super) fn description_file(config: &NodeConfig) -> Option<StateFile> {
+    let (directory, name) = (config.state_dir.as_deref()?, config.name.as_ref()?);
+    Some(StateFile::new(directory, &config.cell, name, "description"))
+}
+
+/// Whether reputations follow from evidence, and not from VOTE's `paper` mode.
+pub(super) fn rates_by_evidence(config: &NodeConfig) -> bool {
+    config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote()
+}
+
+/// The shared settings that pages and readiness go by.
+pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> SharedFacts {
+    SharedFacts {
+        patience: patience(&config.fusion),
+        round_period_s: config.fusion.round.period_s,
+        landmarks: config.landmarks.clone().into(),
+        problem: held.problem.clone(),
+    }
+}

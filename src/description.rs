@@ -1,0 +1,269 @@
+//! The description of a cell at one node: which one is the newest, who is told, and what is believed.
+//!
+//! ```text
+//! candidate set  -> all         stamp      in election messages, authenticated
+//! candidate set  -> brokers     description, retained on `cell`
+//! ```
+//!
+//! A description is taken if its stamp equals what a node that may lead states about itself. So the body needs no
+//! signature, and nobody else can change the cell. Nodes that never lead follow.
+//!
+//! Call [`DescriptionExchange::hear`] for every authenticated stamp, [`DescriptionExchange::take`] for every body,
+//! [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership and membership change, and
+//! [`DescriptionExchange::tick`] about twice in [`PUBLISH_INTERVAL`]. Equal inputs give equal effects.
+//!
+//! # Merge
+//!
+//! The greater [`DescriptionStamp`] stays: the later version, of two equal ones the greater hash. So all sides of a
+//! split agree when they meet, whatever the order. A version that is far ahead changes nothing and is counted.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+use crate::wire::{CellDescription, ContentHash, DescriptionStamp, MAX_INTEGER, SCHEMA_VERSION};
+
+/// Largest rise of the version that one message may state. A cell uses one version for each change by a person.
+pub const MAX_VERSION_STEP: u64 = 1 << 20;
+
+/// Largest version that a node without a description takes from others.
+pub const MAX_FIRST_VERSION: u64 = 1 << 40;
+
+/// Minimum time between the first two publications of one description; it doubles with each further one.
+pub const PUBLISH_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Maximum number of doublings: a node that never has the description costs the others little.
+const MAX_DOUBLINGS: u32 = 5;
+
+/// Maximum number of bodies that wait for the word of a candidate; the oldest gives way.
+const MAX_UNPROVEN: usize = 4;
+
+/// Maximum number of nodes whose stamps are kept.
+const MAX_NODES: usize = 4096;
+
+/// Something that the actors of a node must do, in the order given.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum DescriptionEffect {
+    /// Save a description, apply it, and tell other nodes which one this node has.
+    Adopt {
+        /// The description.
+        description: Arc<CellDescription>,
+        /// The candidate that stated it.
+        stated_by: NodeName,
+    },
+    /// Publish the description, retained.
+    Publish {
+        /// The description.
+        description: Arc<CellDescription>,
+    },
+    /// Count a version that is too far ahead, by its sender.
+    CountImplausible {
+        /// The sender.
+        from: NodeName,
+    },
+}
+
+/// The leader as far as it matters here.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+enum Leader {
+    #[default]
+    Unknown,
+    Myself,
+    Other(NodeName),
+}
+
+/// Word of a node about its description.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Statement {
+    stamp: DescriptionStamp,
+    may_lead: bool,
+}
+
+/// One node's part in the exchange of descriptions; see the module.
+#[derive(Debug, Clone)]
+pub struct DescriptionExchange {
+    name: NodeName,
+    may_lead: bool,
+    current: Option<Arc<CellDescription>>,
+    /// Last word of each node.
+    statements: BTreeMap<NodeName, Statement>,
+    /// Bodies that no candidate has stated yet, oldest first.
+    unproven: VecDeque<Arc<CellDescription>>,
+    leader: Leader,
+    /// Whether brokers may lack the description.
+    is_due: bool,
+    /// Time of the last publication, and the number of those since the description or the leader changed.
+    published: Option<(Timestamp, u32)>,
+    effects: Vec<DescriptionEffect>,
+}
+
+impl DescriptionExchange {
+    /// The exchange of a node that starts with what it had saved.
+    pub fn new(name: NodeName, may_lead: bool, saved: Option<Arc<CellDescription>>) -> Self {
+        Self {
+            name,
+            may_lead,
+            current: saved,
+            statements: BTreeMap::new(),
+            unproven: VecDeque::new(),
+            leader: Leader::Unknown,
+            is_due: false,
+            published: None,
+            effects: Vec::new(),
+        }
+    }
+
+    /// The description that counts here.
+    pub fn current(&self) -> Option<&Arc<CellDescription>> {
+        self.current.as_ref()
+    }
+
+    /// Its stamp; version 0 without one.
+    pub fn stamp(&self) -> DescriptionStamp {
+        self.current.as_ref().map(|current| current.stamp()).unwrap_or_default()
+    }
+
+    /// Takes the authenticated word of a node about its description.
+    pub fn hear(
+        &mut self,
+        from: &NodeName,
+        may_lead: bool,
+        stamp: DescriptionStamp,
+        now: Timestamp,
+    ) -> Vec<DescriptionEffect> {
+        if !self.is_plausible(stamp.version) {
+            return vec![DescriptionEffect::CountImplausible { from: from.clone() }];
+        }
+        if self.statements.len() < MAX_NODES || self.statements.contains_key(from) {
+            self.statements.insert(from.clone(), Statement { stamp, may_lead });
+        }
+        if may_lead && stamp > self.stamp() {
+            let place = self.unproven.iter().position(|body| body.stamp() == stamp);
+            if let Some(body) = place.and_then(|place| self.unproven.remove(place)) {
+                self.adopt(body, from.clone());
+            }
+        }
+        self.finish(now)
+    }
+
+    /// Takes a body from a broker; `description.hash` must be that of its content.
+    pub fn take(&mut self, description: Arc<CellDescription>, now: Timestamp) -> Vec<DescriptionEffect> {
+        let stamp = description.stamp();
+        if stamp < self.stamp() {
+            // It may have taken the place of the right one at the broker.
+            self.is_due = true;
+        } else if stamp > self.stamp() && self.is_plausible(stamp.version) {
+            let states = |(_, statement): &(&NodeName, &Statement)| statement.may_lead && statement.stamp == stamp;
+            match self.statements.iter().find(states).map(|(node, _)| node.clone()) {
+                Some(node) => self.adopt(description, node),
+                None => {
+                    self.unproven.retain(|body| body.stamp() != stamp);
+                    self.unproven.push_back(description);
+                    while self.unproven.len() > MAX_UNPROVEN {
+                        self.unproven.pop_front();
+                    }
+                }
+            }
+        }
+        self.finish(now)
+    }
+
+    /// Sets the cell's description at this node, which may lead. Nothing happens if the content is that of the present
+    /// one.
+    pub fn set(&mut self, text: String, hash: ContentHash, now: Timestamp) -> Vec<DescriptionEffect> {
+        if !self.may_lead || self.stamp().version > 0 && self.stamp().hash == hash {
+            return Vec::new();
+        }
+        let of_candidates = self.statements.values().filter(|statement| statement.may_lead);
+        let known = of_candidates.map(|statement| statement.stamp.version).max().unwrap_or(0);
+        let version = known.max(self.stamp().version).saturating_add(1).min(MAX_INTEGER);
+        let set_by = self.name.clone();
+        let description = Arc::new(CellDescription { schema: SCHEMA_VERSION, version, hash, set_by, text });
+        self.adopt(Arc::clone(&description), self.name.clone());
+        self.publish(description, now);
+        self.finish(now)
+    }
+
+    /// Notes who leads.
+    pub fn lead(&mut self, leader: Option<&NodeName>, now: Timestamp) -> Vec<DescriptionEffect> {
+        let leader = match leader {
+            None => Leader::Unknown,
+            Some(leader) if *leader == self.name => Leader::Myself,
+            Some(leader) => Leader::Other(leader.clone()),
+        };
+        if leader != self.leader {
+            self.leader = leader;
+            self.is_due = true;
+            self.published = None;
+        }
+        self.finish(now)
+    }
+
+    /// Notes a new connection to a broker, which may not have the description.
+    pub fn connect(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
+        self.is_due = true;
+        self.finish(now)
+    }
+
+    /// Forgets the word of nodes that are gone.
+    pub fn retain(&mut self, is_member: impl Fn(&NodeName) -> bool) {
+        self.statements.retain(|node, _| is_member(node));
+    }
+
+    /// Repeats what others still lack.
+    pub fn tick(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
+        self.finish(now)
+    }
+
+    /// Whether a version may follow from the one that is known.
+    fn is_plausible(&self, version: u64) -> bool {
+        let known = self.stamp().version;
+        let highest = if known == 0 { MAX_FIRST_VERSION } else { known.saturating_add(MAX_VERSION_STEP) };
+        version <= highest.min(MAX_INTEGER)
+    }
+
+    fn adopt(&mut self, description: Arc<CellDescription>, stated_by: NodeName) {
+        let stamp = description.stamp();
+        self.current = Some(Arc::clone(&description));
+        self.unproven.retain(|body| body.stamp() > stamp);
+        self.published = None;
+        self.effects.push(DescriptionEffect::Adopt { description, stated_by });
+    }
+
+    fn publish(&mut self, description: Arc<CellDescription>, now: Timestamp) {
+        self.is_due = false;
+        self.published = Some((now, self.published.map_or(0, |(_, times)| times) + 1));
+        self.effects.push(DescriptionEffect::Publish { description });
+    }
+
+    /// Publishes what somebody lacks: the leader to all, another candidate to a leader that is behind.
+    fn finish(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
+        if let Some(description) = self.current.clone()
+            && self.may_lead
+            && self.is_lacking(description.stamp())
+            && self.published.is_none_or(|(at, times)| now.since(at) >= interval_after(times))
+        {
+            self.publish(description, now);
+        }
+        std::mem::take(&mut self.effects)
+    }
+
+    fn is_lacking(&self, stamp: DescriptionStamp) -> bool {
+        let is_behind = |statement: &Statement| statement.stamp < stamp;
+        match &self.leader {
+            Leader::Unknown => false,
+            Leader::Myself => self.is_due || self.statements.values().any(is_behind),
+            Leader::Other(leader) => self.statements.get(leader).is_some_and(is_behind),
+        }
+    }
+}
+
+/// Time from a publication to the next, by its number.
+fn interval_after(times: u32) -> Duration {
+    PUBLISH_INTERVAL * (1 << times.saturating_sub(1).min(MAX_DOUBLINGS))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,136 @@
+use super::DescriptionEffect::{Adopt, CountImplausible, Publish};
+use super::*;
+
+fn name(name: &str) -> NodeName {
+    NodeName::new(name).unwrap()
+}
+
+fn at(ms: u64) -> Timestamp {
+    Timestamp(1_000_000_000 + ms * 1000)
+}
+
+fn described(version: u64, text: &str) -> Arc<CellDescription> {
+    let mut hash = [0; 32];
+    hash.iter_mut().zip(text.bytes()).for_each(|(hash, byte)| *hash = byte);
+    let (hash, set_by) = (ContentHash(hash), name("edge"));
+    Arc::new(CellDescription { schema: SCHEMA_VERSION, version, hash, set_by, text: text.into() })
+}
+
+fn node(own: &str) -> DescriptionExchange {
+    DescriptionExchange::new(name(own), true, None)
+}
+
+fn adopts(effects: &[DescriptionEffect]) -> bool {
+    effects.iter().any(|effect| matches!(effect, Adopt { .. }))
+}
+
+fn publishes(effects: &[DescriptionEffect]) -> bool {
+    effects.iter().any(|effect| matches!(effect, Publish { .. }))
+}
+
+#[test]
+fn a_body_is_taken_on_a_candidates_word_alone_in_either_order() {
+    let new = described(1, "new");
+    for is_body_first in [true, false] {
+        let mut euclid = node("euclid");
+        let taken: Vec<_> = if is_body_first {
+            assert_eq!(euclid.take(Arc::clone(&new), at(0)), []);
+            assert_eq!(euclid.hear(&name("gauss"), false, new.stamp(), at(1)), [], "a vehicle that never leads");
+            euclid.hear(&name("edge"), true, new.stamp(), at(2))
+        } else {
+            assert_eq!(euclid.hear(&name("edge"), true, new.stamp(), at(0)), []);
+            assert!(!adopts(&euclid.take(described(1, "forged"), at(1))), "nobody stated it");
+            euclid.take(Arc::clone(&new), at(2))
+        };
+        assert_eq!(taken, [Adopt { description: Arc::clone(&new), stated_by: name("edge") }]);
+        assert_eq!(euclid.stamp(), new.stamp());
+    }
+}
+
+#[test]
+fn all_agree_after_a_split_in_whatever_order_they_meet() {
+    let sides = [described(3, "a"), described(4, "b"), described(4, "c"), described(2, "z")];
+    let winner = described(4, "c").stamp();
+    for turn in 0..sides.len() {
+        let mut euclid = node("euclid");
+        for index in 0..sides.len() {
+            let side = &sides[(index + turn) % sides.len()];
+            euclid.hear(&name(&format!("n{index}")), true, side.stamp(), at(0));
+            euclid.take(Arc::clone(side), at(0));
+        }
+        assert_eq!(euclid.stamp(), winner, "turn {turn}");
+    }
+}
+
+#[test]
+fn a_change_here_is_the_next_version_and_goes_out_at_once() {
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(described(6, "old")));
+    euclid.hear(&name("edge"), true, described(8, "unseen").stamp(), at(0));
+    let effects = euclid.set("new".into(), ContentHash([7; 32]), at(1));
+    assert!(matches!(&effects[..], [Adopt { .. }, Publish { description }] if description.version == 9));
+    assert_eq!(euclid.set("new".into(), ContentHash([7; 32]), at(2)), [], "it is that already");
+    let mut gauss = DescriptionExchange::new(name("gauss"), false, None);
+    assert_eq!(gauss.set("new".into(), ContentHash([7; 32]), at(1)), [], "it only follows");
+}
+
+#[test]
+fn a_version_far_ahead_is_counted_and_changes_nothing() {
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(described(6, "old")));
+    let far = described(6 + MAX_VERSION_STEP + 1, "far");
+    assert_eq!(euclid.hear(&name("edge"), true, far.stamp(), at(0)), [CountImplausible { from: name("edge") }]);
+    assert!(!adopts(&euclid.take(far, at(0))));
+    euclid.set("new".into(), ContentHash([7; 32]), at(1));
+    assert_eq!(euclid.stamp().version, 7);
+    let first = DescriptionStamp { version: MAX_FIRST_VERSION + 1, ..Default::default() };
+    assert_eq!(node("gauss").hear(&name("edge"), true, first, at(0)), [CountImplausible { from: name("edge") }]);
+}
+
+#[test]
+fn the_leader_repeats_it_while_somebody_lacks_it_and_no_longer() {
+    let held = described(3, "held");
+    let mut edge = DescriptionExchange::new(name("edge"), true, Some(Arc::clone(&held)));
+    assert!(publishes(&edge.lead(Some(&name("edge")), at(0))), "its brokers may not have it");
+    assert!(!publishes(&edge.tick(at(1500))));
+    assert!(publishes(&edge.hear(&name("euclid"), false, DescriptionStamp::default(), at(1600))));
+    assert!(!publishes(&edge.tick(at(3500))), "not that often");
+    assert!(publishes(&edge.tick(at(3600))));
+    edge.hear(&name("euclid"), false, held.stamp(), at(3700));
+    assert!(!publishes(&edge.tick(at(9000))));
+    assert!(publishes(&edge.take(described(2, "displaced"), at(9100))), "an earlier one took its place");
+}
+
+#[test]
+fn a_node_that_never_has_it_costs_the_others_little() {
+    let mut edge = DescriptionExchange::new(name("edge"), true, Some(described(3, "held")));
+    edge.lead(Some(&name("edge")), at(0));
+    let is_repeated = |ms: &u64| publishes(&edge.hear(&name("liar"), false, DescriptionStamp::default(), at(*ms)));
+    let times = (0..600_000).step_by(500).filter(is_repeated).count();
+    assert!((15..=25).contains(&times), "{times} in ten minutes");
+    edge.set("new".into(), ContentHash([7; 32]), at(600_000));
+    assert!(publishes(&edge.tick(at(601_000))), "a new one is repeated soon");
+}
+
+#[test]
+fn a_candidate_that_does_not_lead_tells_a_leader_that_is_behind() {
+    let held = described(3, "held");
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(Arc::clone(&held)));
+    assert!(!publishes(&euclid.lead(Some(&name("edge")), at(0))), "the leader has not said what it has");
+    assert!(publishes(&euclid.hear(&name("edge"), true, DescriptionStamp::default(), at(100))));
+    euclid.hear(&name("edge"), true, held.stamp(), at(200));
+    euclid.hear(&name("gauss"), false, DescriptionStamp::default(), at(300));
+    assert!(!publishes(&euclid.tick(at(5000))), "the rest is the leader's");
+    let mut gauss = DescriptionExchange::new(name("gauss"), false, Some(held));
+    gauss.lead(Some(&name("edge")), at(0));
+    assert!(!publishes(&gauss.hear(&name("edge"), true, DescriptionStamp::default(), at(100))), "it never publishes");
+}
+
+#[test]
+fn bodies_that_nobody_states_take_bounded_room() {
+    let mut euclid = node("euclid");
+    let stated = described(1, "stated");
+    euclid.take(Arc::clone(&stated), at(0));
+    (2..100).for_each(|version| drop(euclid.take(described(version, "junk"), at(0))));
+    assert_eq!(euclid.unproven.len(), MAX_UNPROVEN);
+    euclid.hear(&name("edge"), true, stated.stamp(), at(1));
+    assert!(adopts(&euclid.take(stated, at(2))), "the leader repeats it");
+}
