@@ -437,7 +437,7 @@ impl Election {
         let leader = self.leader().filter(|leader| **leader != self.id).cloned();
         match leader {
             Some(leader) if self.config.role == Role::Cav => self.send_status(&leader, now),
-            _ => self.send_all(&Body::Status { over: self.over.clone() }, now),
+            _ => self.send_all(&Body::Status { over: self.over.clone(), no_login: self.no_login.clone() }, now),
         }
     }
 
