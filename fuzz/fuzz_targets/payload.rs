@@ -9,20 +9,22 @@ use std::fmt::Debug;
 
 use ecod::leadership::election::ElectionMessage;
 use ecod::wire::{
-    Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, Payload, Reputations, Verdicts, decode, encode,
+    CellDescription, Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, Payload, Reputations,
+    Verdicts, decode, encode,
 };
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|input: &[u8]| {
     let Some((kind, bytes)) = input.split_first() else { return };
-    match kind % 7 {
+    match kind % 8 {
         0 => take::<ObjectReport>(bytes),
         1 => take::<GlobalMap>(bytes),
         2 => take::<Verdicts>(bytes),
         3 => take::<Reputations>(bytes),
         4 => take::<LedgerShare>(bytes),
         5 => take::<NodeStatus>(bytes),
-        _ => drop(ElectionMessage::decode(bytes)),
+        6 => drop(ElectionMessage::decode(bytes)),
+        _ => take::<CellDescription>(bytes),
     }
 });
 

@@ -30,11 +30,11 @@ use crate::transport::gossip::Member;
 /// Callback that has a node use a description. It must not block.
 pub type DescriptionSink = Arc<dyn Fn(Arc<CellDescription>) + Send + Sync>;
 
-/// What a keeper needs at its start.
+/// Parts and values that a keeper needs at its start.
 pub struct DescriptionKeeperArguments {
     /// The node's name.
     pub name: NodeName,
-    /// Whether it may lead, and so set and publish descriptions.
+    /// True if it may lead, and so set and publish descriptions.
     pub may_lead: bool,
     /// The description that the node uses, or knows and cannot use.
     pub held: Option<Arc<CellDescription>>,
@@ -44,7 +44,7 @@ pub struct DescriptionKeeperArguments {
     pub apply: DescriptionSink,
     /// The other nodes.
     pub members: watch::Receiver<Vec<Member>>,
-    /// Who leads.
+    /// The leader, as it changes.
     pub leadership: watch::Receiver<Leadership>,
     /// Publishes descriptions.
     pub gateway: ActorSlot<GatewayMessage>,

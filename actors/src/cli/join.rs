@@ -67,7 +67,7 @@ pub(super) struct InviteArguments {
 /// Flags of `join`.
 #[derive(Debug, Args)]
 pub(super) struct JoinArguments {
-    /// What `ecod-node invite` printed
+    /// Token that `ecod-node invite` printed
     token: Token,
     #[command(flatten)]
     node: NodeArguments,
@@ -93,14 +93,14 @@ struct DirectoryArguments {
 const MAX_ADDRESSES: usize = 4;
 
 impl InitArguments {
-    /// Whether the command goes on as a node.
+    /// True if the command goes on as a node.
     pub(super) fn runs_node(&self) -> bool {
         self.node.run
     }
 }
 
 impl JoinArguments {
-    /// Whether the command goes on as a node.
+    /// True if the command goes on as a node.
     pub(super) fn runs_node(&self) -> bool {
         self.node.run
     }

@@ -14,7 +14,7 @@ pub enum DescriptionKeeperMessage {
     Hear {
         /// The node.
         from: NodeName,
-        /// Whether it may lead.
+        /// True if it may lead.
         may_lead: bool,
         /// The version and hash that it has.
         stamp: DescriptionStamp,

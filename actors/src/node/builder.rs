@@ -112,7 +112,7 @@ const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl NodeBuilder {
-    /// What the parts are made from, under the settings of `held`.
+    /// Arguments of all parts, under the settings of `held`.
     ///
     /// # Errors
     /// When the node's own configuration contradicts the cell's description.

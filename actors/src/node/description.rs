@@ -61,7 +61,7 @@ pub(super) fn description_file(config: &NodeConfig) -> Option<StateFile> {
     Some(StateFile::new(directory, &config.cell, name, "description"))
 }
 
-/// Whether reputations follow from evidence, and not from VOTE's `paper` mode.
+/// True if reputations follow from evidence, and not from VOTE's `paper` mode.
 pub(super) fn rates_by_evidence(config: &NodeConfig) -> bool {
     config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote()
 }

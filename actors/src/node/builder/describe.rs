@@ -1,4 +1,4 @@
-//! What a change of the cell's description means for the parts of a node.
+//! Change of the cell's description, as it reaches the parts of a node.
 
 use std::sync::Arc;
 
@@ -57,7 +57,7 @@ impl NodeBuilder {
         if (&before.fusion, &before.landmarks) != (&config.fusion, &config.landmarks) {
             let (fusion, landmarks) = (Box::new(config.fusion.clone()), config.landmarks.clone());
             slots.fuser.send(FuserMessage::Configure { fusion, landmarks });
-            // What was switched on starts with the evidence that there is.
+            // A part that was switched on starts with the evidence that there is.
             let ledger = Arc::new(self.reputations.open().ledger.clone());
             slots.fuser.send(FuserMessage::Adopt { ledger });
         }
