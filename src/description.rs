@@ -28,7 +28,7 @@ use crate::wire::{CellDescription, ContentHash, DescriptionStamp, MAX_INTEGER, S
 /// Largest rise of the version that one message may state. A cell uses one version for each change by a person.
 pub const MAX_VERSION_STEP: u64 = 1 << 20;
 
-/// Largest version that a node without a description takes from others.
+/// Largest version that a node without a description takes from others than its leader.
 pub const MAX_FIRST_VERSION: u64 = 1 << 40;
 
 /// Minimum time between the first two publications of one description; it doubles with each further one.
@@ -39,6 +39,13 @@ const MAX_DOUBLINGS: u32 = 5;
 
 /// Maximum number of bodies that wait for the word of a candidate; the oldest gives way.
 const MAX_UNPROVEN: usize = 4;
+
+/// Maximum number of descriptions of others that are adopted at once; more wait [`ADOPTION_INTERVAL`] each. Each is
+/// written to disk and logged.
+const MAX_ADOPTIONS: usize = 8;
+
+/// Average time between two adoptions of a node that is told of ever new descriptions.
+const ADOPTION_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Maximum number of nodes whose stamps are kept.
 const MAX_NODES: usize = 4096;
@@ -91,6 +98,8 @@ pub struct DescriptionExchange {
     statements: BTreeMap<NodeName, Statement>,
     /// Bodies that no candidate has stated yet, oldest first.
     unproven: VecDeque<Arc<CellDescription>>,
+    /// Times of the latest adoptions from others.
+    adopted: VecDeque<Timestamp>,
     leader: Leader,
     /// Whether brokers may lack the description.
     is_due: bool,
@@ -108,6 +117,7 @@ impl DescriptionExchange {
             current: saved,
             statements: BTreeMap::new(),
             unproven: VecDeque::new(),
+            adopted: VecDeque::new(),
             leader: Leader::Unknown,
             is_due: false,
             published: None,
@@ -133,17 +143,15 @@ impl DescriptionExchange {
         stamp: DescriptionStamp,
         now: Timestamp,
     ) -> Vec<DescriptionEffect> {
-        if !self.is_plausible(stamp.version) {
+        let is_leader = self.leader == Leader::Other(from.clone());
+        if stamp.version > self.highest_plausible() && !is_leader {
             return vec![DescriptionEffect::CountImplausible { from: from.clone() }];
         }
         if self.statements.len() < MAX_NODES || self.statements.contains_key(from) {
             self.statements.insert(from.clone(), Statement { stamp, may_lead });
         }
         if may_lead && stamp > self.stamp() {
-            let place = self.unproven.iter().position(|body| body.stamp() == stamp);
-            if let Some(body) = place.and_then(|place| self.unproven.remove(place)) {
-                self.adopt(body, from.clone());
-            }
+            self.adopt_proven(now);
         }
         self.finish(now)
     }
@@ -154,18 +162,14 @@ impl DescriptionExchange {
         if stamp < self.stamp() {
             // It may have taken the place of the right one at the broker.
             self.is_due = true;
-        } else if stamp > self.stamp() && self.is_plausible(stamp.version) {
-            let states = |(_, statement): &(&NodeName, &Statement)| statement.may_lead && statement.stamp == stamp;
-            match self.statements.iter().find(states).map(|(node, _)| node.clone()) {
-                Some(node) => self.adopt(description, node),
-                None => {
-                    self.unproven.retain(|body| body.stamp() != stamp);
-                    self.unproven.push_back(description);
-                    while self.unproven.len() > MAX_UNPROVEN {
-                        self.unproven.pop_front();
-                    }
-                }
+        } else if stamp > self.stamp() {
+            self.is_due = true;
+            self.unproven.retain(|body| body.stamp() != stamp);
+            self.unproven.push_back(description);
+            while self.unproven.len() > MAX_UNPROVEN {
+                self.unproven.pop_front();
             }
+            self.adopt_proven(now);
         }
         self.finish(now)
     }
@@ -178,7 +182,8 @@ impl DescriptionExchange {
         }
         let of_candidates = self.statements.values().filter(|statement| statement.may_lead);
         let known = of_candidates.map(|statement| statement.stamp.version).max().unwrap_or(0);
-        let version = known.max(self.stamp().version).saturating_add(1).min(MAX_INTEGER);
+        // Those that have what this node has must be able to take it, whatever somebody else has stated.
+        let version = known.max(self.stamp().version).saturating_add(1).min(self.highest_plausible());
         let set_by = self.name.clone();
         let description = Arc::new(CellDescription { schema: SCHEMA_VERSION, version, hash, set_by, text });
         self.adopt(Arc::clone(&description), self.name.clone());
@@ -212,16 +217,38 @@ impl DescriptionExchange {
         self.statements.retain(|node, _| is_member(node));
     }
 
-    /// Repeats what others still lack.
+    /// Repeats what others still lack, and adopts what had to wait.
     pub fn tick(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
+        self.adopt_proven(now);
         self.finish(now)
     }
 
-    /// Whether a version may follow from the one that is known.
-    fn is_plausible(&self, version: u64) -> bool {
+    /// Highest version that may follow from the one that is known. The leader's own word is believed beyond it: so who
+    /// comes late or was away gets the cell's.
+    fn highest_plausible(&self) -> u64 {
         let known = self.stamp().version;
         let highest = if known == 0 { MAX_FIRST_VERSION } else { known.saturating_add(MAX_VERSION_STEP) };
-        version <= highest.min(MAX_INTEGER)
+        highest.min(MAX_INTEGER)
+    }
+
+    /// Adopts the greatest body that a candidate states, unless too many were adopted lately.
+    fn adopt_proven(&mut self, now: Timestamp) {
+        let stated = |body: &Arc<CellDescription>| {
+            let states = |statement: &Statement| statement.may_lead && statement.stamp == body.stamp();
+            self.statements.iter().find(|(_, statement)| states(statement)).map(|(node, _)| node.clone())
+        };
+        let newer = self.unproven.iter().filter(|body| body.stamp() > self.stamp());
+        let proven = newer.filter_map(|body| Some((Arc::clone(body), stated(body)?)));
+        let Some((body, node)) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
+        let is_throttled = |first: &Timestamp| now.since(*first) < ADOPTION_INTERVAL * MAX_ADOPTIONS as u32;
+        if self.adopted.len() == MAX_ADOPTIONS {
+            if self.adopted.front().is_some_and(is_throttled) {
+                return;
+            }
+            self.adopted.pop_front();
+        }
+        self.adopted.push_back(now);
+        self.adopt(body, node);
     }
 
     fn adopt(&mut self, description: Arc<CellDescription>, stated_by: NodeName) {

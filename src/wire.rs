@@ -42,7 +42,9 @@ pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
-pub use validation::{Limits, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload, check_fused_at};
+pub use validation::{
+    Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload, check_fused_at,
+};
 
 use crate::model::epoch::Epoch;
 use crate::model::geometry::Pose;

@@ -86,6 +86,44 @@ fn a_version_far_ahead_is_counted_and_changes_nothing() {
 }
 
 #[test]
+fn a_version_that_is_set_can_be_taken_by_all_whatever_somebody_has_stated() {
+    let held = described(6, "old");
+    let [mut euclid, mut gauss] =
+        ["euclid", "gauss"].map(|own| DescriptionExchange::new(name(own), true, Some(Arc::clone(&held))));
+    let boast = DescriptionStamp { version: 6 + MAX_VERSION_STEP, hash: ContentHash::default() };
+    euclid.hear(&name("liar"), true, boast, at(0));
+    euclid.set("new".into(), ContentHash([7; 32]), at(1));
+    let set = Arc::clone(euclid.current().unwrap());
+    gauss.hear(&name("euclid"), true, set.stamp(), at(2));
+    assert!(adopts(&gauss.take(set, at(3))));
+}
+
+#[test]
+fn who_was_away_for_long_takes_the_leaders() {
+    let far = described(6 + 3 * MAX_VERSION_STEP, "far");
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(described(6, "old")));
+    euclid.lead(Some(&name("edge")), at(0));
+    assert!(!adopts(&euclid.hear(&name("gauss"), true, far.stamp(), at(1))));
+    euclid.hear(&name("edge"), true, far.stamp(), at(2));
+    assert!(adopts(&euclid.take(far, at(3))));
+}
+
+#[test]
+fn ever_new_descriptions_are_adopted_one_a_second_and_the_latest_in_the_end() {
+    let mut euclid = node("euclid");
+    let mut adopted = 0;
+    for version in 1..=100 {
+        let new = described(version, "new");
+        let now = at(version * 10);
+        euclid.hear(&name("liar"), true, new.stamp(), now);
+        adopted += u32::from(adopts(&euclid.take(new, now)));
+    }
+    assert_eq!(adopted, 8, "in a second");
+    assert!(adopts(&euclid.tick(at(20_000))));
+    assert_eq!(euclid.stamp().version, 100);
+}
+
+#[test]
 fn the_leader_repeats_it_while_somebody_lacks_it_and_no_longer() {
     let held = described(3, "held");
     let mut edge = DescriptionExchange::new(name("edge"), true, Some(Arc::clone(&held)));

@@ -447,8 +447,7 @@ impl Election {
 
     fn send(&mut self, to: &NodeName, body: Body, now: Timestamp) {
         self.seq += 1;
-        let hears_you = self.peers.hears(to, now);
-        self.peers.told(to, hears_you);
+        let hears_you = self.peers.tell(to, now);
         let message = ElectionMessage {
             schema: SCHEMA_VERSION,
             from: self.id.clone(),

@@ -14,6 +14,9 @@ use crate::model::geometry::Covariance;
 use crate::model::names::{Label, is_label};
 use crate::model::time::Timestamp;
 
+/// Maximum length of the text of a cell's description in bytes; all vehicles get it with each connection to a broker.
+pub const MAX_DESCRIPTION_BYTES: usize = 256 * 1024;
+
 /// Bounds of a payload; one beyond them is not decoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
@@ -198,13 +201,21 @@ fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
     check_integers([status.epoch])?;
     let described = status.description.as_ref();
     check_integers(described.map(|described| described.version))?;
-    if described.and_then(|described| described.problem.as_ref()).is_some_and(|problem| problem.len() > MAX_TEXT) {
-        return Err(RejectReason::TooLarge);
+    if let Some(problem) = described.and_then(|described| described.problem.as_ref()) {
+        if problem.len() > MAX_TEXT {
+            return Err(RejectReason::TooLarge);
+        }
+        if problem.contains(char::is_control) {
+            return Err(RejectReason::InvalidLabel);
+        }
     }
     check_labels([&*status.version])
 }
 
 fn check_description(description: &CellDescription, _: &Limits) -> Result<(), RejectReason> {
+    if description.text.len() > MAX_DESCRIPTION_BYTES {
+        return Err(RejectReason::TooLarge);
+    }
     check_integers([description.version])
 }
 

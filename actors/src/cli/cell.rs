@@ -224,7 +224,10 @@ impl DoorClient {
                 None => format!("# {node}: none\n"),
             };
         }
-        Ok(shown + &description.map_or_else(String::new, |description| description.text))
+        shown += &description.map_or_else(String::new, |description| description.text);
+        // Text of others must not steer the terminal.
+        shown.retain(|character| !character.is_control() || "\n\t".contains(character));
+        Ok(shown)
     }
 }
 

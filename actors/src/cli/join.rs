@@ -163,13 +163,18 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
         let role = role_named(&arguments.role);
         for name in &arguments.names {
             let token = host.invite(name, rights(role), addresses.clone())?;
-            print(&format!("on {name}'s machine:\n\n    ecod-node join {token}\n\n"))?;
+            print(&format!("on {name}'s machine:\n\n    sudo ecod-node join {token}\n\n"))?;
         }
         let reached: Vec<String> = addresses.iter().map(ToString::to_string).collect();
         eprintln!("waiting at {}; the tokens end with this command", reached.join(", "));
         let until = Instant::now() + Duration::from_secs(u64::from(arguments.hours) * 3600);
         let tell = |visit| match visit {
             Visit::Joined(node) => eprintln!("{node} has joined"),
+            Visit::UsedAgain(node) => eprintln!(
+                "the token of {node} was used twice: the certificate of the first is revoked, copy {} to all nodes. If \
+                 that was another machine than {node}'s, change the cell's key, too",
+                directory.pki().join("revoked.pem").display()
+            ),
             Visit::Failed(from, reason) => eprintln!("{from} has not joined: {reason}"),
         };
         anyhow::Ok(host.serve(listener, until, tell).await)

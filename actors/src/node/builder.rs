@@ -20,7 +20,6 @@ use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, S
 use tokio::sync::watch;
 use uuid::Uuid;
 
-use super::NodeError;
 use super::description::{HeldDescription, rates_by_evidence, shared_facts};
 use super::slots::{ActorKind, ActorSlots};
 use crate::actors::broker::Broker;
@@ -112,23 +111,14 @@ const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl NodeBuilder {
-    /// Arguments of all parts, under the settings of `held`.
-    ///
-    /// # Errors
-    /// When the node's own configuration contradicts the cell's description.
+    /// Arguments of all parts, under the settings of `held`, if the node can use them.
     pub(super) fn new(
         own_config: NodeConfig,
         security: Security,
-        held: HeldDescription,
+        mut held: HeldDescription,
         failed: watch::Sender<Option<String>>,
-    ) -> Result<Self, NodeError> {
-        let config = match &held.description {
-            Some(description) => own_config.described(&description.text).map_err(|error| {
-                let (stamp, set_by) = (description.stamp(), &description.set_by);
-                NodeError::Failed(format!("description {stamp} of the cell, set at {set_by}: {error}"))
-            })?,
-            None => own_config.clone(),
-        };
+    ) -> Self {
+        let config = held.lay_over(&own_config).unwrap_or_else(|| own_config.clone());
         let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
@@ -162,7 +152,7 @@ impl NodeBuilder {
         };
         builder.door = builder.new_door();
         builder.door.publish_description(&builder.present_description());
-        Ok(builder)
+        builder
     }
 
     pub(super) fn slots(&self) -> &ActorSlots {

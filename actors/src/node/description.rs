@@ -43,9 +43,29 @@ impl HeldDescription {
             return Ok(Self { description: Some(Arc::new(saved)), problem: None });
         }
         let Some(set_by) = config.name.clone() else { return Ok(Self::default()) };
+        config
+            .described(&text)
+            .map_err(|error| NodeError::Failed(format!("key `description`: {}: {error}", path.display())))?;
         let hash = content_hash(&set_by, &text);
         let description = CellDescription { schema: SCHEMA_VERSION, version: 1, hash, set_by, text };
         Ok(Self { description: Some(Arc::new(description)), problem: None })
+    }
+
+    /// The node's own configuration under the description. One that contradicts it, or that this version cannot read, is
+    /// not used, and the log and `problem` say why: a description of others stops no node, also when it starts.
+    pub(super) fn lay_over(&mut self, own: &NodeConfig) -> Option<NodeConfig> {
+        let description = self.description.as_ref()?;
+        let (stamp, set_by) = (description.stamp(), &description.set_by);
+        let error = match own.described(&description.text) {
+            Ok(config) => return Some(config),
+            Err(error) => error,
+        };
+        let problem = format!("description {stamp} of the cell, set at {set_by}, is not used: {error}");
+        let shown = |character: char| if character.is_control() { ' ' } else { character };
+        let problem: String = problem.chars().map(shown).take(MAX_PROBLEM).collect();
+        tracing::error!("{problem}");
+        self.problem = Some(problem);
+        None
     }
 
     /// Its entry in the node's status.
@@ -54,6 +74,9 @@ impl HeldDescription {
         Some(DescriptionStatus { version: held.version, hash: held.hash, problem: self.problem.clone() })
     }
 }
+
+/// Longest reason in a status, in characters.
+const MAX_PROBLEM: usize = 500;
 
 /// Where a node keeps the cell's description, if it keeps anything.
 pub(super) fn description_file(config: &NodeConfig) -> Option<StateFile> {

@@ -10,7 +10,8 @@
 //! ```
 //!
 //! A token is for one node. It works until the guest has kept what it got, or the host ends. A guest that fails before
-//! can come again; the certificate that it lost is revoked. The guest's clock does not matter.
+//! can come again. Of all certificates that were given for a token, the last alone stays valid, and only if it was kept. The
+//! guest's clock does not matter.
 
 mod guest;
 mod host;
@@ -27,8 +28,11 @@ pub use guest::{JoinError, Joined, redeem};
 pub use host::{Host, Visit};
 pub use token::{Token, TokenError};
 
-/// Maximum length of a message in bytes. A revocation list is the longest part.
-const MAX_BYTES: u64 = 4 << 20;
+/// Maximum length of the host's answer in bytes. A revocation list is the longest part.
+const MAX_REPLY_BYTES: u64 = 4 << 20;
+
+/// Maximum length of a guest's message in bytes; strangers can send one, too.
+const MAX_REQUEST_BYTES: u64 = 16 << 10;
 
 /// Maximum time for a conversation; the guest writes its files meanwhile.
 const CONVERSATION_TIME: Duration = Duration::from_secs(10);
@@ -83,10 +87,13 @@ async fn write_line(stream: &mut (impl AsyncWrite + Unpin), message: &impl Seria
     stream.flush().await
 }
 
-/// Reads one message, a line of JSON.
-async fn read_line<T: serde::de::DeserializeOwned>(stream: &mut (impl AsyncBufRead + Unpin)) -> std::io::Result<T> {
+/// Reads one message, a line of JSON of at most `max_bytes`.
+async fn read_line<T: serde::de::DeserializeOwned>(
+    stream: &mut (impl AsyncBufRead + Unpin),
+    max_bytes: u64,
+) -> std::io::Result<T> {
     let mut line = String::new();
-    stream.take(MAX_BYTES).read_line(&mut line).await?;
+    stream.take(max_bytes).read_line(&mut line).await?;
     Ok(serde_json::from_str(&line)?)
 }
 
@@ -153,6 +160,25 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn of_two_with_one_token_the_later_joins_and_both_are_told_of() {
+        let Scene { directory, token, visits, serving } = host(SOON).await;
+        let first = redeem(&token).await.unwrap();
+        let second = redeem(&token).await.unwrap();
+        // It is revoked already, so its word is not the node's.
+        first.keep().await.unwrap();
+        let told = |text: &str| visits.lock().unwrap().iter().any(|visit| visit.contains(text));
+        let deadline = Instant::now() + SOON;
+        while !told("used again") {
+            assert!(Instant::now() < deadline, "{:?}", visits.lock().unwrap());
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        assert!(told("UsedAgain"));
+        second.keep().await.unwrap();
+        assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), []);
+        assert!(told("Joined") && revoked(&directory) == 1);
+    }
+
+    #[tokio::test]
     async fn other_names_secrets_and_hosts_get_nothing() {
         let Scene { token, visits, serving, directory } = host(Duration::from_secs(3)).await;
         let secret = Token { secret: [0; 16], ..token.clone() };
@@ -171,6 +197,7 @@ mod tests {
         }
         drop(redeem(&token).await.unwrap());
         assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), [token.node], "it has not kept it");
+        assert_eq!(revoked(&directory), 1, "what was not kept is not valid");
         assert!(visits.lock().unwrap().iter().all(|visit| visit.starts_with("Failed")));
         assert!(!std::fs::read_to_string(directory.path().join("issued.json")).unwrap().contains("\"edge\""));
     }

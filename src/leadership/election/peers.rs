@@ -102,10 +102,11 @@ impl Peers {
         self.table.get(name)
     }
 
-    pub(super) fn told(&mut self, name: &NodeName, hears: bool) {
-        if let Some(peer) = self.table.get_mut(name) {
-            peer.told = hears;
-        }
+    /// Notes that a peer is sent a message, which says whether it is heard; gives that.
+    pub(super) fn tell(&mut self, name: &NodeName, now: Timestamp) -> bool {
+        let Some(peer) = self.table.get_mut(name) else { return false };
+        peer.told = peer.heard_at.is_some_and(|at| now.since(at) <= self.contact_timeout);
+        peer.told
     }
 
     /// Whether a peer follows a leadership of `leader` that is over, and has not been told so: each is told of once, as its

@@ -57,14 +57,14 @@ impl NodeDirectory {
 
     /// Checks that no node has its files here.
     pub(super) fn check_vacant(&self) -> anyhow::Result<()> {
-        let taken = [self.path.join("cell.key"), self.path.join("node.key")].into_iter().find(|path| path.exists());
-        match taken {
-            None => Ok(()),
-            Some(path) => anyhow::bail!(
-                "{} is there: {self} belongs to a node already. Choose another --dir, or remove the files of that node",
-                path.display()
-            ),
-        }
+        // It is written last: what an attempt that failed has left is overwritten.
+        let path = self.path.join("cell.key");
+        ensure!(
+            !path.exists(),
+            "{} is there: {self} belongs to a node already. Choose another --dir, or remove the files of that node",
+            path.display()
+        );
+        Ok(())
     }
 
     /// Directory of the cell's CA.
@@ -82,7 +82,7 @@ impl NodeDirectory {
     }
 
     /// Writes all files of a node, and checks that they fit together. A configuration that is there, such as that of
-    /// the package, is kept as `node.toml.old`.
+    /// the package, is kept as `node.toml.1`, or with the next free number.
     pub(super) fn write(&self, node: &NodeName, welcome: &Welcome, key: &str) -> anyhow::Result<()> {
         let file = |name: &str| self.path.join(name);
         let tls = TlsConfig {
@@ -103,9 +103,11 @@ impl NodeDirectory {
         })?;
         let configuration = format!("{HEAD}{configuration}");
         if self.configuration().exists() {
-            fs::rename(self.configuration(), file("node.toml.old")).context("cannot keep the former node.toml")?;
+            let mut free = (1..).map(|number| file(&format!("node.toml.{number}"))).filter(|path| !path.exists());
+            let kept = free.next().map(|path| fs::rename(self.configuration(), path));
+            kept.transpose().context("cannot keep the former node.toml")?;
         }
-        // The keys last: they are what makes the directory a node's.
+        // The cell's key last: it is what makes the directory a node's.
         let files = [
             ("ca.pem", welcome.ca.as_str(), 0o644),
             ("node.pem", &welcome.certificate, 0o644),
@@ -136,8 +138,11 @@ impl NodeDirectory {
         if !is_service || !has_unit || !Path::new("/run/systemd/system").exists() {
             return Ok(false);
         }
-        let enabled = Command::new("systemctl").args(["enable", "--now", "ecod-node"]).status();
-        ensure!(enabled.context("cannot run systemctl")?.success(), "`systemctl enable --now ecod-node` failed");
+        // One that runs already has another configuration.
+        for command in ["enable", "restart"] {
+            let done = Command::new("systemctl").args([command, "ecod-node"]).status();
+            ensure!(done.context("cannot run systemctl")?.success(), "`systemctl {command} ecod-node` failed");
+        }
         Ok(true)
     }
 

@@ -412,8 +412,7 @@ mod tests {
             let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
             (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
             let builder =
-                NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None))
-                    .unwrap();
+                NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None));
             let keeps = builder.parts().contains(&crate::node::slots::ActorKind::ReputationKeeper);
             assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
         }
@@ -423,8 +422,7 @@ mod tests {
     fn a_part_started_anew_still_says_whom_the_node_follows() {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
         let builder =
-            NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None))
-                .unwrap();
+            NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None));
         assert_eq!((builder.status().epoch, builder.status().aggregator), (0, None));
         let map = GlobalMap {
             schema: SCHEMA_VERSION,

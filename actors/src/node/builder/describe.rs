@@ -15,26 +15,15 @@ use crate::node::config::NodeConfig;
 use crate::node::description::{HeldDescription, rates_by_evidence, shared_facts};
 use crate::node::slots::ActorKind;
 
-/// Longest reason in a status, in characters.
-const MAX_PROBLEM: usize = 500;
-
 impl NodeBuilder {
     /// Uses a description from now on. One that contradicts the node's own configuration, or that this version cannot read,
     /// is kept and passed on, and the node goes on with the settings that it has.
     pub(in crate::node) fn describe(&mut self, description: &Arc<CellDescription>) {
-        let stamp = description.stamp();
-        let described = self.own_config.described(&description.text);
-        let problem = described.as_ref().err().map(|error| {
-            format!("description {stamp} of the cell is not used: {error}").chars().take(MAX_PROBLEM).collect()
-        });
-        self.held = HeldDescription { description: Some(Arc::clone(description)), problem };
-        match described {
-            Ok(config) => {
-                let before = std::mem::replace(&mut self.config, config);
-                self.configure_parts(&before);
-                tracing::info!(%stamp, "the description of the cell is used");
-            }
-            Err(error) => tracing::error!(%stamp, %error, "the description of the cell is not used"),
+        self.held = HeldDescription { description: Some(Arc::clone(description)), problem: None };
+        if let Some(config) = self.held.lay_over(&self.own_config) {
+            let before = std::mem::replace(&mut self.config, config);
+            self.configure_parts(&before);
+            tracing::info!(stamp = %description.stamp(), "the description of the cell is used");
         }
         self.door.publish_description(description);
         self.shared.send_replace(shared_facts(&self.config, &self.held));

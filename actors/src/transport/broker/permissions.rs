@@ -15,7 +15,7 @@
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use ecod::wire::{Limits, Topic, Topics};
+use ecod::wire::{Limits, MAX_DESCRIPTION_BYTES, Topic, Topics};
 use rmqtt::codec::v5::SubscribeAckReason;
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
@@ -201,7 +201,9 @@ fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     match topic {
         Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) => limits.payload_bytes,
         Topic::Nodes(_) => limits.payload_bytes.min(MAX_STATUS_BYTES),
-        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations | Topic::Cell => limits.map_bytes,
+        Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
+        // Line feeds and quotes take two bytes each in JSON.
+        Topic::Cell => limits.map_bytes.min(2 * MAX_DESCRIPTION_BYTES),
     }
 }
 

@@ -16,7 +16,9 @@ use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
-use super::{CONVERSATION_TIME, HOST_NAME, KEPT, Reply, Request, Token, Welcome, read_line, write_line};
+use super::{
+    CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REPLY_BYTES, Reply, Request, Token, Welcome, read_line, write_line,
+};
 
 /// Maximum time for a connection to one address of the host.
 const CONNECT_TIME: Duration = Duration::from_secs(3);
@@ -63,7 +65,7 @@ pub async fn redeem(token: &Token) -> Result<Joined, JoinError> {
     let conversation = async {
         let mut stream = BufStream::new(connect(token).await?);
         write_line(&mut stream, &request).await?;
-        let reply: Reply = read_line(&mut stream).await?;
+        let reply: Reply = read_line(&mut stream, MAX_REPLY_BYTES).await?;
         match reply {
             Reply::Welcome(welcome) => Ok(Joined { welcome: *welcome, key: key.serialize_pem(), stream }),
             Reply::Refused(reason) => Err(JoinError::Refused(reason)),

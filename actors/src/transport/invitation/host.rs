@@ -1,6 +1,6 @@
 //! The side that has the CA: it lets each guest in once.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,7 +19,9 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until, timeout};
 use tokio_rustls::TlsAcceptor;
 
-use super::{CONVERSATION_TIME, HOST_NAME, KEPT, Reply, Request, Token, Welcome, read_line, write_line};
+use super::{
+    CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line, write_line,
+};
 use crate::platform::clock;
 use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, OBSERVER_MARK};
 
@@ -37,8 +39,8 @@ pub struct Host {
 struct Guest {
     rights: Rights,
     secret: [u8; 16],
-    /// Whether it got a certificate that it may have lost.
-    is_issued: bool,
+    /// Serial number of the certificate that it got last.
+    issued: Option<String>,
 }
 
 /// End of a conversation.
@@ -46,9 +48,14 @@ struct Guest {
 pub enum Visit {
     /// The node has kept its files; its token is used up.
     Joined(NodeName),
+    /// The token of the node was used by two guests. The certificate of the first one is revoked.
+    UsedAgain(NodeName),
     /// Nothing was given, or the guest did not say that it has kept it: address and reason.
     Failed(SocketAddr, String),
 }
+
+/// Maximum number of failures that are told.
+const MAX_FAILURES: usize = 256;
 
 /// Conversations at once; more wait.
 const MAX_VISITS: usize = 64;
@@ -56,7 +63,10 @@ const MAX_VISITS: usize = 64;
 /// Wait after an error of the listener, such as too many open files.
 const PAUSE: Duration = Duration::from_millis(100);
 
-type Question = (Request, oneshot::Sender<Reply>);
+type Question = (Request, oneshot::Sender<Answer>);
+
+/// The reply, and the serial number of the certificate in it.
+type Answer = (Reply, Option<String>);
 
 impl Host {
     /// A host without guests. `seeds` are `host:port` of nodes that a guest asks for the cell.
@@ -96,13 +106,16 @@ impl Host {
         let mut secret = [0; 16];
         let drawn = SystemRandom::new().fill(&mut secret);
         drawn.map_err(|_| AuthorityError::Crypto("the system gives no random numbers".into()))?;
-        self.guests.insert(node.clone(), Guest { rights: rights.into(), secret, is_issued: false });
+        self.guests.insert(node.clone(), Guest { rights: rights.into(), secret, issued: None });
         Ok(Token { node: node.clone(), addresses, fingerprint: self.fingerprint, secret })
     }
 
     /// Serves guests until all have joined or the time is over, and tells of each visit; gives those that did not come.
+    ///
+    /// Of each host, one failure for each reason is told. Certificates that were not kept are revoked at the end.
     pub async fn serve(mut self, listener: TcpListener, until: Instant, tell: impl Fn(Visit)) -> Vec<NodeName> {
         let mut visits = JoinSet::new();
+        let mut failures = BTreeSet::new();
         let (ask, mut questions) = mpsc::channel::<Question>(MAX_VISITS);
         while !self.guests.is_empty() {
             tokio::select! {
@@ -111,39 +124,54 @@ impl Host {
                         let (tls, ask) = (self.tls.clone(), ask.clone());
                         visits.spawn(async move {
                             let visit = timeout(CONVERSATION_TIME, receive(tls, stream, ask)).await;
-                            match visit {
-                                Ok(Ok(node)) => Visit::Joined(node),
-                                Ok(Err(error)) => Visit::Failed(from, error.to_string()),
-                                Err(_) => Visit::Failed(from, "it took too long".into()),
-                            }
+                            let failed = |reason: String| (from, reason);
+                            visit
+                                .map_err(|_| failed("it took too long".into()))
+                                .and_then(|joined| joined.map_err(|error| failed(error.to_string())))
                         });
                     }
                     Err(_) => tokio::time::sleep(PAUSE).await,
                 },
                 Some((request, answer)) = questions.recv() => {
-                    // A guest that has left does not wait for it.
-                    let _ = answer.send(self.answer(&request));
-                }
-                Some(Ok(visit)) = visits.join_next() => {
-                    if let Visit::Joined(node) = &visit {
-                        self.guests.remove(node);
+                    let is_again = self.guests.get(&request.node).is_some_and(|guest| guest.issued.is_some());
+                    let given = self.answer(&request);
+                    if is_again && given.1.is_some() {
+                        tell(Visit::UsedAgain(request.node));
                     }
-                    tell(visit);
+                    // A guest that has left does not wait for it.
+                    let _ = answer.send(given);
                 }
+                Some(Ok(visit)) = visits.join_next() => match visit {
+                    Ok((_, node, serial)) if self.guests.get(&node).is_some_and(|guest| guest.issued == serial) => {
+                        self.guests.remove(&node);
+                        tell(Visit::Joined(node));
+                    }
+                    Ok((from, node, _)) => tell(Visit::Failed(from, format!("the token of {node} was used again since"))),
+                    Err((from, reason)) => {
+                        if failures.len() < MAX_FAILURES && failures.insert((from.ip(), reason.clone())) {
+                            tell(Visit::Failed(from, reason));
+                        }
+                    }
+                },
                 () = sleep_until(until) => break,
+            }
+        }
+        for serial in self.guests.values().filter_map(|guest| guest.issued.as_ref()) {
+            if let Err(error) = self.authority.revoke_serial(serial, clock::now()) {
+                tracing::warn!(%error, "a certificate that was not kept stays valid");
             }
         }
         self.guests.into_keys().collect()
     }
 
-    fn answer(&mut self, request: &Request) -> Reply {
+    fn answer(&mut self, request: &Request) -> Answer {
         match self.welcome(request) {
-            Ok(welcome) => Reply::Welcome(Box::new(welcome)),
-            Err(reason) => Reply::Refused(reason),
+            Ok((welcome, serial)) => (Reply::Welcome(Box::new(welcome)), Some(serial)),
+            Err(reason) => (Reply::Refused(reason), None),
         }
     }
 
-    fn welcome(&mut self, request: &Request) -> Result<Welcome, String> {
+    fn welcome(&mut self, request: &Request) -> Result<(Welcome, String), String> {
         let unusable = |error: &dyn std::fmt::Display| format!("the host cannot issue a certificate: {error}");
         // Hashes are compared: the time that it takes tells nothing of the secret.
         let hash = |secret: &[u8]| digest(&SHA256, secret).as_ref().to_vec();
@@ -153,19 +181,16 @@ impl Host {
         let signing = CertificateSigningRequestParams::from_pem(&request.request)
             .map_err(|error| format!("the certificate signing request cannot be used: {error}"))?;
         let (node, now) = (&request.node, clock::now());
-        if guest.is_issued {
-            match self.authority.revoke(node, now) {
-                Ok(_) | Err(AuthorityError::NotIssued(_)) => guest.is_issued = false,
-                Err(error) => return Err(unusable(&error)),
-            }
+        if let Some(serial) = &guest.issued {
+            self.authority.revoke_serial(serial, now).map_err(|error| unusable(&error))?;
         }
         let rights = guest.rights;
         let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
         let issued = self.authority.certify(node, rights, valid, now, &signing.public_key);
-        let certificate = issued.map_err(|error| unusable(&error))?;
-        guest.is_issued = true;
+        let (certificate, serial) = issued.map_err(|error| unusable(&error))?;
+        guest.issued = Some(serial.clone());
         let read = |path| std::fs::read_to_string(path).map_err(|error| unusable(&error));
-        Ok(Welcome {
+        let welcome = Welcome {
             cell: self.authority.cell().clone(),
             role: rights.role,
             certificate,
@@ -173,23 +198,29 @@ impl Host {
             revocation_list: read(self.authority.revocation_list())?,
             cell_key: self.cell_key.clone(),
             seeds: self.seeds.clone(),
-        })
+        };
+        Ok((welcome, serial))
     }
 }
 
-/// One conversation; gives the node that has joined.
-async fn receive(tls: TlsAcceptor, stream: TcpStream, ask: mpsc::Sender<Question>) -> anyhow::Result<NodeName> {
+/// One conversation; gives the node that has kept what it got, and the serial number of its certificate.
+async fn receive(
+    tls: TlsAcceptor,
+    stream: TcpStream,
+    ask: mpsc::Sender<Question>,
+) -> anyhow::Result<(SocketAddr, NodeName, Option<String>)> {
+    let from = stream.peer_addr()?;
     let mut stream = BufStream::new(tls.accept(stream).await?);
-    let request: Request = read_line(&mut stream).await?;
+    let request: Request = read_line(&mut stream, MAX_REQUEST_BYTES).await?;
     let node = request.node.clone();
     let (answer, answered) = oneshot::channel();
     ask.send((request, answer)).await?;
-    let reply = answered.await?;
+    let (reply, serial) = answered.await?;
     write_line(&mut stream, &reply).await?;
     if let Reply::Refused(reason) = reply {
         anyhow::bail!("{node}: {reason}");
     }
-    let kept: String = read_line(&mut stream).await?;
+    let kept: String = read_line(&mut stream, MAX_REQUEST_BYTES).await?;
     anyhow::ensure!(kept == KEPT, "{node} has not kept its files");
-    Ok(node)
+    Ok((from, node, serial))
 }

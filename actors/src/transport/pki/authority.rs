@@ -154,13 +154,14 @@ impl Authority {
         now: Timestamp,
     ) -> Result<(), AuthorityError> {
         let key = KeyPair::generate()?;
-        let certificate = self.certify(node, rights, valid, now, &key)?;
+        let (certificate, _serial) = self.certify(node, rights, valid, now, &key)?;
         let nodes = self.directory.join(NODES);
         write_secret(&nodes.join(format!("{node}.key")), &key.serialize_pem())?;
         write(&nodes.join(format!("{node}.pem")), &certificate)
     }
 
-    /// Certificate in PEM for a key that stays with the node, with the same rights as [`Authority::issue`].
+    /// Certificate in PEM for a key that stays with the node, with the same rights as [`Authority::issue`], and its serial
+    /// number in hexadecimal digits.
     ///
     /// # Errors
     /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
@@ -171,7 +172,7 @@ impl Authority {
         valid: Duration,
         now: Timestamp,
         key: &impl PublicKeyData,
-    ) -> Result<String, AuthorityError> {
+    ) -> Result<(String, String), AuthorityError> {
         if node.as_str().contains(OBSERVER_MARK) {
             return Err(AuthorityError::Name(node.clone()));
         }
@@ -193,11 +194,16 @@ impl Authority {
         let certificate = parameters.signed_by(key, &issuer)?;
         let _lock = self.lock()?;
         let serial = hex::encode(serial.as_ref());
-        let issued = IssuedCertificate { node: node.clone(), serial, expires_at_us: now + valid, revoked_at_us: None };
+        let issued = IssuedCertificate {
+            node: node.clone(),
+            serial: serial.clone(),
+            expires_at_us: now + valid,
+            revoked_at_us: None,
+        };
         // Registered before anyone has it, so that every valid certificate can be revoked.
         self.register.issued.push(issued);
         self.save(&issuer, now)?;
-        Ok(certificate.pem())
+        Ok((certificate.pem(), serial))
     }
 
     /// Name of the cell.
@@ -216,18 +222,32 @@ impl Authority {
     /// # Errors
     /// [`AuthorityError`] when there are none or the list cannot be written.
     pub fn revoke(&mut self, node: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
+        match self.revoke_where(|issued| issued.node == *node, now)? {
+            0 => Err(AuthorityError::NotIssued(node.clone())),
+            revoked => Ok(revoked),
+        }
+    }
+
+    /// Revokes one certificate, unless it is revoked already.
+    pub(crate) fn revoke_serial(&mut self, serial: &str, now: Timestamp) -> Result<(), AuthorityError> {
+        self.revoke_where(|issued| issued.serial == serial, now).map(drop)
+    }
+
+    fn revoke_where(
+        &mut self,
+        is_meant: impl Fn(&IssuedCertificate) -> bool,
+        now: Timestamp,
+    ) -> Result<usize, AuthorityError> {
         let _lock = self.lock()?;
+        let is_valid = |issued: &IssuedCertificate| issued.revoked_at_us.is_none() && issued.expires_at_us > now;
         let mut revoked = 0;
-        for issued in &mut self.register.issued {
-            if issued.node == *node && issued.revoked_at_us.is_none() && issued.expires_at_us > now {
-                issued.revoked_at_us = Some(now);
-                revoked += 1;
-            }
+        for issued in self.register.issued.iter_mut().filter(|issued| is_meant(issued) && is_valid(issued)) {
+            issued.revoked_at_us = Some(now);
+            revoked += 1;
         }
-        if revoked == 0 {
-            return Err(AuthorityError::NotIssued(node.clone()));
+        if revoked > 0 {
+            self.save(&self.issuer()?, now)?;
         }
-        self.save(&self.issuer()?, now)?;
         Ok(revoked)
     }
 
