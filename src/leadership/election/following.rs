@@ -203,9 +203,10 @@ impl Election {
                             let other = other.clone();
                             self.stop_leading(&other.leader);
                             self.adopt(other, now, now);
-                        } else {
+                        } else if self.peers.followers(&self.id, now) > 0 {
                             self.renew_later(&message.from, now);
                         }
+                        // A leader that its last follower has left outdoes nobody: the other one will speak for itself.
                     }
                     Some(other) if *other != own => {}
                     _ if message.term > own.term => self.renew_later(&message.from, now),

@@ -181,6 +181,30 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
     assert!(election.is_leading());
 }
 
+/// After a split: the follower has met the edge, which this leader has not heard yet. In a later term it would be one more
+/// leader to outdo.
+#[test]
+fn a_leader_that_its_last_follower_has_left_waits_for_the_other_leader() {
+    let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
+    let (mut election, mut now) = (euclid(), NOW);
+    while !election.is_leading() {
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    let own = election.epoch().cloned().unwrap();
+    let status = || Body::Status { over: None, no_login: Vec::new() };
+    election.handle(received(&gauss, 1, Some(&own), status()), now);
+    let later = Epoch::new(own.term + 1, edge);
+    let end = now + Duration::from_secs(2);
+    let mut seq = 1;
+    while now < end {
+        seq += 1;
+        now = now + Duration::from_millis(50);
+        election.handle(received(&gauss, seq, Some(&later), status()), now);
+        assert_eq!(election.epoch(), Some(&own));
+    }
+}
+
 /// A leader has no followers yet when it begins. A vehicle that says then that it follows another ends no leadership.
 #[test]
 fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
