@@ -101,7 +101,7 @@ pub struct DescriptionExchange {
     /// Times of the latest adoptions from others.
     adopted: VecDeque<Timestamp>,
     leader: Leader,
-    /// Whether brokers may lack the description.
+    /// True if brokers may lack the description.
     is_due: bool,
     /// Time of the last publication, and the number of those since the description or the leader changed.
     published: Option<(Timestamp, u32)>,

@@ -215,7 +215,7 @@ impl Election {
         matches!(self.state, State::Leading(_))
     }
 
-    /// Whether this leader has said that the next round is its standby's.
+    /// True if this leader has said that the next round is its standby's.
     pub fn is_yielding(&self) -> bool {
         matches!(&self.state, State::Leading(leading) if leading.is_yielding())
     }

@@ -161,7 +161,7 @@ impl HealthMonitor {
         matches!(self.links.get(broker), Some(LinkState::Up | LinkState::Stalled))
     }
 
-    /// Whether this node is logged in at a node's broker, which has shown no other node's certificate.
+    /// True if this node is logged in at a node's broker, which has shown no other node's certificate.
     pub fn is_logged_in_at(&self, node: &NodeName, broker: &BrokerAddress) -> bool {
         self.is_logged_in(broker) && self.nodes.get(broker).is_none_or(|shown| shown == node)
     }

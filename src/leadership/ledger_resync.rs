@@ -154,7 +154,7 @@ impl LedgerResync {
         self.shares(ledger, &changed, &reached)
     }
 
-    /// Whether a broker vouches for the senders of shares: its own node's, this node's, and that of a leader that is
+    /// True if a broker vouches for the senders of shares: its own node's, this node's, and that of a leader that is
     /// followed or was a moment ago. `broker` is the node whose certificate it has proven, if any.
     pub fn is_vouched_for(&self, broker: Option<&NodeName>, share: &LedgerShare, leadership: &Leadership) -> bool {
         let is_of_leader =

@@ -52,7 +52,7 @@ impl Logins {
         self.nodes.iter().filter(|(_, login)| login.is_missing).map(|(name, _)| name)
     }
 
-    /// Whether some broker was last seen without a login that is not known to be missing.
+    /// True if some broker was last seen without a login that is not known to be missing.
     pub(super) fn is_doubtful(&self) -> bool {
         self.nodes.values().any(|login| login.contrary_looks > 0)
     }

@@ -59,7 +59,7 @@ pub struct LeadershipNode {
     logins: Logins,
     /// Followers that could not log in at this leader's broker at the last look.
     without_login: usize,
-    /// Whether these were all of its followers.
+    /// True if these were all of its followers.
     is_deserted: bool,
     own_broker: Option<SocketAddr>,
     /// Last living run of each node, as brokers tell it.

@@ -16,7 +16,7 @@ pub struct Readiness {
     pub ready: bool,
     /// The reason in words.
     pub reason: String,
-    /// Whether a start anew may help.
+    /// True if a start anew may help.
     #[serde(skip)]
     pub needs_restart: bool,
 }

@@ -17,9 +17,9 @@ pub struct Leadership {
     pub standby: Option<NodeName>,
     /// Highest term that the election knows to have been used.
     pub term: u64,
-    /// Whether this node leads, and no follower can log in at its broker. A change alone wakes nobody.
+    /// True if this node leads, and no follower can log in at its broker. A change alone wakes nobody.
     pub is_deserted: bool,
-    /// Whether this node leads, and the next round is its standby's. A change alone wakes nobody.
+    /// True if this node leads, and the next round is its standby's. A change alone wakes nobody.
     pub is_yielding: bool,
 }
 

@@ -71,7 +71,7 @@ impl ReputationLedger {
         self.lanes.get(&Epoch::new(term, aggregator.clone()))?.get(node)
     }
 
-    /// Whether there is a lane after this one.
+    /// True if there is a lane after this one.
     pub fn has_later_than(&self, lane: &Epoch) -> bool {
         self.lanes.last_key_value().is_some_and(|(last, _)| last > lane)
     }

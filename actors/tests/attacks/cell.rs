@@ -296,7 +296,7 @@ struct Landmark {
 }
 
 impl Map {
-    /// Whether the cell made it of the reports of honest vehicles: the object that is there, or none, and nothing else.
+    /// True if the cell made it of the reports of honest vehicles: the object that is there, or none, and nothing else.
     fn is_true(&self) -> bool {
         let [landmark] = &self.landmarks[..] else { return false };
         NODES.iter().any(|(name, role)| *name == self.aggregator && *role != Role::Cav)

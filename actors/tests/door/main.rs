@@ -22,7 +22,7 @@ fn shows(map: &GlobalMap, x_m: f64, contributor: &str) -> bool {
     (east.x_m - x_m).abs() < 1e-3 && east.contributors.iter().any(|name| name.as_str() == contributor)
 }
 
-/// Whether a program got the last of these maps.
+/// True if a program got the last of these maps.
 fn has_last(program: &Program, accepted: &[(Round, Instant)]) -> bool {
     let (last, _) = accepted.last().unwrap();
     program.rounds().iter().any(|(round, _)| round == last)

@@ -51,12 +51,12 @@ impl Leading {
         self.pause = if is_calm { least } else { (before.pause * 2).clamp(least, RENEWAL_PAUSE) };
     }
 
-    /// Whether this leader has said that the next round is another node's.
+    /// True if this leader has said that the next round is another node's.
     pub(super) fn is_yielding(&self) -> bool {
         self.handover.as_ref().is_some_and(|handover| handover.yielded)
     }
 
-    /// Whether this leader has said to a node that the next round is that node's.
+    /// True if this leader has said to a node that the next round is that node's.
     pub(super) fn has_yielded_to(&self, name: &NodeName) -> bool {
         self.handover.as_ref().is_some_and(|handover| handover.yielded && handover.to == *name)
     }

@@ -28,7 +28,7 @@ impl Election {
         }
     }
 
-    /// Whether more than half of this leader and its followers cannot log in at a candidate's broker.
+    /// True if more than half of this leader and its followers cannot log in at a candidate's broker.
     pub(super) fn is_out_of_reach(&self, candidate: &NodeName, now: Timestamp) -> bool {
         if !self.peers.lacks_logins() && self.no_login.is_empty() {
             return false;
@@ -51,7 +51,7 @@ impl Election {
         (is_ready && self.is_deserted(next, now)).then(|| next.clone())
     }
 
-    /// Whether more than half of the followers cannot log in at this leader's broker, and two at least: one node alone may
+    /// True if more than half of the followers cannot log in at this leader's broker, and two at least: one node alone may
     /// lie. A cell of two is the exception. There each is served by its own broker, and the other leads if it is no worse.
     fn is_deserted(&self, next: &NodeName, now: Timestamp) -> bool {
         let (without, followers) = self.peers.without_login(&self.id, &self.id, now);

@@ -55,7 +55,7 @@ pub(super) struct Peer {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Peers {
     table: BTreeMap<NodeName, Peer>,
-    /// Whether any peer cannot log in somewhere.
+    /// True if any peer cannot log in somewhere.
     lacks_logins: bool,
     contact_timeout: Duration,
     response_timeout: Duration,
@@ -144,7 +144,7 @@ impl Peers {
         self.lacks_logins = self.table.values().any(|peer| !peer.no_login.is_empty());
     }
 
-    /// Whether any peer cannot log in somewhere.
+    /// True if any peer cannot log in somewhere.
     pub(super) fn lacks_logins(&self) -> bool {
         self.lacks_logins
     }
@@ -155,7 +155,7 @@ impl Peers {
         (concerned().filter(|(_, peer)| peer.no_login.contains(at)).count(), concerned().count())
     }
 
-    /// Whether a peer cannot log in at the broker of `at`.
+    /// True if a peer cannot log in at the broker of `at`.
     pub(super) fn has_no_login(&self, name: &NodeName, at: &NodeName) -> bool {
         self.table.get(name).is_some_and(|peer| peer.no_login.contains(at))
     }
@@ -216,7 +216,7 @@ impl Peers {
         self.forget_at = self.table.values().filter_map(|peer| peer.given_up_at).min().map(|at| at + wait);
     }
 
-    /// Whether a peer has been heard and fit for `stable`.
+    /// True if a peer has been heard and fit for `stable`.
     pub(super) fn is_stable(&self, name: &NodeName, stable: Duration, now: Timestamp) -> bool {
         let since = self.table.get(name).and_then(|peer| peer.fit_since);
         self.hears(name, now) && since.is_some_and(|since| now >= since + stable)

@@ -136,7 +136,7 @@ pub enum Input {
         description: Option<DescriptionStatus>,
         /// Longest time between two rounds.
         round_period: Duration,
-        /// Whether the node keeps reputations.
+        /// True if the node keeps reputations.
         keeps_reputations: bool,
     },
     /// The node is about to stop.

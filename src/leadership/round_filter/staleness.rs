@@ -27,7 +27,7 @@ struct LeadersDelay {
     candidate: Option<LiveStream>,
     /// Whether the least delay is that of rounds that did not wait.
     is_learnt: bool,
-    /// Whether the least delay is only a bound, until the rounds prove to be live.
+    /// True if the least delay is only a bound, until the rounds prove to be live.
     is_bound: bool,
     /// Time for which rounds have arrived no faster than they were made.
     live_for: Duration,

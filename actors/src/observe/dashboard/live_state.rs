@@ -124,7 +124,7 @@ impl LiveState {
     }
 }
 
-/// Whether two names are of parts of one node.
+/// True if two names are of parts of one node.
 fn are_parts(one: &NodeName, other: &NodeName) -> bool {
     let node = other.vehicle();
     node != *other && node != *one && one.vehicle() == node

@@ -39,7 +39,7 @@ impl Principal {
         Self { identity: identity.map(Arc::new), quota_key, source, has_generated_id }
     }
 
-    /// Whether it is the node itself by its certificate; without certificates, a client of this machine.
+    /// True if it is the node itself by its certificate; without certificates, a client of this machine.
     pub(super) fn is_of(&self, node: &NodeName) -> bool {
         self.identity.as_ref().map_or(self.quota_key.is_none(), |identity| identity.name() == node)
     }

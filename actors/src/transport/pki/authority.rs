@@ -211,7 +211,7 @@ impl Authority {
         &self.register.cell
     }
 
-    /// Whether a node has a certificate that is neither revoked nor expired.
+    /// True if a node has a certificate that is neither revoked nor expired.
     pub(crate) fn has_certificate(&self, node: &NodeName, now: Timestamp) -> bool {
         let is_valid = |issued: &IssuedCertificate| issued.revoked_at_us.is_none() && issued.expires_at_us > now;
         self.register.issued.iter().any(|issued| issued.node == *node && is_valid(issued))
