@@ -51,7 +51,7 @@ const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_
 "#;
 const FRAME_SIZE: (usize, usize) = (160, 120);
 
-/// What it is and where.
+/// Kind of the object, and its place.
 const LABEL: &str = "car";
 const LANDMARK: &str = "\n[[landmarks]]\nid = \"ahead\"\nx_m = 6.6\ny_m = 0.0\n";
 

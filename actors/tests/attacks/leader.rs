@@ -12,8 +12,8 @@ pub(crate) const ROWS: &[Row] = &[Row {
     means: Means::Leader,
     on_brokers: false,
     deeds: (1, "revocation"),
-    // Half a second passes until the list is read, a second until the next leader's first map, and a round before both.
-    bar: Bar { maps: 0.5, honest: 0.5, longest_gap_ms: Some(1600), is_replaced: true, ..UNHARMED },
+    // Half a second passes until the list is read, and a second until the next leader's first map.
+    bar: Bar { maps: 0.5, honest: 0.5, longest_gap_ms: Some(1500), is_replaced: true, ..UNHARMED },
     quick: true,
     run: |target| Box::pin(revoked(target)),
 }];

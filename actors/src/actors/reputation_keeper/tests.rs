@@ -334,7 +334,7 @@ async fn a_saved_ledger_with_any_byte_changed_is_set_aside() {
     }
 }
 
-/// Whoever signs evidence may make counts leap, and waits for its receivers to restart.
+/// A signer of evidence may make counts leap, and wait for its receivers to restart.
 #[tokio::test]
 async fn counts_leap_no_further_after_a_restart_than_before() {
     let (gateway, _published) = listening::slot().await;

@@ -276,7 +276,7 @@ impl LinkTask {
                     self.report_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
                 Packet::Disconnected => return Ok(()),
-                // What counts is whether the node's own status comes back.
+                // The return of the node's own status decides.
                 Packet::Accepted | Packet::Sent | Packet::PublishRefused(_) | Packet::Other => {}
             }
             if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.reported_refusal.is_none() {
