@@ -346,7 +346,7 @@ def test_a_wrong_password_is_refused_and_the_right_one_taken(
 ) -> None:
     broker = mosquitto("allow_anonymous false", f"password_file {passwords(tmp_path, 'ada', 'hush4711')}")
     for login in ({}, {"user": "ada", "password": "wrong"}):
-        with pytest.raises(ecod.Refused, match=f"{broker.address} refuses the login: Not authorized; check certificate, user and password"):
+        with pytest.raises(ecod.Refused, match=f"{broker.address} refuses the login: Not authorized; check .*certificate, user and password"):
             ecod.Cell(broker.address, **login)
     with ecod.Cell(broker.address, user="ada", password="hush4711"):
         pass

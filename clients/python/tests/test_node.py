@@ -75,6 +75,37 @@ def test_tracks_of_a_node_are_read(edge: Callable[..., Server], cell_name: str, 
         assert not cell.counts, cell.counts
 
 
+@pytest.mark.parametrize("encoding", ["json", "cbor", "compact"])
+def test_a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell(
+    edge: Callable[..., Server], cell_name: str, encoding: str, tmp_path: Path
+) -> None:
+    node = edge(ECOD_MQTT__ENCODING=encoding)
+
+    def describe(text: str) -> None:
+        file = tmp_path / "cell.toml"
+        file.write_text(text)
+        subprocess.run(
+            [program(), "cell", "set", str(file), "--cell", cell_name, "--door", node.address], check=True, capture_output=True
+        )
+
+    with ecod.Cell(node.address, cell_name, node="edge") as cell:
+        assert cell.origin() is None and cell.description().version == 0
+        describe("[origin]\nlatitude_deg = 52.2296756\nlongitude_deg = 21.0122287\nheight_m = 113\n")
+        origin = wait_for(cell.origin)
+        assert origin == ecod.geo.Origin(52.2296756, 21.0122287, 113.0) and cell.description().set_by == "edge"
+        # As PROJ has it, for 12.4 m east and 3.1 m south.
+        cell.report([CAR], pose=origin.pose(52.22964774062, 21.01241017960, 180.0))
+        place = agreed(cell, "edge").landmarks[0]
+        latitude, longitude, height = origin.to_wgs84(place.x_m, place.y_m)
+        assert (latitude, longitude) == pytest.approx((52.2296774, 21.0122302), abs=2e-7) and height == pytest.approx(113.0, abs=1e-3)
+        # A vehicle without a node asks at the leader's broker.
+        with ecod.Cell(node.address, cell_name, node="euclid") as elsewhere:
+            assert elsewhere.origin() == origin
+        describe("[fusion.pace]\ngate_m = 0.5\n")
+        wait_for(lambda: cell.origin() is None)
+        assert not cell.counts, cell.counts
+
+
 def test_maps_go_on_after_the_node_is_killed_and_started_again(edge: Callable[..., Server], cell_name: str) -> None:
     node = edge()
     with ecod.Cell(node.address, cell_name, node="euclid") as cell:
@@ -118,7 +149,7 @@ def test_a_cell_with_certificates_takes_a_program_by_its_own(
         assert agreed(cell).landmarks[0].contributors == ["euclid"]
     with ecod.Cell(node.address, cell_name, node="edge", part="lidar", **own) as cell:
         assert "edge" in agreed(cell, "edge").landmarks[0].contributors
-    with pytest.raises(ecod.Refused, match=f"{node.address} refuses the login: Not authorized"):
+    with pytest.raises(ecod.Refused, match=rf"{node.address} refuses the login: Not authorized; check node name \(argument `node` or ECOD_NAME\), certificate"):
         ecod.Cell(node.address, cell_name, node="gauss", part="", **other)
     with pytest.raises(ecod.Unreachable, match=f"no TLS with {node.address} .*broker.example.*check .*`broker_name`"):
         ecod.Cell(node.address, cell_name, node="euclid", broker_name="broker.example", **other)

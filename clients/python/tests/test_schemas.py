@@ -17,7 +17,7 @@ from ecod import codec, messages
 
 # Names that differ; shares are among candidates only.
 CLASS_OF = {"WirePose": "Pose"}
-LEFT_OUT = {"CellDescription", "ClientRefusals", "LedgerShare"}
+LEFT_OUT = {"ClientRefusals", "LedgerShare"}
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ from . import geo
 from .cell import BROKER_NAME, Cell
 from .convert import from_arrays, from_supervision
 from .errors import EcodError, Invalid, Refused, Silent, Unreachable
-from .messages import DescriptionStatus, FieldOfView, FusedObject, GlobalMap, LandmarkState, NodeStatus, ObjectReport
-from .messages import PerceivedObject, Pose, PoseCorrection, Reputation, Reputations, Verdict, Verdicts, time_of
+from .messages import CellDescription, DescriptionStatus, FieldOfView, FusedObject, GlobalMap, LandmarkState, NodeStatus
+from .messages import ObjectReport, PerceivedObject, Pose, PoseCorrection, Reputation, Reputations, Verdict, Verdicts, time_of
 
 # fmt: off
 __all__ = [
-    "BROKER_NAME", "Cell", "DescriptionStatus", "EcodError", "FieldOfView", "FusedObject", "GlobalMap", "Invalid",
+    "BROKER_NAME", "Cell", "CellDescription", "DescriptionStatus", "EcodError", "FieldOfView", "FusedObject", "GlobalMap", "Invalid",
     "LandmarkState", "NodeStatus", "ObjectReport", "PerceivedObject", "Pose", "PoseCorrection", "Refused", "Reputation", "Reputations", "Silent",
     "Unreachable", "Verdict", "Verdicts", "from_arrays", "from_supervision", "geo", "time_of",
 ]

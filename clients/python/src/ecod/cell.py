@@ -17,7 +17,8 @@ from typing import Any, Optional, TypeVar, Union
 from .codec import Rejected, encode
 from .connection import Connection, host_and_port, log, tls_context
 from .errors import Invalid, Silent
-from .messages import SCHEMA_VERSION, FieldOfView, GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Pose
+from .geo import Origin
+from .messages import SCHEMA_VERSION, CellDescription, FieldOfView, GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Pose
 from .messages import Reputations, Verdicts, is_name
 from .streams import Stream
 
@@ -77,13 +78,15 @@ class Cell:
         self._maps = Stream(GlobalMap, "global_detections")
         self._verdicts = Stream(Verdicts, "global_verdicts")
         self._reputations = Stream(Reputations, "reputations", is_retained=True)
-        self._statuses = Stream(NodeStatus, "nodes/+", is_retained=True)
+        self._statuses = Stream(NodeStatus, "nodes/+", is_retained=True, has_rounds=False)
+        self._descriptions = Stream(CellDescription, "cell", is_retained=True, has_rounds=False)
         if not ca and (cert or key):
             raise Invalid("cert and key need `ca`, the file with the certificates that a broker must show")
         tls = tls_context(ca, cert, key, broker_name or address[0]) if ca else None
         login = (user or env("ECOD_MQTT__USER"), password or env("ECOD_MQTT__PASSWORD"))
-        # A cell's broker takes ids of this form only, by which nobody ends another's session.
-        client_id = f"{self.name}-{uuid.uuid4().hex}"
+        # With certificates a cell's broker takes ids of this form only, by which nobody ends another's session. Without,
+        # it takes them for nodes'.
+        client_id = f"{self.name}-{uuid.uuid4().hex[: 32 if tls else 16]}"
         self._connection = Connection(address, client_id, tls, login, self._take, timeout)
 
     def maps(self, timeout: Optional[float] = None) -> Iterator[GlobalMap]:
@@ -105,6 +108,23 @@ class Cell:
     def statuses(self, timeout: Optional[float] = None) -> Iterator[NodeStatus]:
         """The statuses of the nodes: the present ones first, then every change; the newest of each node."""
         return self._read(self._statuses, timeout)
+
+    def description(self, timeout: float = 10.0) -> CellDescription:
+        """The settings that all nodes of the cell share, as they are now; version 0 if there are none.
+
+        A node always tells the programs beside it. Other brokers have nothing in a cell without a description: raises
+        `Silent` when nothing comes within `timeout` seconds, and `Refused` when the broker refuses.
+        """
+        for description in self._read(self._descriptions, timeout):
+            return description
+        raise Silent(f"the connection to {self._connection.at} is closed")
+
+    def origin(self, timeout: float = 10.0) -> Optional[Origin]:
+        """The place of the cell's maps on Earth, None if the cell's description has none. Raises as `description`.
+
+        It may change while the cell runs; asking for it with every map costs little.
+        """
+        return Origin.of(self.description(timeout).text)
 
     def report(
         self,
@@ -210,7 +230,7 @@ class Cell:
     def _take(self, topic: str, payload: bytes) -> None:
         """Takes a message from the broker: the newest of its kind counts, an unusable one is counted and told of once."""
         head, _, node = topic[len(self._root) :].partition("/")
-        for stream in (self._maps, self._verdicts, self._reputations, self._statuses):
+        for stream in (self._maps, self._verdicts, self._reputations, self._statuses, self._descriptions):
             if stream.topic.partition("/")[0] == head:
                 try:
                     stream.take(node, payload, self._connection.changed)

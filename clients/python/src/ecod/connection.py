@@ -186,7 +186,8 @@ class Connection:
         self._answer = reason
         if reason.is_failure:
             if reason.value in FINAL:
-                self._refusal = Refused(f"{self.at} refuses the login: {reason}; check certificate, user and password")
+                check = "check node name (argument `node` or ECOD_NAME), certificate, user and password"
+                self._refusal = Refused(f"{self.at} refuses the login: {reason}; {check}")
             log.warning("%s refuses the login: %s", self.at, reason)
         else:
             log.info("connected to %s", self.at)

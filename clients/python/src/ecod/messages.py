@@ -247,6 +247,17 @@ class Reputations:
 
 
 @dataclass(frozen=True)
+class CellDescription:
+    """The settings that all nodes of a cell share, as TOML; version 0 without any."""
+
+    schema: Schema
+    version: Count
+    hash: Hash
+    set_by: Name
+    text: str
+
+
+@dataclass(frozen=True)
 class DescriptionStatus:
     """A node's description of its cell; `problem` says why the node does not use it."""
 

@@ -20,8 +20,8 @@ MAX_NODES = 1024
 class Stream(Generic[M]):
     """One kind of payload. Rounds replace each other; statuses do so for each node."""
 
-    def __init__(self, kind: type[M], topic: str, is_retained: bool = False) -> None:
-        self.kind, self.topic, self.is_retained = kind, topic, is_retained
+    def __init__(self, kind: type[M], topic: str, is_retained: bool = False, has_rounds: bool = True) -> None:
+        self.kind, self.topic, self.is_retained, self.has_rounds = kind, topic, is_retained, has_rounds
         self.number = 0
         self.told: set[str] = set()
         self._newest: dict[str, tuple[int, M]] = {}
@@ -33,7 +33,7 @@ class Stream(Generic[M]):
         message: Any = decode(self.kind, payload) if payload else None
         if message is not None and node and message.node != node:
             raise Rejected("node_mismatch", f"a status of {message.node!r}")
-        if message is not None and not node:
+        if message is not None and self.has_rounds:
             self._check_order((message.epoch, message.aggregator or "", message.round))
         with changed:
             self._newest.pop(node, None)

@@ -1,0 +1,360 @@
+//! A program's part in a cell.
+
+use std::collections::BTreeMap;
+use std::env;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant, SystemTime};
+
+use ecod::leadership::BrokerAddress;
+use ecod::model::names::{LandmarkId, NodeName, PART_MARK};
+use ecod::model::origin::GeographicOrigin;
+use ecod::model::time::Timestamp;
+use ecod::wire::{
+    CellDescription, Encoding, FieldOfView, GlobalMap, Limits, NodeStatus, ObjectReport, PerceivedObject, ReportKind,
+    Reputations, Topics, Verdicts, WirePose, encode,
+};
+use rumqttc::Transport;
+use rumqttc::v5::MqttOptions;
+use uuid::Uuid;
+
+use crate::connection::Shared;
+use crate::streams::{Stream, Streams};
+use crate::{Error, Tls};
+
+/// Where a cell is, and who the program is.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// HOST:PORT of a node or broker; without a port 1883, with `tls` 8883.
+    pub broker: String,
+    /// Name of the cell.
+    pub cell: String,
+    /// Node beside which the program runs. It reports as `<node>--<part>`.
+    pub node: String,
+    /// Name of the program at its node. If empty, it reports as the node itself, which then must not report.
+    pub part: String,
+    /// User at an external broker, and password.
+    pub login: Option<(String, String)>,
+    /// Certificates; none for plaintext.
+    pub tls: Option<Tls>,
+    /// Time for the first login, and for the answer to [`Cell::description`].
+    pub timeout: Duration,
+}
+
+impl Default for Settings {
+    /// Settings by the environment: `ECOD_BROKER` (default `localhost`), `ECOD_CELL` (`cell`), `ECOD_NAME` (the
+    /// machine's host name), `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD`. The part is `rust`, the timeout 10 s.
+    fn default() -> Self {
+        let setting = |name| env::var(name).ok().filter(|value| !value.is_empty());
+        let or = |name, default: &str| setting(name).unwrap_or_else(|| default.to_owned());
+        Self {
+            broker: or("ECOD_BROKER", "localhost"),
+            cell: or("ECOD_CELL", "cell"),
+            node: setting("ECOD_NAME").unwrap_or_else(host_name),
+            part: "rust".to_owned(),
+            login: setting("ECOD_MQTT__USER").map(|user| (user, or("ECOD_MQTT__PASSWORD", ""))),
+            tls: None,
+            timeout: Duration::from_secs(10),
+        }
+    }
+}
+
+/// What one frame shows. One without objects is a report, too.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// Time of the picture, not of the detection.
+    pub captured_at: SystemTime,
+    /// Detections with their positions in the cell's frame.
+    pub objects: Vec<PerceivedObject>,
+    /// Pose of the camera. With it, the reporting vehicle itself is on the map.
+    pub pose: Option<WirePose>,
+    /// Known locations in view.
+    pub seen: Option<Vec<LandmarkId>>,
+    /// Field of view from the pose.
+    pub view: Option<FieldOfView>,
+}
+
+impl Frame {
+    /// Objects of a frame that was captured now.
+    pub fn new(objects: Vec<PerceivedObject>) -> Self {
+        Self { captured_at: SystemTime::now(), objects, pose: None, seen: None, view: None }
+    }
+}
+
+/// A connection to a cell, which is made anew whenever it is lost. Its methods may be called from any thread.
+pub struct Cell {
+    name: NodeName,
+    topics: Topics,
+    shared: Arc<Shared>,
+    /// Reports of each kind so far.
+    sent: Mutex<[u64; ReportKind::COUNT]>,
+    timeout: Duration,
+}
+
+/// An endless loop over messages; made by [`Cell::maps`] and its like.
+///
+/// A slow reader gets the newest message next, and never a backlog. The loop ends when the cell is closed.
+pub struct Messages<M> {
+    shared: Arc<Shared>,
+    filter: String,
+    stream: fn(&Streams) -> &Stream<M>,
+    number: u64,
+    timeout: Option<Duration>,
+}
+
+/// Keep-alive as the default of nodes.
+const KEEP_ALIVE: Duration = Duration::from_secs(5);
+
+/// Silence after which the log says where to look.
+const SILENCE: Duration = Duration::from_secs(10);
+
+/// Longest wait of a reader between two looks at the clock.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// Room in a packet for topic and header in bytes.
+const HEADER_BYTES: usize = 4096;
+
+impl Cell {
+    /// Connects to a cell.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] for settings that no broker could use, [`Error::Unreachable`] or [`Error::Refused`] unless the
+    /// broker lets the program in within the timeout.
+    pub fn connect(settings: Settings) -> Result<Self, Error> {
+        let invalid = |error: &dyn std::fmt::Display| Error::Invalid(error.to_string());
+        let part = if settings.part.is_empty() { String::new() } else { format!("{PART_MARK}{}", settings.part) };
+        let name = NodeName::new(settings.node + &part).map_err(|error| invalid(&error))?;
+        let cell = NodeName::new(&settings.cell).map_err(|error| invalid(&error))?;
+        let default_port = if settings.tls.is_some() { 8883 } else { 1883 };
+        let address = broker_address(&settings.broker, default_port)?;
+        // With TLS the host is compared with the name in the certificate, which has no brackets.
+        let host = if settings.tls.is_some() { address.host().trim_matches(['[', ']']) } else { address.host() };
+        // With certificates a cell's broker takes ids of this form only, by which nobody ends another's session. Without,
+        // it takes them for nodes'.
+        let mut run = Uuid::new_v4().simple().to_string();
+        if settings.tls.is_none() {
+            run.truncate(16);
+        }
+        let mut options = MqttOptions::new(format!("{name}-{run}"), host, address.port());
+        let limits = Limits::default();
+        options.set_keep_alive(KEEP_ALIVE).set_clean_start(true);
+        options.set_connection_timeout(settings.timeout.as_secs().clamp(1, 10));
+        options.set_max_packet_size(u32::try_from(limits.map_bytes + HEADER_BYTES).ok());
+        let mut network = rumqttc::NetworkOptions::new();
+        // Otherwise small messages wait for acknowledgements.
+        network.set_tcp_nodelay(true);
+        options.set_network_options(network);
+        if let Some((user, password)) = settings.login {
+            options.set_credentials(user, password);
+        }
+        if let Some(tls) = &settings.tls {
+            options.set_transport(Transport::tls_with_config(tls.client()?.into()));
+        }
+        let topics = Topics::new(&cell);
+        let shared = Shared::connect(address.to_string(), topics.clone(), options, settings.timeout)?;
+        Ok(Self { name, topics, shared, sent: Default::default(), timeout: settings.timeout })
+    }
+
+    /// The name in which the program reports.
+    pub fn name(&self) -> &NodeName {
+        &self.name
+    }
+
+    /// The maps of the cell, from now on. One that is not later by epoch and round than the last is dropped.
+    pub fn maps(&self) -> Messages<GlobalMap> {
+        self.read("global_detections", |streams| &streams.maps, false)
+    }
+
+    /// The verdicts of the cell, by the rules of [`Cell::maps`].
+    pub fn verdicts(&self) -> Messages<Verdicts> {
+        self.read("global_verdicts", |streams| &streams.verdicts, false)
+    }
+
+    /// The trust in each vehicle: the present state first, then by the rules of [`Cell::maps`].
+    pub fn reputations(&self) -> Messages<Reputations> {
+        self.read("reputations", |streams| &streams.reputations, true)
+    }
+
+    /// The statuses of the nodes: the present ones first, then every change.
+    pub fn statuses(&self) -> Messages<NodeStatus> {
+        self.read("nodes/+", |streams| &streams.statuses, true)
+    }
+
+    /// The settings that all nodes of the cell share, as they are now; version 0 if there are none.
+    ///
+    /// # Errors
+    /// [`Error::Silent`] if nothing comes within the timeout: a node always tells the programs beside it, other brokers have
+    /// nothing in a cell without a description. [`Error::Refused`] when the broker refuses.
+    pub fn description(&self) -> Result<Arc<CellDescription>, Error> {
+        let mut descriptions = self.read("cell", |streams| &streams.descriptions, true).timeout(self.timeout);
+        let closed = || Err(Error::Silent(format!("the connection to {} is closed", self.shared.at)));
+        descriptions.next().unwrap_or_else(closed)
+    }
+
+    /// The place of the cell's maps on Earth, if the cell's description has one. It may change while the cell runs.
+    ///
+    /// # Errors
+    /// As [`Cell::description`], and [`Error::Invalid`] for one that cannot be read.
+    pub fn origin(&self) -> Result<Option<GeographicOrigin>, Error> {
+        let description = self.description()?;
+        let invalid = |error: &dyn std::fmt::Display| {
+            Error::Invalid(format!("the description of the cell has no usable [origin]: {error}"))
+        };
+        let settings: toml::Table = description.text.parse().map_err(|error| invalid(&error))?;
+        let Some(origin) = settings.get("origin") else { return Ok(None) };
+        let origin: GeographicOrigin = origin.clone().try_into().map_err(|error| invalid(&error))?;
+        origin.validate().map_err(|error| invalid(&error))?;
+        Ok(Some(origin))
+    }
+
+    /// Reports a frame, for the map. Gives whether it was sent: without a connection it is dropped and counted. It never
+    /// waits.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] for values that the protocol does not allow. [`Error::Refused`] when the broker refused the
+    /// login or an earlier report.
+    pub fn report(&self, frame: Frame) -> Result<bool, Error> {
+        self.send(ReportKind::Detections, frame)
+    }
+
+    /// Votes on what is at known locations, for the verdicts: objects name their `landmark`.
+    ///
+    /// # Errors
+    /// As [`Cell::report`], and when an object names no location.
+    pub fn vote(&self, frame: Frame) -> Result<bool, Error> {
+        if let Some(place) = frame.objects.iter().position(|object| object.landmark.is_none()) {
+            return Err(Error::Invalid(format!("not sent: objects[{place}] names no landmark, as a vote must")));
+        }
+        self.send(ReportKind::VoteDetections, frame)
+    }
+
+    /// Messages that were not taken, by the reasons in `docs/protocol.md`, and reports that were not sent: `unsent`.
+    pub fn counts(&self) -> BTreeMap<&'static str, u64> {
+        self.shared.state().counts.clone()
+    }
+
+    /// Ends the connection, and with it all loops over messages. Dropping the cell does the same.
+    pub fn close(&self) {
+        self.shared.close();
+    }
+
+    fn read<M>(&self, level: &str, stream: fn(&Streams) -> &Stream<M>, is_retained: bool) -> Messages<M> {
+        let filter = self.topics.filter(level);
+        let mut state = self.shared.state();
+        state.subscribe(&filter);
+        let number = if is_retained { 0 } else { stream(&state.streams).number() };
+        drop(state);
+        Messages { shared: Arc::clone(&self.shared), filter, stream, number, timeout: None }
+    }
+
+    fn send(&self, kind: ReportKind, frame: Frame) -> Result<bool, Error> {
+        let since_epoch = frame.captured_at.duration_since(SystemTime::UNIX_EPOCH);
+        let since_epoch = since_epoch.map_err(|_| Error::Invalid("not sent: captured_at is before 1970".to_owned()))?;
+        let Ok(mut sent) = self.sent.lock() else { return Ok(false) };
+        let Some(seq) = sent.get_mut(kind as usize) else { return Ok(false) };
+        let report = ObjectReport {
+            pose: frame.pose,
+            objects: frame.objects,
+            seen: frame.seen,
+            view: frame.view,
+            ..ObjectReport::new(self.name.clone(), *seq + 1, Timestamp::default() + since_epoch)
+        };
+        check(&report)?;
+        let payload = encode(&report, Encoding::Json);
+        let (bytes, at_most) = (payload.len(), Limits::default().payload_bytes);
+        if bytes > at_most {
+            let objects = report.objects.len();
+            return Err(Error::Invalid(format!("not sent: {bytes} bytes with {objects} objects, at most {at_most}")));
+        }
+        let topic = self.topics.path(&kind.topic(self.name.clone()));
+        let mut state = self.shared.state();
+        state.check_refusal(&topic, &self.shared.at)?;
+        *seq += 1;
+        let is_sent = state.publish(&topic, payload);
+        if !is_sent {
+            *state.counts.entry("unsent").or_default() += 1;
+        }
+        Ok(is_sent)
+    }
+}
+
+impl Drop for Cell {
+    fn drop(&mut self) {
+        self.close();
+    }
+}
+
+impl<M> Messages<M> {
+    /// The same loop, in which silence of this length gives [`Error::Silent`]. A vehicle should stop then.
+    #[must_use]
+    pub fn timeout(mut self, silence: Duration) -> Self {
+        self.timeout = Some(silence);
+        self
+    }
+}
+
+impl<M> Iterator for Messages<M> {
+    type Item = Result<Arc<M>, Error>;
+
+    /// Waits for the next message. After an error the loop may go on.
+    fn next(&mut self) -> Option<Self::Item> {
+        let (began, mut is_told) = (Instant::now(), false);
+        let mut state = self.shared.state();
+        while !state.is_closing {
+            // Asked for anew after a refusal.
+            state.subscribe(&self.filter);
+            if let Some((number, message)) = (self.stream)(&state.streams).after(self.number) {
+                self.number = number;
+                return Some(Ok(message));
+            }
+            if let Err(refusal) = state.check_refusal(&self.filter, &self.shared.at) {
+                return Some(Err(refusal));
+            }
+            let waited = began.elapsed();
+            let remedy = if state.is_connected() { "does a node lead the cell of this name?" } else { "no connection" };
+            let silence = || format!("nothing on {} from {} for {waited:.1?}; {remedy}", self.filter, self.shared.at);
+            if self.timeout.is_some_and(|timeout| waited >= timeout) {
+                return Some(Err(Error::Silent(silence())));
+            }
+            if waited >= SILENCE && !is_told {
+                is_told = true;
+                log::warn!("{}", silence());
+            }
+            let left = self.timeout.map_or(PATIENCE, |timeout| timeout.saturating_sub(waited).min(PATIENCE));
+            state = self.shared.wait(state, left);
+        }
+        None
+    }
+}
+
+/// The present time by this machine's clock, to be compared with a message's `fused_at_us`.
+pub fn now() -> Timestamp {
+    Timestamp::default() + SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
+}
+
+/// Checks a report, and names the object that is not allowed.
+fn check(report: &ObjectReport) -> Result<(), Error> {
+    let limits = Limits::default();
+    let Err(reason) = report.validate(&limits) else { return Ok(()) };
+    let is_at_fault = |object: &PerceivedObject| {
+        let alone = ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us);
+        ObjectReport { objects: vec![object.clone()], ..alone }.validate(&limits).is_err()
+    };
+    let place = report.objects.iter().position(is_at_fault);
+    let whose = place.map_or_else(String::new, |place| format!("objects[{place}]: "));
+    Err(Error::Invalid(format!("not sent: {whose}{reason}")))
+}
+
+/// The parts of HOST:PORT; the port may be absent.
+fn broker_address(text: &str, default_port: u16) -> Result<BrokerAddress, Error> {
+    let address = text.parse::<BrokerAddress>();
+    let address = address.or_else(|error| format!("{text}:{default_port}").parse().map_err(|_| error));
+    address.map_err(|error| Error::Invalid(error.to_string()))
+}
+
+/// The machine's name without its domain, as far as names of nodes may have its characters: as nodes do it.
+fn host_name() -> String {
+    let system = rustix::system::uname();
+    let host = system.nodename().to_string_lossy();
+    let allowed = |c: char| if c.is_ascii_alphanumeric() || c == '_' { c } else { '-' };
+    host.split('.').next().unwrap_or_default().chars().map(allowed).collect()
+}

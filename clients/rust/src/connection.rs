@@ -1,0 +1,297 @@
+//! A connection to a broker on a thread of its own, made anew whenever it is lost.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use ecod::wire::{RejectReason, Topics};
+use rumqttc::Outgoing;
+use rumqttc::v5::mqttbytes::QoS;
+use rumqttc::v5::mqttbytes::v5::{ConnectReturnCode, PubAckReason, SubscribeReasonCode};
+use rumqttc::v5::{Client, Connection, ConnectionError, Event, Incoming, MqttOptions};
+use uuid::Uuid;
+
+use crate::Error;
+use crate::streams::Streams;
+
+/// What the connection's thread and the program share.
+pub(crate) struct Shared {
+    /// Address of the broker as given, for messages.
+    pub(crate) at: String,
+    topics: Topics,
+    state: Mutex<State>,
+    /// Notified with every message, connection, refusal and end.
+    changed: Condvar,
+}
+
+/// State of the connection.
+#[derive(Default)]
+pub(crate) struct State {
+    pub(crate) streams: Streams,
+    pub(crate) counts: BTreeMap<&'static str, u64>,
+    pub(crate) is_closing: bool,
+    /// The sending half while the broker lets the program in.
+    client: Option<Client>,
+    /// Outcome of the first login.
+    login: Option<Result<(), Error>>,
+    /// Refusal of the latest login, if the broker will refuse the next one, too.
+    refusal: Option<Error>,
+    filters: BTreeSet<String>,
+    /// Topics and filters that the broker was asked for on this connection.
+    asked: BTreeSet<String>,
+    /// Those under way, in order, and by packet once they are sent.
+    queued: VecDeque<String>,
+    unanswered: HashMap<u16, String>,
+    denied: HashMap<String, String>,
+    has_ended: bool,
+}
+
+/// Messages that wait for the network at most; more are dropped, as late ones are worthless.
+const MAX_WAITING: usize = 16;
+
+/// Wait before the first new attempt, doubled with every failure, and the longest.
+const RETRY_MIN: Duration = Duration::from_millis(100);
+const RETRY_MAX: Duration = Duration::from_secs(5);
+
+/// Time to send what waits when the connection is closed.
+const FLUSH_TIMEOUT: Duration = Duration::from_secs(1);
+
+impl Shared {
+    /// Connects, and waits until the broker lets the program in.
+    pub(crate) fn connect(
+        at: String,
+        topics: Topics,
+        options: MqttOptions,
+        timeout: Duration,
+    ) -> Result<Arc<Self>, Error> {
+        let shared = Arc::new(Self { at, topics, state: Mutex::default(), changed: Condvar::new() });
+        let thread = Arc::clone(&shared);
+        let spawned = thread::Builder::new().name("ecod-client".to_owned()).spawn(move || thread.run(&options));
+        spawned.map_err(|error| Error::Unreachable(format!("no thread for the connection: {error}")))?;
+        let waited = shared.changed.wait_timeout_while(shared.state(), timeout, |state| state.login.is_none());
+        let (mut state, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        let late = || Err(Error::Unreachable(format!("{} does not answer the login within {timeout:?}", shared.at)));
+        let login = state.login.clone().unwrap_or_else(late);
+        state.is_closing = login.is_err();
+        drop(state);
+        shared.changed.notify_all();
+        login.map(|()| shared)
+    }
+
+    pub(crate) fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits for a change, for at most so long.
+    pub(crate) fn wait<'a>(&self, state: MutexGuard<'a, State>, patience: Duration) -> MutexGuard<'a, State> {
+        self.changed.wait_timeout(state, patience).unwrap_or_else(PoisonError::into_inner).0
+    }
+
+    /// Sends what waits, and ends the connection and all loops over messages.
+    pub(crate) fn close(&self) {
+        let mut state = self.state();
+        state.is_closing = true;
+        if let Some(client) = state.client.take()
+            && client.try_disconnect().is_ok()
+        {
+            self.changed.notify_all();
+            let ended = self.changed.wait_timeout_while(state, FLUSH_TIMEOUT, |state| !state.has_ended);
+            drop(ended);
+        }
+        self.changed.notify_all();
+    }
+
+    /// Carries messages until the program closes the connection.
+    fn run(&self, options: &MqttOptions) {
+        let mut wait = RETRY_MIN;
+        loop {
+            // A client of its own for each connection: what waited in the last one is too old.
+            let (client, mut connection) = Client::new(options.clone(), MAX_WAITING);
+            let began = Instant::now();
+            let lost = self.carry(&client, &mut connection);
+            let mut state = self.state();
+            if state.client.take().is_some() && !state.is_closing {
+                log::warn!("connection to {} lost: {lost}; trying again, reports are dropped until then", self.at);
+            }
+            // A broker that lets the program in only to end the connection is not asked more and more often.
+            wait = if began.elapsed() > RETRY_MAX { RETRY_MIN } else { (2 * wait).min(RETRY_MAX) };
+            let pause = wait.mul_f64(0.25 + f64::from(Uuid::new_v4().as_bytes()[0]) / 1024.0);
+            let waited = self.changed.wait_timeout_while(state, pause, |state| !state.is_closing);
+            let (mut state, _) = waited.unwrap_or_else(PoisonError::into_inner);
+            if state.is_closing {
+                state.has_ended = true;
+                self.changed.notify_all();
+                return;
+            }
+        }
+    }
+
+    /// Sends and receives until the connection ends; gives the reason.
+    fn carry(&self, client: &Client, connection: &mut Connection) -> String {
+        loop {
+            let event = match connection.recv() {
+                Ok(Ok(event)) => event,
+                Ok(Err(error)) => {
+                    let reason = with_causes(&error);
+                    self.note_failure(&error, &reason);
+                    return reason;
+                }
+                Err(_) => return "closed".to_owned(),
+            };
+            let mut state = self.state();
+            match event {
+                Event::Incoming(Incoming::ConnAck(_)) => state.begin(client),
+                Event::Incoming(Incoming::Publish(message)) => self.take(&mut state, &message.topic, &message.payload),
+                Event::Incoming(Incoming::SubAck(answer)) => {
+                    let refused =
+                        answer.return_codes.iter().find(|code| !matches!(code, SubscribeReasonCode::Success(_)));
+                    state.note_answer(answer.pkid, refused.map(|code| format!("{code:?}")));
+                }
+                Event::Incoming(Incoming::PubAck(answer)) => {
+                    let is_taken = matches!(answer.reason, PubAckReason::Success | PubAckReason::NoMatchingSubscribers);
+                    let text = answer.properties.and_then(|properties| properties.reason_string);
+                    let refusal = (!is_taken).then(|| text.unwrap_or_else(|| format!("{:?}", answer.reason)));
+                    state.note_answer(answer.pkid, refusal);
+                }
+                Event::Outgoing(Outgoing::Publish(packet) | Outgoing::Subscribe(packet)) if packet != 0 => {
+                    let asked = state.queued.pop_front();
+                    asked.and_then(|asked| state.unanswered.insert(packet, asked));
+                }
+                Event::Outgoing(Outgoing::Disconnect) => return "closed".to_owned(),
+                _ => continue,
+            }
+            if state.is_closing && state.client.take().is_some() {
+                // It was closed while the broker was asked.
+                client.try_disconnect().unwrap_or_default();
+            }
+            drop(state);
+            self.changed.notify_all();
+        }
+    }
+
+    /// Takes a message. An unusable one is counted, and told of once.
+    fn take(&self, state: &mut State, topic: &[u8], payload: &[u8]) {
+        let parsed = std::str::from_utf8(topic).ok().and_then(|topic| self.topics.parse(topic));
+        let Err(reason) = state.streams.take(parsed, payload, Instant::now()) else { return };
+        let count = state.counts.entry(reason.as_str()).or_default();
+        *count += 1;
+        // An order that is not kept is usual after a reconnection.
+        if *count == 1 && reason != RejectReason::Superseded {
+            let topic = String::from_utf8_lossy(topic);
+            log::warn!("not taken from {topic}: {reason}; others like it are only counted");
+        }
+    }
+
+    fn note_failure(&self, error: &ConnectionError, reason: &str) {
+        let mut state = self.state();
+        let refusal = match error {
+            ConnectionError::ConnectionRefused(code) => {
+                let check = "check node name (`node` or ECOD_NAME), certificate, user and password";
+                let text = format!("{} refuses the login: {code:?}; {check}", self.at);
+                log::warn!("{text}");
+                state.refusal = is_final(*code).then(|| Error::Refused(text.clone()));
+                Error::Refused(text)
+            }
+            _ => Error::Unreachable(format!(
+                "cannot log in at {}: {reason}; is a node or broker there that speaks MQTT 5, {}?",
+                self.at, "and do both speak TLS or neither, with certificates of the cell"
+            )),
+        };
+        state.login.get_or_insert(Err(refusal));
+        drop(state);
+        self.changed.notify_all();
+    }
+}
+
+impl State {
+    /// Notes that the broker lets the program in.
+    fn begin(&mut self, client: &Client) {
+        (self.refusal, self.client) = (None, Some(client.clone()));
+        self.login.get_or_insert(Ok(()));
+        self.asked.clear();
+        self.queued.clear();
+        self.unanswered.clear();
+        self.denied.clear();
+        self.filters.clone().iter().for_each(|filter| self.subscribe(filter));
+    }
+
+    pub(crate) fn is_connected(&self) -> bool {
+        self.client.is_some()
+    }
+
+    /// Asks for messages, on this connection and all that follow.
+    pub(crate) fn subscribe(&mut self, filter: &str) {
+        self.filters.insert(filter.to_owned());
+        let Some(client) = &self.client else { return };
+        if !self.asked.contains(filter) && client.try_subscribe(filter, QoS::AtLeastOnce).is_ok() {
+            self.ask(filter);
+        }
+    }
+
+    /// Sends a message if that is possible at once; gives whether it is.
+    pub(crate) fn publish(&mut self, topic: &str, payload: Vec<u8>) -> bool {
+        let Some(client) = &self.client else { return false };
+        // The first message asks for an answer: nothing else says that the broker does not allow them.
+        let is_question = !self.asked.contains(topic);
+        let qos = if is_question { QoS::AtLeastOnce } else { QoS::AtMostOnce };
+        let is_sent = client.try_publish(topic, qos, false, payload).is_ok();
+        if is_sent && is_question {
+            self.ask(topic);
+        }
+        is_sent
+    }
+
+    /// Gives what the broker refused: the login, or this topic or filter, each refusal of it once.
+    pub(crate) fn check_refusal(&mut self, topic: &str, at: &str) -> Result<(), Error> {
+        if let Some(refusal) = &self.refusal {
+            return Err(refusal.clone());
+        }
+        let Some(reason) = self.denied.remove(topic) else { return Ok(()) };
+        self.asked.remove(topic);
+        let remedy = "do name and certificate or user allow it?";
+        Err(Error::Refused(format!("the broker at {at} refuses {topic}: {reason}; {remedy}")))
+    }
+
+    fn ask(&mut self, topic: &str) {
+        self.asked.insert(topic.to_owned());
+        self.queued.push_back(topic.to_owned());
+    }
+
+    fn note_answer(&mut self, packet: u16, refusal: Option<String>) {
+        if let (Some(topic), Some(reason)) = (self.unanswered.remove(&packet), refusal) {
+            log::warn!("the broker refuses {topic}: {reason}");
+            self.denied.insert(topic, reason);
+        }
+    }
+}
+
+/// True if a broker that refuses a login so will refuse the next one.
+fn is_final(code: ConnectReturnCode) -> bool {
+    use ConnectReturnCode::{BadAuthenticationMethod, BadClientId, BadUserNamePassword, Banned, NotAuthorized};
+    use ConnectReturnCode::{ClientIdentifierNotValid, MalformedPacket, ProtocolError, RefusedProtocolVersion};
+    matches!(
+        code,
+        BadAuthenticationMethod
+            | BadClientId
+            | BadUserNamePassword
+            | Banned
+            | NotAuthorized
+            | ClientIdentifierNotValid
+            | MalformedPacket
+            | ProtocolError
+            | RefusedProtocolVersion
+            | ConnectReturnCode::UnsupportedProtocolVersion
+    )
+}
+
+/// An error's text with those of its causes.
+fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    for cause in std::iter::successors(error.source(), |cause| cause.source()).map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}

@@ -1,0 +1,23 @@
+#![doc = include_str!("../README.md")]
+
+mod cell;
+mod connection;
+mod error;
+mod streams;
+mod tls;
+
+pub use cell::{Cell, Frame, Messages, Settings, now};
+pub use ecod;
+pub use ecod::model::names::{Label, LandmarkId, NodeName};
+pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
+pub use ecod::model::time::Timestamp;
+pub use ecod::wire::{
+    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, NodeState, NodeStatus, PerceivedObject,
+    Reputation, Reputations, Role, Verdict, Verdicts, WirePose,
+};
+pub use error::Error;
+pub use tls::Tls;
+
+#[cfg(doctest)]
+#[doc = include_str!("../../../docs/programs.md")]
+struct Programs;

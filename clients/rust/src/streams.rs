@@ -1,0 +1,125 @@
+//! The newest payloads of each topic, for any number of readers, none of whom holds up the others or the network.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use ecod::leadership::round_filter::EpochGate;
+use ecod::leadership::timers::EPOCH_MEMORY;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::wire::{
+    CellDescription, GlobalMap, Limits, NodeStatus, Payload, RejectReason, Reputations, Topic, Verdicts, decode,
+};
+
+/// All payloads of one connection.
+#[derive(Debug, Default)]
+pub(crate) struct Streams {
+    pub(crate) maps: Stream<GlobalMap>,
+    pub(crate) verdicts: Stream<Verdicts>,
+    pub(crate) reputations: Stream<Reputations>,
+    pub(crate) statuses: Stream<NodeStatus>,
+    pub(crate) descriptions: Stream<CellDescription>,
+}
+
+/// One kind of payload: the newest, of statuses the newest of each node.
+#[derive(Debug)]
+pub(crate) struct Stream<M> {
+    newest: BTreeMap<Option<NodeName>, (u64, Arc<M>)>,
+    number: u64,
+    gate: EpochGate,
+    admitted_at: Option<Instant>,
+}
+
+/// Nodes whose statuses are kept; beyond that the one that was heard longest ago gives way.
+const MAX_NODES: usize = 1024;
+
+/// Aggregator of reputations that name none.
+const UNNAMED: NodeName = NodeName::from_static("-");
+
+impl Streams {
+    /// Takes a payload. One that is rejected changes nothing.
+    pub(crate) fn take(&mut self, topic: Option<Topic>, payload: &[u8], now: Instant) -> Result<(), RejectReason> {
+        match topic {
+            Some(Topic::GlobalDetections) => {
+                self.maps.take(payload, now, |map| (map.epoch, Some(&map.aggregator), map.round))
+            }
+            Some(Topic::GlobalVerdicts) => {
+                self.verdicts.take(payload, now, |it| (it.epoch, Some(&it.aggregator), it.round))
+            }
+            Some(Topic::Reputations) => {
+                self.reputations.take(payload, now, |it| (it.epoch, it.aggregator.as_ref(), it.round))
+            }
+            Some(Topic::Cell) if payload.is_empty() => {
+                self.descriptions.newest.clear();
+                Ok(())
+            }
+            Some(Topic::Cell) => {
+                self.descriptions.put(None, decode(payload, &Limits::default())?);
+                Ok(())
+            }
+            Some(Topic::Nodes(node)) if payload.is_empty() => {
+                self.statuses.newest.remove(&Some(node));
+                Ok(())
+            }
+            Some(Topic::Nodes(node)) => {
+                let status = decode::<NodeStatus>(payload, &Limits::default())?;
+                if status.node != node {
+                    return Err(RejectReason::NodeMismatch);
+                }
+                self.statuses.put(Some(node), status);
+                Ok(())
+            }
+            _ => Err(RejectReason::UnknownTopic),
+        }
+    }
+}
+
+impl<M> Default for Stream<M> {
+    fn default() -> Self {
+        Self { newest: BTreeMap::new(), number: 0, gate: EpochGate::default(), admitted_at: None }
+    }
+}
+
+impl<M> Stream<M> {
+    /// Takes a round, unless it is earlier than the last by epoch, aggregator and number.
+    fn take(
+        &mut self,
+        payload: &[u8],
+        now: Instant,
+        order: impl Fn(&M) -> (u64, Option<&NodeName>, u64),
+    ) -> Result<(), RejectReason>
+    where
+        M: Payload,
+    {
+        let message: M = decode(payload, &Limits::default())?;
+        let (term, aggregator, round) = order(&message);
+        if self.admitted_at.is_some_and(|at| now.duration_since(at) >= EPOCH_MEMORY) {
+            // The cell may have begun anew.
+            self.gate = EpochGate::default();
+        }
+        self.gate.admit(&Epoch::new(term, aggregator.cloned().unwrap_or(UNNAMED)), round)?;
+        self.admitted_at = Some(now);
+        self.put(None, message);
+        Ok(())
+    }
+
+    fn put(&mut self, node: Option<NodeName>, message: M) {
+        self.number += 1;
+        self.newest.insert(node, (self.number, Arc::new(message)));
+        if self.newest.len() > MAX_NODES {
+            let oldest = self.newest.iter().min_by_key(|(_, (number, _))| *number).map(|(node, _)| node.clone());
+            oldest.and_then(|node| self.newest.remove(&node));
+        }
+    }
+
+    /// Number of the newest payload.
+    pub(crate) fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// The earliest of the newest payloads that came after the numbered one.
+    pub(crate) fn after(&self, number: u64) -> Option<(u64, Arc<M>)> {
+        self.newest.values().filter(|(at, _)| *at > number).min_by_key(|(at, _)| *at).cloned()
+    }
+}
