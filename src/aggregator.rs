@@ -76,13 +76,13 @@ pub struct Aggregator {
     rounds: RoundTrigger,
     pace: Option<Pace>,
     tracks: Option<Tracker>,
-    /// Whether tracking ends when the first location becomes known.
+    /// True if tracking ends when the first location becomes known.
     tracks_open_cell: bool,
     /// Reports that only tracking used, because a later one of their vehicle came before.
     overtaken: u64,
     vote: Option<Vote>,
     by_packets: bool,
-    /// Whether any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
+    /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
     voted: bool,
 }
 

@@ -11,7 +11,7 @@ use pathfinding::matrix::Matrix;
 
 /// A row and a column that may be assigned to each other.
 pub trait Candidate: Copy {
-    /// Whether the matrix of a cluster has a spare column for each row. Only the choice between assignments of equal
+    /// True if the matrix of a cluster has a spare column for each row. Only the choice between assignments of equal
     /// benefit depends on it.
     const SPARE_COLUMNS: bool = false;
 

@@ -10,7 +10,7 @@ pub struct ConfigError {
     pub key: String,
     /// The value found.
     pub value: String,
-    /// What would be accepted.
+    /// The allowed values.
     pub allowed: String,
 }
 

@@ -50,7 +50,7 @@ config_section! {
         /// Standard deviation in metres added to every reported covariance. Default 0.05. It covers errors of pose and
         /// map that vehicles cannot report.
         pub position_floor_m: f64 = 0.05, in 1e-4 to 100.0;
-        /// Whether a landmark takes at most one object of a report. Default true: two plates cannot share one parking
+        /// True if a landmark takes at most one object of a report. Default true: two plates cannot share one parking
         /// spot, and where gates overlap the nearer landmark may belong to another object. With false every object
         /// counts at the nearest landmark.
         pub one_to_one: bool = true;
@@ -137,7 +137,7 @@ impl Pace {
         }
     }
 
-    /// Whether an object names a known location or is within the gate of one.
+    /// True if an object names a known location or is within the gate of one.
     pub fn is_at_landmark(&self, object: &PerceivedObject) -> bool {
         let (landmarks, gate_m) = match self {
             Self::Paper(pace) => pace.places(),

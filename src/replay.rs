@@ -124,11 +124,11 @@ pub struct Replay {
     /// Lines that were read ahead, with their numbers.
     ahead: VecDeque<(u64, RecordedReport)>,
     cell: Option<Aggregator>,
-    /// Whether any report of each kind was used.
+    /// True where any report of each kind was used.
     heard: [bool; ReportKind::COUNT],
     /// Locations of an open cell.
     learnt: HashSet<LandmarkId>,
-    /// Whether a report waits for its round to close.
+    /// True if a report waits for its round to close.
     pending: bool,
     /// Line number of the newest line, blank ones included.
     number: u64,

@@ -29,7 +29,7 @@ pub struct Evidence {
     pub node: NodeName,
     /// The label that it stated.
     pub label: Label,
-    /// Whether the verdict was the same.
+    /// True if the verdict was the same.
     pub correct: bool,
 }
 

@@ -316,7 +316,7 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(6)]
     pub aggregator: Option<NodeName>,
-    /// Whether its broker, fuser and gateway work, so that it could lead; absent on a node that never leads.
+    /// True if its broker, fuser and gateway work, so that it could lead; absent on a node that never leads.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(7)]
     pub fit: Option<bool>,

@@ -75,7 +75,7 @@ struct Node {
 struct Cell {
     nodes: Vec<Node>,
     packets: Vec<Packet>,
-    /// Who led which epoch, counted by leaderships.
+    /// Number of leaderships of each epoch.
     led: BTreeMap<Epoch, usize>,
     crashes_left: usize,
     went_back: bool,
@@ -330,7 +330,7 @@ impl Cell {
 }
 
 impl CellModel {
-    /// Whether to let this state settle: it takes thousands of steps, so a fixed sample of the last ones has to do.
+    /// True if to let this state settle: it takes thousands of steps, so a fixed sample of the last ones has to do.
     fn settles(&self, cell: &Cell) -> bool {
         let clocks: u64 = cell.nodes.iter().map(|node| node.clock.micros() / 1000).sum();
         cell.steps.is_multiple_of(self.depth.min(20))

@@ -13,7 +13,8 @@ use syn::visit::{self, Visit};
 type Module = Vec<String>;
 
 /// Crates by name in paths, and their sources.
-const CRATES: [(&str, &str); 3] = [("ecod", "src"), ("ecod_actors", "actors/src"), ("ecod_lab", "lab/src")];
+const CRATES: [(&str, &str); 4] =
+    [("ecod", "src"), ("ecod_actors", "actors/src"), ("ecod_client", "clients/rust/src"), ("ecod_lab", "lab/src")];
 
 #[test]
 fn imports_run_downward_without_a_circle() {

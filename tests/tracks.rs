@@ -123,7 +123,7 @@ fn a_standby_leads_on_with_the_same_identities() {
     assert_eq!(ids(&next), ids(&map.unwrap()));
 }
 
-/// What `euclid` saw in the frames that were overtaken by the next is in the map too, once each; what comes later than
+/// Detections of `euclid` in frames that were overtaken by the next are in the map too, once each; one that comes later than
 /// the bound is not, and is counted.
 #[test]
 fn overtaken_reports_count_for_tracks_within_the_bound_and_not_for_known_locations() {

@@ -10,7 +10,7 @@ pub struct Timeliness {
 }
 
 impl Timeliness {
-    /// Whether an aggregator can work with these reports. If nearly all vehicles seem wrong, the fault is
+    /// True if an aggregator can work with these reports. If nearly all vehicles seem wrong, the fault is
     /// the aggregator's. A single vehicle proves nothing: it must not depose a leader.
     pub fn is_usable(self) -> bool {
         self.untimely < 2 || 4 * self.timely >= self.untimely

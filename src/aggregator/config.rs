@@ -24,12 +24,12 @@ pub enum Algorithms {
 }
 
 impl Algorithms {
-    /// Whether PACE is among them.
+    /// True if PACE is among them.
     pub fn pace(self) -> bool {
         self != Self::Vote
     }
 
-    /// Whether VOTE is among them.
+    /// True if VOTE is among them.
     pub fn vote(self) -> bool {
         self != Self::Pace
     }
@@ -57,7 +57,7 @@ pub struct FusionConfig {
 }
 
 impl FusionConfig {
-    /// Whether objects are tracked in a cell with or without known locations.
+    /// True if objects are tracked in a cell with or without known locations.
     pub fn tracks_objects(&self, has_landmarks: bool) -> bool {
         let is_wanted = match self.tracks.mode {
             TracksMode::Auto => !has_landmarks,
@@ -67,7 +67,7 @@ impl FusionConfig {
         self.algorithms.pace() && is_wanted
     }
 
-    /// Whether rounds yield evidence about vehicles in a cell with or without known locations.
+    /// True if rounds yield evidence about vehicles in a cell with or without known locations.
     pub fn rates_vehicles(&self, has_landmarks: bool) -> bool {
         self.algorithms.vote() || self.tracks_objects(has_landmarks)
     }

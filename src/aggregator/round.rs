@@ -63,7 +63,7 @@ pub struct RoundTrigger {
     due: usize,
     /// Length of the present round.
     length: Duration,
-    /// Whether it lasts that long even if all have reported.
+    /// True if it lasts that long even if all have reported.
     held: bool,
     /// Number of [`EARLY`] rounds that have begun.
     early: usize,
@@ -72,9 +72,9 @@ pub struct RoundTrigger {
 #[derive(Debug, Clone)]
 struct Reporter {
     last_report: Timestamp,
-    /// Whether it has reported in the present round.
+    /// True if it has reported in the present round.
     reported: bool,
-    /// Whether its report was due when the last round closed.
+    /// True if its report was due when the last round closed.
     due: bool,
 }
 

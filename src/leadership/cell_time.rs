@@ -53,7 +53,7 @@ pub enum ClockEvent {
 /// One node's knowledge of all clocks.
 #[derive(Debug, Clone)]
 pub struct CellTime {
-    /// Whether the node's own wall clock counts.
+    /// True if the node's own wall clock counts.
     is_candidate: bool,
     /// The node's wall clock less its steady clock; none before the first look.
     wall_offset_us: Option<i64>,
@@ -150,6 +150,11 @@ impl CellTime {
             let offset_us = cell_offset.saturating_add(offset_us);
             self.reading = Some(ClockReading { offset_us, error_us: Some(error_us) });
         }
+    }
+
+    /// Forgets the clock of a node that is not trusted any more. If it led, its successor goes by the others' clocks.
+    pub fn forget(&mut self, name: &NodeName) {
+        self.peers.remove(name);
     }
 
     /// Looks at the wall clock, `wall_offset_us` ahead of the steady one. A leader adjusts the cell's time.

@@ -25,16 +25,16 @@ pub struct ElectionConfig {
     /// Beats that must be missing in a row, and no round taken, before a leader counts as lost. Default 4. Fewer is
     /// faster, and takes lost packets for a lost leader more often.
     pub silence_beats: u32,
-    /// How long a node that starts listens before it may lead, in ms. Default 1200. Longer makes it surer to find the
+    /// Time for which a node that starts listens before it may lead, in ms. Default 1200. Longer makes it surer to find the
     /// leader that is there, and a lone vehicle wait.
     pub join_ms: u64,
-    /// How much longer each next candidate waits before it claims the lead, in ms. Default 60. Must exceed the
+    /// Time that each next candidate waits longer before it claims the lead, in ms. Default 60. Must exceed the
     /// network's usual delay. Otherwise two candidates claim at once, and one of them gives way.
     pub claim_step_ms: u64,
-    /// How long a better candidate must have been fit and heard before it is handed the lead, in ms. Default 3000.
+    /// Time for which a better candidate must be fit and heard before it is handed the lead, in ms. Default 3000.
     /// Longer suffers a node that comes and goes less, and stays with the substitute longer.
     pub stable_ms: u64,
-    /// How long a handover may take before the leader gives it up, in ms. Default 3000.
+    /// Time after which the leader gives up a handover, in ms. Default 3000.
     pub handover_ms: u64,
     /// A timer later than this was stalled, in ms; only this much of the delay counts as time. Default 40.
     pub stall_ms: u64,

@@ -210,7 +210,7 @@ impl Election {
         self.current_epoch().map(|epoch| &epoch.leader)
     }
 
-    /// Whether this node leads.
+    /// True if this node leads.
     pub fn is_leading(&self) -> bool {
         matches!(self.state, State::Leading(_))
     }
@@ -276,6 +276,10 @@ impl Election {
             return;
         }
         if message.term != self.terms.seen && !self.is_plausible(&mut message, now) {
+            return;
+        }
+        if !self.peers.is_in_sequence(&message, now) {
+            self.effects.push(ElectionEffect::CountImplausible { from: message.from });
             return;
         }
         if !self.peers.note(&message, now) {

@@ -32,13 +32,13 @@ pub struct HealthMonitor {
 /// The answer of the parts to a look at them.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct HealthSample {
-    /// Whether clients can connect to the node's own broker.
+    /// True if clients can connect to the node's own broker.
     pub broker_serves: bool,
     /// State of the gateway's links; none when it does not answer.
     pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
-    /// Whether the fuser runs.
+    /// True if the fuser runs.
     pub fuser_runs: bool,
-    /// Whether the fuser rejects nearly all vehicles' reports for their time.
+    /// True if the fuser rejects nearly all vehicles' reports for their time.
     pub rejects_reports: bool,
 }
 
@@ -62,7 +62,7 @@ impl HealthMonitor {
         self.look_at
     }
 
-    /// Whether to look at the parts now; the next look is then due [`HEALTH_PERIOD`] later.
+    /// True if to look at the parts now; the next look is then due [`HEALTH_PERIOD`] later.
     pub fn is_due(&mut self, now: Timestamp) -> bool {
         // A clock that was set back does not put the look off.
         self.look_at = self.look_at.min(now + HEALTH_PERIOD);
@@ -76,7 +76,7 @@ impl HealthMonitor {
     /// Notes the state of a link; true when an established one has broken and nothing listens there any more.
     pub fn note_link(&mut self, broker: &BrokerAddress, state: LinkState) -> bool {
         match state {
-            // Whether nothing listens there is not known yet.
+            // It is not known yet that nothing listens there.
             LinkState::Down | LinkState::Stalled => {
                 self.links.entry(broker.clone()).and_modify(|known| *known = state);
                 false
@@ -150,13 +150,13 @@ impl HealthMonitor {
         }
     }
 
-    /// Whether members on other machines are reached: by the node's own broker, unless it is `private` to this machine,
+    /// True if members on other machines are reached: by the node's own broker, unless it is `private` to this machine,
     /// or by an external one for as long as there is a link to it.
     pub fn reaches_others(&self, plane: &DataPlane, private: bool, no_other: bool) -> bool {
         !private || self.is_up(plane.external.as_ref(), no_other)
     }
 
-    /// Whether this node is logged in at a broker.
+    /// True if this node is logged in at a broker.
     pub fn is_logged_in(&self, broker: &BrokerAddress) -> bool {
         matches!(self.links.get(broker), Some(LinkState::Up | LinkState::Stalled))
     }

@@ -16,6 +16,11 @@
 //! this node follows, or followed a moment ago, or from another candidate than the lane's aggregator. Candidates
 //! accept nothing else themselves, so a lane that a candidate has invented for itself gets no further.
 //!
+//! A node that starts may hear a false claimant first, and follows it until the leader renews its term. So what an
+//! aggregator says of itself is on trial until its leadership was followed for [`EVIDENCE_TRIAL`]. Until then it counts
+//! here alone, as this node may be handed the lead. It is forgotten when another leader is followed, which tells of its
+//! predecessors what it knows. What an honest leader of a short time counted it tells again when it leads again.
+//!
 //! Nothing is sent here: methods return the shares to publish. The caller signs those of the node's own lanes. Time is
 //! counted in ticks of the publication period.
 
@@ -24,7 +29,7 @@ mod growth;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use crate::leadership::timers::{FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD};
+use crate::leadership::timers::{EVIDENCE_TRIAL, FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD};
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -41,7 +46,7 @@ const REPEATS: u32 = 3;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LedgerResync {
     name: NodeName,
-    /// Whether evidence is signed.
+    /// True if evidence is signed.
     is_signed: bool,
     ticks_per_snapshot: u32,
     /// The node's own leadership, while it leads.
@@ -53,7 +58,7 @@ pub struct LedgerResync {
     ticks: u32,
     /// The leader that was heard last.
     leader: Option<Epoch>,
-    /// Whether it is to have everything.
+    /// True if it is to have everything.
     owes_everything: bool,
     everything_sent_at: Option<Timestamp>,
     /// Evidence shared since it was first heard.
@@ -62,15 +67,23 @@ pub struct LedgerResync {
     wait: u32,
     /// Number of times that this will still happen.
     repeats: u32,
-    /// When each of the latest leaders was last followed.
-    followed: BTreeMap<NodeName, Timestamp>,
+    /// The latest leaders.
+    followed: BTreeMap<NodeName, Followed>,
     growth: GrowthLimit,
 }
 
-/// Outcome of a share that was merged.
+/// A leader that is followed or was a moment ago.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Followed {
+    /// Since when, without another leader.
+    since: Timestamp,
+    last: Timestamp,
+}
+
+/// Outcome of a share that was merged, or of a period that passed.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Merged {
-    /// Whether the ledger changed.
+    /// True if the ledger changed, or what of it is to be saved.
     pub is_news: bool,
     /// Reasons why entries were left out.
     pub refused: Vec<RejectReason>,
@@ -204,7 +217,7 @@ impl LedgerResync {
         if self.is_signed && !share.is_empty() && (share.signed.is_none() || share.lane().is_none()) {
             return Err(RejectReason::BadSignature);
         }
-        self.note_leader(leadership, now);
+        let has_judged = self.note_leader(ledger, leadership, now);
         let is_reset = self.take_reset(share, ledger, date);
         let is_over = !self.is_signed && share.reset_at_us.unwrap_or_default() < ledger.reset_at();
         let (mut taken, refused) =
@@ -227,10 +240,16 @@ impl LedgerResync {
         let present = present.as_ref();
         let taken = Arc::new(taken);
         let is_statement = self.is_signed && taken.lane().is_some_and(|lane| !self.has_counted(&lane, ledger));
-        let is_news =
-            if is_statement { ledger.merge_statement(&taken, present) } else { ledger.merge_share(&taken, present) };
+        let trial_ends_at =
+            self.trial_end(&share.node, now).filter(|_| taken.lane().is_some_and(|lane| lane.leader == share.node));
+        let is_news = match trial_ends_at {
+            Some(ends_at) if is_statement => ledger.merge_on_trial(&taken, present, ends_at),
+            None if is_statement => ledger.merge_statement(&taken, present),
+            Some(_) | None => ledger.merge_share(&taken, present),
+        };
         self.growth.note(&taken, ledger, now);
-        Ok(Merged { is_news: is_news | is_reset, refused, shares: self.take_everything(ledger, now) })
+        let is_news = is_news | is_reset | has_judged;
+        Ok(Merged { is_news, refused, shares: self.take_everything(ledger, now) })
     }
 
     /// The part of a share that is evidence for this node, and the reasons to leave out the rest.
@@ -275,7 +294,7 @@ impl LedgerResync {
         (taken, refused.into_iter().collect())
     }
 
-    /// Whether this node counted all that is known of a lane, and so signs it.
+    /// True if this node counted all that is known of a lane, and so signs it.
     fn has_counted(&self, lane: &Epoch, ledger: &ReputationLedger) -> bool {
         lane.leader == self.name && ledger.has_lane(lane) && !ledger.is_stated(lane)
     }
@@ -287,7 +306,7 @@ impl LedgerResync {
         self.lane.as_ref().or(self.leader.as_ref().filter(is_of_leader))
     }
 
-    /// Whether a candidate may tell of a lane.
+    /// True if a candidate may tell of a lane.
     fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
         let is_counting = |present: &Epoch| present == lane || self.lane_of_leader(leadership) == Some(lane);
         if leadership.present_epoch().is_some_and(is_counting) {
@@ -296,12 +315,21 @@ impl LedgerResync {
         !self.is_signed || *sender != lane.leader || self.followed.contains_key(sender)
     }
 
-    /// Notes who leads. The last word of a leader may come when another leads already.
-    fn note_leader(&mut self, leadership: &Leadership, now: Timestamp) {
-        self.followed.retain(|_, at| now.since(*at) < LAST_WORD_TIME);
-        if let Some(leader) = leadership.leader() {
-            self.followed.insert(leader.clone(), now);
+    /// Notes who leads; true if a trial of evidence ended. The last word of a leader may come when another leads already.
+    fn note_leader(&mut self, ledger: &mut ReputationLedger, leadership: &Leadership, now: Timestamp) -> bool {
+        let leader = leadership.leader();
+        if let Some(leader) = leader {
+            let latest = self.followed.iter().max_by_key(|(_, followed)| followed.last);
+            let since = latest.filter(|(latest, _)| *latest == leader).map_or(now, |(_, followed)| followed.since);
+            self.followed.insert(leader.clone(), Followed { since, last: now });
         }
+        self.followed.retain(|_, followed| now.since(followed.last) < LAST_WORD_TIME);
+        ledger.end_trials(now, |lane| leader.is_some_and(|leader| ![&lane.leader, &self.name].contains(&leader)))
+    }
+
+    /// End of the trial of what a leader tells of itself, unless it is over.
+    fn trial_end(&self, leader: &NodeName, now: Timestamp) -> Option<Timestamp> {
+        self.followed.get(leader).map(|followed| followed.since + EVIDENCE_TRIAL).filter(|ends_at| *ends_at > now)
     }
 
     /// Forgets all evidence if the share knows of a later reset than this node; true if it does.
@@ -315,8 +343,8 @@ impl LedgerResync {
     }
 
     /// Lets a publication period pass.
-    pub fn tick(&mut self, ledger: &ReputationLedger, leadership: &Leadership, now: Timestamp) -> Vec<LedgerShare> {
-        self.note_leader(leadership, now);
+    pub fn tick(&mut self, ledger: &mut ReputationLedger, leadership: &Leadership, now: Timestamp) -> Merged {
+        let is_news = self.note_leader(ledger, leadership, now);
         if self.growth.len() > 2 * MAX_ENTRIES {
             self.growth.retain(|lane| ledger.has_lane(lane));
         }
@@ -329,7 +357,7 @@ impl LedgerResync {
                 shares.extend(self.snapshot(ledger));
             }
         }
-        shares
+        Merged { is_news, refused: Vec::new(), shares }
     }
 
     /// All evidence, or one share that says that there is none: a node that takes over waits for it, and a node that has

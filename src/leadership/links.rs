@@ -14,7 +14,7 @@ use crate::model::time::Timestamp;
 pub struct DataPlane {
     /// A broker that belongs to no node and is used by all.
     pub external: Option<BrokerAddress>,
-    /// Whether the brokers of leader and standby are used. Without an external broker they always are. Beside one they
+    /// True if the brokers of leader and standby are used. Without an external broker they always are. Beside one they
     /// are if configured, so that nothing is switched when it goes or returns.
     pub embedded: bool,
 }

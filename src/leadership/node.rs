@@ -64,16 +64,18 @@ pub struct LeadershipNode {
     own_broker: Option<SocketAddr>,
     /// Last living run of each node, as brokers tell it.
     runs: BTreeMap<NodeName, Uuid>,
+    /// Leaders that a broker's word ended, and their runs by the membership.
+    disconnected: BTreeMap<NodeName, Option<u64>>,
     preparation: Option<Preparation>,
     /// Epoch of the last accepted round: a node without word from the election says that it follows it.
     accepted: Option<Epoch>,
     /// The leadership as told last.
     leadership: Leadership,
     status: NodeStatus,
-    /// Whether the gateway knows the status.
+    /// True if the gateway knows the status.
     is_status_told: bool,
     deadline: Timestamp,
-    /// Whether sockets are read before timers run, after a late wake-up.
+    /// True if sockets are read before timers run, after a late wake-up.
     is_draining: bool,
     effects: Vec<Effect>,
 }
@@ -110,6 +112,7 @@ impl LeadershipNode {
             is_deserted: false,
             own_broker: None,
             runs: BTreeMap::new(),
+            disconnected: BTreeMap::new(),
             preparation: None,
             accepted: status.aggregator.clone().map(|aggregator| Epoch::new(status.epoch, aggregator)),
             leadership: before.clone(),
@@ -301,7 +304,7 @@ impl LeadershipNode {
     }
 
     /// Notes a status. Where all use one broker, its word that the leader's connection broke is the quickest news of the
-    /// leader's end.
+    /// leader's end. Any member can give that word: it ends the leader once in each run, and later has it asked about.
     fn take_status(&mut self, status: &NodeStatus, now: Timestamp) {
         let peer = status.node.clone();
         if status.state != NodeState::Offline {
@@ -314,7 +317,10 @@ impl LeadershipNode {
         let has_ended = self.runs.remove(&peer) == Some(status.id);
         if has_ended && !self.links.plane().embedded && self.election.leader() == Some(&peer) {
             self.log(Notice::LeaderDisconnected { peer: peer.clone() });
-            self.feed(ElectionInput::PeerGone { peer }, now);
+            let run = self.members.run_of(&peer);
+            let is_first = self.disconnected.insert(peer.clone(), run) != Some(run);
+            let input = if is_first { ElectionInput::PeerGone { peer } } else { ElectionInput::PeerSuspected { peer } };
+            self.feed(input, now);
         }
     }
 
@@ -402,7 +408,7 @@ impl LeadershipNode {
         self.set_health(Health { broker: health.broker && is_reached, ..health }, now);
     }
 
-    /// Whether this node is logged in at a broker with which the challenger would lead: its own, or an external one. If
+    /// True if this node is logged in at a broker with which the challenger would lead: its own, or an external one. If
     /// none admits anybody, handing over would silence the cell. The challenger repeats that it is ready.
     fn is_served_by(&self, challenger: &NodeName) -> bool {
         let plane = self.links.plane();
@@ -411,7 +417,7 @@ impl LeadershipNode {
             || self.members.broker_of(challenger).is_some_and(|at| self.monitor.is_logged_in_at(challenger, &at))
     }
 
-    /// Whether the members reach the broker that this node would lead with; the first time that they do not is logged.
+    /// True if the members reach the broker that this node would lead with; the first time that they do not is logged.
     fn is_reached(&mut self, no_other: bool) -> bool {
         let is_private = self.own_broker.is_some_and(|broker| broker.ip().is_loopback());
         let is_reached = self.members.elsewhere().next().is_none()

@@ -12,7 +12,7 @@ use crate::model::time::Timestamp;
 /// Readiness of a node, and the reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Readiness {
-    /// Whether the node is ready.
+    /// True if the node is ready.
     pub ready: bool,
     /// The reason in words.
     pub reason: String,
@@ -30,6 +30,15 @@ impl Readiness {
     /// A node that is not ready.
     pub fn not(reason: String) -> Self {
         Self { ready: false, reason, needs_restart: true }
+    }
+
+    /// The readiness of the same node with a problem of its settings, if there is one, which no start anew mends.
+    #[must_use]
+    pub fn unless(self, problem: Option<String>) -> Self {
+        match problem {
+            Some(reason) => Self { ready: false, reason, needs_restart: self.needs_restart },
+            None => self,
+        }
     }
 
     /// Judges from the leadership, the epoch and arrival of the last accepted round, and whether a broker carries what
@@ -113,6 +122,20 @@ mod tests {
         let readiness = Readiness::judge(&deserted, Some(&(epoch(4), Timestamp(0))), true, None, Timestamp(0));
         assert_eq!(readiness.reason, "leading, but no follower can log in at this node's broker");
         assert_eq!((readiness.ready, readiness.needs_restart), (false, false));
+    }
+
+    #[test]
+    fn a_problem_of_settings_is_told_first_and_restarts_nothing() {
+        let following = Leadership { position: Position::Following, epoch: Some(epoch(4)), ..Leadership::default() };
+        let judge = |problem: Option<&str>, last_round: Option<&(Epoch, Timestamp)>| {
+            let judged = Readiness::judge(&following, last_round, false, TIMEOUT, Timestamp(0));
+            let Readiness { ready, reason, needs_restart } = judged.unless(problem.map(Into::into));
+            (ready, reason, needs_restart)
+        };
+        let fresh = (epoch(4), Timestamp(0));
+        assert_eq!(judge(None, Some(&fresh)), (true, "following edge".into(), false));
+        assert_eq!(judge(Some("no origin"), Some(&fresh)), (false, "no origin".into(), false));
+        assert_eq!(judge(Some("no origin"), None), (false, "no origin".into(), true), "rounds are missing, too");
     }
 
     #[test]

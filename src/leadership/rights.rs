@@ -31,12 +31,12 @@ impl Rights {
     /// The rights of a node that never leads.
     pub const NONE: Self = Self { role: Role::Cav, priority: 0 };
 
-    /// Whether a node may lead at all.
+    /// True if a node may lead at all.
     pub fn may_lead(self) -> bool {
         self.role != Role::Cav
     }
 
-    /// Whether a node may declare this role and priority. A priority says nothing about a node that never leads.
+    /// True if a node may declare this role and priority. A priority says nothing about a node that never leads.
     pub fn allow(self, role: Role, priority: u8) -> bool {
         role == Role::Cav || rank(role) <= rank(self.role) && priority <= self.priority
     }

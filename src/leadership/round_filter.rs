@@ -57,9 +57,9 @@ pub struct AcceptedRound {
     pub epoch: Epoch,
     /// Its number.
     pub round: u64,
-    /// Whether it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no maps come.
+    /// True if it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no maps come.
     pub is_sign_of_life: bool,
-    /// Whether a new leader may go on from it. While nobody is known to lead, rounds of any term are accepted.
+    /// True if a new leader may go on from it. While nobody is known to lead, rounds of any term are accepted.
     pub is_known_term: bool,
 }
 

@@ -41,6 +41,7 @@
 //! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, whoever states them |
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
+//! | [`EVIDENCE_TRIAL`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a node follows a false claimant for less |
 //! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from a far future would be the last |
 //! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
 //! | [`MIN_CLOCK_JUMP`] | 1 s | [`MAX_ROUND_AGE`] | a report's age tells by which time, before or after a jump, it is stamped |
@@ -151,6 +152,9 @@ pub const MAX_CLOCK_SLEW: i64 = 5_000;
 
 /// Time after the end of a leadership in which evidence that its leader sends is still accepted.
 pub const LAST_WORD_TIME: Duration = Duration::from_secs(5);
+
+/// Time for which a leader is followed without another before others pass its evidence on.
+pub const EVIDENCE_TRIAL: Duration = Duration::from_secs(20);
 
 /// Maximum time by which the clock of the node that forgot all evidence may be ahead of this node's.
 pub const MAX_RESET_AHEAD: Duration = Duration::from_secs(24 * 3600);
@@ -284,6 +288,7 @@ mod tests {
             (config.response_timeout(), REDISCOVERY_TIME, "a restarted membership costs no leader"),
             (DISK_TIMEOUT, config.handover(), "a hung disk ends no handover"),
             (config.handover(), LAST_WORD_TIME, "the last evidence counts after a handover"),
+            (RENEWAL_PAUSE + 2 * config.idle_beat(), EVIDENCE_TRIAL, "a false claimant's evidence goes no further"),
             (config.response_timeout(), RENEWAL_PAUSE, "a renewal is heard by all before the next"),
             (FULL_RESYNC_PAUSE, Duration::from_secs(10), "a new leader is told before the next snapshot"),
         ] {

@@ -67,12 +67,12 @@ impl Leadership {
         self.epoch.as_ref().filter(|_| self.position != Position::Seeking)
     }
 
-    /// Whether this node leads.
+    /// True if this node leads.
     pub fn is_leading(&self) -> bool {
         self.position == Position::Leading
     }
 
-    /// Whether the election knows that a term was used. Only what nodes say with the cell's key makes a term known.
+    /// True if the election knows that a term was used. Only what nodes say with the cell's key makes a term known.
     pub fn knows_term(&self, term: u64) -> bool {
         term <= self.term
     }

@@ -47,7 +47,7 @@ impl BoundingBox {
         Point2::new((self.x_min + self.x_max) / 2.0, (self.y_min + self.y_max) / 2.0)
     }
 
-    /// Whether all edges are finite and the box has an area.
+    /// True if all edges are finite and the box has an area.
     pub fn is_valid(&self) -> bool {
         let edges = [self.x_min, self.y_min, self.x_max, self.y_max];
         edges.iter().all(|e| e.is_finite()) && self.width() > 0.0 && self.height() > 0.0

@@ -74,7 +74,7 @@ impl Covariance {
         Matrix2::new(self.xx, self.xy, self.xy, self.yy)
     }
 
-    /// Whether all entries are finite and the matrix is positive semi-definite up to rounding.
+    /// True if all entries are finite and the matrix is positive semi-definite up to rounding.
     pub fn is_valid(&self) -> bool {
         let (product, square) = (self.xx * self.yy, self.xy * self.xy);
         let finite = self.xx.is_finite() && self.yy.is_finite() && product.is_finite();

@@ -111,12 +111,12 @@ pub type Label = SmolStr;
 /// The id of a known location, such as `slot-0`. Cheap to clone.
 pub type LandmarkId = SmolStr;
 
-/// Whether a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
+/// True if a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
 pub fn is_label(text: &str) -> bool {
     (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(|c| c.is_control() || is_layout_control(c))
 }
 
-/// Whether a character breaks lines or turns the direction of the text around it: a label with one would show another's
+/// True if a character breaks lines or turns the direction of the text around it: a label with one would show another's
 /// text on pages and terminals (Unicode Technical Report 36, section 2.7).
 fn is_layout_control(c: char) -> bool {
     matches!(c, '\u{61C}' | '\u{200E}' | '\u{200F}' | '\u{2028}'..='\u{202E}' | '\u{2066}'..='\u{2069}')

@@ -70,7 +70,7 @@ struct Contestant<'a> {
     pairing: Pairing<'a>,
     /// Number of the object in the contests of the report.
     object: u32,
-    /// Whether the place is the object's nearest.
+    /// True if the place is the object's nearest.
     is_wish: bool,
     gate_sigmas: f64,
 }

@@ -67,7 +67,7 @@ pub fn landmarks_in_view(
     landmarks.iter().filter(in_view).map(|landmark| landmark.id.clone()).collect()
 }
 
-/// Whether a target that faces as the landmark does is inside the image and large enough.
+/// True if a target that faces as the landmark does is inside the image and large enough.
 fn is_readable(landmark: &Landmark, camera: &Pose, intrinsics: &Intrinsics, config: &ViewConfig) -> bool {
     let to_camera = camera.position - landmark.position;
     let towards_camera_rad = to_camera.y.atan2(to_camera.x);
@@ -115,7 +115,7 @@ impl Occluder {
         Self { range_m, bearing_rad, half_angle_rad }
     }
 
-    /// Whether any part of a target at the given range and bearing is behind this object; `width_share` is the visible
+    /// True if any part of a target at the given range and bearing is behind this object; `width_share` is the visible
     /// share of its width.
     fn hides(&self, range_m: f64, bearing_rad: f64, width_share: f64, config: &ViewConfig) -> bool {
         self.range_m + config.clearance_m < range_m

@@ -25,7 +25,7 @@ impl VirtualClock {
         self.now.unwrap_or_default()
     }
 
-    /// Whether a line is ahead of the present, or of most lines that follow, by at most the tolerance.
+    /// True if a line is ahead of the present, or of most lines that follow, by at most the tolerance.
     pub(super) fn is_plausible(&self, at: Timestamp, following: impl Iterator<Item = Timestamp>) -> bool {
         if self.now.is_some_and(|now| at.since(now) <= self.tolerance) {
             return true;

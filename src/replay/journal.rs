@@ -64,7 +64,7 @@ pub struct JournalSummary {
     pub rejected: BTreeMap<RejectReason, u64>,
     /// Entries and reports that were lost.
     pub missing: u64,
-    /// Whether it began in the middle of a run.
+    /// True if it began in the middle of a run.
     pub continued: bool,
     /// Maps and sets of verdicts.
     pub written: u64,

@@ -254,7 +254,7 @@ fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
     (landmarks.collect(), reports)
 }
 
-/// What a live node does until the round of the last report: reports as they come, timers at their deadlines.
+/// Output of a live node until the round of the last report: reports as they come, timers at their deadlines.
 fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]) -> Vec<FusedLine> {
     let ReplayConfig { aggregator, fusion, landmarks, .. } = config.clone();
     let mut cell = Aggregator::new(aggregator, 1, fusion, landmarks, reports[0].2);

@@ -31,6 +31,8 @@ pub struct ReputationLedger {
     pub(super) sizes: BTreeMap<NodeName, usize>,
     /// Signed shares of aggregators, by lane. They are not serialised with the counts.
     pub(super) statements: BTreeMap<Epoch, Statements>,
+    /// Signed shares on trial, by lane, and when the trial ends.
+    pub(super) on_trial: BTreeMap<Epoch, (Statements, Timestamp)>,
     /// Time of the last reset, in cells without certificates; 0 if there was none.
     pub(super) reset_at: Timestamp,
 }

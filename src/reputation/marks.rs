@@ -44,7 +44,7 @@ impl Marks {
         changed
     }
 
-    /// Whether a mark of this number is kept or would be, if it were inserted.
+    /// True if a mark of this number is kept or would be, if it were inserted.
     pub(super) fn would_keep(&self, number: u64) -> bool {
         number > 0 && is_kept(number, self.last().max(number))
     }

@@ -49,14 +49,14 @@ impl ReputationLedger {
         (entries, self.marks().filter(|mark| other.lacks_mark(mark)).collect())
     }
 
-    /// Whether a count is missing here or larger than here.
+    /// True if a count is missing here or larger than here.
     pub fn lacks_entry(&self, entry: &LedgerEntry) -> bool {
         let record = self.record_of(entry.epoch, &entry.aggregator, &entry.node);
         let counts = record.and_then(|record| record.labels.get(&entry.label));
         counts.is_none_or(|counts| counts.correct < entry.correct || counts.incorrect < entry.incorrect)
     }
 
-    /// Whether a mark is missing here and would be kept.
+    /// True if a mark is missing here and would be kept.
     pub fn lacks_mark(&self, mark: &LedgerMark) -> bool {
         let record = self.record_of(mark.epoch, &mark.aggregator, &mark.node);
         record.is_none_or(|record| record.marks.would_keep(mark.number) && !record.marks.has(mark.number))
@@ -76,7 +76,7 @@ impl ReputationLedger {
         self.lanes.last_key_value().is_some_and(|(last, _)| last > lane)
     }
 
-    /// Whether there is a lane.
+    /// True if there is a lane.
     pub fn has_lane(&self, lane: &Epoch) -> bool {
         self.lanes.contains_key(lane)
     }
@@ -160,6 +160,7 @@ impl ReputationLedger {
         self.resize(&lane.leader, self.size_of(lane), 0);
         self.lanes.remove(lane);
         self.statements.remove(lane);
+        self.on_trial.remove(lane);
     }
 
     /// Notes that so many counts and marks of an aggregator became so many.

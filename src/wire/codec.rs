@@ -114,7 +114,7 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     }
 }
 
-/// Whether the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not finite.
+/// True if the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not finite.
 fn is_at_non_finite_word(bytes: &[u8], error: &serde_json::Error) -> bool {
     let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
     // The column is at the first letter of the word or next to it.
@@ -288,7 +288,7 @@ mod tests {
         }
     }
 
-    /// Whether a number was rounded to no less than 11 significant bits.
+    /// True if a number was rounded to no less than 11 significant bits.
     fn near(read: f64, written: f64) -> bool {
         (read - written).abs() <= written.abs() / 2048.0
     }

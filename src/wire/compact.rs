@@ -20,7 +20,7 @@ use super::RejectReason;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// Whether the first byte of a payload is that of a compact one: an array, where JSON and CBOR with names have a map.
+/// True if the first byte of a payload is that of a compact one: an array, where JSON and CBOR with names have a map.
 pub(super) fn is_compact(first: u8) -> bool {
     const ARRAY: u8 = 4;
     first >> 5 == ARRAY
@@ -57,7 +57,7 @@ pub(crate) trait Form<T> {
         None
     }
 
-    /// Whether the field is left out.
+    /// True if the field is left out.
     fn is_nil(_value: &T) -> bool {
         false
     }
@@ -200,7 +200,7 @@ impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
     }
 }
 
-/// Whether a collection has more entries than `read`; one without a count ends with a break.
+/// True if a collection has more entries than `read`; one without a count ends with a break.
 fn has_more(d: &mut Decoder<'_>, count: Option<u64>, read: usize) -> Result<bool, decode::Error> {
     match count {
         Some(count) => Ok((read as u64) < count),

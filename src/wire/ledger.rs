@@ -61,7 +61,7 @@ impl LedgerShare {
         lanes.all(|lane| lane == (term, aggregator)).then(|| Epoch::new(term, aggregator.clone()))
     }
 
-    /// Whether it has neither counts nor marks.
+    /// True if it has neither counts nor marks.
     pub fn is_empty(&self) -> bool {
         self.entries.is_empty() && self.marks.is_empty()
     }

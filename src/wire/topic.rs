@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::model::names::NodeName;
 
-/// What a topic carries.
+/// Content of a topic.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Topic {
     /// A vehicle's reports for PACE.
@@ -27,7 +27,7 @@ pub enum Topic {
     Nodes(NodeName),
 }
 
-/// What a vehicle's report is for, told by the topic that it came on.
+/// Algorithm that a report is for, told by the topic that it came on.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ReportKind {
@@ -42,7 +42,7 @@ impl ReportKind {
     /// All kinds.
     pub const ALL: [Self; Self::COUNT] = [Self::Detections, Self::VoteDetections];
 
-    /// How many kinds there are; `kind as usize` is below it.
+    /// Number of kinds; `kind as usize` is below it.
     pub const COUNT: usize = 2;
 
     /// The topic of a node's reports of this kind.
@@ -81,7 +81,7 @@ impl Topics {
         format!("{}/{level}", self.root)
     }
 
-    /// What a full topic carries; `None` for a topic that is none of this cell's.
+    /// Content of a full topic; `None` for one that is not of this cell.
     pub fn parse(&self, path: &str) -> Option<Topic> {
         let level = path.strip_prefix(&self.root)?.strip_prefix('/')?;
         let (kind, node) = level.split_once('/').map_or((level, None), |(kind, node)| (kind, Some(node)));

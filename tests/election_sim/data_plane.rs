@@ -12,7 +12,7 @@ use ecod::leadership::round_filter::Origin;
 use ecod::leadership::timers::{ELECTED_SILENCE, EPOCH_MEMORY, MAX_ROUND_AGE};
 use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, LedgerShare, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, LedgerShare, LedgerSignature, SCHEMA_VERSION};
 
 use crate::node::{Accepted, Arrival, Map, address_of};
 use crate::world::{MS, World};
@@ -53,7 +53,7 @@ impl World {
         self.handle(to, Input::LinkChanged { broker: address_of(broker), state });
     }
 
-    /// Whether a node gets an answer of another's broker now.
+    /// True if a node gets an answer of another's broker now.
     fn reaches(&self, node: usize, broker: usize) -> bool {
         let there = &self.nodes[broker];
         let serves = there.machine.is_some() && there.broker_works && there.paused_until <= self.now;
@@ -129,7 +129,11 @@ impl World {
     /// Sends shares to all candidates that have a link to one of the brokers that the node publishes to; some are lost.
     pub(crate) fn share(&mut self, index: usize, shares: Vec<LedgerShare>) {
         let leads = self.nodes[index].lane.as_ref().map(|lane| lane.term);
-        for share in shares {
+        for mut share in shares {
+            if self.nodes[index].signs && !share.is_empty() {
+                let signature = LedgerSignature { certificate: String::new(), signature: String::new() };
+                share.signed.get_or_insert(signature);
+            }
             assert_eq!(share.epoch, leads, "{} shares what another leadership recorded as its own", share.node);
             for broker in self.brokers_of(index) {
                 for to in self.clients_of(broker).into_iter().filter(|to| *to != index) {
@@ -169,7 +173,7 @@ impl World {
         }
     }
 
-    /// Whether an accepted map may be shown to a driver: it is no repetition, none superseded, and not old.
+    /// Checks that an accepted map may be shown to a driver: it is no repetition, none superseded, and not old.
     fn judge(&self, to: usize, map: &Map) {
         let node = &self.nodes[to];
         let age = self.now - map.made_at;

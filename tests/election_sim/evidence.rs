@@ -42,14 +42,14 @@ impl Votes {
         Evidence { node, label, correct }
     }
 
-    /// Whether an entry counts no more votes than were settled.
+    /// True if an entry counts no more votes than were settled.
     fn hold(&self, entry: &LedgerEntry) -> bool {
         let LedgerEntry { epoch, aggregator, node, label, correct, incorrect } = entry.clone();
         let settled = self.counts.get(&EntryKey { lane: Epoch::new(epoch, aggregator), node, label });
         settled.is_some_and(|settled| correct <= settled.correct && incorrect <= settled.incorrect)
     }
 
-    /// Whether a mark holds the counts that a vehicle once had.
+    /// True if a mark holds the counts that a vehicle once had.
     fn passed(&self, mark: &LedgerMark) -> bool {
         let LedgerMark { epoch, aggregator, node, correct, incorrect, .. } = mark.clone();
         let course = self.courses.get(&(Epoch::new(epoch, aggregator), node));
@@ -90,13 +90,15 @@ impl World {
         let now = Timestamp(self.now).shifted(self.nodes[to].steady_clock);
         let node = &mut self.nodes[to];
         if let Ok(merged) = node.resync.merge(share, &mut node.ledger, &candidates, &node.leadership, now, now) {
-            self.judge_merge(to, share);
+            if !self.nodes[to].signs {
+                self.judge_merge(to, share);
+            }
             self.share(to, merged.shares);
             self.handle(to, Input::EvidenceReceived { from: share.node.clone() });
         }
     }
 
-    /// Whether a node knows what it was told of terms that its election knows. Of its present leadership only
+    /// Checks that a node has kept all that it was told of terms that its election knows. Of its present leadership only
     /// the leader tells.
     fn judge_merge(&self, to: usize, share: &LedgerShare) {
         let node = &self.nodes[to];
@@ -122,7 +124,8 @@ impl World {
         let lost = node.saved.beyond(&node.ledger);
         assert!(lost.0.is_empty() && lost.1.is_empty(), "{} forgot {lost:?}", node.name);
         node.saved.clone_from(&node.ledger);
-        let shares = node.resync.tick(&node.ledger, &node.leadership, now);
+        node.saved.end_trials(now, |_| true);
+        let shares = node.resync.tick(&mut node.ledger, &node.leadership, now).shares;
         self.share(index, shares);
         self.push_to(index, PUBLISH_PERIOD, Arrival::Keep);
     }
@@ -133,16 +136,20 @@ impl World {
         members.filter(|node| node.config.role != Role::Cav).map(|node| node.name.clone()).collect()
     }
 
-    /// All that the living candidates know.
+    /// All that the living candidates know. Signed evidence counts if another than its aggregator passes it on.
     pub(crate) fn known_evidence(&self) -> ReputationLedger {
         let mut all = ReputationLedger::default();
         for (_, node) in self.alive().filter(|(_, node)| node.config.role != Role::Cav) {
-            all.merge(&node.ledger);
+            if node.signs {
+                node.ledger.statements().for_each(|share| _ = all.merge_share(share, None));
+            } else {
+                all.merge(&node.ledger);
+            }
         }
         all
     }
 
-    /// Whether every living candidate knows all of `known`.
+    /// Checks that every living candidate knows all of `known`.
     pub(crate) fn everyone_knows(&self, known: &ReputationLedger) -> Result<(), String> {
         for (_, node) in self.alive().filter(|(_, node)| node.config.role != Role::Cav) {
             let (entries, marks) = known.beyond(&node.ledger);
@@ -153,7 +160,7 @@ impl World {
         Ok(())
     }
 
-    /// Whether every count, mark and total of a living node is made of votes that a leader settled, each once.
+    /// Checks that every count, mark and total of a living node is made of votes that a leader settled, each once.
     pub(crate) fn nothing_is_counted_twice(&self) -> Result<(), String> {
         for (_, node) in self.alive() {
             if let Some(entry) = node.ledger.entries().find(|entry| !self.votes.hold(entry)) {

@@ -245,18 +245,28 @@ fn a_leader_with_a_broken_part_makes_way() {
 /// Evidence about vehicles is counted once, and what any candidate knows when the faults end all know soon.
 #[test]
 fn no_evidence_is_lost_or_counted_twice() {
+    evidence_survives(false);
+}
+
+/// The same in cells with certificates, of what a candidate passes on: leaderships of some seconds may be forgotten.
+#[test]
+fn no_signed_evidence_is_lost_or_counted_twice() {
+    evidence_survives(true);
+}
+
+fn evidence_survives(signed: bool) {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);
         let nodes = world.nodes.len();
         let has_disks = world.random.chance(50);
-        world.nodes.iter_mut().for_each(|node| node.has_disk = has_disks);
+        world.nodes.iter_mut().for_each(|node| (node.has_disk, node.signs) = (has_disks, signed));
         start_all(&mut world);
         for _ in 0..world.random.between(1, 6) {
             plan_fault(&mut world, nodes);
         }
         let leaders_end = world.random.between(6 * SECOND, 10 * SECOND);
         world.run_for(leaders_end);
-        // What they learnt last only some candidates have heard of.
+        // Only some candidates have heard of their last counts.
         for leader in world.leaders() {
             world.plan(0, Fault::Kill { node: leader, seen: true });
         }

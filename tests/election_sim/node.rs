@@ -19,7 +19,7 @@ use ecod::reputation::ReputationLedger;
 use ecod::wire::{LedgerShare, NodeStatus};
 use uuid::Uuid;
 
-/// What can happen to a cell.
+/// An event in a cell.
 #[derive(Debug, Clone)]
 pub(crate) enum Fault {
     /// The process starts, with its disk.
@@ -146,7 +146,9 @@ pub(crate) struct Node {
     pub(crate) ledger: ReputationLedger,
     /// The ledger on disk.
     pub(crate) saved: ReputationLedger,
-    /// Whether ledgers survive the process; terms do in any case.
+    /// True if evidence is signed.
+    pub(crate) signs: bool,
+    /// True if ledgers survive the process; terms do in any case.
     pub(crate) has_disk: bool,
     /// The leadership as the machine told it.
     pub(crate) leadership: Leadership,
@@ -193,6 +195,7 @@ impl Node {
             publishers: PublisherFilter::default(),
             ledger: ReputationLedger::default(),
             saved: ReputationLedger::default(),
+            signs: false,
             has_disk: true,
             leadership: Leadership::default(),
             accepted: Vec::new(),
@@ -233,7 +236,8 @@ impl Node {
         self.closed = (0, now);
         self.publishers = PublisherFilter::default();
         self.lane = None;
-        self.resync = LedgerResync::new(self.name.clone(), TICKS_PER_SNAPSHOT);
+        let resync = if self.signs { LedgerResync::signed } else { LedgerResync::new };
+        self.resync = resync(self.name.clone(), TICKS_PER_SNAPSHOT);
         if !self.has_disk {
             self.saved = ReputationLedger::default();
         }
@@ -281,7 +285,7 @@ impl Node {
         if self.fuser_works { closed + (now - since) / 100_000 } else { closed }
     }
 
-    /// What broker, gateway and fuser answer.
+    /// Answers of broker, gateway and fuser.
     pub(crate) fn sample(&self) -> HealthSample {
         let links = || self.links.iter().map(|(broker, state)| (address_of(*broker), *state)).collect();
         let links = self.gateway_works.then(links);

@@ -37,7 +37,7 @@ pub(crate) struct World {
     pub(crate) packets: u64,
     /// Largest extra delay of every timer in µs: a busy machine.
     pub(crate) lateness: u64,
-    /// What to print when a check fails.
+    /// Text to print when a check fails.
     pub(crate) history: Vec<String>,
     pub(crate) votes: Votes,
     cuts: BTreeSet<(usize, usize)>,
@@ -275,7 +275,7 @@ impl World {
         }
     }
 
-    /// What a membership would find out, a while later and node by node.
+    /// Gives the nodes the news of a membership, a while later and node by node.
     fn gossip(&mut self) {
         for to in 0..self.nodes.len() {
             for about in 0..self.nodes.len() {
@@ -301,12 +301,12 @@ impl World {
         self.push(100 * MS, Event::Gossip);
     }
 
-    /// How many packets were sent to a node, there or not.
+    /// Number of packets that were sent to a node, there or not.
     pub(crate) fn packets_to(&self, index: usize) -> u64 {
         self.nodes[index].packets
     }
 
-    /// Whether a connection between two nodes works, which needs both directions.
+    /// True if a connection between two nodes works, which needs both directions.
     pub(crate) fn linked(&self, a: usize, b: usize) -> bool {
         !self.cuts.contains(&(a, b)) && !self.cuts.contains(&(b, a))
     }

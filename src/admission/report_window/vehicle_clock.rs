@@ -186,7 +186,7 @@ impl VehicleClock {
         Some(Admitted::InOrder(captured.shifted(bounds.to_aggregator(least))))
     }
 
-    /// Whether a later report was admitted.
+    /// True if a later report was admitted.
     fn is_overtaken(&self, report: &ObjectReport) -> bool {
         (report.captured_at_us, Some(report.seq)) <= (self.last_captured, self.last_seq)
     }
@@ -215,13 +215,13 @@ impl VehicleClock {
         Ok(())
     }
 
-    /// Whether a delay fits the clock that is known.
+    /// True if a delay fits the clock that is known.
     fn is_known(&self, delay: i64, bounds: Bounds) -> bool {
         let least = self.delay.least();
         least != i64::MAX && (-bounds.slack()..=bounds.max_age).contains(&delay.saturating_sub(least))
     }
 
-    /// Whether the clock estimate rests on a single report that was ahead, and this report is not.
+    /// True if the clock estimate rests on a single report that was ahead, and this report is not.
     fn is_contradicted(&self, captured: Timestamp, delay: i64, bounds: Bounds) -> bool {
         let least = self.delay.least();
         self.delay.observed() == 1
@@ -230,7 +230,7 @@ impl VehicleClock {
             && delay.saturating_sub(least) > bounds.slack()
     }
 
-    /// Whether the timestamp is too far ahead of all before, and the previous report does not confirm it.
+    /// True if the timestamp is too far ahead of all before, and the previous report does not confirm it.
     fn is_suspect(&mut self, captured: Timestamp, delay_us: i64, slack_us: i64) -> bool {
         let before = self.suspect.take();
         let least = self.delay.least();

@@ -221,3 +221,18 @@ fn stamps_of_a_liar_are_survived() {
     let others = [cell.errors()[0], cell.errors()[2]];
     assert!(others.iter().all(|error| error.abs() < 5_000), "{others:?}");
 }
+
+#[test]
+fn a_leader_that_is_not_trusted_any_more_has_no_say_in_its_successors_time() {
+    let forged = 5 * SECOND_US;
+    let mut cell = Cell::new(&[(Role::Edge, 0, forged), (Role::Auto, 0, 0)]);
+    cell.run(3);
+    assert!(cell.errors()[1].abs_diff(forged) < 5_000);
+    let (gone, now) = (cell.nodes[0].name.clone(), cell.now);
+    cell.leader = 1;
+    let leadership = cell.leadership(1);
+    let successor = &mut cell.nodes[1];
+    successor.time.forget(&gone);
+    let events = successor.time.look(0, &leadership, now);
+    assert_eq!(cell.errors()[1], 0, "{events:?}");
+}

@@ -39,7 +39,7 @@ pub struct AnsweredStamps {
 }
 
 impl ClockStamps {
-    /// Whether all stamps are integers that a node sends.
+    /// True if all stamps are integers that a node sends.
     pub(super) fn is_plausible(&self) -> bool {
         let answered = self.answers.map(|answered| [answered.sent_us, answered.received_us]);
         let stamps = [Some(self.sent_us), self.wall_us, self.cell_us].into_iter().flatten();

@@ -116,8 +116,8 @@ pub enum ElectionEffect {
         /// The leader that hands over.
         leader: NodeName,
     },
-    /// Count a message of this node that states a term or round beyond what a cell can have reached. The number has
-    /// changed nothing.
+    /// Count a message of this node with a term, round or sequence number beyond what can have been reached. The number
+    /// has changed nothing.
     CountImplausible {
         /// The sender.
         from: NodeName,

@@ -43,14 +43,14 @@ pub(super) struct Following {
     round_interval: Option<Duration>,
     /// Time at which this node heard the leader.
     pub(super) direct_at: Timestamp,
-    /// Whether a beat of this leadership was heard. Rounds, and the word of other nodes, may overtake messages that the
+    /// True if a beat of this leadership was heard. Rounds, and the word of other nodes, may overtake messages that the
     /// leader sent before it led.
     pub(super) has_beaten: bool,
     /// Time at which the leader said that it hears this node.
     pub(super) bidirectional_at: Timestamp,
     /// Time at which others heard the leader, at least.
     pub(super) indirect_heard_at: Timestamp,
-    /// Whether the membership gave the leader up since it was last heard.
+    /// True if the membership gave the leader up since it was last heard.
     pub(super) given_up: bool,
     /// Latest claim to lead by another node, with the time of the first one since the leader was last heard. It is followed
     /// if the leader is lost.
@@ -59,7 +59,7 @@ pub(super) struct Following {
     pub(super) asked_at: Option<Timestamp>,
     /// Time of the leader's last offer of the lead.
     pub(super) offered_at: Option<Timestamp>,
-    /// Whether this node is ready to take the lead.
+    /// True if this node is ready to take the lead.
     pub(super) prepared: bool,
 }
 

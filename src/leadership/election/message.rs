@@ -63,7 +63,7 @@ pub struct ElectionMessage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(8)]
     pub epoch: Option<Epoch>,
-    /// Whether the sender lately heard the addressee: links may work one way only.
+    /// True if the sender lately heard the addressee: links may work one way only.
     #[n(6)]
     pub hears_you: bool,
     /// Its content.
@@ -91,7 +91,7 @@ pub struct Candidacy {
     /// Its processor load in quarters, damped.
     #[n(2)]
     pub load: u8,
-    /// Whether broker, fuser and gateway all work.
+    /// True if broker, fuser and gateway all work.
     #[n(3)]
     pub fit: bool,
 }
@@ -166,7 +166,7 @@ pub enum Body {
         /// The round published last.
         #[n(1)]
         round: u64,
-        /// How many nodes follow and are heard.
+        /// Number of nodes that follow and are heard.
         #[n(2)]
         followers: u8,
         /// The epoch that this one succeeded, if any.

@@ -30,7 +30,7 @@ pub(super) struct Peer {
     pub(super) candidacy: Option<Candidacy>,
     /// Epoch that it follows or leads, by its own message.
     pub(super) epoch: Option<Epoch>,
-    /// Whether our last message to it said that we hear it.
+    /// True if our last message to it said that we hear it.
     pub(super) told: bool,
     /// Set while it refuses this node's leadership.
     refuses: bool,
@@ -50,6 +50,9 @@ pub(super) struct Peer {
     /// Time at which the membership gave it up, if it was not heard since.
     given_up_at: Option<Timestamp>,
 }
+
+/// Largest step of the sequence numbers of a node that is heard. A leader of 200 nodes sends 4000 messages a second.
+pub(super) const MAX_SEQ_STEP: u64 = 1 << 16;
 
 /// All other nodes that were ever heard of and not given up.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -109,7 +112,7 @@ impl Peers {
         peer.told
     }
 
-    /// Whether a peer follows a leadership of `leader` that is over, and has not been told so: each is told of once, as its
+    /// True if a peer follows a leadership of `leader` that is over, and has not been told so: each is told of once, as its
     /// answer is answered too.
     pub(super) fn correct(&mut self, name: &NodeName, leader: &NodeName, current: Option<&Epoch>) -> bool {
         let Some(peer) = self.table.get_mut(name) else { return false };
@@ -158,6 +161,15 @@ impl Peers {
     /// True if a peer cannot log in at the broker of `at`.
     pub(super) fn has_no_login(&self, name: &NodeName, at: &NodeName) -> bool {
         self.table.get(name).is_some_and(|peer| peer.no_login.contains(at))
+    }
+
+    /// True if a message's number can be that of its sender's next: messages are sent to each node, and some are lost.
+    pub(super) fn is_in_sequence(&self, message: &ElectionMessage, now: Timestamp) -> bool {
+        let known = self.table.get(&message.from).filter(|peer| peer.run == message.run);
+        known.is_none_or(|peer| {
+            let is_silent = peer.heard_at.is_none_or(|at| now.since(at) > self.contact_timeout);
+            is_silent || message.seq <= peer.seq.saturating_add(MAX_SEQ_STEP)
+        })
     }
 
     /// Notes what every message says about its sender; false for one that is repeated or overtaken.
@@ -229,17 +241,17 @@ impl Peers {
         }
     }
 
-    /// Whether a peer was heard lately.
+    /// True if a peer was heard lately.
     pub(super) fn hears(&self, name: &NodeName, now: Timestamp) -> bool {
         self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| now.since(at) <= self.contact_timeout)
     }
 
-    /// Whether a peer was heard at `since` or later.
+    /// True if a peer was heard at `since` or later.
     pub(super) fn heard_since(&self, name: &NodeName, since: Timestamp) -> bool {
         self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| at >= since)
     }
 
-    /// How many nodes heard lately follow a leader, by their own word. Parts share the certificate of their node, which
+    /// Number of nodes heard lately that follow a leader, by their own word. Parts share the certificate of their node, which
     /// counts once.
     pub(super) fn followers(&self, leader: &NodeName, now: Timestamp) -> usize {
         self.followers_of(leader, now).count()
@@ -251,7 +263,7 @@ impl Peers {
         self.table.iter().filter(move |(name, peer)| follows(peer) && is_node(name) && self.hears(name, now))
     }
 
-    /// Whether a peer could lead, as far as is known without having heard it lately.
+    /// True if a peer could lead, as far as is known without having heard it lately.
     pub(super) fn may_lead(&self, name: &NodeName, now: Timestamp) -> bool {
         self.table.get(name).is_some_and(|peer| {
             peer.candidacy.is_some_and(|candidacy| candidacy.may_lead())
@@ -259,7 +271,7 @@ impl Peers {
         })
     }
 
-    /// Whether a peer that a leader named its successor could still lead: the leader's word outweighs what the peer
+    /// True if a peer that a leader named its successor could still lead: the leader's word outweighs what the peer
     /// said of itself long ago.
     pub(super) fn may_succeed(&self, name: &NodeName, now: Timestamp) -> bool {
         let unfit =

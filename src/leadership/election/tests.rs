@@ -1,6 +1,7 @@
 use std::time::Duration;
 
 use super::message::{MAX_FIRST_TERM, MAX_ROUND_STEP};
+use super::peers::MAX_SEQ_STEP;
 use super::*;
 use crate::wire::Role;
 
@@ -76,6 +77,28 @@ fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
     assert_eq!(hear(2, MAX_TERM), (cell, true));
     assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), (cell, true));
     assert_eq!(hear(4, cell + 1), (cell + 1, false));
+}
+
+#[test]
+fn a_forged_sequence_number_mutes_nobody_that_is_heard() {
+    let mut election = euclid();
+    let hear = |election: &mut Election, seq, term, now| {
+        let status = Body::Status { over: None, no_login: Vec::new() };
+        let effects = election.handle(of_edge(seq, term, status), now);
+        (election.term(), is_counted(&effects))
+    };
+    assert_eq!(hear(&mut election, 1, 9, NOW), (9, false));
+    for forged in [2 + MAX_SEQ_STEP, (1 << 53) - 1, u64::MAX] {
+        assert_eq!(hear(&mut election, forged, 10, NOW), (9, true));
+    }
+    assert_eq!(hear(&mut election, 2, 11, NOW), (11, false), "the node itself is heard");
+    let mut now = NOW;
+    while now < NOW + Duration::from_secs(10) {
+        now = now + Duration::from_millis(50);
+        election.tick(now);
+    }
+    let (_, is_counted) = hear(&mut election, 10 * MAX_SEQ_STEP, 12, now);
+    assert!(!is_counted, "a node that was out of reach is far ahead");
 }
 
 #[test]
@@ -224,7 +247,7 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
     let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
     election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
     assert!(election.is_leading());
-    // What is true the other leader says itself.
+    // True news come from the other leader itself.
     election.handle(received(&edge, 3, Some(&lie), beat_after(election.epoch().cloned().as_ref())), now);
     assert_eq!(election.leader(), Some(&edge));
 }

@@ -48,12 +48,12 @@ impl GrowthLimit {
         limit
     }
 
-    /// Whether a count is plausible. The first one of a vehicle and label is noted by [`Self::note`].
+    /// True if a count is plausible. The first one of a vehicle and label is noted by [`Self::note`].
     pub(super) fn admits(&self, entry: &LedgerEntry, now: Timestamp) -> bool {
         self.admits_votes(&key_of(entry), entry.correct.saturating_add(entry.incorrect), now)
     }
 
-    /// Whether a mark is plausible.
+    /// True if a mark is plausible.
     pub(super) fn admits_mark(&self, mark: &LedgerMark, now: Timestamp) -> bool {
         let votes = mark.correct.saturating_add(mark.incorrect);
         votes == mark.number.saturating_mul(MARK_VOTES) && self.admits_votes(&key_of_mark(mark), votes, now)

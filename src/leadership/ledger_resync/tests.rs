@@ -1,5 +1,7 @@
 //! Evidence of others: whose is accepted, what it costs, and how it survives the end of leaders.
 
+mod trial;
+
 use super::growth::MAX_FIRST_VOTES;
 use super::*;
 use crate::leadership::view::Position;
@@ -15,6 +17,8 @@ struct Candidate {
     resync: LedgerResync,
     ledger: ReputationLedger,
     leadership: Leadership,
+    /// Time up to which it has waited, in ms.
+    now_ms: u64,
 }
 
 /// Publication periods between two snapshots.
@@ -23,7 +27,12 @@ const PERIOD: u32 = 10;
 impl Candidate {
     fn new(node: &str) -> Self {
         let leadership = Leadership { term: u64::MAX, ..Leadership::default() };
-        Self { resync: LedgerResync::new(name(node), PERIOD), ledger: ReputationLedger::default(), leadership }
+        Self {
+            resync: LedgerResync::new(name(node), PERIOD),
+            ledger: ReputationLedger::default(),
+            leadership,
+            now_ms: 0,
+        }
     }
 
     fn lead(&mut self, term: u64) {
@@ -43,13 +52,26 @@ impl Candidate {
 
     /// Lets snapshot periods pass; returns what is shared.
     fn wait(&mut self, periods: u32) -> Vec<LedgerShare> {
-        let tick = |_| self.resync.tick(&self.ledger, &self.leadership, Timestamp(0));
+        let now = Timestamp(self.now_ms * 1000);
+        let tick = |_| self.resync.tick(&mut self.ledger, &self.leadership, now).shares;
         (0..periods * PERIOD).flat_map(tick).collect()
+    }
+
+    /// Lets time pass, a publication period each second; returns what is shared.
+    fn wait_until(&mut self, at_ms: u64) -> Vec<LedgerShare> {
+        let mut shares = Vec::new();
+        while self.now_ms < at_ms {
+            self.now_ms = (self.now_ms + 1000).min(at_ms);
+            let now = Timestamp(self.now_ms * 1000);
+            shares.extend(self.resync.tick(&mut self.ledger, &self.leadership, now).shares);
+        }
+        shares
     }
 
     /// Takes in shares; returns what comes back.
     fn hear(&mut self, shares: &[LedgerShare]) -> Vec<LedgerShare> {
-        shares.iter().flat_map(|share| self.merge(share, 0).unwrap().shares).collect()
+        let now_ms = self.now_ms;
+        shares.iter().flat_map(|share| self.merge(share, now_ms).unwrap().shares).collect()
     }
 
     fn vehicles(&self) -> Vec<String> {
@@ -191,7 +213,7 @@ fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains
     b2.hear(&b1.wait(1));
     drop(b1);
     b2.lead(3);
-    // What the loser sends when the sides heal is lost: it is not yet linked to the winner's broker.
+    // The loser's messages when the sides heal are lost: it is not yet linked to the winner's broker.
     b2.resync.step_down();
     drop(b2.resync.snapshot(&b2.ledger));
     a.lead(4);
@@ -303,12 +325,14 @@ fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
     euclid.leadership = following(8, "gauss");
     euclid.hear(&sign(vec![share("gauss", Some(8), vec![slander(8, "gauss", 3)])]));
     assert_eq!(euclid.incorrect("gauss"), 3, "a leader is believed while it leads");
+    let over = EVIDENCE_TRIAL.as_millis() as u64;
+    euclid.wait_until(over);
     euclid.leadership = following(9, "edge");
     let late = sign(vec![share("gauss", None, vec![slander(8, "gauss", 4)])]);
-    euclid.merge(&late[0], 1000).unwrap();
+    euclid.merge(&late[0], over + 1000).unwrap();
     assert_eq!(euclid.incorrect("gauss"), 4, "and in its last word");
     let later = sign(vec![share("gauss", None, vec![slander(8, "gauss", 5)])]);
-    let merged = euclid.merge(&later[0], 1000 + LAST_WORD_TIME.as_millis() as u64).unwrap();
+    let merged = euclid.merge(&later[0], over + 1000 + LAST_WORD_TIME.as_millis() as u64).unwrap();
     assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Unattested][..]));
 }
 
@@ -323,6 +347,7 @@ fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificat
     }
     assert_eq!(said.len(), 3, "one signature for each round");
     euclid.hear(&said);
+    euclid.wait_until(EVIDENCE_TRIAL.as_millis() as u64);
     let news = share("leader", Some(8), Vec::new());
     (euclid.leadership, edge.leadership) = (following(8, "leader"), following(8, "leader"));
     euclid.hear(std::slice::from_ref(&news));

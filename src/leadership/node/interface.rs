@@ -23,7 +23,7 @@ pub struct NodeSettings {
     pub plane: DataPlane,
     /// Longest time between two rounds.
     pub round_period: Duration,
-    /// Whether the node keeps reputations, and so waits for evidence before it is handed the lead.
+    /// True if the node keeps reputations, and so waits for evidence before it is handed the lead.
     pub keeps_reputations: bool,
     /// The node's own status; state, epoch, aggregator and fitness follow the election.
     pub status: NodeStatus,
@@ -38,7 +38,7 @@ pub struct Member {
     pub run: u64,
     /// Its broker, if it has one.
     pub broker: Option<BrokerAddress>,
-    /// Whether it reaches this node's loopback address.
+    /// True if it reaches this node's loopback address.
     pub is_on_this_machine: bool,
 }
 
@@ -285,7 +285,7 @@ pub enum Notice {
 }
 
 impl NodeSettings {
-    /// Whether the node never leads.
+    /// True if the node never leads.
     pub(super) fn is_vehicle_only(&self) -> bool {
         self.election.role == Role::Cav
     }

@@ -32,7 +32,7 @@ impl Members {
         }
     }
 
-    /// Whether this run of a member is known.
+    /// True if this run of a member is known.
     pub(super) fn knows(&self, member: &Member) -> bool {
         self.living.get(&member.name).is_some_and(|known| known.run == member.run)
     }
@@ -47,6 +47,11 @@ impl Members {
         }
         let since = *self.missing_since.get_or_insert(now);
         if now.since(since) < REDISCOVERY_TIME { Vec::new() } else { missing }
+    }
+
+    /// The run of a living member.
+    pub(super) fn run_of(&self, name: &NodeName) -> Option<u64> {
+        self.living.get(name).map(|member| member.run)
     }
 
     /// The broker of a living member.

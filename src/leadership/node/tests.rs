@@ -187,6 +187,29 @@ fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
     scene.take(Input::StatusHeard { status: status(living, NodeState::Aggregating) });
     scene.take(Input::StatusHeard { status: status(living, NodeState::Offline) });
     assert!(scene.notices().contains(&&Notice::LeaderDisconnected { peer: name("edge") }));
+    assert_ne!(scene.machine.leadership.leader(), Some(&name("edge")));
+}
+
+/// Any member can say in the broker's place that the leader's connection broke.
+#[test]
+fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
+    let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
+    scene.take(Input::LinkChanged { broker: "10.0.0.9:1883".parse().unwrap(), state: LinkState::Up });
+    for (attempt, run, is_ended) in [(0, 1, true), (1, 1, false), (2, 1, false), (3, 2, true)] {
+        let edge = Member { run, ..member("edge", 2) };
+        scene.members = vec![edge.clone()];
+        scene.take(Input::MemberAlive { member: edge });
+        scene.run_for(1000);
+        let beat = Body::Beat { every_ms: 50, round: 40, followers: 2, after: None, successors: vec![name("euclid")] };
+        scene.hear_in(Epoch::new(7 + 2 * attempt, name("edge")), beat);
+        assert_eq!(scene.machine.leadership.leader(), Some(&name("edge")), "attempt {attempt}");
+        for state in [NodeState::Aggregating, NodeState::Offline] {
+            let (node, id) = (name("edge"), Uuid::from_u128(attempt.into()));
+            scene.take(Input::StatusHeard { status: NodeStatus { node, id, state, ..status(Role::Edge) } });
+        }
+        let is_gone = scene.machine.leadership.leader() != Some(&name("edge"));
+        assert_eq!(is_gone, is_ended, "attempt {attempt}");
+    }
 }
 
 #[test]

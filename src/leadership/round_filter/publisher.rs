@@ -23,7 +23,7 @@ struct Publisher {
 }
 
 impl PublisherFilter {
-    /// Whether a node may publish for all now.
+    /// True if a node may publish for all now.
     pub fn may_publish(&mut self, name: &NodeName, leadership: &Leadership, now: Timestamp) -> bool {
         match leadership.leader() {
             None => true,

@@ -25,7 +25,7 @@ struct LeadersDelay {
     /// Delay on which rounds agree that seem to have waited, or of which nobody knows: the leader's clock may have been
     /// set.
     candidate: Option<LiveStream>,
-    /// Whether the least delay is that of rounds that did not wait.
+    /// True if the least delay is that of rounds that did not wait.
     is_learnt: bool,
     /// True if the least delay is only a bound, until the rounds prove to be live.
     is_bound: bool,
@@ -90,7 +90,7 @@ impl StalenessFilter {
         Self { delay: None, newest_at: now, resumed_at: None }
     }
 
-    /// Whether a round of `epoch`, whose order is right, spent no more than [`MAX_ROUND_WAIT`] in queues. A node that was
+    /// True if a round of `epoch`, whose order is right, spent no more than [`MAX_ROUND_WAIT`] in queues. A node that was
     /// stopped, or a link that was, finds the rounds of that time waiting.
     ///
     /// The first round of a leadership is fresh: its clock is not known. After a time without rounds, since the start too,

@@ -29,15 +29,15 @@ fn max_rounds_in(time: Duration) -> u64 {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct SuccessionFilter {
     gate: EpochGate,
-    /// Whether any term is believed while nobody is known to lead.
+    /// True if any term is believed while nobody is known to lead.
     believes_any_term: bool,
     /// Arrival of the last admitted message; before any, of the first message.
     newest_at: Option<Timestamp>,
     elected: Option<Elected>,
     /// Time since when others than the elected are admitted, or it is not.
     others_since: Option<Timestamp>,
-    /// The elected epoch in which others have used up their credit.
-    overruled: Option<Epoch>,
+    /// The elected leader beside which others have used up their credit, also in terms that it renews.
+    overruled: Option<NodeName>,
     /// The publisher of a term that the election has not heard of while nobody is known to lead.
     stranger: Option<Stranger>,
 }
@@ -60,7 +60,7 @@ struct Stranger {
 }
 
 impl Elected {
-    /// Whether its standby may have taken over, or itself gone on in a later term, as after a split has healed. Leaders of
+    /// True if its standby may have taken over, or itself gone on in a later term, as after a split has healed. Leaders of
     /// the same term are rivals that began at the same time.
     fn is_succeeded_by(&self, epoch: &Epoch, round: u64, standby: Option<&NodeName>) -> bool {
         let goes_on = |last| round > last && round - last <= MAX_ROUNDS_AHEAD;
@@ -105,6 +105,7 @@ impl SuccessionFilter {
             elected.filter(|elected| self.elected.as_ref().is_none_or(|last| last.epoch != **elected))
         {
             self.elected = Some(Elected { epoch: elected.clone(), last_round: None, heard_at: received_at });
+            self.overruled.take_if(|leader| *leader != elected.leader);
         }
         match elected {
             Some(elected) if elected == epoch => self.admit_elected(epoch, round, received_at),
@@ -120,7 +121,7 @@ impl SuccessionFilter {
         }
     }
 
-    /// Whether an epoch that nobody vouches for is not to be believed yet.
+    /// True if an epoch that nobody vouches for is not to be believed yet.
     ///
     /// The election hears of terms from those who know the cell's key, at the latest when the next leader beats, and it
     /// knows of a term that is over. Without any election only who publishes on and on is believed, and of several the
@@ -156,7 +157,7 @@ impl SuccessionFilter {
             let since = *self.others_since.get_or_insert(received_at);
             if received_at.since(since) >= SUCCESSOR_CREDIT {
                 self.gate = EpochGate::default();
-                self.overruled = Some(epoch.clone());
+                self.overruled = Some(epoch.leader.clone());
             }
         }
         self.admit_in_order(epoch, round, received_at, true)?;
@@ -182,7 +183,7 @@ impl SuccessionFilter {
                 None if goes_on => false,
                 _ => !known.is_succeeded_by(epoch, round, standby),
             });
-            if usurps || self.overruled.as_ref() == Some(elected) {
+            if usurps || self.overruled.as_ref() == Some(&elected.leader) {
                 return Err(Refusal::NotElected);
             }
         }
@@ -276,6 +277,28 @@ mod tests {
             filter.admit(&forged, round + 1, at(100 * round + 50), &leadership).ok();
         }
         assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
+    }
+
+    /// Each claim of a later term makes the leader renew its own.
+    #[test]
+    fn one_that_poses_as_the_next_leader_is_not_believed_again_when_the_leader_renews_its_term() {
+        let forged = |term| epoch(term + 1, "euclid");
+        let mut filter = SuccessionFilter::new(0);
+        let mut lost = Vec::new();
+        for round in 0..1000 {
+            // Every 10 s.
+            let elected = epoch(7 + 2 * (round / 100), "edge");
+            let leadership = led_by(elected.clone(), Some("euclid"));
+            if filter.admit(&elected, round, at(100 * round), &leadership).is_err() {
+                lost.push(round);
+            }
+            filter.admit(&forged(elected.term), round + 1, at(100 * round + 50), &leadership).ok();
+        }
+        assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
+        let after = led_by(epoch(40, "gauss"), Some("euclid"));
+        assert_eq!(filter.admit(&epoch(40, "gauss"), 1001, at(100_100), &after), Ok(()));
+        let taken_over = filter.admit(&epoch(41, "euclid"), 1002, at(100_200), &after);
+        assert_eq!(taken_over, Ok(()), "beside another leader it has credit");
     }
 
     #[test]

@@ -8,7 +8,7 @@ pub(super) struct GridPoint {
     pub(super) position: Point2<f64>,
     /// Position of the landmark in configuration order.
     pub(super) landmark: u32,
-    /// Whether the landmark has a vacancy sign.
+    /// True if the landmark has a vacancy sign.
     pub(super) has_sign: bool,
 }
 
@@ -45,7 +45,7 @@ impl Grid {
         Self { cell_m, points, ends }
     }
 
-    /// Whether there are no points.
+    /// True if there are no points.
     pub(super) fn is_empty(&self) -> bool {
         self.points.is_empty()
     }

@@ -26,7 +26,7 @@ pub struct LandmarkIndex {
 pub struct LandmarkCandidate {
     /// Position of the landmark in configuration order.
     pub landmark: usize,
-    /// Whether the detection is the landmark's vacancy sign rather than an object in front of it.
+    /// True if the detection is the landmark's vacancy sign rather than an object in front of it.
     pub is_vacancy_sign: bool,
     /// Squared distance in standard deviations.
     pub mahalanobis_squared: f64,
@@ -128,7 +128,7 @@ impl LandmarkIndex {
         near(&self.objects, false).chain(signs.into_iter().flat_map(move |signs| near(signs, true)))
     }
 
-    /// Whether a label is the text of a landmark's vacancy sign.
+    /// True if a label is the text of a landmark's vacancy sign.
     fn reads_sign(&self, label: &Label, near: &GridPoint) -> bool {
         let sign = || self.landmarks[near.landmark as usize].vacancy.as_ref();
         near.has_sign && sign().is_some_and(|sign| sign.label == *label)

@@ -4,7 +4,7 @@ use super::{EDGE_PX, LineOfSight, ObjectSize};
 use crate::model::detection::BoundingBox;
 use crate::perception::camera::Intrinsics;
 
-/// Whether the image's left or right edge cuts the box.
+/// True if the image's left or right edge cuts the box.
 pub(super) fn is_clipped(bounds: &BoundingBox, camera: &Intrinsics) -> bool {
     bounds.x_min < EDGE_PX || bounds.x_max > f64::from(camera.width) - EDGE_PX
 }

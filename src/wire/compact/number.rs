@@ -116,7 +116,7 @@ impl Rounding {
     }
 }
 
-/// Whether the number is an integer of a single byte.
+/// True if the number is an integer of a single byte.
 fn is_short(value: f64) -> bool {
     value.fract() == 0.0 && (-24.0..24.0).contains(&value)
 }

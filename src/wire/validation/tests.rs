@@ -88,7 +88,7 @@ fn status() -> NodeStatus {
     }
 }
 
-/// What spoils a payload, and the reason that is then given.
+/// A change that spoils a payload, and the reason that is then given.
 type Flaw<T> = (fn(&mut T), RejectReason);
 
 /// Spoils a sound payload in every listed way and sends it; CBOR, because JSON has no word for NaN.
