@@ -80,13 +80,17 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::Permissions;
     use std::net::{TcpListener, UdpSocket};
+    use std::os::unix::fs::PermissionsExt;
+    use std::time::Duration;
 
     use ecod::model::names::NodeName;
     use ecod::wire::Role;
 
     use super::*;
     use crate::observe::recorder::RecordConfig;
+    use crate::transport::pki::{Authority, TlsConfig};
 
     fn config() -> NodeConfig {
         let mut config =
@@ -118,17 +122,40 @@ mod tests {
         assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0, "nothing is left behind");
     }
 
+    /// Issues certificates for 60 days into the directory.
+    fn certificates(config: &NodeConfig, directory: &Path) -> TlsConfig {
+        let (now, name) = (crate::platform::clock::now(), NodeName::from_static("edge"));
+        let mut authority = Authority::init(directory, &config.cell, now).unwrap();
+        authority.issue(&name, Role::Edge, Duration::from_secs(60 * 86_400), now).unwrap();
+        let (certificate, key) = authority.files_of(&name);
+        TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) }
+    }
+
+    #[tokio::test]
+    async fn a_private_key_is_for_the_node_and_the_programs_beside_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut config = config();
+        let files = certificates(&config, directory.path());
+        config.tls = Some(files.clone());
+        for (mode, verdict) in [
+            (0o600, CheckResult::Fine),
+            (0o640, CheckResult::Fine),
+            (0o644, CheckResult::Doubtful),
+            (0o660, CheckResult::Doubtful),
+        ] {
+            std::fs::set_permissions(&files.key, Permissions::from_mode(mode)).unwrap();
+            let finding = finding(&config, "certificates").await;
+            assert_eq!(finding.verdict, verdict, "{mode:o}: {finding:?}");
+        }
+    }
+
     #[tokio::test]
     async fn a_revocation_list_without_a_list_is_named() {
         let directory = tempfile::tempdir().unwrap();
-        let (mut config, now) = (config(), crate::platform::clock::now());
-        let name = NodeName::from_static("edge");
-        let mut authority = crate::transport::pki::Authority::init(directory.path(), &config.cell, now).unwrap();
-        authority.issue(&name, Role::Edge, std::time::Duration::from_secs(86_400), now).unwrap();
-        let ((certificate, key), list) = (authority.files_of(&name), authority.revocation_list());
-        std::fs::write(&list, "").unwrap();
-        let (ca, revocation_list) = (authority.ca(), Some(list));
-        config.tls = Some(crate::transport::pki::TlsConfig { ca, certificate, key, revocation_list });
+        let mut config = config();
+        let files = certificates(&config, directory.path());
+        std::fs::write(files.revocation_list.as_ref().unwrap(), "").unwrap();
+        config.tls = Some(files);
         let finding = finding(&config, "certificates").await;
         assert_eq!(finding.verdict, CheckResult::Broken);
         assert!(finding.seen.contains("revoked.pem") && finding.fix.unwrap().contains("revoked.pem"));

@@ -55,7 +55,7 @@ use builder::{NodeBuilder, cause};
 use description::HeldDescription;
 use restarts::Restarts;
 
-/// What the supervisor is asked to do; it stops by [`NodeHandle::stop`].
+/// Messages to the supervisor; it stops by [`NodeHandle::stop`].
 #[derive(Debug)]
 pub enum NodeMessage {
     /// Log how the node is.
@@ -72,7 +72,7 @@ pub enum NodeMessage {
     },
     /// This is how the node is.
     NoteReadiness {
-        /// Whether it does what it is there for.
+        /// Readiness for its task.
         readiness: Readiness,
     },
 }
@@ -113,7 +113,7 @@ pub struct NodeHandle {
     counters: Arc<Counters>,
 }
 
-/// How often a node logs how it is.
+/// Time between two log lines about a node's health.
 const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 
 /// Starts a node; `config` is taken as valid.
@@ -188,7 +188,7 @@ impl NodeHandle {
         self.members.clone()
     }
 
-    /// Who leads the cell, as it changes.
+    /// The cell's leadership, as it changes.
     pub fn leadership(&self) -> watch::Receiver<Leadership> {
         self.leadership.clone()
     }

@@ -6,4 +6,5 @@ pub mod content_hash;
 pub mod latest_slot;
 pub mod secret;
 pub mod state_file;
+pub mod state_writer;
 pub(crate) mod throttle;

@@ -115,7 +115,7 @@ fn links_in_the_documentation_lead_somewhere() {
     assert!(followed > 40, "only {followed} links found");
 }
 
-/// What a heading is called in links to it.
+/// Name of a heading in links to it.
 fn anchor(line: &str) -> String {
     let Some(words) = line.strip_prefix('#') else { return String::new() };
     let kept = words.trim_start_matches('#').trim().chars();

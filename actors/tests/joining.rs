@@ -3,14 +3,14 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
 use std::fs::{self, File};
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::net::UdpSocket;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-/// How long anything may take.
+/// Maximum time for anything.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn ecod_node(arguments: &[&str]) -> Command {
@@ -94,7 +94,9 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
     let elsewhere = tempfile::tempdir().unwrap();
     let again = fails(&["join", for_gauss, "--dir", elsewhere.path().to_str().unwrap()]);
     assert!(again.contains("the token was used already"), "{again}");
-    succeeds(&["join", for_euclid, "--dir", euclid]);
+    let mut join = ecod_node(&["join", "-", "--dir", euclid]).stdin(Stdio::piped()).spawn().unwrap();
+    writeln!(join.stdin.take().unwrap(), "{for_euclid}").unwrap();
+    assert!(join.wait().unwrap().success(), "the token comes from standard input");
     assert!(host.0.wait().unwrap().success(), "all have joined");
     let late = fails(&["join", for_euclid, "--dir", elsewhere.path().to_str().unwrap()]);
     assert!(late.contains("is `ecod-node invite` still running"), "{late}");

@@ -29,7 +29,7 @@ fn documented_schemas_are_those_of_the_code() {
     assert_eq!(documented, schemas.len(), "a schema of no payload in {}", directory.display());
 }
 
-/// What follows `before` in a line, up to `end`.
+/// The text after `before` in a line, up to `end`.
 fn values<'a>(text: &'a str, before: &'a str, end: char) -> BTreeSet<&'a str> {
     let rest = text.lines().filter_map(|line| line.split_once(before));
     rest.map(|(_, rest)| rest.split(end).next().unwrap_or(rest)).collect()

@@ -11,10 +11,10 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use tempfile::TempDir;
 
-/// How long anything may take.
+/// Maximum time for anything.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// What a service manager waits for a sign of life here.
+/// Time for which a service manager waits for a sign of life here.
 const WATCHDOG: Duration = Duration::from_secs(4);
 
 /// A node started as systemd does it, and the socket that it talks to; killed when dropped.
@@ -120,14 +120,14 @@ fn a_node_that_is_stopped_feeds_no_watchdog() {
     let edge = Service::start(&["--role", "edge", "--listen", "127.0.0.1:0"]);
     edge.hears("WATCHDOG=1");
     edge.signal(Signal::SIGSTOP);
-    // What was told before the signal arrived.
+    // Messages from before the signal.
     while edge.hear(Instant::now() + WATCHDOG / 20).is_some() {}
     assert_eq!(edge.hear(Instant::now() + WATCHDOG / 2), None);
     edge.signal(Signal::SIGCONT);
     edge.hears("WATCHDOG=1");
 }
 
-/// What a node that is told to stop as soon as it serves has logged.
+/// Log of a node that is told to stop as soon as it serves.
 fn log(arguments: &[&str]) -> Vec<String> {
     let mut command = program();
     command.args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"]).args(arguments);

@@ -84,7 +84,7 @@ fn node(config: &NodeConfig, directory: &Path, collector: &str) -> Child {
         .unwrap()
 }
 
-/// What was collected of one detection: by name, from frame to acceptance.
+/// Spans of one detection: by name, from frame to acceptance.
 struct Way {
     frame: Span,
     steps: Vec<Span>,
@@ -152,7 +152,7 @@ async fn a_detection_is_followed_from_the_frame_to_the_map_that_its_vehicle_acce
         "a frame's span lasts until it is published"
     );
 
-    // What was recorded last goes out as a node ends.
+    // The last spans go out as a node ends.
     for node in &mut nodes {
         drop(node.stdin.take());
         assert!(timeout(PATIENCE, node.wait()).await.unwrap().unwrap().success());

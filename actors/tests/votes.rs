@@ -158,7 +158,7 @@ async fn vehicles_that_disagree_get_a_verdict_and_reputations() {
     }
 }
 
-/// What the broker keeps for latecomers.
+/// Reputations that the broker retains.
 async fn retained_reputations(edge: &NodeHandle) -> Reputations {
     let broker = edge.broker_address().unwrap();
     let options = rumqttc::MqttOptions::new("latecomer", broker.ip().to_string(), broker.port());

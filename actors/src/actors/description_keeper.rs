@@ -11,12 +11,10 @@ use std::time::Duration;
 
 use ecod::description::{DescriptionEffect, DescriptionExchange, PUBLISH_INTERVAL};
 use ecod::leadership::Leadership;
-use ecod::leadership::timers::DISK_TIMEOUT;
 use ecod::model::names::NodeName;
 use ecod::wire::{CellDescription, RejectReason};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
-use tokio::task::JoinHandle;
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::description_keeper::DescriptionKeeperMessage;
@@ -24,6 +22,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::platform::clock;
 use crate::platform::content_hash::{content_hash, is_intact};
 use crate::platform::state_file::StateFile;
+use crate::platform::state_writer::StateWriter;
 use crate::telemetry::counters::{Counters, OTHERS};
 use crate::transport::gossip::Member;
 
@@ -60,10 +59,7 @@ pub struct DescriptionKeeper;
 pub struct DescriptionKeeperState {
     exchange: DescriptionExchange,
     name: NodeName,
-    file: Option<StateFile>,
-    is_unsaved: bool,
-    writing: Option<JoinHandle<std::io::Result<()>>>,
-    has_disk_failed: bool,
+    writer: StateWriter,
     apply: DescriptionSink,
     members: watch::Receiver<Vec<Member>>,
     leadership: watch::Receiver<Leadership>,
@@ -99,14 +95,15 @@ impl Actor for DescriptionKeeper {
         } = arguments;
         leadership.mark_changed();
         myself.send_interval(TICK, || DescriptionKeeperMessage::Tick);
-        Ok(DescriptionKeeperState {
+        let mut writer = StateWriter::new(file, "description of the cell");
+        if held.is_some() {
             // One that the node was started with is not on the disk yet.
-            is_unsaved: held.is_some(),
+            writer.note_change();
+        }
+        Ok(DescriptionKeeperState {
             exchange: DescriptionExchange::new(name.clone(), may_lead, held),
             name,
-            file,
-            writing: None,
-            has_disk_failed: false,
+            writer,
             apply,
             members,
             leadership,
@@ -154,8 +151,7 @@ impl Actor for DescriptionKeeper {
         };
         let has_adopted = effects.iter().any(|effect| matches!(effect, DescriptionEffect::Adopt { .. }));
         state.carry_out(effects);
-        // A disk that hangs holds up one message, and no other.
-        if has_adopted || is_tick && state.writing.as_ref().is_none_or(JoinHandle::is_finished) {
+        if has_adopted || is_tick {
             state.save().await;
         }
         Ok(())
@@ -169,7 +165,7 @@ impl DescriptionKeeperState {
                 DescriptionEffect::Adopt { description, stated_by } => {
                     let (stamp, set_by) = (description.stamp(), &description.set_by);
                     tracing::info!(%stamp, %set_by, %stated_by, "the cell has a new description");
-                    self.is_unsaved = true;
+                    self.writer.note_change();
                     (self.apply)(description);
                 }
                 DescriptionEffect::Publish { description } => {
@@ -182,29 +178,9 @@ impl DescriptionKeeperState {
         }
     }
 
-    /// Saves what has changed; a disk that fails or hangs is warned of, and the node goes on.
     async fn save(&mut self) {
-        let (Some(file), Some(held)) = (self.file.clone(), self.exchange.current()) else { return };
-        if self.is_unsaved && self.writing.is_none() {
-            let held = Arc::clone(held);
-            self.is_unsaved = false;
-            self.writing = Some(tokio::task::spawn_blocking(move || file.save(&*held)));
-        }
-        let Some(writing) = &mut self.writing else { return };
-        let written = match tokio::time::timeout(DISK_TIMEOUT, writing).await {
-            Ok(written) => {
-                self.writing = None;
-                written.map_err(std::io::Error::other).flatten()
-            }
-            Err(elapsed) => Err(elapsed.into()),
-        };
-        self.is_unsaved |= written.is_err();
-        let has_failed = std::mem::replace(&mut self.has_disk_failed, written.is_err());
-        if let Err(error) = written
-            && !has_failed
-        {
-            let path = self.file.as_ref().map(|file| file.path().display().to_string());
-            tracing::warn!(path, %error, "description of the cell not saved, tried again");
+        if let Some(held) = self.exchange.current() {
+            self.writer.save(|| CellDescription::clone(held)).await;
         }
     }
 }

@@ -56,7 +56,7 @@ pub struct DetectorState {
     optics: ImageSize,
     /// The last size mismatch, which is logged once.
     mismatch: Option<SizeMismatch>,
-    /// Whether the last frame failed; only the first failure in a row is logged.
+    /// True if the last frame failed; only the first failure in a row is logged.
     failing: bool,
     projector: ActorSlot<ProjectorMessage>,
     images: Option<ImageRecorder>,

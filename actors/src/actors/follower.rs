@@ -38,7 +38,7 @@ use crate::telemetry::spans::Spans;
 use crate::transport::broker::Door;
 use crate::transport::mqtt::Delivery;
 
-/// What a follower needs at its start.
+/// Arguments of a follower's start.
 pub struct FollowerArguments {
     /// Gets the newest of everything.
     pub newest: Newest,
@@ -49,7 +49,7 @@ pub struct FollowerArguments {
     pub recording: LogSender,
     /// The last term that an earlier run of the node wrote to disk.
     pub saved_term: u64,
-    /// Who leads.
+    /// The leadership, as it changes.
     pub leadership: watch::Receiver<Leadership>,
     /// Is told of the rounds taken.
     pub election: ActorSlot<LeaderElectionMessage>,

@@ -20,6 +20,7 @@ use ecod::aggregator::round::FirstRound;
 use ecod::aggregator::{Aggregator, Command, Fused};
 use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::replay::JournalEvent;
 use ecod::tracking::TracksLosses;
@@ -39,7 +40,7 @@ use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::{RoundReports, Spans};
 use crate::transport::mqtt::Delivery;
 
-/// What a fuser needs at its start.
+/// Arguments of a fuser's start.
 pub struct FuserArguments {
     /// The aggregator it drives.
     pub aggregator: Aggregator,
@@ -80,7 +81,7 @@ pub struct FuserState {
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
-    /// What the aggregator has left out so far and is counted already.
+    /// Losses of the aggregator that are counted already.
     losses: [u64; 4],
     spans: Spans,
     /// Reports of the present round, while their spans are recorded.
@@ -112,6 +113,7 @@ impl Actor for Fuser {
         match message {
             FuserMessage::TakeReports => state.take_reports(),
             FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
+            FuserMessage::ForgetMap { of } => state.forget_map(&of),
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
@@ -202,6 +204,10 @@ impl FuserState {
         if self.aggregator.leads().is_none() {
             self.last_map = Some((map, received_at));
         }
+    }
+
+    fn forget_map(&mut self, aggregator: &NodeName) {
+        self.last_map = self.last_map.take().filter(|(map, _)| map.aggregator != *aggregator);
     }
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {

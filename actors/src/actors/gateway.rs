@@ -72,7 +72,7 @@ pub struct GatewayState {
     role: SubscriptionRole,
     encoding: Encoding,
     report_brokers: Option<Vec<BrokerAddress>>,
-    /// Whether to subscribe to reports on every broker.
+    /// True if to subscribe to reports on every broker.
     watches_reports: bool,
     status: NodeStatus,
     status_topic: String,
@@ -227,7 +227,7 @@ impl GatewayState {
         self.role.filters().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
     }
 
-    /// Whether this node itself needs the reports on a broker.
+    /// True if this node itself needs the reports on a broker.
     fn takes_reports_of(&self, broker: &BrokerAddress) -> bool {
         match self.role {
             SubscriptionRole::Candidate => self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker)),
@@ -287,7 +287,7 @@ impl GatewayState {
         }
     }
 
-    /// Whether receivers with this node's limits accept a payload. A larger one would cut links, or every receiver would
+    /// True if receivers with this node's limits accept a payload. A larger one would cut links, or every receiver would
     /// drop it. The first of each topic is logged.
     fn fits<T: Payload>(&mut self, topic: &str, bytes: usize) -> bool {
         let limit = T::max_bytes(&self.setup.config.limits());

@@ -60,7 +60,7 @@ pub struct Parts {
     pub door: Door,
 }
 
-/// What an election needs at its start.
+/// Arguments of an election's start.
 pub struct LeaderElectionArguments {
     /// Settings of the node's leadership.
     pub settings: NodeSettings,

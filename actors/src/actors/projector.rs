@@ -13,6 +13,8 @@ use std::sync::Arc;
 use ecod::aggregator::Algorithms;
 use ecod::leadership::cell_time::ClockReading;
 use ecod::model::detection::Detection;
+use ecod::model::geometry::Pose;
+use ecod::model::origin::{GeographicOrigin, StatedPose};
 use ecod::model::time::Timestamp;
 use ecod::perception::pose_history::PoseHistory;
 use ecod::wire::{ObjectReport, ReportKind};
@@ -28,8 +30,12 @@ use crate::telemetry::counters::{Counters, Event};
 
 /// Arguments of a projector's start.
 pub struct ProjectorArguments {
-    /// Camera, pose and known locations.
+    /// Camera and known locations.
     pub perception: Perception,
+    /// The pose of a vehicle that stands still, if it is known.
+    pub standing: Option<Pose>,
+    /// The place of the cell's frame on Earth.
+    pub origin: Option<GeographicOrigin>,
     /// UDP address for the poses of a moving vehicle.
     pub poses: Option<SocketAddr>,
     /// Algorithms to report for.
@@ -49,8 +55,12 @@ pub struct Projector;
 /// Perception and motion of the vehicle.
 pub struct ProjectorState {
     perception: Perception,
+    standing: Option<Pose>,
+    origin: Option<GeographicOrigin>,
     /// Recent poses of a moving vehicle.
     poses: Option<PoseHistory>,
+    /// True once the log has said why a pose is not used.
+    is_pose_problem_logged: bool,
     algorithms: Algorithms,
     clock: CellClock,
     gateway: ActorSlot<GatewayMessage>,
@@ -69,13 +79,24 @@ impl Actor for Projector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let ProjectorArguments { perception, poses, algorithms, clock, gateway, counters } = arguments;
+        let ProjectorArguments { perception, standing, origin, poses, algorithms, clock, gateway, counters } =
+            arguments;
         let mut feed = JoinSet::new();
         if let Some(address) = poses {
             feed.spawn(pose_feed::listen(address, myself, Arc::clone(&counters)));
         }
-        let history = poses.map(|_| PoseHistory::default());
-        Ok(ProjectorState { perception, poses: history, algorithms, clock, gateway, counters, _feed: feed })
+        Ok(ProjectorState {
+            perception,
+            standing,
+            origin,
+            poses: poses.map(|_| PoseHistory::default()),
+            is_pose_problem_logged: false,
+            algorithms,
+            clock,
+            gateway,
+            counters,
+            _feed: feed,
+        })
     }
 
     async fn handle(
@@ -86,26 +107,47 @@ impl Actor for Projector {
     ) -> Result<(), ActorProcessingErr> {
         match message {
             ProjectorMessage::Report { detections, captured_at } => state.report(detections, captured_at),
-            ProjectorMessage::Configure { perception, algorithms } => {
+            ProjectorMessage::Configure { perception, standing, origin, algorithms } => {
                 state.perception = perception.continuing(&state.perception);
-                state.algorithms = algorithms;
+                (state.standing, state.algorithms) = (standing, algorithms);
+                state.move_to(origin);
             }
-            ProjectorMessage::TakePose { at, pose } => {
-                if state.poses.as_mut().is_some_and(|poses| !poses.push(at, pose)) {
-                    state.counters.count(Event::PoseRejected);
-                }
-            }
+            ProjectorMessage::TakePose { at, pose } => state.take_pose(at, &pose),
         }
         Ok(())
     }
 }
 
 impl ProjectorState {
-    fn report(&mut self, detections: Vec<Detection>, captured_at: Timestamp) {
-        if let Some(poses) = &self.poses {
-            let Some(pose) = poses.at(captured_at) else { return self.counters.count(Event::FrameWithoutPose) };
-            self.perception.set_pose(pose);
+    /// Goes on in a frame with this origin. Poses in another one are forgotten.
+    fn move_to(&mut self, origin: Option<GeographicOrigin>) {
+        if self.origin != origin {
+            self.origin = origin;
+            self.poses = self.poses.as_ref().map(|_| PoseHistory::default());
+            self.is_pose_problem_logged = false;
         }
+    }
+
+    fn take_pose(&mut self, at: Timestamp, stated: &StatedPose) {
+        let Some(poses) = &mut self.poses else { return };
+        let is_taken = match stated.in_map(self.origin.as_ref()) {
+            Ok(pose) => poses.push(at, pose),
+            Err(error) => {
+                if !std::mem::replace(&mut self.is_pose_problem_logged, true) {
+                    tracing::warn!(%error, "pose rejected, further ones are only counted");
+                }
+                false
+            }
+        };
+        if !is_taken {
+            self.counters.count(Event::PoseRejected);
+        }
+    }
+
+    fn report(&mut self, detections: Vec<Detection>, captured_at: Timestamp) {
+        let pose = self.poses.as_ref().map_or(self.standing, |poses| poses.at(captured_at));
+        let Some(pose) = pose else { return self.counters.count(Event::FrameWithoutPose) };
+        self.perception.set_pose(pose);
         let found = detections.len();
         let span = tracing::info_span!("project");
         let mut report = span.in_scope(|| self.perception.report(detections, captured_at));

@@ -22,14 +22,13 @@ use std::sync::Arc;
 use ecod::leadership::Leadership;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::node::Input;
-use ecod::leadership::timers::DISK_TIMEOUT;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig};
 use ecod::wire::{LedgerShare, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
-use tokio::task::{JoinHandle, JoinSet};
+use tokio::task::JoinSet;
 
 pub use config::ReputationKeeperConfig;
 #[cfg(fuzzing)]
@@ -45,23 +44,24 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
+use crate::platform::state_writer::{SaveOutcome, StateWriter};
 use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::Delivery;
 use crate::transport::pki::{Credentials, EvidenceSigner};
 use store::Saved;
 
-/// What a keeper needs at its start.
+/// Arguments of a keeper's start.
 pub struct ReputationKeeperArguments {
     /// The node's name.
     pub name: NodeName,
     /// The cell's name.
     pub cell: NodeName,
-    /// How evidence becomes reputations.
+    /// Rules by which evidence becomes reputations.
     pub reputation: ReputationConfig,
     /// Its rhythm.
     pub config: ReputationKeeperConfig,
-    /// What earlier runs of the actor knew; shared with whoever starts a fuser.
+    /// Knowledge of earlier runs of the actor; shared with whoever starts a fuser.
     pub reputations: SharedReputations,
     /// Where it is saved, if anywhere.
     pub file: Option<StateFile>,
@@ -71,7 +71,7 @@ pub struct ReputationKeeperArguments {
     pub newest: watch::Receiver<Option<Received<Reputations>>>,
     /// The other nodes.
     pub members: watch::Receiver<Vec<Member>>,
-    /// Who leads.
+    /// The leadership, as it changes.
     pub leadership: watch::Receiver<Leadership>,
     /// Where reputations and shares are published.
     pub gateway: ActorSlot<GatewayMessage>,
@@ -94,12 +94,12 @@ pub struct ReputationKeeperState {
     arguments: ReputationKeeperArguments,
     resync: LedgerResync,
     signer: Option<EvidenceSigner>,
+    /// The certificate under which this node's own counts were made, in base64.
+    certificate: Option<String>,
     last_round: u64,
     published: Option<(Epoch, u64)>,
-    unsaved: bool,
+    writer: StateWriter,
     unadopted: bool,
-    writing: Option<JoinHandle<std::io::Result<()>>>,
-    disk_failed: bool,
     /// Tasks that end with the actor.
     tasks: JoinSet<()>,
 }
@@ -172,18 +172,20 @@ impl ReputationKeeperState {
     fn new(arguments: ReputationKeeperArguments) -> Self {
         let (name, ticks_per_snapshot) = (arguments.name.clone(), arguments.config.ticks_per_snapshot());
         let credentials = arguments.credentials.clone();
+        let mut writer = StateWriter::new(arguments.file.clone(), "reputations");
+        // A run before may have left something.
+        writer.note_change();
         let resync = if credentials.is_some() { LedgerResync::signed } else { LedgerResync::new };
+        let signer = credentials.map(|credentials| EvidenceSigner::new(arguments.cell.clone(), credentials));
         Self {
             resync: resync(name, ticks_per_snapshot),
-            signer: credentials.map(|credentials| EvidenceSigner::new(arguments.cell.clone(), credentials)),
+            certificate: signer.as_ref().map(EvidenceSigner::certificate),
+            signer,
             arguments,
             last_round: 0,
             published: None,
-            // A run before may have left something.
-            unsaved: true,
+            writer,
             unadopted: false,
-            writing: None,
-            disk_failed: false,
             tasks: JoinSet::new(),
         }
     }
@@ -212,7 +214,9 @@ impl ReputationKeeperState {
         evidence: &[Evidence],
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     ) {
-        self.unsaved |= !evidence.is_empty() || reputations.is_some();
+        if !evidence.is_empty() || reputations.is_some() {
+            self.writer.note_change();
+        }
         let mut store = self.arguments.reputations.open();
         let shares = self.resync.record(epoch, evidence, &mut store.ledger);
         if let Some(reputations) = reputations {
@@ -261,7 +265,7 @@ impl ReputationKeeperState {
         }
         if merged.is_news {
             self.arguments.counters.count(Event::LedgerMerged);
-            self.unsaved = true;
+            self.writer.note_change();
             self.unadopted = true;
         }
         self.publish_shares(merged.shares);
@@ -274,10 +278,15 @@ impl ReputationKeeperState {
     }
 
     async fn tick(&mut self) {
-        self.settle().await;
         let leadership = self.arguments.leadership.borrow().clone();
-        let shares = self.resync.tick(&self.arguments.reputations.open().ledger, &leadership, clock::now());
-        self.publish_shares(shares);
+        let passed = self.resync.tick(&mut self.arguments.reputations.open().ledger, &leadership, clock::now());
+        if passed.is_news {
+            tracing::debug!("what a leader tells of itself is no longer on trial");
+            self.writer.note_change();
+            self.unadopted = true;
+        }
+        self.settle().await;
+        self.publish_shares(passed.shares);
     }
 
     /// Saves, publishes and uses what has changed.
@@ -327,44 +336,32 @@ impl ReputationKeeperState {
         }
     }
 
-    /// Drops the evidence of aggregators whose certificate was revoked; true if there was any.
+    /// Drops the evidence of aggregators whose certificate was revoked, and this node's own if it has a new certificate
+    /// since; true if there was any.
     fn drop_revoked(&mut self) -> bool {
         let Some(signer) = &mut self.signer else { return false };
+        let counted_under = self.certificate.replace(signer.certificate());
         let mut store = self.arguments.reputations.open();
-        let has_dropped = store.ledger.retain_statements(|share| signer.is_trusted(share));
+        let mut has_dropped = store.ledger.retain_statements(|share| signer.is_trusted(share));
+        if counted_under.is_some_and(|certificate| !signer.is_of_cell(&certificate)) {
+            has_dropped |= store.ledger.forget_own(&self.arguments.name);
+        }
         if has_dropped {
             tracing::info!(lanes = store.ledger.lanes(), "evidence of revoked nodes dropped");
-            (self.unsaved, self.unadopted) = (true, true);
+            self.writer.note_change();
+            self.unadopted = true;
         }
         has_dropped
     }
 
-    /// Saves what has changed; a disk that fails or hangs is counted, and the node goes on.
     async fn save(&mut self) {
-        let Some(file) = self.arguments.file.clone().filter(|_| self.unsaved) else { return };
-        if self.writing.is_none() {
-            let saved = Saved::of(&self.arguments.reputations.open(), &self.arguments);
-            self.unsaved = false;
-            self.writing = Some(tokio::task::spawn_blocking(move || file.save(&saved)));
-        }
-        let Some(writing) = &mut self.writing else { return };
-        let written = match tokio::time::timeout(DISK_TIMEOUT, writing).await {
-            Ok(written) => {
-                self.writing = None;
-                written.map_err(std::io::Error::other).flatten()
-            }
-            Err(elapsed) => Err(elapsed.into()),
-        };
-        let Err(error) = written else {
-            self.disk_failed = false;
-            self.arguments.counters.count(Event::ReputationsSaved);
-            return;
-        };
-        self.unsaved = true;
-        self.arguments.counters.count(Event::ReputationsNotSaved);
-        if !std::mem::replace(&mut self.disk_failed, true) {
-            let path = self.arguments.file.as_ref().map(|file| file.path().display().to_string());
-            tracing::warn!(path, %error, "reputations not saved");
+        let arguments = &self.arguments;
+        let outcome =
+            self.writer.save(|| Saved::of(&arguments.reputations.open(), self.certificate.as_ref(), arguments)).await;
+        match outcome {
+            SaveOutcome::Unchanged => {}
+            SaveOutcome::Written => self.arguments.counters.count(Event::ReputationsSaved),
+            SaveOutcome::Failed => self.arguments.counters.count(Event::ReputationsNotSaved),
         }
     }
 }

@@ -37,7 +37,7 @@ pub struct CameraConfig {
     /// Conditions for a location to be in view.
     #[serde(default)]
     pub view: ViewConfig,
-    /// Whether to vote on objects at known locations, in a cell that runs VOTE. Default true.
+    /// True if to vote on objects at known locations, in a cell that runs VOTE. Default true.
     #[serde(default = "yes")]
     pub votes: bool,
 }

@@ -94,7 +94,7 @@ pub enum SourceConfig {
     Video {
         /// The file.
         path: PathBuf,
-        /// Whether to restart at the end. Default false.
+        /// True if to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },
@@ -105,7 +105,7 @@ pub enum SourceConfig {
         /// Frames per second. Default 10.
         #[serde(default = "default_fps")]
         fps: f64,
-        /// Whether to restart at the end. Default false.
+        /// True if to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },

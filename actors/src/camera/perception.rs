@@ -75,10 +75,9 @@ impl Perception {
         Self { vehicle_camera, camera, projection, view, gate, seq: 0, discarded: DiscardCounts::default() }
     }
 
-    /// The same producer with the pose, the numbers of reports and the counts of an earlier one.
+    /// The same producer with the numbers of reports and the counts of an earlier one.
     #[must_use]
-    pub fn continuing(mut self, earlier: &Self) -> Self {
-        self.set_pose(earlier.vehicle_camera.pose);
+    pub fn continuing(self, earlier: &Self) -> Self {
         Self { seq: earlier.seq, discarded: earlier.discarded.clone(), ..self }
     }
 

@@ -4,10 +4,12 @@ use std::net::SocketAddr;
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::geometry::Pose;
+use ecod::model::origin::{GeographicPose, StatedPose};
 use ecod::model::time::Timestamp;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
-/// The vehicle's pose in the cell's east-north frame; `[pose]` in the configuration file.
+/// The vehicle's pose, in the cell's frame or on Earth; `[pose]` in the configuration file.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PoseConfig {
@@ -17,6 +19,19 @@ pub struct PoseConfig {
     pub y_m: f64,
     /// Heading in degrees, counter-clockwise from east. Default 0.
     pub heading_deg: f64,
+    /// Latitude (WGS 84) in degrees, north positive. With `longitude_deg` and `azimuth_deg` it replaces the keys above; the
+    /// cell needs an `[origin]` then. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub latitude_deg: Option<f64>,
+    /// Longitude in degrees, east positive. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub longitude_deg: Option<f64>,
+    /// Height above the ellipsoid in metres. Default that of the cell's origin.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height_m: Option<f64>,
+    /// Heading in degrees, clockwise from true north. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub azimuth_deg: Option<f64>,
     /// UDP address that receives poses from the vehicle's localisation. It replaces the keys above, and a frame without
     /// a pose near its time is not reported. Default none: the vehicle stands still.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -24,28 +39,68 @@ pub struct PoseConfig {
 }
 
 impl PoseConfig {
-    /// Checks every value.
+    /// Checks every value, and that they are of one kind.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the first key out of range.
+    /// [`ConfigError`] naming the first key that is out of range, missing or of the other kind.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("x_m", self.x_m, -1e8, 1e8)?;
         check_range("y_m", self.y_m, -1e8, 1e8)?;
-        check_range("heading_deg", self.heading_deg, -360.0, 360.0)
+        check_range("heading_deg", self.heading_deg, -360.0, 360.0)?;
+        let StatedPose::OnEarth(pose) = self.stated() else { return self.validate_in_map() };
+        for (key, value) in [("x_m", self.x_m), ("y_m", self.y_m), ("heading_deg", self.heading_deg)] {
+            if value != 0.0 {
+                let allowed = "absent beside `latitude_deg` and `longitude_deg`: the heading is `azimuth_deg`, clockwise \
+                               from true north";
+                return Err(ConfigError::new(key, value, allowed));
+            }
+        }
+        pose.validate()
+    }
+
+    /// Checks that no part of a pose on Earth stands alone.
+    fn validate_in_map(&self) -> Result<(), ConfigError> {
+        let parts = [
+            ("latitude_deg", self.latitude_deg),
+            ("longitude_deg", self.longitude_deg),
+            ("azimuth_deg", self.azimuth_deg),
+        ];
+        let missing = parts.iter().find(|(_, value)| value.is_none());
+        match missing {
+            Some((key, _)) if self.height_m.is_some() || parts.iter().any(|(_, value)| value.is_some()) => {
+                let allowed = "a number: a pose on Earth has `latitude_deg`, `longitude_deg` and `azimuth_deg`, its \
+                               heading clockwise from true north";
+                Err(ConfigError::new(*key, "nothing", allowed))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// The constant pose.
-    pub fn pose(&self) -> Pose {
-        Pose::new(self.x_m, self.y_m, self.heading_deg.to_radians())
+    pub fn stated(&self) -> StatedPose {
+        match (self.latitude_deg, self.longitude_deg, self.azimuth_deg) {
+            (Some(latitude_deg), Some(longitude_deg), Some(azimuth_deg)) => StatedPose::OnEarth(GeographicPose {
+                latitude_deg,
+                longitude_deg,
+                height_m: self.height_m,
+                azimuth_deg,
+            }),
+            _ => StatedPose::InMap(Pose::new(self.x_m, self.y_m, self.heading_deg.to_radians())),
+        }
     }
 }
 
-/// A received pose; unknown fields are ignored.
+/// A received pose in the cell's frame; unknown fields are ignored.
 #[derive(Debug, Deserialize)]
 struct PoseFix {
     x_m: f64,
     y_m: f64,
     heading_rad: f64,
+}
+
+/// The time of a received pose.
+#[derive(Debug, Deserialize)]
+struct FixTime {
     /// Unix time by this machine's clock. Default the time of receipt.
     captured_at_us: Option<Timestamp>,
 }
@@ -57,18 +112,36 @@ const WORLD_M: f64 = 1e8;
 ///
 /// ```json
 /// {"x_m": 4.2, "y_m": -1.0, "heading_rad": 1.57, "captured_at_us": 1732154400000000}
+/// {"latitude_deg": 52.2296756, "longitude_deg": 21.0122287, "azimuth_deg": 90.0}
 /// ```
 ///
 /// # Errors
 /// The problem as text.
-pub fn read_pose(datagram: &[u8], now: Timestamp, wall_offset_us: i64) -> Result<(Timestamp, Pose), String> {
-    let fix: PoseFix = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
+pub fn read_pose(datagram: &[u8], now: Timestamp, wall_offset_us: i64) -> Result<(Timestamp, StatedPose), String> {
+    let fix: Value = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
+    let time = FixTime::deserialize(&fix).map_err(|error| error.to_string())?;
+    let captured_at = time.captured_at_us.map(|wall| wall.shifted(wall_offset_us.saturating_neg()));
+    let is_on_earth = fix.get("latitude_deg").is_some();
+    let pose = if is_on_earth { on_earth(&fix).map(StatedPose::OnEarth) } else { in_map(&fix).map(StatedPose::InMap) };
+    Ok((captured_at.unwrap_or(now), pose?))
+}
+
+fn on_earth(fix: &Value) -> Result<GeographicPose, String> {
+    let pose = GeographicPose::deserialize(fix).map_err(|error| error.to_string())?;
+    let ConfigError { key, value, allowed } = match pose.validate() {
+        Ok(()) => return Ok(pose),
+        Err(error) => error,
+    };
+    Err(format!("`{key}`: {value} is not allowed, must be {allowed}"))
+}
+
+fn in_map(fix: &Value) -> Result<Pose, String> {
+    let fix = PoseFix::deserialize(fix).map_err(|error| error.to_string())?;
     let within = |value: f64, most: f64| value.abs() <= most;
     if !within(fix.x_m, WORLD_M) || !within(fix.y_m, WORLD_M) || !within(fix.heading_rad, 1e3) {
         return Err(format!("{fix:?} is not in this world"));
     }
-    let captured_at = fix.captured_at_us.map(|wall| wall.shifted(wall_offset_us.saturating_neg()));
-    Ok((captured_at.unwrap_or(now), Pose::new(fix.x_m, fix.y_m, fix.heading_rad)))
+    Ok(Pose::new(fix.x_m, fix.y_m, fix.heading_rad))
 }
 
 #[cfg(test)]
@@ -80,8 +153,19 @@ mod tests {
         let now = Timestamp(7);
         let told =
             read_pose(br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#, now, 2).unwrap();
-        assert_eq!(told, (Timestamp(3), Pose::new(1.0, -2.5, 3.1)));
+        assert_eq!(told, (Timestamp(3), StatedPose::InMap(Pose::new(1.0, -2.5, 3.1))));
         assert_eq!(read_pose(br#"{"x_m":1,"y_m":2,"heading_rad":0}"#, now, 2).unwrap().0, now);
+    }
+
+    #[test]
+    fn a_pose_on_earth_is_told_in_degrees() {
+        let told = read_pose(
+            br#"{"latitude_deg":52.2,"longitude_deg":21,"azimuth_deg":270,"captured_at_us":5}"#,
+            Timestamp(7),
+            0,
+        );
+        let pose = GeographicPose { latitude_deg: 52.2, longitude_deg: 21.0, height_m: None, azimuth_deg: 270.0 };
+        assert_eq!(told, Ok((Timestamp(5), StatedPose::OnEarth(pose))));
     }
 
     #[test]
@@ -91,9 +175,36 @@ mod tests {
             (b"{\"x_m\":1e12,\"y_m\":2,\"heading_rad\":0}", "world"),
             (b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":0,\"captured_at_us\":-1}", "invalid value"),
             (b"\xff\xfe", "line 1"),
+            (b"{\"latitude_deg\":52,\"longitude_deg\":21,\"heading_rad\":0}", "azimuth_deg"),
+            (b"{\"latitude_deg\":152,\"longitude_deg\":21,\"azimuth_deg\":0}", "`latitude_deg`: 152"),
         ] {
             let error = read_pose(datagram, Timestamp(0), 0).unwrap_err();
             assert!(error.contains(reason), "{error}");
         }
+    }
+
+    #[test]
+    fn a_configured_pose_is_all_in_the_frame_or_all_on_earth() {
+        let pose = |toml: &str| {
+            let pose: PoseConfig = toml::from_str(toml).unwrap();
+            pose.validate().map(|()| pose.stated()).map_err(|error| error.to_string())
+        };
+        let on_earth = "latitude_deg = 52.2\nlongitude_deg = 21\n";
+        assert_eq!(
+            pose("x_m = 1\nheading_deg = 180"),
+            Ok(StatedPose::InMap(Pose::new(1.0, 0.0, std::f64::consts::PI)))
+        );
+        let stated = pose(&format!("{on_earth}height_m = 113\nazimuth_deg = 90"));
+        assert!(matches!(stated, Ok(StatedPose::OnEarth(GeographicPose { height_m: Some(113.0), .. }))), "{stated:?}");
+        for (more, parts) in [
+            ("", ["`azimuth_deg`", "nothing"]),
+            ("azimuth_deg = 400", ["`azimuth_deg`", "400"]),
+            ("azimuth_deg = 90\nx_m = 2", ["`x_m`", "absent beside `latitude_deg`"]),
+            ("azimuth_deg = 90\nheading_deg = 2", ["`heading_deg`", "`azimuth_deg`, clockwise from true north"]),
+        ] {
+            let error = pose(&format!("{on_earth}{more}")).unwrap_err();
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+        assert!(pose("height_m = 113").unwrap_err().contains("`latitude_deg`"));
     }
 }

@@ -67,7 +67,8 @@ pub(super) struct InviteArguments {
 /// Flags of `join`.
 #[derive(Debug, Args)]
 pub(super) struct JoinArguments {
-    /// Token that `ecod-node invite` printed
+    /// Token that `ecod-node invite` printed; `-` reads it from standard input, so that no list of processes shows it
+    #[arg(value_parser = read_token)]
     token: Token,
     #[command(flatten)]
     node: NodeArguments,
@@ -195,7 +196,11 @@ pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
         let joined = redeem(&arguments.token).await?;
         directory.write(node, &joined.welcome, &joined.key)?;
         let cell = joined.welcome.cell.clone();
-        joined.keep().await.context("the files are there, but the host does not know it: it will wait in vain")?;
+        if let Err(error) = joined.keep().await {
+            directory.vacate()?;
+            let again = "run `ecod-node join` again with the same token while `ecod-node invite` still runs there";
+            return Err(anyhow!(error).context(format!("the host does not know that {node} has joined: {again}")));
+        }
         anyhow::Ok(cell)
     })?;
     print(&format!("{node} has joined the cell {cell}; its files are in {directory}\n"))?;
@@ -228,6 +233,16 @@ impl DirectoryArguments {
         directory.check_vacant().map_err(Failure::usage)?;
         Ok(directory)
     }
+}
+
+/// The token in an argument, or in a line of standard input.
+fn read_token(argument: &str) -> anyhow::Result<Token> {
+    let mut line = argument.to_owned();
+    if argument == "-" {
+        line.clear();
+        std::io::stdin().read_line(&mut line)?;
+    }
+    Ok(line.parse()?)
 }
 
 fn rights(role: Role) -> Rights {

@@ -87,7 +87,7 @@ fn resolved(format: LogFormat, is_service: bool) -> LogFormat {
     }
 }
 
-/// Whether standard error is connected to the journal. The variable alone may be inherited from another process.
+/// True if standard error is connected to the journal. The variable alone may be inherited from another process.
 fn stderr_is_journal() -> bool {
     let Some(stream) = std::env::var("JOURNAL_STREAM").ok() else { return false };
     std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))

@@ -43,7 +43,8 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
     let identity: &CertificateSubject = &current.identity;
     let left = identity.expires().since(clock::now());
     let shown = format!("for {}, {} days left", identity.name(), left.as_secs() / 86_400);
-    let is_public = std::fs::metadata(&files.key).is_ok_and(|metadata| metadata.permissions().mode() & 0o077 != 0);
+    // Programs beside the node may have it by their group.
+    let is_public = std::fs::metadata(&files.key).is_ok_and(|metadata| metadata.permissions().mode() & 0o037 != 0);
     Some(if left.is_zero() {
         Finding::broken(check, "expired", format!("`ecod-node pki issue {name}` creates a new one"))
     } else if let Some(error) = credentials.check_rights(config.role, config.election.priority).err() {
@@ -51,8 +52,8 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
     } else if is_public {
         Finding::doubtful(
             check,
-            format!("{} is readable by other users", files.key.display()),
-            format!("chmod 600 {}", files.key.display()),
+            format!("{} is readable by everyone, or may be written by others", files.key.display()),
+            format!("chmod 640 {}", files.key.display()),
         )
     } else if files.revocation_list.is_none() {
         Finding::doubtful(check, format!("{shown}, no revocation list"), "set `tls.revocation_list`")

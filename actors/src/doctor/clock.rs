@@ -10,7 +10,7 @@ const CHECK: &str = "clock";
 /// Files that time services write when they run or have set the clock.
 const MARKS: [&str; 2] = ["/run/systemd/timesync/synchronized", "/run/chrony/chronyd.pid"];
 
-/// Whether a time service keeps the clock. Aggregators estimate clock offsets, but larger ones cost accuracy, and they
+/// State of the service that keeps the clock. Aggregators estimate clock offsets, but larger ones cost accuracy, and they
 /// reject reports beyond `fusion.window.max_clock_offset_s`.
 pub(super) fn synchronised() -> Finding {
     let fix = "run a time service, such as `apt install chrony` or `timedatectl set-ntp true`";

@@ -14,7 +14,7 @@ use ecod::reputation::ReputationLedger;
 use ecod::wire::{GlobalMap, Reputation};
 use ractor::RpcReplyPort;
 
-/// What the fuser is asked to do.
+/// Messages to the fuser.
 #[derive(Debug)]
 pub enum FuserMessage {
     /// Fuse the reports that wait in its queue.
@@ -25,6 +25,11 @@ pub enum FuserMessage {
         map: Arc<GlobalMap>,
         /// When it came.
         received_at: Timestamp,
+    },
+    /// Do not go on from a map of this aggregator: it is not trusted any more.
+    ForgetMap {
+        /// The aggregator.
+        of: NodeName,
     },
     /// Close the round if it is due.
     CloseRound,

@@ -25,7 +25,7 @@ pub enum GatewayMessage {
     /// Subscribe to reports on every broker for display, or end that. It is repeated from time to time, as a restarted
     /// gateway has forgotten it.
     WatchReports {
-        /// Whether they are wanted.
+        /// True if they are wanted.
         wanted: bool,
     },
     /// Replace the subscriber, such as after a receiver's restart.

@@ -8,12 +8,12 @@ use ecod::wire::NodeStatus;
 use crate::transport::gossip::MembershipEvent;
 use crate::transport::mqtt::Delivery;
 
-/// What the election is told.
+/// Messages to the election.
 #[derive(Debug)]
 pub enum LeaderElectionMessage {
     /// The membership found something out, or brought a message.
     Membership {
-        /// What it was.
+        /// The news.
         event: MembershipEvent,
     },
     /// A broker passed on a status.
@@ -23,7 +23,7 @@ pub enum LeaderElectionMessage {
     },
     /// Something else happened at the node.
     Note {
-        /// What it was.
+        /// The news.
         input: Input,
     },
 }

@@ -3,6 +3,7 @@
 use ecod::aggregator::Algorithms;
 use ecod::model::detection::Detection;
 use ecod::model::geometry::Pose;
+use ecod::model::origin::{GeographicOrigin, StatedPose};
 use ecod::model::time::Timestamp;
 
 use crate::camera::perception::Perception;
@@ -19,8 +20,12 @@ pub enum ProjectorMessage {
     },
     /// Go on under other settings.
     Configure {
-        /// Camera, pose and known locations.
+        /// Camera and known locations.
         perception: Box<Perception>,
+        /// The pose of a vehicle that stands still, if it is known.
+        standing: Option<Pose>,
+        /// The place of the cell's frame on Earth.
+        origin: Option<GeographicOrigin>,
         /// Algorithms to report for.
         algorithms: Algorithms,
     },
@@ -28,7 +33,7 @@ pub enum ProjectorMessage {
     TakePose {
         /// Time of the pose by the clock that stamps frames.
         at: Timestamp,
-        /// Pose in the world frame.
-        pose: Pose,
+        /// Pose in the cell's frame or on Earth.
+        pose: StatedPose,
     },
 }

@@ -10,7 +10,7 @@ use ecod::wire::{LedgerShare, Reputation};
 
 use crate::transport::mqtt::Delivery;
 
-/// What the keeper is asked to do.
+/// Messages to the keeper.
 #[derive(Debug)]
 pub enum ReputationKeeperMessage {
     /// Publish in the node's own leadership from now on.

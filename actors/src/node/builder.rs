@@ -56,7 +56,7 @@ use crate::transport::broker::{AccessPolicy, BrokerError, Door, EmbeddedBroker, 
 use crate::transport::gossip::{BindError, FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
-/// What the parts are made from; kept to make them again.
+/// Materials of the parts; kept to make them again.
 pub(super) struct NodeBuilder {
     /// The node's own configuration.
     own_config: NodeConfig,
@@ -91,7 +91,7 @@ pub(super) struct NodeBuilder {
     failed: watch::Sender<Option<String>>,
 }
 
-/// How long a part may take to stop.
+/// Maximum time for a part to stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Locks the node's state. A directory that cannot be written is reported when something is saved.
@@ -106,7 +106,7 @@ fn lock_state(directory: &Path, cell: &NodeName, name: &NodeName) -> Option<File
     lock.ok()
 }
 
-/// How often, and how far apart, a broker or membership started anew tries to get its address back.
+/// Number of attempts, and time between them, by which a broker or membership started anew gets its address back.
 const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
@@ -289,6 +289,8 @@ impl NodeBuilder {
             ActorKind::Projector => {
                 let arguments = ProjectorArguments {
                     perception: crate::node::camera::perception(&self.config).map_err(in_full)?,
+                    standing: self.standing_pose(),
+                    origin: self.config.origin,
                     poses: self.config.pose.listen,
                     algorithms: crate::node::camera::algorithms(&self.config),
                     clock: self.clock.clone(),

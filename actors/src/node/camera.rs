@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ecod::aggregator::Algorithms;
+use ecod::model::geometry::Pose;
 use ecod::perception::landmark::LandmarkIndex;
 
 use crate::actors::detector::DetectorArguments;
@@ -22,7 +23,17 @@ use crate::telemetry::spans::Spans;
 #[error("this node has no camera")]
 pub struct NoCamera;
 
-/// The way from detections to reports, as configured.
+/// The pose of a vehicle that stands still; none where poses are received.
+///
+/// # Errors
+/// When it is on Earth, and has no place in the cell's frame.
+pub fn standing_pose(config: &NodeConfig) -> anyhow::Result<Option<Pose>> {
+    let is_used = config.camera.is_some() && config.pose.listen.is_none();
+    let pose = is_used.then(|| config.pose.stated().in_map(config.origin.as_ref())).transpose();
+    pose.context("key `pose.latitude_deg`")
+}
+
+/// The way from detections to reports, as configured. Each frame has its own pose.
 ///
 /// # Errors
 /// When there is no camera or its calibration file cannot be used.
@@ -31,7 +42,7 @@ pub fn perception(config: &NodeConfig) -> anyhow::Result<Perception> {
     let gate = config.fusion.pace.gate();
     let vehicle_camera = VehicleCamera {
         node: config.name.clone().unwrap_or(ecod::model::names::NodeName::from_static("node")),
-        pose: config.pose.pose(),
+        pose: Pose::new(0.0, 0.0, 0.0),
         mount: camera.mount.into(),
         lens: camera.optics.lens().context("key `camera.optics.calibration`")?,
         landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),

@@ -40,7 +40,7 @@ pub struct NodeConfig {
     pub name: Option<NodeName>,
     /// Name of the cell; nodes of other cells are not heard. Default `cell`.
     pub cell: NodeName,
-    /// What the node is meant to do. Default `auto`.
+    /// The node's role. Default `auto`.
     pub role: Role,
     /// Where the embedded broker listens. Default port 8883 on all interfaces with `[tls]`; without, port 1883 on
     /// 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says otherwise. A broker that is
@@ -58,9 +58,9 @@ pub struct NodeConfig {
     pub map_log: Option<PathBuf>,
     /// Where the vehicle is. Default at the origin, looking east.
     pub pose: PoseConfig,
-    /// How the nodes of the cell find and watch each other.
+    /// Settings by which the nodes of the cell find and watch each other.
     pub membership: MembershipConfig,
-    /// Who leads the cell.
+    /// Election of the leader.
     pub election: ElectionConfig,
     /// MQTT connections.
     pub mqtt: MqttConfig,
@@ -69,9 +69,9 @@ pub struct NodeConfig {
     pub tls: Option<TlsConfig>,
     /// Limits of the embedded broker.
     pub broker: BrokerConfig,
-    /// How reports are fused; used by aggregators.
+    /// Settings of fusion; used by aggregators.
     pub fusion: FusionConfig,
-    /// How often reputations are published, saved and replicated; used by aggregators.
+    /// Periods at which reputations are published, saved and replicated; used by aggregators.
     pub reputations: ReputationKeeperConfig,
     /// A web page with the cell, metrics and health.
     pub dashboard: DashboardConfig,
@@ -128,7 +128,7 @@ pub enum LoadError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the operating system said.
+        /// The operating system's error.
         source: std::io::Error,
     },
     /// Keys or values are of the wrong kind or unknown.
@@ -298,17 +298,17 @@ impl NodeConfig {
         Security::load(self.tls.as_ref().zip(self.name.as_ref()), &self.mqtt, (&self.membership, &self.cell))
     }
 
-    /// Whether the node may lead its cell.
+    /// True if the node may lead its cell.
     pub fn may_lead(&self) -> bool {
         self.role != Role::Cav
     }
 
-    /// Whether the node's broker may carry the cell's data.
+    /// True if the node's broker may carry the cell's data.
     pub fn serves_nodes(&self) -> bool {
         self.may_lead() && self.data_plane().embedded
     }
 
-    /// Whether the node has a broker: for the cell, or only as a door for its programs.
+    /// True if the node has a broker: for the cell, or only as a door for its programs.
     pub fn has_broker(&self) -> bool {
         self.serves_nodes() || self.broker.door
     }

@@ -95,6 +95,18 @@ pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> Share
         patience: patience(&config.fusion),
         round_period_s: config.fusion.round.period_s,
         landmarks: config.landmarks.clone().into(),
-        problem: held.problem.clone(),
+        problem: held.problem.clone().or_else(|| pose_problem(config)),
     }
+}
+
+/// The reason why the frames of the node's camera have no place in the cell's frame.
+#[cfg(feature = "camera")]
+fn pose_problem(config: &NodeConfig) -> Option<String> {
+    let error = super::camera::standing_pose(config).err()?;
+    Some(format!("the camera's frames are not reported: {error:#}"))
+}
+
+#[cfg(not(feature = "camera"))]
+fn pose_problem(_config: &NodeConfig) -> Option<String> {
+    None
 }

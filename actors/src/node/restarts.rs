@@ -18,7 +18,7 @@ pub(super) struct Restarts {
 }
 
 impl Restarts {
-    /// Whether one more restart is allowed; counts it if so.
+    /// True if one more restart is allowed; counts it if so.
     pub(super) fn allow(&mut self, now: Timestamp) -> bool {
         self.times.retain(|time| now.since(*time) < RESTART_SPAN);
         let allowed = self.times.len() < MAX_RESTARTS;

@@ -14,13 +14,13 @@ use sd_notify::NotifyState;
 /// The service manager of this process.
 #[derive(Debug)]
 pub struct ServiceManager {
-    /// How long it waits for a sign of life; none without a watchdog.
+    /// Time for which it waits for a sign of life; none without a watchdog.
     watchdog: Option<Duration>,
     told: Option<String>,
     failing: bool,
 }
 
-/// How often readiness is looked at; with a watchdog, so many times within what it waits, if that is more often.
+/// Time between two looks at readiness; shorter where a watchdog waits for less than a few of them.
 const PERIOD: Duration = Duration::from_secs(1);
 const BEATS: u32 = 4;
 
@@ -31,7 +31,7 @@ impl ServiceManager {
         Some(Self { watchdog: sd_notify::watchdog_enabled(), told: None, failing: false })
     }
 
-    /// How often it is told how the node is.
+    /// Time between two signs of life.
     pub fn period(&self) -> Duration {
         self.watchdog.map_or(PERIOD, |watchdog| (watchdog / BEATS).clamp(Duration::from_millis(1), PERIOD))
     }
@@ -41,7 +41,7 @@ impl ServiceManager {
         self.tell(&[NotifyState::Ready]);
     }
 
-    /// How the node is now; feeds the watchdog unless a start anew may help.
+    /// Takes the node's readiness; feeds the watchdog unless a start anew may help.
     pub fn beat(&mut self, readiness: Readiness) {
         if !readiness.needs_restart && self.watchdog.is_some() {
             self.tell(&[NotifyState::Watchdog]);

@@ -26,12 +26,12 @@ use crate::platform::clock;
 use crate::transport::broker::BrokerHealth;
 use crate::transport::mqtt::{BrokerAddress, DataPlane, LinkState, Security};
 
-/// What a node's readiness is judged from; reading never makes another part wait.
+/// Facts on which a node's readiness is judged; reading never makes another part wait.
 #[derive(Debug, Clone)]
 pub struct Vitals {
     /// The newest of everything.
     pub newest: Newest,
-    /// Who leads.
+    /// The leadership, as it changes.
     pub leadership: watch::Receiver<Leadership>,
     /// The cell's time.
     pub clock: CellClock,
@@ -58,16 +58,16 @@ pub struct SharedFacts {
     pub round_period_s: f64,
     /// Known locations.
     pub landmarks: Arc<[LandmarkConfig]>,
-    /// The reason why the node does not use the cell's description.
+    /// The reason why the node does not use the cell's description, or does not report.
     pub problem: Option<String>,
 }
 
-/// What the gateway and the broker answered.
+/// Answers of the gateway and the broker.
 #[derive(Debug, Clone, Default)]
 pub struct Probe {
-    /// How the links are; none when the gateway did not answer.
+    /// States of the links; none when the gateway did not answer.
     pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
-    /// Whether the node's own broker serves.
+    /// True if the node's own broker serves.
     pub broker_serves: bool,
     /// Vehicles whose reports are usable by their time, and others.
     pub timeliness: Timeliness,
@@ -92,27 +92,27 @@ impl Vitals {
         Probe { broker_serves, links, timeliness: timeliness.unwrap_or_default() }
     }
 
-    /// Whether the node is ready now, the parts being as they answered.
+    /// Readiness of the node now, the parts being as they answered.
     pub fn readiness(&self, probe: &Probe) -> Readiness {
         let leadership = self.leadership.borrow().clone();
         if let Some(fault) = self.security.clock_fault() {
             return Readiness::not(fault);
         }
         let Timeliness { timely, untimely } = probe.timeliness;
+        let vehicles = timely + untimely;
+        let trouble = format!("leading, but the times of {untimely} of {vehicles} vehicles' reports are unusable");
         if leadership.is_leading() && !probe.timeliness.is_usable() {
-            let vehicles = timely + untimely;
-            return Readiness::not(format!(
-                "leading, but the times of {untimely} of {vehicles} vehicles' reports are unusable"
-            ));
+            return Readiness::not(trouble);
         }
+        // The reports of its only vehicle depose no leader.
+        let lone = Some(trouble).filter(|_| leadership.is_leading() && timely == 0 && untimely > 0);
         let SharedFacts { patience, problem, .. } = self.shared.borrow().clone();
-        if let Some(problem) = problem {
-            return Readiness::not(problem);
-        }
-        Readiness::judge(&leadership, self.last_round().as_ref(), self.broker_works(probe), patience, clock::now())
+        let works = self.broker_works(probe);
+        Readiness::judge(&leadership, self.last_round().as_ref(), works, patience, clock::now())
+            .unless(problem.or(lone))
     }
 
-    /// Whether a broker carries what this node publishes.
+    /// True if a broker carries what this node publishes.
     fn broker_works(&self, probe: &Probe) -> bool {
         let up = |broker| probe.links.as_ref().and_then(|links| links.get(broker)) == Some(&LinkState::Up);
         self.plane.external.as_ref().is_some_and(up) || (self.plane.embedded && probe.broker_serves)

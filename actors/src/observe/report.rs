@@ -120,7 +120,7 @@ impl Report {
         Ok(())
     }
 
-    /// Whether the log has no message.
+    /// True if the log has no message.
     pub fn is_empty(&self) -> bool {
         self.messages == 0
     }

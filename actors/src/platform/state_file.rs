@@ -106,10 +106,7 @@ impl StateFile {
     /// When the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
         fs::create_dir_all(self.path.parent().unwrap_or(Path::new(".")))?;
-        let state = serde_json::to_vec(state)?;
-        let mut bytes = format!("{HEADER}{}\n", checksum(&state)).into_bytes();
-        bytes.extend(state);
-        replace_file(&self.path, &bytes, 0o666)
+        replace_file(&self.path, &with_checksum(&serde_json::to_vec(state)?), 0o666)
     }
 }
 
@@ -118,8 +115,16 @@ fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, String> {
     serde_json::from_slice(content(bytes)?).map_err(|error| error.to_string())
 }
 
+/// The bytes of a file with this state.
+pub(crate) fn with_checksum(state: &[u8]) -> Vec<u8> {
+    [HEADER.as_bytes(), checksum(state).as_bytes(), b"\n", state].concat()
+}
+
 /// The bytes of the state in a file whose checksum is right. Without a header, all of it.
-fn content(bytes: &[u8]) -> Result<&[u8], String> {
+///
+/// # Errors
+/// The flaw, if the checksum is wrong.
+pub(crate) fn content(bytes: &[u8]) -> Result<&[u8], String> {
     let Some(rest) = bytes.strip_prefix(HEADER.as_bytes()) else { return Ok(bytes) };
     let (found, rest) = rest.split_at(rest.len().min(2 * SHA256.output_len()));
     let state = rest.strip_prefix(b"\n").filter(|state| found == checksum(state).as_bytes());

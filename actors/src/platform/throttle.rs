@@ -20,7 +20,7 @@ impl TokenBucket {
         Self { tokens: burst, burst, interval, refilled_at: now }
     }
 
-    /// Whether a whole burst is allowed now.
+    /// True if a whole burst is allowed now.
     pub(crate) fn is_full(&self, now: Timestamp) -> bool {
         now.since(self.refilled_at) >= self.interval * self.burst.saturating_sub(self.tokens)
     }

@@ -213,7 +213,7 @@ impl Counters {
     }
 }
 
-/// Whether a reason occurs without anybody's fault: around a change of leader, or on a network that re-orders.
+/// True if a reason occurs without anybody's fault: around a change of leader, or on a network that re-orders.
 fn is_everyday(reason: RejectReason) -> bool {
     use RejectReason::{NotCandidate, NotElected, NotFused, OutOfOrder, Stale, Superseded, UnknownTerm};
     matches!(reason, NotCandidate | NotElected | NotFused | OutOfOrder | Stale | Superseded | UnknownTerm)

@@ -20,6 +20,7 @@ mod publish_throttle;
 mod relay;
 mod retained;
 mod subscriptions;
+mod websocket;
 use std::net::SocketAddr;
 
 #[cfg(fuzzing)]

@@ -76,6 +76,11 @@ pub enum MembershipEvent {
         /// The node.
         name: NodeName,
     },
+    /// The certificate of a node was revoked or has expired. That the node is down follows.
+    Expelled {
+        /// The node.
+        name: NodeName,
+    },
     /// A living node's addresses changed.
     Changed {
         /// The node as it is now.

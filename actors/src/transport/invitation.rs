@@ -7,6 +7,7 @@
 //!                                                   <-     node, secret, certificate signing request
 //! certificate, CA, revocation list, cell's key      ->
 //!                                                   <-     "kept": all is on disk
+//! "kept": the token is used up                       ->
 //! ```
 //!
 //! A token is for one node. It works until the guest has kept what it got, or the host ends. A guest that fails before
@@ -40,7 +41,7 @@ const CONVERSATION_TIME: Duration = Duration::from_secs(10);
 /// Name in the host's certificate of one use. The token tells which certificate it is.
 const HOST_NAME: &str = "invitation.ecod.internal";
 
-/// The guest's last message.
+/// The last message of both.
 const KEPT: &str = "kept";
 
 /// The guest's wish.

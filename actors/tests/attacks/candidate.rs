@@ -39,6 +39,24 @@ pub(crate) const ROWS: &[Row] = &[
         run: |target| Box::pin(largest_term(target)),
     },
     Row {
+        attack: "a member's beats as an edge that nine nodes follow",
+        means: Means::Candidate,
+        on_brokers: false,
+        deeds: (30, "messages"),
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(beats(target, 1)),
+    },
+    Row {
+        attack: "the same with the largest round",
+        means: Means::Candidate,
+        on_brokers: false,
+        deeds: (30, "messages"),
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(beats(target, MAX_INTEGER)),
+    },
+    Row {
         attack: "maps with the largest round, in the leader's name",
         means: Means::Candidate,
         on_brokers: true,
@@ -70,12 +88,19 @@ async fn flood(target: Target) -> anyhow::Result<()> {
     Ok(())
 }
 
-async fn join(target: &Target) -> anyhow::Result<Insider> {
-    Insider::join(target, (CANDIDATE, Role::Auto), Some(Arc::clone(&target.credentials))).await?.admitted().await
+async fn join(target: &Target, role: Role) -> anyhow::Result<Insider> {
+    Insider::join(target, (CANDIDATE, role), Some(Arc::clone(&target.credentials))).await?.admitted().await
+}
+
+/// Claims a lead that its certificate does not allow.
+async fn beats(target: Target, round: u64) -> anyhow::Result<()> {
+    let insider = join(&target, Role::Edge).await?;
+    let beat = Body::Beat { every_ms: 50, round, followers: 9, after: None, successors: Vec::new() };
+    insider.repeat(9, Some(insider.epoch(9)), beat).await
 }
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {
-    join(&target).await?.repeat(MAX_TERM, None, Body::Status { over: None, no_login: Vec::new() }).await
+    join(&target, Role::Auto).await?.repeat(MAX_TERM, None, Body::Status { over: None, no_login: Vec::new() }).await
 }
 
 async fn largest_round(target: Target) -> anyhow::Result<()> {
@@ -110,7 +135,7 @@ async fn publish_for_ever(target: &Target, packets: &[Vec<u8>]) -> anyhow::Resul
 
 /// Shares in the names of others, signed by the attacker or not at all, and of leaderships that never were.
 async fn forged_evidence(target: Target) -> anyhow::Result<()> {
-    let _member = join(&target).await?;
+    let _member = join(&target, Role::Auto).await?;
     let signer = EvidenceSigner::new(NodeName::from_static(CELL), Arc::clone(&target.credentials));
     let shares =
         TERMS.into_iter().flat_map(|term| [(term, LEADER), (term, CANDIDATE)]).flat_map(|(term, aggregator)| {

@@ -232,7 +232,7 @@ impl Cell {
             longest_gap_ms: longest_gap_ms(&maps, from),
             is_replaced: maps.last().is_some_and(|line| line.map.aggregator != LEADER),
             rss_mb: if ended.is_empty() { self.peak_memory_mb()? } else { 0 },
-            false_maps: maps.iter().filter(|line| !line.map.is_true()).count(),
+            believed_lies: maps.iter().filter(|line| !line.map.is_true()).count() + self.believers()?,
             ended,
             deeds: 0,
             fault: None,
@@ -247,6 +247,18 @@ impl Cell {
         let lines = whole.lines().map(serde_json::from_str::<Line>);
         let lines = lines.collect::<Result<Vec<_>, _>>().with_context(|| file.display().to_string())?;
         Ok(lines.into_iter().filter(|line| line.received_at_us >= since).collect())
+    }
+
+    /// Number of nodes that keep evidence about the vehicles of [`inverted`](crate::shares::inverted).
+    fn believers(&self) -> anyhow::Result<usize> {
+        let mut believers = 0;
+        for node in &self.nodes {
+            let files = fs::read_dir(self.directory.path().join(node.name).join("state"))?;
+            let states = files.map(|file| Ok(fs::read(file?.path())?)).collect::<anyhow::Result<Vec<_>>>()?;
+            let is_forged = |state: &Vec<u8>| state.windows(6).any(|text| text == b"\"liar\"");
+            believers += usize::from(states.iter().any(is_forged));
+        }
+        Ok(believers)
     }
 
     fn ended(&mut self) -> anyhow::Result<Vec<String>> {

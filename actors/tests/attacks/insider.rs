@@ -93,12 +93,14 @@ impl Insider {
     /// Says the same to all members, ten times a second.
     pub(crate) async fn repeat(&self, term: u64, epoch: Option<Epoch>, body: Body) -> anyhow::Result<()> {
         for seq in 1.. {
+            // It seems to be fit where it claims to lead.
+            let fit = matches!(body, Body::Beat { .. });
             let message = ElectionMessage {
                 schema: SCHEMA_VERSION,
                 from: self.name.clone(),
                 run: self.run,
                 seq,
-                candidacy: Candidacy { role: self.role, priority: u8::MAX, load: 0, fit: false },
+                candidacy: Candidacy { role: self.role, priority: u8::MAX, load: 0, fit },
                 term,
                 epoch: epoch.clone(),
                 hears_you: true,

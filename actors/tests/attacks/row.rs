@@ -16,7 +16,7 @@ pub(crate) struct Row {
     /// Least number of deeds, and their unit: without them the attack has not taken place.
     pub(crate) deeds: (u64, &'static str),
     pub(crate) bar: Bar,
-    /// Whether it runs on every change.
+    /// True if it runs on every change.
     pub(crate) quick: bool,
     /// The attack; it is stopped from outside unless it ends by itself.
     pub(crate) run: fn(Target) -> Attack,
@@ -63,7 +63,7 @@ pub(crate) struct Bar {
     pub(crate) rss_mb: u64,
     /// Longest time without a map, in ms.
     pub(crate) longest_gap_ms: Option<u64>,
-    /// Whether another node leads in the end than in the beginning.
+    /// True if another node leads in the end than in the beginning.
     pub(crate) is_replaced: bool,
 }
 
@@ -84,10 +84,11 @@ pub(crate) struct Outcome {
     pub(crate) rss_mb: u64,
     /// Longest time between two maps in ms.
     pub(crate) longest_gap_ms: u64,
-    /// Whether the last map is of another node than the leader of the beginning.
+    /// True if the last map is of another node than the leader of the beginning.
     pub(crate) is_replaced: bool,
-    /// Maps that say what no honest vehicle has seen, or that no node of the cell made.
-    pub(crate) false_maps: usize,
+    /// Maps that say what no honest vehicle has seen, or that no node of the cell made, and nodes that keep forged
+    /// evidence.
+    pub(crate) believed_lies: usize,
     /// Nodes that ended.
     pub(crate) ended: Vec<String>,
     /// Deeds of the attacker, and the reason for which the attack ended early.
@@ -114,7 +115,7 @@ impl Bar {
             && outcome.rss_mb <= self.rss_mb
             && self.longest_gap_ms.is_none_or(|most| outcome.longest_gap_ms <= most)
             && outcome.is_replaced == self.is_replaced
-            && outcome.false_maps == 0
+            && outcome.believed_lies == 0
             && outcome.ended.is_empty()
     }
 }
@@ -135,8 +136,8 @@ impl fmt::Display for Outcome {
         )?;
         write!(f, ", {} deeds", self.deeds)?;
         self.fault.iter().try_for_each(|fault| write!(f, ", attack ended: {fault}"))?;
-        if self.false_maps > 0 {
-            write!(f, ", {} false maps", self.false_maps)?;
+        if self.believed_lies > 0 {
+            write!(f, ", {} lies believed", self.believed_lies)?;
         }
         if self.is_replaced {
             write!(f, ", another leader")?;
@@ -153,11 +154,11 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
     let width = lines.iter().map(|(row, ..)| row.attack.chars().count()).max().unwrap_or_default();
     let mut text = format!(
         "{:width$}  {:16}  {:7}  {:22}  {:>11}  {:>6}  {:>6}  {:>6}  {:>5}  {:27}  verdict\n",
-        "attack", "means", "at", "did", "maps", "honest", "RSS MB", "gap ms", "false", "bar"
+        "attack", "means", "at", "did", "maps", "honest", "RSS MB", "gap ms", "lies", "bar"
     );
     for (row, victim, outcome) in lines {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
-        let wrong = outcome.false_maps;
+        let lies = outcome.believed_lies;
         let verdict = match (row.took_place(outcome), row.bar.is_met(outcome)) {
             (false, _) => outcome
                 .fault
@@ -171,7 +172,7 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
         let (gap, did, at) = (outcome.longest_gap_ms, format!("{} {}", outcome.deeds, row.deeds.1), victim.name());
         let _ = writeln!(
             text,
-            "{attack:width$}  {means:16}  {at:7}  {did:22}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {wrong:>5}  {:27}  {verdict}",
+            "{attack:width$}  {means:16}  {at:7}  {did:22}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {lies:>5}  {:27}  {verdict}",
             row.bar.to_string()
         );
     }

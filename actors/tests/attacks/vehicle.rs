@@ -131,11 +131,15 @@ async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
         stream.write_all(&packet(0x31, &[&text(&topic), &vec![b'x'; 16 * 1024]])).await?;
     }
     let filter = [&text("ecod/v1/+/nodes/#")[..], &[0]].concat();
-    let packet = packet(0x82, &[&[0, 1], &filter.repeat(10_000)]);
-    let ask = |_| async {
+    // As many as the broker takes, and more than that.
+    let packets =
+        [(64 * 1024 - 2) / filter.len(), 10_000].map(|filters| packet(0x82, &[&[0, 1], &filter.repeat(filters)]));
+    let (packets, target) = (&packets, &target);
+    let ask = |number: usize| async move {
+        let packet = &packets[number % 2];
         loop {
-            if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
-                while stream.write_all(&packet).await.is_ok() {
+            if let Ok(mut stream) = log_in(target, &target.vehicle, VEHICLE).await {
+                while stream.write_all(packet).await.is_ok() {
                     target.did(packet.len());
                 }
             }

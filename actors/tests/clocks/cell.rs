@@ -19,7 +19,7 @@ use tempfile::TempDir;
 use crate::feeder::Feeder;
 use crate::record::{Entry, Record};
 
-/// How long anything may take.
+/// Maximum time for anything.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Setting of a wall clock.
@@ -134,7 +134,7 @@ impl Cell {
             "noether" => "cav",
             _ => "auto",
         };
-        let bind = if name == "euclid" { self.gossip.to_string() } else { "127.0.0.1:0".into() };
+        let bind = if name == "gauss" { self.gossip.to_string() } else { "127.0.0.1:0".into() };
         let mut config = format!(
             "name = \"{name}\"\nrole = \"{role}\"\ncell = \"clocks\"\nmap_log = \"{directory}/{name}.maps\"\n\
              landmarks = [{{ id = \"spot\", x_m = 6.6, y_m = 0.0 }}]\n\

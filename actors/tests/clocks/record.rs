@@ -19,7 +19,7 @@ pub(crate) struct Record {
 pub(crate) struct Entry<'a>(&'a ReceivedMap);
 
 impl Entry<'_> {
-    /// Whether a vehicle's detection is in the map.
+    /// True if a vehicle's detection is in the map.
     pub(crate) fn has(&self, vehicle: &str) -> bool {
         let mut contributors = self.0.map.landmarks.iter().flat_map(|landmark| &landmark.contributors);
         contributors.any(|name| name.as_str() == vehicle)

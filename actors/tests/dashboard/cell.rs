@@ -150,7 +150,7 @@ async fn report_to(broker: SocketAddr, vehicle: usize, landmarks: usize) {
 
 const NAMES: [&str; 6] = ["ada", "boole", "curie", "dirac", "escher", "fermat"];
 
-/// What a vehicle says of the lot: parked cars at most spots, a pedestrian who walks about, and votes on what stands at
+/// A vehicle's reports of the lot: parked cars at most spots, a pedestrian who walks about, and votes on what stands at
 /// the first spots, about which the last vehicle errs.
 fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, ObjectReport); 2] {
     let second = clock::now().micros() as f64 / 1e6;

@@ -4,6 +4,7 @@ mod access;
 mod browser;
 mod cell;
 mod cost;
+mod door_page;
 mod health;
 mod http;
 mod load;

@@ -72,7 +72,7 @@ async fn metrics_say_what_the_node_does() {
     node.stop().await;
 }
 
-/// What is summed over nodes must be summed over those of one cell.
+/// Sums over nodes must be over those of one cell.
 #[test]
 fn the_dashboard_of_grafana_shows_one_cell_at_a_time() {
     let text = include_str!("../../../packaging/grafana/ecod.json");
@@ -130,7 +130,7 @@ fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
     assert_eq!(asked.split('|').collect::<BTreeSet<_>>(), left_out);
 }
 
-/// What all ask for is read once for them.
+/// A value that many ask for is read once.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_that_scrape_at_once_get_the_same() {
     let (node, page) = start(config("edge", Role::Edge, 6)).await;

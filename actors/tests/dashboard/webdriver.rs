@@ -49,7 +49,7 @@ impl Browser {
         self.command("url", json!({ "url": url })).await;
     }
 
-    /// What a script's expression is.
+    /// Value of a script's expression.
     pub(crate) async fn evaluate(&self, expression: &str) -> Value {
         self.command("execute/sync", json!({ "script": format!("return ({expression})"), "args": [] })).await
     }
@@ -96,7 +96,7 @@ impl Browser {
         self.chromium("Emulation.setTouchEmulationEnabled", json!({ "enabled": false })).await;
     }
 
-    /// What the browser complained of: errors of scripts, of policies, of missing files.
+    /// Complaints of the browser: errors of scripts, of policies, of missing files.
     pub(crate) async fn complaints(&self) -> Vec<String> {
         let log = self.command("se/log", json!({ "type": "browser" })).await;
         let entries = log.as_array().cloned().unwrap_or_default();

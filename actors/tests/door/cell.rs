@@ -1,35 +1,51 @@
 //! Real nodes, each on a runtime of its own, and plain MQTT clients at their doors.
 
-use std::collections::BTreeMap;
-use std::net::{SocketAddr, UdpSocket};
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, Role, decode, encode};
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::{Authority, BrokerTrust, Credentials, TlsConfig};
 use rumqttc::v5::mqttbytes::QoS;
 use rumqttc::v5::mqttbytes::v5::Packet;
 use rumqttc::v5::{AsyncClient, Event, MqttOptions};
+use rumqttc::{TlsConfiguration, Transport};
+use tempfile::TempDir;
 use tokio::runtime::{Builder, Runtime};
 use tokio::task::JoinHandle;
 use tracing_subscriber::EnvFilter;
+use uuid::Uuid;
 
-/// How long anything may take.
+/// Maximum time for anything.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 pub(crate) struct Cell {
-    seed: SocketAddr,
     nodes: BTreeMap<String, (NodeHandle, Runtime)>,
+    /// Of the map logs, and of the certificates.
+    directory: TempDir,
+    authority: Option<Authority>,
 }
 
 impl Cell {
     pub(crate) fn new() -> Self {
         tracing_subscriber::fmt().with_env_filter(EnvFilter::from_default_env()).try_init().ok();
-        Self { seed: UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap(), nodes: BTreeMap::new() }
+        Self { nodes: BTreeMap::new(), directory: tempfile::tempdir().unwrap(), authority: None }
+    }
+
+    /// A cell whose nodes and programs have certificates.
+    pub(crate) fn with_certificates() -> Self {
+        let cell = Self::new();
+        let authority =
+            Authority::init(&cell.directory.path().join("pki"), &NodeName::from_static("lot"), clock::now());
+        Self { authority: Some(authority.unwrap()), ..cell }
     }
 
     /// An edge, two vehicles that may lead, and one that may not; all follow the edge, and gauss stands by.
@@ -38,7 +54,11 @@ impl Cell {
     }
 
     pub(crate) async fn of_four_with(adjust: impl Fn(&mut NodeConfig)) -> Self {
-        let mut cell = Self::new();
+        Self::new().and_four(adjust).await
+    }
+
+    pub(crate) async fn and_four(self, adjust: impl Fn(&mut NodeConfig)) -> Self {
+        let mut cell = self;
         let nodes = [("edge", Role::Edge), ("gauss", Role::Auto), ("noether", Role::Auto), ("euclid", Role::Cav)];
         for (name, role) in nodes {
             cell.start(name, role, |config| {
@@ -47,37 +67,98 @@ impl Cell {
             })
             .await;
         }
-        cell.until("the edge serves all", |cell| cell.sources().iter().all(|source| source.as_deref() == Some("edge")))
-            .await;
-        cell.until("gauss is the standby", |cell| {
-            cell.nodes.values().all(|(node, _)| {
-                node.leadership().borrow().standby.as_ref().is_some_and(|name| name.as_str() == "gauss")
-            })
-        })
-        .await;
-        tokio::time::sleep(Duration::from_millis(300)).await;
+        cell.served_by("edge").await;
+        cell.stands_by("gauss").await;
         cell
     }
 
+    /// Waits until every node takes maps of this node.
+    pub(crate) async fn served_by(&self, name: &str) {
+        let all = |cell: &Self| cell.sources().iter().all(|source| source.as_deref() == Some(name));
+        self.until(&format!("{name} serves all"), all).await;
+    }
+
+    /// Waits until every node knows this node as the standby, and has a link to it.
+    pub(crate) async fn stands_by(&self, name: &str) {
+        let standby = |node: &NodeHandle| node.leadership().borrow().standby.as_ref().map(ToString::to_string);
+        let all = |cell: &Self| cell.nodes.values().all(|(node, _)| standby(node).as_deref() == Some(name));
+        self.until(&format!("{name} is the standby"), all).await;
+        tokio::time::sleep(Duration::from_millis(300)).await;
+    }
+
     pub(crate) async fn start(&mut self, name: &str, role: Role, adjust: impl FnOnce(&mut NodeConfig)) {
-        let bind = if self.nodes.is_empty() { self.seed } else { loopback() };
         let mut config = NodeConfig {
             name: Some(NodeName::new(name).unwrap()),
             cell: NodeName::from_static("lot"),
             role,
             listen: Some(loopback()),
+            map_log: Some(self.map_log(name)),
             landmarks: vec![LandmarkConfig::at("west", 0.0, 0.0), LandmarkConfig::at("east", 3.0, 0.0)],
             ..NodeConfig::default()
         };
-        config.membership.bind = Some(bind);
-        config.membership.seeds = vec![self.seed.to_string()];
+        config.membership.bind = Some(loopback());
+        let seeds = self.nodes.values().filter_map(|(node, _)| node.gossip_address());
+        config.membership.seeds = seeds.map(|address| address.to_string()).collect();
         config.membership.multicast.enabled = false;
         config.dashboard.enabled = false;
+        if let Some(authority) = &mut self.authority {
+            let (node, year) = (NodeName::new(name).unwrap(), Duration::from_secs(365 * 86_400));
+            authority.issue(&node, Rights { role, priority: u8::MAX }, year, clock::now()).unwrap();
+            config.tls = Some(files(authority, &node));
+        }
         adjust(&mut config);
         config.validate().unwrap();
         let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
         let node = runtime.spawn(node::start(config)).await.unwrap().unwrap();
         self.nodes.insert(name.to_owned(), (node, runtime));
+    }
+
+    /// A program at a node's door, with the node's certificate if there are any.
+    pub(crate) async fn program(&self, id: &str, node: &str, filters: &[&str]) -> Program {
+        self.program_with(id, (node, node), filters).await
+    }
+
+    /// A program at one node's door, with the certificate of another.
+    pub(crate) async fn program_with(&self, id: &str, (door, owner): (&str, &str), filters: &[&str]) -> Program {
+        let door = self.door(door);
+        let Some(authority) = &self.authority else { return Program::connect(id, door, filters).await };
+        let owner = NodeName::new(owner).unwrap();
+        let id = format!("{owner}--{id}-{}", Uuid::new_v4().simple());
+        let credentials = Credentials::load(&files(authority, &owner), &owner).unwrap();
+        let tls = TlsConfiguration::Rustls(BrokerTrust::of_door(&credentials).client());
+        let mut options = MqttOptions::new(id, door.ip().to_string(), door.port());
+        options.set_transport(Transport::tls_with_config(tls));
+        Program::connect_with(options, filters).await
+    }
+
+    fn map_log(&self, name: &str) -> PathBuf {
+        self.directory.path().join(format!("{name}.maps"))
+    }
+
+    /// The maps that a node has accepted, by its log.
+    pub(crate) fn accepted(&self, name: &str) -> Vec<Round> {
+        let text = std::fs::read_to_string(self.map_log(name)).unwrap_or_default();
+        let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
+        let map = |line| serde_json::from_str::<serde_json::Value>(line).unwrap()["map"].take();
+        whole.lines().map(|line| round_of(&serde_json::from_value(map(line)).unwrap())).collect()
+    }
+
+    /// Waits until each program has its node's newest map: it has got exactly the maps that the node accepted, in order.
+    /// The result is who led in them.
+    pub(crate) async fn have_exactly(&self, programs: &[(&str, Program)]) -> Vec<BTreeSet<String>> {
+        let mut leaders = Vec::new();
+        for (name, program) in programs {
+            let accepted = self.accepted(name);
+            let last = accepted.last().expect("the node accepts maps");
+            let got = || program.rounds().into_iter().map(|(round, _)| round).collect::<Vec<_>>();
+            self.until("the program has its node's newest map", |_| got().contains(last)).await;
+            let mut got = got();
+            got.truncate(1 + got.iter().position(|round| round == last).unwrap());
+            let since = accepted.iter().position(|round| *round == got[0]).expect("the node accepted the first");
+            assert_eq!(got, accepted[since..], "{name}");
+            leaders.push(got.into_iter().map(|(_, leader, _)| leader).collect());
+        }
+        leaders
     }
 
     /// Ends all tasks of a node where they are; its sockets close.
@@ -137,6 +218,11 @@ impl Cell {
     }
 }
 
+fn files(authority: &Authority, node: &NodeName) -> TlsConfig {
+    let (certificate, key) = authority.files_of(node);
+    TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) }
+}
+
 fn loopback() -> SocketAddr {
     SocketAddr::from(([127, 0, 0, 1], 0))
 }
@@ -167,7 +253,10 @@ pub(crate) struct Program {
 impl Program {
     /// Connects and subscribes; returns once the broker has answered.
     pub(crate) async fn connect(id: &str, door: SocketAddr, filters: &[&str]) -> Self {
-        let mut options = MqttOptions::new(id, door.ip().to_string(), door.port());
+        Self::connect_with(MqttOptions::new(id, door.ip().to_string(), door.port()), filters).await
+    }
+
+    async fn connect_with(mut options: MqttOptions, filters: &[&str]) -> Self {
         options.set_max_packet_size(Some(1 << 20));
         let (client, mut events) = AsyncClient::new(options, 64);
         for filter in filters {
@@ -223,8 +312,18 @@ impl Program {
 
     /// Reports a car at a place.
     pub(crate) async fn report(&self, topic: &str, name: &str, seq: u64, x_m: f64) {
+        self.send(topic, name, seq, PerceivedObject::new("car", 0.9, x_m, 0.0)).await;
+    }
+
+    /// Votes for a car at a known location.
+    pub(crate) async fn vote(&self, name: &str, seq: u64, landmark: &str) {
+        let car = PerceivedObject::new("car", 0.9, 0.0, 0.0);
+        self.send("vote_detections", name, seq, PerceivedObject { landmark: Some(landmark.into()), ..car }).await;
+    }
+
+    async fn send(&self, topic: &str, name: &str, seq: u64, object: PerceivedObject) {
         let report = ObjectReport {
-            objects: vec![PerceivedObject::new("car", 0.9, x_m, 0.0)],
+            objects: vec![object],
             ..ObjectReport::new(NodeName::new(name).unwrap(), seq, clock::now())
         };
         self.publish(&format!("{topic}/{name}"), encode(&report, Encoding::Json), QoS::AtMostOnce).await;

@@ -3,15 +3,24 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
 mod cell;
+mod certificates;
+mod courses;
+#[expect(dead_code, reason = "the tests of brokers need more of it")]
+#[path = "../mqtt/mosquitto.rs"]
+mod mosquitto;
+mod process;
+mod readers;
+mod websocket;
 
 use std::time::{Duration, Instant};
 
-use ecod::wire::{GlobalMap, Role, decode};
+use ecod::wire::{GlobalMap, Role, Verdicts, decode};
 use ecod_actors::node::NodeHandle;
 use ecod_actors::telemetry::counters::ShedReason;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 
 use cell::{Cell, PATIENCE, Program, Round};
+use process::Node;
 
 fn is_at_east(node: &NodeHandle, x_m: f64, contributor: &str) -> bool {
     node.newest_map().borrow().as_ref().is_some_and(|received| shows(&received.map, x_m, contributor))
@@ -29,7 +38,7 @@ fn has_last(program: &Program, accepted: &[(Round, Instant)]) -> bool {
 }
 
 /// Reports until a node's map shows it.
-async fn reported(cell: &Cell, program: &Program, name: &str, viewer: &str, x_m: f64, contributor: &str) {
+pub(crate) async fn reported(cell: &Cell, program: &Program, name: &str, viewer: &str, x_m: f64, contributor: &str) {
     let shown = async {
         for seq in 0.. {
             program.report("detections", name, seq, x_m).await;
@@ -54,7 +63,7 @@ async fn a_program_gets_what_its_node_accepts_also_when_the_leader_is_killed() {
     let at_edge = programs[0].1.lock().unwrap().clone();
     cell.until("the edge's program has its maps", |_| has_last(&programs[0].2, &at_edge)).await;
     cell.kill("edge");
-    cell.until("gauss serves all", |cell| cell.sources().iter().all(|source| source.as_deref() == Some("gauss"))).await;
+    cell.served_by("gauss").await;
     tokio::time::sleep(Duration::from_secs(2)).await;
     for (name, accepted, program) in &programs {
         let accepted = if *name == "edge" { at_edge.clone() } else { accepted.lock().unwrap().clone() };
@@ -99,7 +108,7 @@ async fn a_detector_at_the_door_of_any_node_is_heard_whoever_leads() {
     reported(&cell, &lidar, "euclid--lidar", "noether", 3.1, "euclid").await;
     reported(&cell, &radar, "noether", "euclid", 2.9, "noether").await;
     cell.kill("edge");
-    cell.until("gauss serves all", |cell| cell.sources().iter().all(|source| source.as_deref() == Some("gauss"))).await;
+    cell.served_by("gauss").await;
     reported(&cell, &lidar, "euclid--lidar", "noether", 3.2, "euclid").await;
     reported(&cell, &radar, "noether", "euclid", 2.8, "noether").await;
     cell.stop().await;
@@ -126,21 +135,26 @@ async fn a_program_sees_statuses_reputations_and_the_reports_of_all() {
         }
     };
     tokio::time::timeout(PATIENCE, probed).await.expect("reports reach all doors");
+    let reporters = ["gauss--lidar", "gauss"];
     for seq in 0..10 {
-        lidar.report("detections", "gauss--lidar", seq, 3.0).await;
+        for reporter in reporters {
+            lidar.report("detections", reporter, seq, 3.0).await;
+        }
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
-    let seqs = |display: &Program| -> Vec<u64> {
+    let seqs = |display: &Program, reporter: &str| -> Vec<u64> {
         let seq = |payload: &[u8]| decode::<ecod::wire::ObjectReport>(payload, &Default::default()).unwrap().seq;
-        display.heard_on("detections/gauss--lidar").iter().map(|heard| seq(&heard.payload)).collect()
+        display.heard_on(&format!("detections/{reporter}")).iter().map(|heard| seq(&heard.payload)).collect()
     };
     for (name, display) in &displays {
         for topic in cell.names().iter().map(|node| format!("nodes/{node}")).chain(["reputations".into()]) {
             cell.until(&format!("{name}: {topic}"), |_| heard(display, &topic)).await;
         }
-        cell.until(&format!("{name}: the last report"), |_| seqs(display).contains(&9)).await;
-        let reports = seqs(display);
-        assert_eq!(reports, (0..10).collect::<Vec<_>>(), "{name}: each report once");
+        for reporter in reporters {
+            cell.until(&format!("{name}: {reporter}'s last report"), |_| seqs(display, reporter).contains(&9)).await;
+            let reports = seqs(display, reporter);
+            assert_eq!(reports, (0..10).collect::<Vec<_>>(), "{name}: each report of {reporter} once");
+        }
     }
     drop(displays);
     cell.stop().await;
@@ -170,11 +184,58 @@ async fn a_claim_of_another_name_is_refused_aloud() {
         let denied = rejects.iter().find(|count| count.source == "mallory" && count.reason.as_str() == "not_permitted");
         assert_eq!(denied.map(|count| count.times), Some(5));
         let statuses = program.heard_on(&format!("nodes/{name}/clients"));
-        let status: serde_json::Value = serde_json::from_slice(&statuses.last().expect("a status").payload).unwrap();
-        assert_eq!((&status["node"], &status["refused"][0]["client"]), (&name.into(), &"mallory".into()), "{status}");
+        let late = Program::connect("late", cell.door(name), &["nodes/+/clients"]).await;
+        let retained = || late.heard_on(&format!("nodes/{name}/clients"));
+        cell.until("the retained status", |_| !retained().is_empty()).await;
+        for heard in [statuses.last().expect("a status"), &retained()[0]] {
+            let status: serde_json::Value = serde_json::from_slice(&heard.payload).unwrap();
+            assert_eq!(
+                (&status["node"], &status["refused"][0]["client"]),
+                (&name.into(), &"mallory".into()),
+                "{status}"
+            );
+        }
         let forged = program.heard_on("global_detections").iter().any(|heard| heard.payload == payload("gauss"));
         assert!(!forged && program.heard_on("nodes/gauss").iter().all(|heard| heard.payload != payload("gauss")));
     }
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_log_names_a_refused_program_once() {
+    let node = Node::start();
+    let program = Program::connect("mallory", node.door().await, &[]).await;
+    for topic in ["global_detections", "global_verdicts", "global_detections"] {
+        assert_eq!(program.ask(topic, b"{}".to_vec()).await.0, "NotAuthorized");
+    }
+    let log = node.log();
+    let told: Vec<_> = log.lines().filter(|line| line.contains("WARN") && line.contains("mallory")).collect();
+    assert!(matches!(told[..], [line] if line.contains("not_permitted")), "{log}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn votes_at_the_door_of_a_follower_are_in_the_verdicts_at_another() {
+    let cell = Cell::of_four().await;
+    let lidar = Program::connect("lidar", cell.door("euclid"), &[]).await;
+    let display = Program::connect("display", cell.door("noether"), &["global_verdicts"]).await;
+    let is_voted = || {
+        let verdicts = display.heard_on("global_verdicts").into_iter();
+        let mut verdicts = verdicts.map(|heard| decode::<Verdicts>(&heard.payload, &Default::default()).unwrap());
+        verdicts.any(|message| {
+            let east = message.verdicts.iter().find(|verdict| &*verdict.landmark == "east").unwrap();
+            east.label.as_deref() == Some("car") && east.contributors.iter().any(|name| name.as_str() == "euclid")
+        })
+    };
+    let voted = async {
+        for seq in 0.. {
+            lidar.vote("euclid--lidar", seq, "east").await;
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            if is_voted() {
+                return;
+            }
+        }
+    };
+    tokio::time::timeout(PATIENCE, voted).await.expect("a verdict by the vote");
     cell.stop().await;
 }
 
@@ -210,7 +271,7 @@ async fn the_door_is_the_same_with_an_external_broker() {
     for (name, role) in [("gauss", Role::Auto), ("euclid", Role::Cav)] {
         cell.start(name, role, |config| config.mqtt.broker = Some(broker.into())).await;
     }
-    cell.until("gauss serves all", |cell| cell.sources().iter().all(|source| source.as_deref() == Some("gauss"))).await;
+    cell.served_by("gauss").await;
     for name in ["gauss", "euclid"] {
         assert_eq!(cell.node(name).broker_address(), None, "no node is told of a door");
         let program = Program::connect("lidar", cell.door(name), &["global_detections"]).await;

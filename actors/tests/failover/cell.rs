@@ -17,7 +17,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::record::Record;
 
-/// How long anything may take.
+/// Maximum time for anything.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Some nodes of one cell, found by one seed.

@@ -103,6 +103,16 @@ async fn a_node_that_may_not_publish_is_told_though_the_broker_keeps_silent() {
 }
 
 #[tokio::test]
+async fn a_node_that_stalls_after_its_login_accuses_no_broker() {
+    let (_broker, address) = embedded();
+    let mqtt = MqttConfig { connect_timeout_ms: 100, ..MqttConfig::default() };
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
+    std::thread::sleep(Duration::from_millis(300));
+    until("euclid hears itself", || euclid.counters.events(Event::Echo) > 0).await;
+    assert_eq!(euclid.counters.events(Event::BrokerRefused), 0);
+}
+
+#[tokio::test]
 async fn a_node_speaks_on_all_its_links_and_hears_itself_once() {
     let ((_first, one), (_second, two)) = (embedded(), embedded());
     let mut edge = Node::join("edge", SubscriptionRole::Candidate, MqttConfig::default(), &[&one, &two]).await;
@@ -177,7 +187,7 @@ async fn an_observer_takes_reports_whoever_stops_looking_at_them() {
     for wanted in [true, false] {
         observer.send(GatewayMessage::WatchReports { wanted });
     }
-    // What was unsubscribed would be so before a message that is sent on the same connection later returns.
+    // An UNSUBSCRIBE takes effect before a message that is sent later on the same connection returns.
     let before = observer.counters.events(Event::Echo);
     observer.send(GatewayMessage::PublishStatus { status: observer.status.clone() });
     until("the status returns", || observer.counters.events(Event::Echo) > before).await;

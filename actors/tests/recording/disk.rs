@@ -101,7 +101,7 @@ fn a_disk_that_refuses_bytes_costs_entries_and_nothing_else() {
     assert!(log.messages.iter().any(|message| is(&message, "\"missing\"")), "and that something is lost");
 }
 
-/// Who only follows takes no reports of others unless told to, which shows in the log of the node, not only in what is
+/// A follower takes no reports of others unless told to, which shows in the log of the node, not only in what is
 /// missing afterwards.
 #[test]
 fn a_vehicle_that_never_leads_says_that_it_records_no_reports_of_others() {

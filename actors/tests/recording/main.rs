@@ -73,7 +73,7 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
         let more = again.keys().filter(|key| !own.contains_key(*key)).count();
         assert!(more <= 20, "{node}: {more} rounds of {} were not recorded", again.len());
         assert!(!said.contains("missing") && !said.contains("middle"), "{said}");
-        // Who leads only while the others stop has no reports to fuse.
+        // A node that leads only while the others stop has no reports to fuse.
         if node == "edge" || node == substitute {
             assert!(own.values().any(|line| line.contains("\"euclid\"")), "{node} fused reports");
         }
@@ -83,7 +83,7 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
     assert!(leaders.contains(&"edge") && leaders.contains(&&*substitute), "{leaders:?}");
 }
 
-/// What is edited between two runs of a node holds for the second alone, also when both are made again.
+/// An edit between two runs of a node holds for the second alone, also when both are made again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn every_run_is_made_again_under_its_own_configuration() {
     let mut cell = Cell::default();

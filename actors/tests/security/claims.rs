@@ -20,6 +20,9 @@ async fn nobody_speaks_on_the_topics_of_another() {
         gauss.publish_and_wait(&format!("ecod/v1/lot/{topic}"), false).await.unwrap();
         assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
     }
+    let counts = cell.counters.rejects_by_source();
+    let by_gauss = counts.iter().find(|count| count.source == "gauss" && count.reason.as_str() == "not_permitted");
+    assert_eq!(by_gauss.map(|count| count.times), Some(7));
     // The edge sees the next report, and none of the above.
     cell.honest_traffic_goes_on().await;
 }

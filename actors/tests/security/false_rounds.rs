@@ -22,7 +22,7 @@ const ATTACK: Duration = Duration::from_secs(3);
 /// A vehicle that no honest map names.
 const FALSE: &str = "zeno";
 
-/// What an honest leader would publish next, if it told of a vehicle that is not there.
+/// The map that an honest leader would publish next, if it told of a vehicle that is not there.
 fn false_map(after: &GlobalMap, ahead: u64) -> GlobalMap {
     let fused_at_us = Timestamp(after.fused_at_us.micros() + 100_000 * ahead);
     let correction = PoseCorrection { about_m: [0.0; 2], dx_m: 0.0, dy_m: 0.0, dheading_rad: 0.0, pairs: 1.0 };

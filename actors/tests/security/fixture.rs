@@ -22,7 +22,7 @@ use uuid::Uuid;
 
 pub(crate) const DAY: Duration = Duration::from_secs(86_400);
 
-/// How long anything may take on a machine that does much else.
+/// Maximum time for anything on a machine that does much else.
 pub(crate) const SOON: Duration = Duration::from_secs(20);
 
 /// Longest time from a changed revocation list until a node has nothing to do with the revoked one any more.

@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use ecod::wire::Role;
 use ecod_actors::node::NodeHandle;
-use tokio::time::sleep;
+use ecod_actors::transport::pki::TlsConfig;
+use tokio::time::{Instant, sleep};
 
 use crate::fixture::{DAY, Pki};
-use crate::nodes::{aggregator, start, start_with, until};
+use crate::nodes::{aggregator, start, start_cell, start_with, until};
 
 /// An edge whose broker has room for its own node only.
 async fn full_edge(pki: &mut Pki) -> NodeHandle {
@@ -33,6 +34,33 @@ async fn followers_of_a_leader_that_lets_nobody_in_go_on_to_the_next() {
     sleep(Duration::from_secs(7)).await;
     assert!(nodes.into_iter().all(follows_euclid), "{:?}", nodes.map(aggregator));
     assert_eq!(euclid.leadership().borrow().term, term, "the lead moved again");
+    for node in [gauss, euclid, edge] {
+        node.stop().await;
+    }
+}
+
+/// Its own files are in order, so that it starts, and leads where it is alone.
+#[tokio::test]
+async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_nothing() {
+    let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
+    let files = [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Cav)]
+        .map(|(node, role)| pki.issue(node, role, DAY));
+    let [edge, euclid, gauss] = start_cell(files).await;
+    edge.stop().await;
+    until("euclid leads", || aggregator(&gauss).as_deref() == Some("euclid")).await;
+    let term = euclid.leadership().borrow().term;
+    let foreign = TlsConfig { ca: pki.authority.ca(), ..elsewhere.issue("edge", Role::Edge, DAY) };
+    let edge = start("edge", Role::Edge, foreign, euclid.gossip_address()).await;
+    let round = || gauss.newest_map().borrow().as_ref().map_or(0, |newest| newest.map.round);
+    // Longer than an edge is on trial before it is handed the lead.
+    let (first, began) = (round(), Instant::now());
+    sleep(Duration::from_secs(8)).await;
+    let rounds = round() - first;
+    let expected = began.elapsed().as_millis() as u64 / 100;
+    assert_eq!(aggregator(&gauss).as_deref(), Some("euclid"));
+    assert_eq!(euclid.leadership().borrow().term, term, "the lead moved");
+    assert!(rounds * 20 >= expected * 19, "{rounds} of {expected} rounds");
+    assert!(edge.members().borrow().is_empty(), "admitted");
     for node in [gauss, euclid, edge] {
         node.stop().await;
     }

@@ -18,3 +18,4 @@ mod resources;
 mod shares;
 mod stolen_leader;
 mod topics;
+mod websocket;

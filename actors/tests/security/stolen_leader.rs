@@ -26,6 +26,7 @@ async fn a_revoked_leader_is_replaced_as_soon_as_the_list_is_read_and_does_not_c
     let [edge, euclid, gauss] = start_cell([edge_files, euclid_files, gauss_files]).await;
 
     pki.authority.revoke(&name("edge"), clock::now()).unwrap();
+    let revoked = Instant::now();
     let read_in = until("the list is read", || {
         let knows_edge = |node: &NodeHandle| node.members().borrow().iter().any(|member| member.name == name("edge"));
         !knows_edge(&euclid) || !knows_edge(&gauss)
@@ -34,6 +35,19 @@ async fn a_revoked_leader_is_replaced_as_soon_as_the_list_is_read_and_does_not_c
     let replaced_in = until("maps of another leader", || aggregator(&gauss).as_deref() == Some("euclid")).await;
     println!("the next leader's first map came {replaced_in:?} after the list was read, which took {read_in:?}");
     assert!(read_in < GONE_WITHIN && replaced_in < REPLACED_WITHIN, "{read_in:?}, {replaced_in:?}");
+    let reputations_of = |node: &NodeHandle| {
+        let newest = node.newest_reputations().borrow().clone();
+        newest.and_then(|newest| newest.message.aggregator.clone())
+    };
+    until("all is of another leader", || {
+        [&euclid, &gauss]
+            .into_iter()
+            .all(|node| aggregator(node).as_deref() == Some("euclid") && reputations_of(node) == Some(name("euclid")))
+    })
+    .await;
+    let gone_in = revoked.elapsed();
+    println!("on each node all was gone {gone_in:?} after the revocation, reputations included");
+    assert!(gone_in < GONE_WITHIN, "{gone_in:?}");
     let end = Instant::now() + Duration::from_secs(3);
     while Instant::now() < end {
         for node in [&euclid, &gauss] {

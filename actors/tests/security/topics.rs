@@ -72,6 +72,20 @@ async fn subscriptions_without_number_are_refused() {
     cell.honest_traffic_goes_on().await;
 }
 
+#[tokio::test]
+async fn a_packet_of_too_many_filters_ends_its_connection() {
+    let mut cell = Cell::start_with(|config| config.max_packet_bytes = Some(1 << 20)).await;
+    let mut stream = secure(&mut cell).await;
+    ask(&mut stream, &login(None), &CONNACK).await;
+    let filters = [&text("nodes/+")[..], &[0]].concat().repeat(7000);
+    // The broker may cut it off before the last byte.
+    stream.write_all(&packet(0x82, &[&[0, 1], &filters])).await.ok();
+    let ended = timeout(SOON, stream.read(&mut [0])).await.expect("it is not cut off");
+    assert!(matches!(ended, Ok(0) | Err(_)), "{ended:?}");
+    cell.counted(Event::ClientMalformed, 1).await;
+    cell.honest_traffic_goes_on().await;
+}
+
 /// The broker without a guard has no one to ask, and must survive all the same.
 #[tokio::test]
 async fn a_broker_without_a_guard_survives_endless_topics() {

@@ -11,6 +11,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
 use crate::doors::DoorVerdict;
+use crate::flood::FloodCost;
 
 /// A map that a node accepted.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -40,7 +41,7 @@ pub(crate) struct NodeRun {
 pub(crate) struct Phase {
     pub(crate) from: Timestamp,
     pub(crate) until: Timestamp,
-    /// How many new leaderships there may be.
+    /// Allowed number of new leaderships.
     pub(crate) changes: RangeInclusive<usize>,
     /// Groups of living nodes that reach each other; each has one leader at the end of the phase.
     pub(crate) components: Vec<BTreeSet<NodeName>>,
@@ -48,7 +49,7 @@ pub(crate) struct Phase {
     pub(crate) measured: BTreeSet<NodeName>,
 }
 
-/// What one trial came to.
+/// Outcome of one trial.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Verdict {
     /// Longest time between two accepted maps of any measured vehicle.
@@ -57,19 +58,21 @@ pub(crate) struct Verdict {
     pub(crate) stale_accepted: u64,
     /// Rounds that a measured vehicle did not get, and rounds that it got from two leaders.
     pub(crate) missed_rounds: u64,
-    /// Whether a living node was without maps at the end of a phase.
+    /// True if a living node was without maps at the end of a phase.
     pub(crate) unrecovered: bool,
-    /// Whether a component had two leaders at the end of a phase.
+    /// True if a component had two leaders at the end of a phase.
     pub(crate) double_leader: bool,
-    /// Whether the reputations after the trial differ from those before; judged by the caller.
+    /// True if the reputations after the trial differ from those before; judged by the caller.
     pub(crate) reputations_changed: bool,
     /// New leaderships beyond those that the faults explain, and expected ones that did not come about.
     pub(crate) false_failovers: u64,
-    /// Whether so much processor time was withheld from the machine that a missed bar of time tells nothing; judged by
+    /// True if so much processor time was withheld from the machine that a missed bar of time tells nothing; judged by
     /// the caller.
     pub(crate) is_void: bool,
-    /// How programs beside the measured vehicles fared; judged by the caller.
+    /// Outcome for programs beside the measured vehicles; judged by the caller.
     pub(crate) doors: DoorVerdict,
+    /// Cost of a flood, if there was one; judged by the caller.
+    pub(crate) flood: Option<FloodCost>,
 }
 
 /// A node that has taken no map for so long at the end of a phase is without service.
@@ -105,7 +108,7 @@ pub(crate) fn percentile(sorted: &[Duration], percent: usize) -> Option<Duration
     sorted.get(rank - 1).copied()
 }
 
-/// How many maps a process took although it had taken a later one.
+/// Number of maps that a process took although it had taken a later one.
 pub(crate) fn stale(run: &NodeRun) -> u64 {
     let mut latest: Option<(&Epoch, u64)> = None;
     let mut stale = 0;
@@ -136,7 +139,8 @@ fn missed(run: &NodeRun, phase: &Phase) -> u64 {
     pairs(run, phase.from, phase.until).map(between).sum()
 }
 
-fn served(runs: &[NodeRun], node: &NodeName, until: Timestamp) -> bool {
+/// True if the node, or the program at its door, still took maps at this time.
+pub(crate) fn served(runs: &[NodeRun], node: &NodeName, until: Timestamp) -> bool {
     let maps = runs.iter().filter(|run| run.node == *node).flat_map(|run| &run.accepted);
     maps.into_iter().any(|map| map.at <= until && until.since(map.at) <= SERVED_WITHIN)
 }

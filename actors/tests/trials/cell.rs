@@ -9,11 +9,13 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod_actors::platform::clock;
 use tempfile::TempDir;
 
 use crate::analysis::{Accepted, NodeRun};
 use crate::doors;
+use crate::flood::{Flood, FloodCost};
 use crate::logs;
 use crate::network::{self, Bridged};
 use crate::ports::Ports;
@@ -32,23 +34,23 @@ pub(crate) const EDGE: usize = 0;
 /// Time for all processes to start and agree.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// How long everything must have been well before a fault.
+/// Time for which all must have been well before a fault.
 const SETTLED: Duration = Duration::from_millis(1500);
 
-/// What a cell consists of.
+/// Parts of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Plan {
     /// One edge and vehicles.
     pub(crate) nodes: usize,
-    /// Whether the edge is started at all.
+    /// True if the edge is started at all.
     pub(crate) edge: bool,
-    /// Whether all use mosquitto.
+    /// True if all use mosquitto.
     pub(crate) external_broker: bool,
-    /// Whether the brokers of the nodes are used beside it.
+    /// True if the brokers of the nodes are used beside it.
     pub(crate) fallback: bool,
-    /// Whether every node has a network namespace.
+    /// True if every node has a network namespace.
     pub(crate) bridged: bool,
-    /// Whether the vehicles vote on what they see.
+    /// True if the vehicles vote on what they see.
     pub(crate) votes: bool,
 }
 
@@ -57,6 +59,7 @@ pub(crate) struct Plan {
 pub(crate) struct Cell {
     nodes: Vec<Node>,
     busy: Vec<Process>,
+    flood: Option<(usize, Timestamp, Flood)>,
     mosquitto: Option<Process>,
     network: Option<Bridged>,
     directory: TempDir,
@@ -77,7 +80,7 @@ struct Node {
     runs: usize,
 }
 
-/// Whether there is a mosquitto here.
+/// True if there is a mosquitto here.
 pub(crate) fn has_mosquitto() -> bool {
     Path::new(MOSQUITTO).exists()
 }
@@ -90,6 +93,7 @@ impl Cell {
         let mut cell = Self {
             nodes: Vec::new(),
             busy: Vec::new(),
+            flood: None,
             mosquitto: None,
             network,
             directory,
@@ -172,7 +176,7 @@ impl Cell {
         opened.map(|node| Ok(NodeRun { node: node.name.clone(), accepted: logs::at_door(&node.door_log())? })).collect()
     }
 
-    /// What keeps the cell from being well.
+    /// The reason for which the cell is not well yet.
     fn disagreement(&mut self) -> anyhow::Result<Option<String>> {
         let mut leaders = BTreeSet::new();
         for node in &mut self.nodes {
@@ -222,6 +226,30 @@ impl Cell {
             self.busy.push(Process::start(command(shell, None).args(["-c", "while :; do :; done"]))?);
         }
         Ok(())
+    }
+
+    /// Has programs flood a node's door until the cell ends.
+    pub(crate) fn flood(&mut self, index: usize) -> anyhow::Result<()> {
+        let other = if index == 1 { 2 } else { 1 };
+        let [node, other] = [index, other].map(|index| &self.nodes[index]);
+        let process = node.process.as_ref().context("the process does not run")?.id();
+        let flood = Flood::start(node.address.broker, &node.name, process, &other.name)?;
+        self.flood = Some((index, clock::now(), flood));
+        Ok(())
+    }
+
+    /// The node whose door is flooded.
+    pub(crate) fn flooded(&self) -> Option<&NodeName> {
+        self.flood.as_ref().map(|(index, ..)| &self.nodes[*index].name)
+    }
+
+    /// Cost of the flood so far, if there is one.
+    pub(crate) fn flood_cost(&self) -> anyhow::Result<Option<FloodCost>> {
+        let (Some((_, since, flood)), Some(flooded)) = (&self.flood, self.flooded()) else { return Ok(None) };
+        let (messages, grown_kib) = flood.cost()?;
+        let others = self.nodes.iter().skip(1).filter(|node| node.name != *flooded);
+        let unheard = others.map(|node| logs::without(&node.map_log(), flooded, *since)).sum::<anyhow::Result<_>>()?;
+        Ok(Some(FloodCost { messages, grown_kib, unheard }))
     }
 
     /// Cuts the network in two, the edge being on the larger side, or heals it.
@@ -305,7 +333,7 @@ impl Cell {
         self.nodes.iter().map(|node| node.address.gossip).collect()
     }
 
-    /// How many nodes there are, running or not.
+    /// Number of nodes, running or not.
     pub(crate) fn nodes(&self) -> usize {
         self.nodes.len()
     }
@@ -316,7 +344,7 @@ impl Cell {
         self.nodes.iter().filter_map(process).collect()
     }
 
-    /// What every run of every process accepted.
+    /// Maps that every run of every process accepted.
     pub(crate) fn runs(&self) -> anyhow::Result<Vec<NodeRun>> {
         let runs = self.nodes.iter().flat_map(|node| (1..=node.runs).map(move |run| (node, run)));
         let read = |(node, run): (&Node, usize)| {

@@ -11,7 +11,7 @@ use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
-use crate::analysis::{Accepted, NodeRun, Phase, longest_wait, stale};
+use crate::analysis::{Accepted, NodeRun, Phase, longest_wait, served, stale};
 use crate::process::{Process, command};
 use crate::settings::CELL;
 
@@ -27,6 +27,8 @@ pub(crate) struct DoorVerdict {
     pub(crate) delays: Vec<Duration>,
     /// Maps that a program got twice, out of order or not at all, and maps that its node never accepted.
     pub(crate) wrong: u64,
+    /// Ends of phases at which a program was without maps.
+    pub(crate) unserved: u64,
 }
 
 /// Starts a client that writes to `log` every map at this address.
@@ -38,14 +40,25 @@ pub(crate) fn open(address: SocketAddr, namespace: Option<&str>, log: &Path) -> 
     Process::start(client.args(["-h", &host, "-p", &port, "-t", &topic, "-F", "%U %p"]).stdout(file))
 }
 
-/// Compares the doors, by node, with the logs of all processes.
-pub(crate) fn judge_doors(runs: &[NodeRun], doors: &[NodeRun], phases: &[Phase]) -> DoorVerdict {
+/// Compares the doors, by node, with the logs of all processes. At a flooded door programs may wait, and get the same maps.
+pub(crate) fn judge_doors(
+    runs: &[NodeRun],
+    doors: &[NodeRun],
+    phases: &[Phase],
+    flooded: Option<&NodeName>,
+) -> DoorVerdict {
     let mut verdict = DoorVerdict::default();
     let measured: BTreeSet<&NodeName> = phases.iter().flat_map(|phase| &phase.measured).collect();
     for door in doors.iter().filter(|door| measured.contains(&door.node)) {
+        let measuring = || phases.iter().filter(|phase| phase.measured.contains(&door.node));
         let own: Vec<&NodeRun> = runs.iter().filter(|run| run.node == door.node).collect();
         verdict.wrong += stale(door) + differences(&own, door);
-        for phase in phases.iter().filter(|phase| phase.measured.contains(&door.node)) {
+        let is_unserved = |phase: &&Phase| !served(std::slice::from_ref(door), &door.node, phase.until);
+        verdict.unserved += measuring().filter(is_unserved).count() as u64;
+        if flooded == Some(&door.node) {
+            continue;
+        }
+        for phase in measuring() {
             let at_node = own.iter().filter_map(|run| longest_wait(run, phase.from, phase.until)).max();
             let at_door = longest_wait(door, phase.from, phase.until);
             let longer = at_door.unwrap_or_default().saturating_sub(at_node.unwrap_or_default());
@@ -93,10 +106,14 @@ mod tests {
     }
 
     fn judge(node: &NodeRun, door: NodeRun) -> DoorVerdict {
-        let nodes = BTreeSet::from([NodeName::from_static("a")]);
-        let (from, until) = (Timestamp(0), Timestamp(10_000_000));
-        let phase = Phase { from, until, changes: 0..=0, components: Vec::new(), measured: nodes };
-        judge_doors(std::slice::from_ref(node), &[door], &[phase])
+        judge_until(500, node, door, None)
+    }
+
+    fn judge_until(end_ms: u64, node: &NodeRun, door: NodeRun, flooded: Option<&NodeName>) -> DoorVerdict {
+        let measured = BTreeSet::from([NodeName::from_static("a")]);
+        let (from, until) = (Timestamp(0), Timestamp(end_ms * 1000));
+        let phase = Phase { from, until, changes: 0..=0, components: Vec::new(), measured };
+        judge_doors(std::slice::from_ref(node), &[door], &[phase], flooded)
     }
 
     #[test]
@@ -104,7 +121,19 @@ mod tests {
         let node = run([(1, 100), (2, 200), (3, 350), (4, 450)]);
         let verdict = judge(&node, run([(2, 201), (3, 354), (4, 451)]));
         let delays = [1, 4, 1].map(Duration::from_millis).to_vec();
-        assert_eq!(verdict, DoorVerdict { longer_gap: Some(Duration::from_millis(3)), delays, wrong: 0 });
+        assert_eq!(verdict, DoorVerdict { longer_gap: Some(Duration::from_millis(3)), delays, wrong: 0, unserved: 0 });
+    }
+
+    #[test]
+    fn a_program_that_gets_no_more_maps_is_unserved_also_at_a_flooded_door() {
+        let node = run((1..=20).map(|round| (round, 100 * round)));
+        let cut_short = run((1..=10).map(|round| (round, 100 * round + 1)));
+        for flooded in [None, Some(&NodeName::from_static("a"))] {
+            let unserved = |end_ms, door: &NodeRun| judge_until(end_ms, &node, door.clone(), flooded).unserved;
+            assert_eq!(unserved(2050, &cut_short), 1);
+            assert_eq!(unserved(2050, &run([])), 1);
+            assert_eq!((unserved(1050, &cut_short), unserved(2050, &node)), (0, 0));
+        }
     }
 
     #[test]

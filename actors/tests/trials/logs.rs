@@ -13,7 +13,7 @@ use serde::Deserialize;
 use crate::analysis::Accepted;
 use crate::doors;
 
-/// What the trials need of a line of a map log.
+/// Part of a map log's line that the trials need.
 #[derive(Deserialize)]
 struct Line {
     received_at_us: Timestamp,
@@ -26,11 +26,25 @@ struct Map {
     aggregator: NodeName,
     round: u64,
     fused_at_us: Timestamp,
+    landmarks: Vec<Landmark>,
+}
+
+#[derive(Deserialize)]
+struct Landmark {
+    contributors: Vec<NodeName>,
 }
 
 /// All maps of a log; a line that a killed process left unfinished is none.
 pub(crate) fn accepted(path: &Path) -> anyhow::Result<Vec<Accepted>> {
     maps(path, parse)
+}
+
+/// Number of maps in a log, from a time on, to which a node contributes nothing.
+pub(crate) fn without(path: &Path, node: &NodeName, since: Timestamp) -> anyhow::Result<u64> {
+    let lacks = |map: &Map| map.landmarks.iter().all(|landmark| !landmark.contributors.contains(node));
+    let lines = whole_lines(path)?;
+    let lines = lines.lines().map(serde_json::from_str::<Line>).collect::<Result<Vec<_>, _>>()?;
+    Ok(lines.iter().filter(|line| line.received_at_us >= since && lacks(&line.map)).count() as u64)
 }
 
 /// All maps that a client at a node's door got.
@@ -43,12 +57,17 @@ pub(crate) fn at_door(path: &Path) -> anyhow::Result<Vec<Accepted>> {
 }
 
 fn maps(path: &Path, parse: impl Fn(&str) -> anyhow::Result<Accepted>) -> anyhow::Result<Vec<Accepted>> {
-    let text = match fs::read_to_string(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+    whole_lines(path)?.lines().map(|line| parse(line).with_context(|| format!("map log {}", path.display()))).collect()
+}
+
+/// The text of a log without an unfinished last line.
+fn whole_lines(path: &Path) -> anyhow::Result<String> {
+    let mut text = match fs::read_to_string(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(String::new()),
         text => text.with_context(|| format!("cannot read {}", path.display()))?,
     };
-    let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
-    whole.lines().map(|line| parse(line).with_context(|| format!("map log {}", path.display()))).collect()
+    text.truncate(text.rfind('\n').unwrap_or_default());
+    Ok(text)
 }
 
 /// The last map of a log, if there is any yet.
@@ -75,7 +94,7 @@ fn parse(line: &str) -> anyhow::Result<Accepted> {
 
 impl Map {
     fn received(self, at: Timestamp) -> Accepted {
-        let Self { epoch, aggregator, round, fused_at_us: fused_at } = self;
+        let Self { epoch, aggregator, round, fused_at_us: fused_at, .. } = self;
         Accepted { at, epoch: Epoch::new(epoch, aggregator), round, fused_at }
     }
 }
@@ -116,6 +135,15 @@ mod tests {
         assert_eq!(maps.iter().map(|map| map.round).collect::<Vec<_>>(), [88, 89]);
         assert_eq!(maps[0].epoch.to_string(), "edge@3");
         assert_eq!(last_accepted(log.path()).unwrap().as_ref(), maps.last());
+    }
+
+    #[test]
+    fn maps_without_a_node_count_from_a_time_on() {
+        let (maps, euclid) = (LINE.replace('\n', ""), NodeName::from_static("euclid"));
+        let seen = maps.replace(r#""landmarks":[]"#, r#""landmarks":[{"contributors":["euclid"]}]"#);
+        let log = file(&format!("{maps}\n{maps}\n{seen}\n"));
+        let without = |since| without(log.path(), &euclid, Timestamp(since)).unwrap();
+        assert_eq!((without(1500), without(1501)), (2, 0));
     }
 
     #[test]

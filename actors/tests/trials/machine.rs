@@ -53,12 +53,12 @@ impl Machine {
         }
     }
 
-    /// Whether what comes late may be late for want of processor time.
+    /// True if what comes late may be late for want of processor time.
     pub(crate) fn is_starved(&self) -> bool {
         self.most_withheld() > MOST_WITHHELD || self.longest_delay > LONGEST_DELAY
     }
 
-    /// What was seen of that.
+    /// The findings in words.
     pub(crate) fn account(&self) -> String {
         let (withheld, delay) = (100.0 * self.most_withheld(), self.longest_delay);
         format!("{withheld:.0} % of the processors' time withheld, a sleeper late by {} ms", delay.as_millis())

@@ -10,6 +10,7 @@
 mod analysis;
 mod cell;
 mod doors;
+mod flood;
 mod logs;
 mod machine;
 mod network;
@@ -31,6 +32,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use crate::analysis::{Phase, Verdict, judge};
 use crate::cell::{Cell, EDGE, Plan};
 use crate::doors::judge_doors;
+use crate::flood::FloodCost;
 use crate::machine::Machine;
 use crate::report::{Outcome, table};
 use crate::scenario::{Cure, Fault, Needs, SCENARIOS, Scenario, Step, Who};
@@ -115,10 +117,13 @@ async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> 
         Ok(verdict) => {
             let gap = verdict.gap.map_or_else(|| "none".to_owned(), |gap| format!("{} ms", gap.as_millis()));
             let misses = Outcome::new(scenario, nodes, &[Verdict { is_void: false, ..verdict.clone() }]).misses();
-            // What meets its bars in spite of it counts.
+            // A trial that meets its bars in spite of it counts.
             let verdict = Verdict { is_void: verdict.is_void && !misses.is_empty(), ..verdict };
             let void = if verdict.is_void { ", void: the machine stood still" } else { "" };
-            println!("{label}: gap {gap}{void}");
+            let flood = verdict.flood.as_ref().map_or_else(String::new, |FloodCost { messages, grown_kib, .. }| {
+                format!(", {messages} messages of a flood, which the node met with {} MiB", grown_kib / 1024)
+            });
+            println!("{label}: gap {gap}{flood}{void}");
             if !misses.is_empty() {
                 let mut shown = verdict.clone();
                 shown.doors.delays.clear();
@@ -132,11 +137,7 @@ async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> 
 
 async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict> {
     cell.settle().await?;
-    if scenario
-        .script
-        .iter()
-        .any(|step| matches!(step.fault, Fault::Kill(victims) if victims.iter().any(|who| matches!(who, Who::Standby))))
-    {
+    if scenario.needs_standby() {
         cell.until_standby().await?;
     }
     cell.open_doors().await?;
@@ -162,10 +163,11 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
     if machine.is_starved() {
         println!("the machine stood still: {}", machine.account());
     }
+    let flood = cell.flood_cost()?;
     // Doors first: a node has written what its door has sent.
     let (doors, runs) = (cell.doors()?, cell.runs()?);
-    let doors = judge_doors(&runs, &doors, &phases);
-    Ok(Verdict { reputations_changed, is_void: machine.is_starved(), doors, ..judge(&runs, &phases) })
+    let doors = judge_doors(&runs, &doors, &phases, cell.flooded());
+    Ok(Verdict { reputations_changed, is_void: machine.is_starved(), doors, flood, ..judge(&runs, &phases) })
 }
 
 fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
@@ -184,6 +186,7 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
         Fault::ResumeEdge => cell.pause(EDGE, false),
         Fault::KillExternalBroker => cell.kill_mosquitto(),
         Fault::Busy(loops) => cell.busy(loops),
+        Fault::FloodStandby => cell.flood(cell.standby()?),
         Fault::Split => cell.split(true),
         Fault::CutOneWay => cell.cut_one_way(true),
         Fault::Lose(percent) => cell.lose(percent),

@@ -20,7 +20,7 @@ pub(crate) struct Bridged {
     nodes: usize,
 }
 
-/// Whether namespaces can be made here.
+/// True if namespaces can be made here.
 pub(crate) fn has_namespaces() -> bool {
     let probe = namespace(usize::MAX);
     let made = ip(&["netns", "add", &probe]).and_then(|()| ip(&["link", "add", &bridge('p'), "type", "bridge"]));
@@ -29,7 +29,7 @@ pub(crate) fn has_namespaces() -> bool {
     made.is_ok()
 }
 
-/// Whether packets can be dropped at random here.
+/// True if packets can be dropped at random here.
 pub(crate) fn has_packet_filter() -> bool {
     Command::new("nft").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
 }
@@ -90,7 +90,7 @@ impl Bridged {
 
 impl Drop for Bridged {
     fn drop(&mut self) {
-        // What was never made is not there to be removed.
+        // One that was never made is not there to be removed.
         for node in 0..self.nodes {
             let _ = ip(&["netns", "delete", &namespace(node)]);
         }

@@ -58,7 +58,7 @@ impl Process {
         self.signal(Signal::SIGCONT)
     }
 
-    /// How the process ended, if it has.
+    /// Exit status of the process, if it has ended.
     pub(crate) fn ended(&mut self) -> anyhow::Result<Option<std::process::ExitStatus>> {
         Ok(self.child.try_wait()?)
     }

@@ -5,6 +5,7 @@ use std::time::Duration;
 use serde::Serialize;
 
 use crate::analysis::{Verdict, percentile};
+use crate::flood::FloodCost;
 use crate::scenario::Scenario;
 
 /// Parts of a second.
@@ -27,6 +28,8 @@ pub(crate) struct Outcome {
     false_failovers: u64,
     reputations_changed: usize,
     doors: Doors,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    flood: Option<Flood>,
     #[serde(skip)]
     gap_bar_ms: Option<u64>,
     #[serde(skip)]
@@ -40,7 +43,7 @@ struct Gaps {
     max: Option<u64>,
 }
 
-/// How programs beside the vehicles fared.
+/// Outcome for programs beside the vehicles.
 #[derive(Debug, Serialize)]
 struct Doors {
     /// By how much the gap of a program exceeds that of its node, over the trials.
@@ -48,6 +51,41 @@ struct Doors {
     /// By how much a program has a map later than its node.
     delay_us: Gaps,
     wrong_maps: u64,
+    /// Programs that were without maps at the end of a phase.
+    unserved: u64,
+}
+
+/// Outcome of floods of a door.
+#[derive(Debug, Serialize)]
+struct Flood {
+    least_messages: u64,
+    most_grown_kib: u64,
+    unheard: u64,
+}
+
+impl Flood {
+    /// Fewer messages are no flood.
+    const LEAST_MESSAGES: u64 = 2000;
+    /// Most memory that a flood may cost the node.
+    const GROWN_BAR_KIB: u64 = 32 * 1024;
+
+    fn new(costs: &[&FloodCost]) -> Option<Self> {
+        Some(Self {
+            least_messages: costs.iter().map(|cost| cost.messages).min()?,
+            most_grown_kib: costs.iter().map(|cost| cost.grown_kib).max()?,
+            unheard: costs.iter().map(|cost| cost.unheard).sum(),
+        })
+    }
+
+    fn misses(&self) -> impl Iterator<Item = String> {
+        let Self { least_messages, most_grown_kib, unheard } = *self;
+        let (least, most) = (Self::LEAST_MESSAGES, Self::GROWN_BAR_KIB);
+        let few = (least_messages < least).then(|| format!("flood of {least_messages} messages, at least {least}"));
+        let grown =
+            (most_grown_kib > most).then(|| format!("flooded node grew by {most_grown_kib} KiB, at most {most}"));
+        let unheard = (unheard > 0).then(|| format!("maps without the flooded node {unheard}, must be 0"));
+        [few, grown, unheard].into_iter().flatten()
+    }
 }
 
 impl Gaps {
@@ -70,6 +108,7 @@ impl Doors {
             longer_gap_us: Gaps::new(doors().filter_map(|door| door.longer_gap), MICROS),
             delay_us: Gaps::new(doors().flat_map(|door| door.delays.iter().copied()), MICROS),
             wrong_maps: all.iter().map(|verdict| verdict.doors.wrong).sum(),
+            unserved: doors().map(|door| door.unserved).sum(),
         }
     }
 
@@ -80,14 +119,15 @@ impl Doors {
             let bar = bar.as_micros() as u64;
             gaps.p50.filter(|p50| *p50 > bar).map(|p50| format!("{what} p50 {p50} us, at most {bar}"))
         };
-        let wrong = (self.wrong_maps > 0).then(|| format!("wrong maps at doors {}, must be 0", self.wrong_maps));
+        let none = |what: &str, count: u64| (count > 0).then(|| format!("{what} at doors {count}, must be 0"));
+        let counts = [none("wrong maps", self.wrong_maps), none("programs without maps", self.unserved)];
         let longer = over("longer gap at doors", &self.longer_gap_us, Self::LONGER_GAP_BAR).filter(|_| trials >= 10);
-        [wrong, longer, over("delay at doors", &self.delay_us, Self::DELAY_BAR)].into_iter().flatten()
+        counts.into_iter().chain([longer, over("delay at doors", &self.delay_us, Self::DELAY_BAR)]).flatten()
     }
 }
 
 impl Outcome {
-    /// What the verdicts come to: of void ones only what no want of processor time excuses.
+    /// Summary of the verdicts: of void ones only what no want of processor time excuses.
     pub(crate) fn new(scenario: &Scenario, nodes: usize, all: &[Verdict]) -> Self {
         let verdicts: Vec<&Verdict> = all.iter().filter(|verdict| !verdict.is_void).collect();
         Self {
@@ -103,6 +143,7 @@ impl Outcome {
             false_failovers: verdicts.iter().map(|verdict| verdict.false_failovers).sum(),
             reputations_changed: all.iter().filter(|verdict| verdict.reputations_changed).count(),
             doors: Doors::new(&verdicts, all),
+            flood: Flood::new(&verdicts.iter().filter_map(|verdict| verdict.flood.as_ref()).collect::<Vec<_>>()),
             gap_bar_ms: scenario.gap.limit(nodes).map(|limit| limit.as_millis() as u64),
             seamless: scenario.seamless,
         }
@@ -123,7 +164,8 @@ impl Outcome {
             none("false_failovers", self.false_failovers),
             none("reputations_changed", self.reputations_changed as u64),
         ];
-        gap.into_iter().chain(counts.into_iter().flatten()).chain(self.doors.misses(self.trials)).collect()
+        let flood = self.flood.iter().flat_map(Flood::misses);
+        gap.into_iter().chain(counts.into_iter().flatten()).chain(self.doors.misses(self.trials)).chain(flood).collect()
     }
 }
 
@@ -167,14 +209,16 @@ pub(crate) fn table(outcomes: &[Outcome]) -> String {
 /// The same trials as programs beside the vehicles see them.
 fn doors_table(outcomes: &[Outcome]) -> String {
     let mut text = format!(
-        "\n{:<29}{:>6}{:>12}{:>9}{:>12}{:>9}{:>9}{:>7}\n",
-        "at doors", "nodes", "longer gap", "max", "later, p50", "p99", "max", "wrong"
+        "\n{:<29}{:>6}{:>12}{:>9}{:>12}{:>9}{:>9}{:>7}{:>9}\n",
+        "at doors", "nodes", "longer gap", "max", "later, p50", "p99", "max", "wrong", "without"
     );
     for Outcome { scenario, nodes, doors, .. } in outcomes {
-        let Doors { longer_gap_us: longer, delay_us: delay, wrong_maps } = doors;
+        let Doors { longer_gap_us: longer, delay_us: delay, wrong_maps, unserved } = doors;
         let [longer, longest] = [longer.p50, longer.max].map(millis);
         let [p50, p99, max] = [delay.p50, delay.p99, delay.max].map(millis);
-        text += &format!("{scenario:<29}{nodes:>6}{longer:>12}{longest:>9}{p50:>12}{p99:>9}{max:>9}{wrong_maps:>7}\n");
+        text += &format!(
+            "{scenario:<29}{nodes:>6}{longer:>12}{longest:>9}{p50:>12}{p99:>9}{max:>9}{wrong_maps:>7}{unserved:>9}\n"
+        );
     }
     text + "in ms: how much longer a program waited than its node, p50 and most of the trials, and how much later it had each map\n\n"
 }
@@ -215,16 +259,27 @@ mod tests {
 
     #[test]
     fn programs_are_served_as_their_nodes_are() {
-        let doors = |longer, later, wrong| {
+        let doors = |longer, later, wrong, unserved| {
             let (longer, later) = (Duration::from_millis(longer), Duration::from_micros(later));
-            let doors = DoorVerdict { longer_gap: Some(longer), delays: vec![later], wrong };
+            let doors = DoorVerdict { longer_gap: Some(longer), delays: vec![later], wrong, unserved };
             let verdict = Verdict { gap: Some(Duration::from_millis(150)), doors, ..Verdict::default() };
             Outcome::new(&SCENARIOS[0], 5, &vec![verdict; 10]).misses()
         };
-        assert!(doors(5, 1000, 0).is_empty());
+        assert!(doors(5, 1000, 0, 0).is_empty());
         let misses = ["longer gap at doors p50 6000 us, at most 5000", "delay at doors p50 1001 us, at most 1000"];
-        assert_eq!(doors(6, 1001, 0), misses);
-        assert_eq!(doors(0, 0, 1), ["wrong maps at doors 10, must be 0"]);
+        assert_eq!(doors(6, 1001, 0, 0), misses);
+        assert_eq!(doors(0, 0, 1, 0), ["wrong maps at doors 10, must be 0"]);
+        assert_eq!(doors(0, 0, 0, 1), ["programs without maps at doors 10, must be 0"]);
+    }
+
+    #[test]
+    fn a_flood_costs_its_node_little_and_its_reports_nothing() {
+        let misses = |messages, grown_kib, unheard| {
+            let flood = Some(FloodCost { messages, grown_kib, unheard });
+            outcome("edge_sigkill_door_flood", Verdict { flood, ..Verdict::default() }).misses()
+        };
+        assert!(misses(Flood::LEAST_MESSAGES, Flood::GROWN_BAR_KIB, 0).is_empty());
+        assert_eq!(misses(Flood::LEAST_MESSAGES - 1, Flood::GROWN_BAR_KIB + 1, 1).len(), 3);
     }
 
     #[test]
@@ -256,7 +311,7 @@ mod tests {
             "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "void": 0, "gap_ms": {"p50": 150, "p99": 150, "max": 150},
             "stale_accepted": 0, "missed_rounds": 0, "unrecovered": 0, "double_leader_after_quiet": 0,
             "false_failovers": 0, "reputations_changed": 0,
-            "doors": {"longer_gap_us": {"p50": null, "p99": null, "max": null}, "delay_us": {"p50": null, "p99": null, "max": null}, "wrong_maps": 0},
+            "doors": {"longer_gap_us": {"p50": null, "p99": null, "max": null}, "delay_us": {"p50": null, "p99": null, "max": null}, "wrong_maps": 0, "unserved": 0},
         }]);
         assert_eq!(json, expected);
     }

@@ -17,9 +17,11 @@ pub(crate) enum Fault {
     KillExternalBroker,
     /// So many processes compete for the processor.
     Busy(usize),
+    /// Programs flood the standby's door, from now on.
+    FloodStandby,
     /// The network falls in two.
     Split,
-    /// What the leader sends to one vehicle is lost.
+    /// The leader's packets to one vehicle are lost.
     CutOneWay,
     /// So many percent of all packets are lost.
     Lose(u8),
@@ -27,7 +29,7 @@ pub(crate) enum Fault {
     Heal(Cure),
 }
 
-/// What is healed.
+/// Part that is healed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Cure {
     Split,
@@ -50,11 +52,11 @@ pub(crate) struct Step {
     pub(crate) watch: Duration,
     /// Fewest and most new leaderships that follow.
     pub(crate) changes: (usize, usize),
-    /// Whether gap and missed rounds are those of the trial.
+    /// True if gap and missed rounds are those of the trial.
     pub(crate) measured: bool,
 }
 
-/// What a scenario needs beside loopback.
+/// Needs of a scenario beside loopback.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Needs {
     Loopback,
@@ -67,7 +69,7 @@ pub(crate) enum Needs {
     PacketFilter,
 }
 
-/// What the gap may be at most.
+/// Bar of the gap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum GapBar {
     /// Nothing is asked of it.
@@ -84,14 +86,25 @@ pub(crate) struct Scenario {
     pub(crate) name: &'static str,
     pub(crate) needs: Needs,
     pub(crate) least_nodes: usize,
-    /// Whether the edge is there at the start.
+    /// True if the edge is there at the start.
     pub(crate) edge: bool,
     pub(crate) script: &'static [Step],
     pub(crate) gap: GapBar,
-    /// Whether vehicles vote beforehand, and what is known of them must not change.
+    /// True if vehicles vote beforehand, and what is known of them must not change.
     pub(crate) votes: bool,
-    /// Whether no measured vehicle may miss a round or get one twice.
+    /// True if no measured vehicle may miss a round or get one twice.
     pub(crate) seamless: bool,
+}
+
+impl Scenario {
+    /// True if it does something to the standby, which then must have been named.
+    pub(crate) fn needs_standby(&self) -> bool {
+        self.script.iter().any(|step| match step.fault {
+            Fault::FloodStandby => true,
+            Fault::Kill(victims) => victims.iter().any(|who| matches!(who, Who::Standby)),
+            _ => false,
+        })
+    }
 }
 
 impl GapBar {
@@ -118,10 +131,17 @@ const BASE: Scenario = Scenario {
 };
 
 /// All scenarios in the order of running.
-pub(crate) const SCENARIOS: [Scenario; 12] = [
+pub(crate) const SCENARIOS: [Scenario; 13] = [
     Scenario {
         name: "edge_sigkill",
         script: &[measured(Fault::Kill(&[Who::Edge]), 2, (1, 1))],
+        gap: GapBar::Killed,
+        ..BASE
+    },
+    Scenario {
+        name: "edge_sigkill_door_flood",
+        least_nodes: 3,
+        script: &[step(Fault::FloodStandby, 3, (0, 0)), measured(Fault::Kill(&[Who::Edge]), 3, (1, 1))],
         gap: GapBar::Killed,
         ..BASE
     },

@@ -32,13 +32,13 @@ pub(crate) const CELL: &str = "trial";
 pub(crate) const LANDMARK: &str = "ahead";
 
 /// One object ahead of the vehicle in every frame.
-pub(crate) const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]
+pub(crate) const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":7.5,"y_min":5.0,"x_max":8.5,"y_max":6.0}}]
 "#;
 
-/// A grey image: the vehicles see by recorded detections, but all else is as with a camera.
+/// A grey image of the default optics' shape: the vehicles see by recorded detections, but all else is as with a camera.
 pub(crate) fn frame() -> Vec<u8> {
-    let mut ppm = b"P6 16 16 255\n".to_vec();
-    ppm.extend([128; 16 * 16 * 3]);
+    let mut ppm = b"P6 16 12 255\n".to_vec();
+    ppm.extend([128; 16 * 12 * 3]);
     ppm
 }
 
@@ -75,5 +75,5 @@ pub(crate) fn configuration(
             plan.votes
         );
     }
-    text + &format!("\n[[landmarks]]\nid = \"{LANDMARK}\"\nx_m = 6.0\ny_m = 0.0\n")
+    text + &format!("\n[[landmarks]]\nid = \"{LANDMARK}\"\nx_m = 6.6\ny_m = 0.0\n")
 }

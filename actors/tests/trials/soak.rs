@@ -37,7 +37,7 @@ fn soak() {
     end_with_the_harness(run());
 }
 
-/// What a soak came to.
+/// Outcome of a soak.
 #[derive(Debug, Serialize)]
 struct Summary {
     nodes: usize,

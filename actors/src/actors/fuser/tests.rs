@@ -40,6 +40,20 @@ fn map(epoch: Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
     FollowerMessage::TakeMap { delivery: Delivery::local(map, received_at) }
 }
 
+fn standby() -> FuserState {
+    FuserState::new(FuserArguments {
+        aggregator: Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
+        report_queue: LatestReportQueue::default(),
+        newest: None,
+        recording: LogSender::default(),
+        clock: CellClock::default(),
+        gateway: ActorSlot::default(),
+        keeper: ActorSlot::default(),
+        counters: Arc::default(),
+        spans: spans(),
+    })
+}
+
 #[tokio::test]
 async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
     let elected = Leadership {
@@ -76,17 +90,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         follower.drain_and_wait(None).await.unwrap();
         fuser.get().unwrap().drain_and_wait(None).await.unwrap();
 
-        let mut fuser = FuserState::new(FuserArguments {
-            aggregator: Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
-            report_queue: LatestReportQueue::default(),
-            newest: None,
-            recording: LogSender::default(),
-            clock: CellClock::default(),
-            gateway: ActorSlot::default(),
-            keeper: ActorSlot::default(),
-            counters: Arc::default(),
-            spans: spans(),
-        });
+        let mut fuser = standby();
         let mut maps = 0;
         while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {
             fuser.take_map(map, received_at);
@@ -96,4 +100,15 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         let kept = fuser.last_map.map(|(map, _)| (map.epoch, map.round));
         assert_eq!((kept, maps), (Some((7, 3)), 3), "{leadership:?}");
     }
+}
+
+#[tokio::test]
+async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more() {
+    let mut fuser = standby();
+    let FollowerMessage::TakeMap { delivery } = map(epoch(7, "edge"), 1, Timestamp(1)) else { panic!("a map") };
+    fuser.take_map(Arc::clone(&delivery.message), Timestamp(1));
+    fuser.forget_map(&NodeName::from_static("gauss"));
+    assert!(fuser.last_map.is_some(), "another's");
+    fuser.forget_map(&NodeName::from_static("edge"));
+    assert!(fuser.last_map.is_none());
 }

@@ -86,6 +86,11 @@ impl ElectionDriver {
             MembershipEvent::Alive { member } => Input::MemberAlive { member: as_seen(&member) },
             MembershipEvent::Changed { member } => Input::MemberChanged { member: as_seen(&member) },
             MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
+            MembershipEvent::Expelled { name } => {
+                self.cell_time.forget(&name);
+                self.parts.fuser.send(FuserMessage::ForgetMap { of: name });
+                return;
+            }
             MembershipEvent::Down { name } => Input::MemberDown { name },
             MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
                 Ok(message) => {
@@ -183,6 +188,7 @@ impl ElectionDriver {
             Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),
             Effect::Log { notice: Notice::Overreached { from, role, priority, rights } } => {
                 self.counters.count(Event::Overreached);
+                self.counters.reject(RejectReason::NotPermitted, from.as_str());
                 if self.overreached.insert(from.clone()) {
                     tracing::warn!(
                         %from, ?role, priority, ?rights,

@@ -25,7 +25,7 @@ struct Answer {
     is_saved: bool,
 }
 
-/// Whether a term is kept, should the node restart.
+/// Fate of a term, should the node restart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TermState {
     /// It is on disk.

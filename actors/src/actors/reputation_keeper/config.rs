@@ -5,7 +5,7 @@ use std::time::Duration;
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
-/// How often reputations are published, saved and replicated.
+/// Periods at which reputations are published, saved and replicated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ReputationKeeperConfig {

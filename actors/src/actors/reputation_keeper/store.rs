@@ -37,7 +37,11 @@ impl ReputationStore {
     /// Takes over what was saved, within the bounds of what others send. Where evidence is signed, `signer` verifies it.
     /// `date` is the present time; a clock that was never set judges no other.
     fn take(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
-        let Saved { entries, marks, mut statements, standing, signed, reset_at_us, node, .. } = saved;
+        let Saved { entries, marks, mut statements, standing, signed, certificate, reset_at_us, node, .. } = saved;
+        let is_own_valid = match (&mut signer, &certificate) {
+            (Some(signer), Some(certificate)) => signed && signer.is_of_cell(certificate),
+            (signer, _) => signer.is_none() || signed,
+        };
         if reset_at_us.since(date) >= MAX_RESET_AHEAD && date >= EARLIEST {
             tracing::warn!(%reset_at_us, "saved time of a reset not used: it is in the future");
         } else if reset_at_us > self.ledger.reset_at() {
@@ -61,7 +65,7 @@ impl ReputationStore {
         let counts = entries.into_iter().map(|entry| share(vec![entry], Vec::new()));
         let mut counts: Vec<_> = counts.chain(marks.into_iter().map(|mark| share(Vec::new(), vec![mark]))).collect();
         let read = counts.len() + statements.len();
-        counts.retain(|share| (signer.is_none() || signed) && is_plausible(share));
+        counts.retain(|share| is_own_valid && is_plausible(share));
         let mut is_valid = |share: &_| signer.as_mut().is_none_or(|signer| signer.verify_again(share).is_ok());
         statements.retain(|share| is_plausible(share) && is_valid(share));
         let dropped = read - counts.len() - statements.len();
@@ -116,9 +120,12 @@ pub(super) struct Saved {
     #[serde(default)]
     marks: Vec<LedgerMark>,
     standing: BTreeMap<NodeName, Reputation>,
-    /// Whether the counts of others are in `statements`.
+    /// True if the counts of others are in `statements`.
     #[serde(default)]
     signed: bool,
+    /// The certificate under which this node counted, in base64.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    certificate: Option<String>,
     /// Shares that other aggregators signed.
     #[serde(default)]
     statements: Vec<LedgerShare>,
@@ -127,7 +134,11 @@ pub(super) struct Saved {
 }
 
 impl Saved {
-    pub(super) fn of(store: &ReputationStore, arguments: &ReputationKeeperArguments) -> Self {
+    pub(super) fn of(
+        store: &ReputationStore,
+        certificate: Option<&String>,
+        arguments: &ReputationKeeperArguments,
+    ) -> Self {
         let (ledger, signed) = (&store.ledger, arguments.credentials.is_some());
         let is_kept = |term: u64, aggregator: &NodeName| {
             !signed || (*aggregator == arguments.name && !ledger.is_stated(&Epoch::new(term, aggregator.clone())))
@@ -137,6 +148,7 @@ impl Saved {
             marks: ledger.marks().filter(|mark| is_kept(mark.epoch, &mark.aggregator)).collect(),
             standing: store.standing.clone(),
             signed,
+            certificate: certificate.cloned(),
             statements: ledger.statements().map(|share| LedgerShare::clone(share)).collect(),
             reset_at_us: ledger.reset_at(),
             ..Self::reset(&arguments.cell, &arguments.name, Timestamp::default())
@@ -153,6 +165,7 @@ impl Saved {
             marks: Vec::new(),
             standing: BTreeMap::new(),
             signed: true,
+            certificate: None,
             statements: Vec::new(),
             reset_at_us,
         }

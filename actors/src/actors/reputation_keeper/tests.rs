@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use ecod::leadership::Position;
 use ecod::leadership::cell_time::ClockReading;
+use ecod::leadership::timers::EVIDENCE_TRIAL;
 use ecod::model::time::Timestamp;
 use ecod::wire::LedgerEntry;
 use tempfile::TempDir;
@@ -82,9 +83,13 @@ fn arguments(gateway: &ActorSlot<GatewayMessage>, counters: &Arc<Counters>) -> R
 async fn evidence_of_others_is_judged_counted_and_answered() {
     let (gateway, mut published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
-    let mut keeper = ReputationKeeperState::new(arguments(&gateway, &counters));
+    let directory = tempfile::tempdir().unwrap();
+    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let mut keeper =
+        ReputationKeeperState::new(ReputationKeeperArguments { file: Some(file), ..arguments(&gateway, &counters) });
     let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
     keeper.arguments.reputations.open().ledger.record(3, &name("euclid"), &own);
+    keeper.save().await;
 
     keeper.merge(&share("mallory", None, vec![counted(7, "mallory")]));
     keeper.merge(&share("edge", Some(7), vec![counted(7, "edge"), counted(8, "edge")]));
@@ -92,7 +97,10 @@ async fn evidence_of_others_is_judged_counted_and_answered() {
     assert_eq!(counters.rejects(RejectReason::UnknownTerm), 1);
     assert_eq!(counters.events(Event::LedgerMerged), 1);
     assert_eq!(keeper.arguments.reputations.open().ledger.totals()[&name("gauss")], (1, 1));
-    assert!(keeper.unsaved && keeper.unadopted);
+    assert!(keeper.unadopted);
+    keeper.save().await;
+    keeper.save().await;
+    assert_eq!(counters.events(Event::ReputationsSaved), 2, "saved when there is news, and not again");
 
     gateway.get().unwrap().drain_and_wait(None).await.unwrap();
     let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else { panic!("the leader is told") };
@@ -159,6 +167,11 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     keeper.merge(&said);
     assert_eq!(votes(&keeper), (1, 1));
     keeper.save().await;
+    let mut early = ReputationKeeperState::new(with());
+    store::restore(&early.arguments, early.signer.as_mut());
+    assert_eq!(votes(&early), (1, 0), "its leader is on trial");
+    keeper.merge(&Delivery::local(Arc::clone(&said.message), said.received_at + EVIDENCE_TRIAL));
+    keeper.save().await;
 
     let mut again = ReputationKeeperState::new(with());
     store::restore(&again.arguments, again.signer.as_mut());
@@ -179,6 +192,41 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     let mut last = ReputationKeeperState::new(with());
     store::restore(&last.arguments, last.signer.as_mut());
     assert_eq!(votes(&last), (1, 0));
+}
+
+#[tokio::test]
+async fn what_a_node_counted_under_a_revoked_certificate_does_not_come_back_with_a_new_one() {
+    let (gateway, _published) = listening::slot().await;
+    let counters = Arc::<Counters>::default();
+    let mut certificates = Certificates::new();
+    let file = StateFile::new(certificates.directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let with = |credentials: &Arc<Credentials>| ReputationKeeperArguments {
+        credentials: Some(Arc::clone(credentials)),
+        file: Some(file.clone()),
+        ..arguments(&gateway, &counters)
+    };
+    let votes = |keeper: &ReputationKeeperState| {
+        keeper.arguments.reputations.open().ledger.totals().get(&name("gauss")).copied().unwrap_or_default()
+    };
+    let stolen = certificates.of("euclid");
+    let mut running = ReputationKeeperState::new(with(&stolen));
+    let vote = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
+    running.record(&Epoch::new(3, name("euclid")), 1, &[vote], None);
+    running.save().await;
+
+    let renewed = certificates.of("euclid");
+    let mut restarted = ReputationKeeperState::new(with(&renewed));
+    restarted.restore();
+    assert_eq!(votes(&restarted), (1, 0), "a certificate that is renewed changes nothing");
+
+    certificates.authority.revoke(&name("euclid"), clock::now()).unwrap();
+    let new = certificates.of("euclid");
+    tokio::time::sleep(Duration::from_millis(1100)).await;
+    let mut restarted = ReputationKeeperState::new(with(&new));
+    restarted.restore();
+    assert_eq!(votes(&restarted), (0, 0), "after a restart");
+    assert!(running.signer.as_mut().unwrap().reload() && running.drop_revoked());
+    assert_eq!(votes(&running), (0, 0), "while it runs");
 }
 
 #[tokio::test]

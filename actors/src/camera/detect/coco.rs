@@ -29,7 +29,7 @@ pub struct CocoConfig {
     pub threshold: f64,
     /// Intersection over union above which two boxes of one class count as the same object. Default 0.5.
     pub max_overlap: f64,
-    /// Whether to also search four overlapping quarters of the image. Default false. Finds objects of
+    /// True if to also search four overlapping quarters of the image. Default false. Finds objects of
     /// half the size and takes five times as long.
     pub tiling: bool,
 }
@@ -231,7 +231,7 @@ fn placed(b: &BoundingBox, x: f64, y: f64, width: f64, height: f64) -> BoundingB
     }
 }
 
-/// Whether an inner edge of a tile cuts the box. A neighbouring tile or the image shows all of it.
+/// True if an inner edge of a tile cuts the box. A neighbouring tile or the image shows all of it.
 fn is_cut(b: &BoundingBox, right: bool, lower: bool) -> bool {
     let cut = |low: f64, high: f64, second: bool| if second { low < CUT_SHARE } else { high > 1.0 - CUT_SHARE };
     cut(b.x_min, b.x_max, right) || cut(b.y_min, b.y_max, lower)

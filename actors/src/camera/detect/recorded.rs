@@ -22,7 +22,7 @@ use crate::camera::frame::Frame;
 pub struct RecordedConfig {
     /// The JSON Lines file.
     pub path: PathBuf,
-    /// Whether to start again after the last line; default false: nothing is detected from then on.
+    /// True if to start again after the last line; default false: nothing is detected from then on.
     #[serde(default)]
     pub looping: bool,
 }
@@ -35,7 +35,7 @@ pub enum RecordingError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         #[source]
         source: std::io::Error,
     },
@@ -46,7 +46,7 @@ pub enum RecordingError {
         path: PathBuf,
         /// Line number, from 1.
         line: usize,
-        /// What is wrong with it.
+        /// The flaw.
         reason: String,
     },
 }

@@ -17,13 +17,14 @@ use crate::transport::pki::{Credentials, TlsConfig};
 /// Directory from which the service reads its configuration.
 const SERVICE_DIRECTORY: &str = "/etc/ecod";
 
-/// Directory of the service's state; its owner is the service's user.
+/// Directory of the service's state.
 const STATE_DIRECTORY: &str = "/var/lib/ecod";
 
 /// A directory with the files of a node; on the machine that has made the cell, also those of the CA.
 pub(super) struct NodeDirectory {
     path: PathBuf,
-    is_root: bool,
+    /// Directory of the service's state, if these are the service's files; its owner is the service's user.
+    state_of_service: Option<PathBuf>,
 }
 
 /// `node.toml` as it is first written.
@@ -52,7 +53,8 @@ impl NodeDirectory {
         let path = given.unwrap_or(Path::new(usual));
         let made = DirBuilder::new().recursive(true).mode(0o750).create(path);
         let path = made.and_then(|()| path.canonicalize()).with_context(|| format!("cannot use {}", path.display()))?;
-        Ok(Self { path, is_root })
+        let is_service = is_root && path == Path::new(SERVICE_DIRECTORY);
+        Ok(Self { path, state_of_service: is_service.then(|| STATE_DIRECTORY.into()) })
     }
 
     /// Checks that no node has its files here.
@@ -65,6 +67,12 @@ impl NodeDirectory {
             path.display()
         );
         Ok(())
+    }
+
+    /// Makes the directory vacant again.
+    pub(super) fn vacate(&self) -> anyhow::Result<()> {
+        let path = self.path.join("cell.key");
+        fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))
     }
 
     /// Directory of the cell's CA.
@@ -91,8 +99,7 @@ impl NodeDirectory {
             key: file("node.key"),
             revocation_list: Some(file("revoked.pem")),
         };
-        let has_service = self.is_root && self.path == Path::new(SERVICE_DIRECTORY);
-        let state_dir = if has_service { STATE_DIRECTORY.into() } else { file("state") };
+        let state_dir = self.state_of_service.clone().unwrap_or_else(|| file("state"));
         let configuration = toml::to_string(&Configuration {
             name: node,
             cell: &welcome.cell,
@@ -107,16 +114,18 @@ impl NodeDirectory {
             let kept = free.next().map(|path| fs::rename(self.configuration(), path));
             kept.transpose().context("cannot keep the former node.toml")?;
         }
+        // Programs of the service's group speak for the node, and are no members.
+        let key_mode = if self.state_of_service.is_some() { 0o640 } else { 0o600 };
         // The cell's key last: it is what makes the directory a node's.
         let files = [
             ("ca.pem", welcome.ca.as_str(), 0o644),
             ("node.pem", &welcome.certificate, 0o644),
             ("revoked.pem", &welcome.revocation_list, 0o644),
             ("node.toml", &configuration, 0o640),
-            ("node.key", key, 0o600),
+            ("node.key", key, key_mode),
             ("cell.key", &welcome.cell_key, 0o600),
         ];
-        let owner = fs::metadata(STATE_DIRECTORY).ok().filter(|_| has_service);
+        let owner = self.state_of_service.as_ref().and_then(|state| fs::metadata(state).ok());
         for (name, text, mode) in files {
             let path = file(name);
             replace_file(&path, text.as_bytes(), mode)
@@ -132,10 +141,9 @@ impl NodeDirectory {
 
     /// Has the system run the node from now on, if it is the system's: true if so.
     pub(super) fn enable_service(&self) -> anyhow::Result<bool> {
-        let is_service = self.is_root && self.path == Path::new(SERVICE_DIRECTORY);
         let units = ["/lib/systemd/system", "/etc/systemd/system"];
         let has_unit = units.iter().any(|units| Path::new(units).join("ecod-node.service").exists());
-        if !is_service || !has_unit || !Path::new("/run/systemd/system").exists() {
+        if self.state_of_service.is_none() || !has_unit || !Path::new("/run/systemd/system").exists() {
             return Ok(false);
         }
         // One that runs already has another configuration.
@@ -148,8 +156,11 @@ impl NodeDirectory {
 
     /// A command that uses this directory.
     pub(super) fn command(&self, command: &str) -> String {
-        let usual = self.is_root && self.path == Path::new(SERVICE_DIRECTORY);
-        if usual { format!("ecod-node {command}") } else { format!("ecod-node {command} --dir {self}") }
+        if self.state_of_service.is_some() {
+            format!("ecod-node {command}")
+        } else {
+            format!("ecod-node {command} --dir {self}")
+        }
     }
 }
 
@@ -164,3 +175,41 @@ const HEAD: &str = "\
 # Known locations, pose and camera are yours to add: docs/first-cell.md. `ecod-node --config FILE --print-config` shows
 # every key with its value.
 ";
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+    use std::time::Duration;
+
+    use ecod::wire::Role;
+
+    use super::*;
+    use crate::platform::clock;
+    use crate::transport::pki::Authority;
+
+    #[test]
+    fn the_services_group_reads_the_nodes_certificate_and_key_and_not_the_cells_key() {
+        let directory = tempfile::tempdir().unwrap();
+        let (cell, node) = (NodeName::from_static("lot-1"), NodeName::from_static("euclid"));
+        let mut authority = Authority::init(&directory.path().join("pki"), &cell, clock::now()).unwrap();
+        authority.issue(&node, Role::Cav, Duration::from_secs(86_400), clock::now()).unwrap();
+        let (certificate, key) = authority.files_of(&node);
+        let read = |path: PathBuf| fs::read_to_string(path).unwrap();
+        let welcome = Welcome {
+            cell,
+            role: Role::Cav,
+            certificate: read(certificate),
+            ca: read(authority.ca()),
+            revocation_list: read(authority.revocation_list()),
+            cell_key: "k".repeat(64),
+            seeds: Vec::new(),
+        };
+        let key = read(key);
+        for (state_of_service, expected) in [(Some(directory.path().into()), 0o640), (None, 0o600)] {
+            let files = NodeDirectory { path: directory.path().into(), state_of_service };
+            files.write(&node, &welcome, &key).unwrap();
+            let mode = |name| fs::metadata(directory.path().join(name)).unwrap().permissions().mode() & 0o777;
+            assert_eq!([mode("node.pem"), mode("node.key"), mode("cell.key")], [0o644, expected, 0o600]);
+        }
+    }
+}

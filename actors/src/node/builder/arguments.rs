@@ -302,7 +302,7 @@ impl NodeBuilder {
         DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
     }
 
-    /// What the node's readiness is judged from.
+    /// Facts on which the node's readiness is judged.
     pub(in crate::node) fn vitals(&self) -> Vitals {
         Vitals {
             newest: self.newest.clone(),
@@ -367,7 +367,7 @@ impl NodeBuilder {
         Some(StateFile::new(directory, &self.config.cell, &self.name, what))
     }
 
-    /// What the node says about itself when a part starts, also anew: it follows whom it followed before.
+    /// The node's status when a part starts, also anew: it follows whom it followed before.
     fn status(&self) -> NodeStatus {
         let newest = self.newest.map.borrow();
         let taken = newest.as_ref().map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()));

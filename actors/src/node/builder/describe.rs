@@ -55,12 +55,22 @@ impl NodeBuilder {
             match crate::node::camera::perception(config) {
                 Ok(perception) => {
                     let (perception, algorithms) = (Box::new(perception), crate::node::camera::algorithms(config));
-                    slots.projector.send(ProjectorMessage::Configure { perception, algorithms });
+                    let (standing, origin) = (self.standing_pose(), config.origin);
+                    slots.projector.send(ProjectorMessage::Configure { perception, standing, origin, algorithms });
                 }
                 Err(error) => {
                     tracing::error!(error = format!("{error:#}"), "the camera goes on with the settings before");
                 }
             }
         }
+    }
+
+    /// The pose of a vehicle that stands still, if it has a place in the cell's frame. The log says why it has none.
+    #[cfg(feature = "camera")]
+    pub(super) fn standing_pose(&self) -> Option<ecod::model::geometry::Pose> {
+        crate::node::camera::standing_pose(&self.config).unwrap_or_else(|error| {
+            tracing::error!(error = format!("{error:#}"), "the camera's frames are not reported");
+            None
+        })
     }
 }

@@ -14,7 +14,7 @@ use super::NodeConfig;
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SharedConfig {
-    /// How reports are fused.
+    /// Settings of fusion.
     pub fusion: FusionConfig,
     /// The known locations.
     pub landmarks: Vec<LandmarkConfig>,

@@ -113,7 +113,7 @@ fn key(token: &[u8]) -> hmac::Key {
     hmac::Key::new(hmac::HMAC_SHA256, token)
 }
 
-/// Whether a `Host` header names loopback. Any port is allowed, since a tunnel may end on another.
+/// True if a `Host` header names loopback. Any port is allowed, since a tunnel may end on another.
 fn is_this_machine(host: &HeaderValue) -> bool {
     let Ok(host) = host.to_str() else { return false };
     let name = match host.rsplit_once(':') {

@@ -11,7 +11,7 @@ use crate::platform::secret::Secret;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DashboardConfig {
-    /// Whether page, metrics and health are served. Default true.
+    /// True if page, metrics and health are served. Default true.
     pub enabled: bool,
     /// Address and port of the page; port 0 takes a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a
     /// free port if that is in use. An address that other machines reach needs a token.

@@ -44,7 +44,7 @@ pub(crate) struct Admitted {
     pub(crate) slot: ConnectionSlot,
     /// Ends when the connection is displaced.
     pub(crate) displaced: oneshot::Receiver<()>,
-    /// Whether it displaced another.
+    /// True if it displaced another.
     pub(crate) displaces: bool,
 }
 

@@ -18,7 +18,7 @@ use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 #[derive(Debug, Default)]
 pub struct LiveState {
     reports: [AtomicU64; ReportKind::COUNT],
-    /// Whether browsers want reports, and whether programs do.
+    /// True where browsers want reports, and where programs do.
     wants_reports: [AtomicBool; 2],
     latest: Mutex<Latest>,
 }
@@ -93,7 +93,7 @@ impl LiveState {
         self.reports[kind as usize].load(Relaxed)
     }
 
-    /// Whether this node receives reports only to show them.
+    /// True if this node receives reports only to show them.
     pub fn wants_reports(&self) -> bool {
         self.wants_reports.iter().any(|wants| wants.load(Relaxed))
     }

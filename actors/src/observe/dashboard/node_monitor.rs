@@ -80,7 +80,7 @@ impl NodeMonitor {
         self.snapshots.receiver_count()
     }
 
-    /// Whether the node is ready.
+    /// Readiness of the node.
     pub(crate) fn readiness(&self) -> Readiness {
         self.sources.vitals.readiness(&self.observed().probe)
     }

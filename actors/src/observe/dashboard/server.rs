@@ -73,7 +73,7 @@ impl Server {
         Ok(Self { stop: Some(stop), thread: Some(thread) })
     }
 
-    /// Whether the thread ended by itself.
+    /// True if the thread ended by itself.
     pub(crate) fn has_ended(&self) -> bool {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }

@@ -31,7 +31,7 @@ pub(crate) struct Snapshot {
     pub now_us: Timestamp,
     /// This node.
     pub node: NodeFacts,
-    /// Whether this node is ready.
+    /// Readiness of this node.
     pub readiness: Readiness,
     /// The leader, its standby and this node's position.
     pub leadership: LeadershipFacts,
@@ -75,11 +75,11 @@ pub(crate) struct NodeEntry {
     pub name: NodeName,
     /// Its role.
     pub role: Role,
-    /// Whether it answers. A node that never answered is alive while a linked broker reports its status.
+    /// True if it answers. A node that never answered is alive while a linked broker reports its status.
     pub alive: bool,
     /// State that it reported.
     pub state: Option<NodeState>,
-    /// Whether it reported that it could lead.
+    /// True if it reported that it could lead.
     pub fit: Option<bool>,
     /// Version of its software.
     pub version: Option<String>,

@@ -30,9 +30,9 @@ pub struct RecordConfig {
     pub min_free_mb: u64,
     /// Maximum entries that wait for the disk. Default 4096. Further ones are dropped and counted.
     pub queue: usize,
-    /// Whether to write scenes and transforms for Foxglove and Lichtblick. Default true. They double the log.
+    /// True if to write scenes and transforms for Foxglove and Lichtblick. Default true. They double the log.
     pub drawable: bool,
-    /// Whether a node that never leads records all reports of its cell. Default false. A node that may lead always does.
+    /// True if a node that never leads records all reports of its cell. Default false. A node that may lead always does.
     pub reports: bool,
     /// Camera images a second, as JPEG. Default 0, none. Each takes 50 to 100 kB at 640x480.
     pub camera_hz: f64,

@@ -18,7 +18,7 @@ use super::log_identity::LogIdentity;
 pub(crate) struct LogFile {
     writer: Writer<BufWriter<File>>,
     path: PathBuf,
-    /// Whether the disk holds any message.
+    /// True if the disk holds any message.
     has_messages: bool,
     opened: Instant,
     channels: HashMap<(SchemaName, String), Channel>,

@@ -50,12 +50,12 @@ pub enum LogItem {
 }
 
 impl LogItem {
-    /// Whether the log holds anything of it.
+    /// True if the log holds anything of it.
     pub(crate) fn is_written(&self) -> bool {
         !matches!(self, Self::Round(_))
     }
 
-    /// Whether an exact rerun of the aggregator needs it.
+    /// True if an exact rerun of the aggregator needs it.
     pub(crate) fn is_of_journal(&self) -> bool {
         matches!(self, Self::Report(..) | Self::Journal(_))
     }

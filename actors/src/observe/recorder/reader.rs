@@ -93,7 +93,7 @@ pub struct LogReader {
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Channel>,
     node: Option<NodeName>,
-    /// Whether the data section was read to its end.
+    /// True if the data section was read to its end.
     complete: bool,
     ended: bool,
     /// Number of messages by unknown schema.
@@ -107,7 +107,7 @@ struct Channel {
 }
 
 impl LogReader {
-    /// Whether the file is in MCAP format.
+    /// True if the file is in MCAP format.
     ///
     /// # Errors
     /// [`LogError::Unreadable`].

@@ -35,7 +35,7 @@ pub(crate) struct LogWriter {
     pending: Pending,
     flush_due: Instant,
     retry_at: Option<Instant>,
-    /// Whether the last write failed; only the first failure is logged.
+    /// True if the last write failed; only the first failure is logged.
     failing: bool,
 }
 

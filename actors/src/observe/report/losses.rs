@@ -62,7 +62,7 @@ impl Losses {
         self.newest = Some((run, reading));
     }
 
-    /// Whether the log has any reading.
+    /// True if the log has any reading.
     pub(super) fn are_known(&self) -> bool {
         self.newest.is_some()
     }

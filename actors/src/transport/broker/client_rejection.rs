@@ -15,7 +15,7 @@ pub(super) enum ClientRejection {
     Evicted,
     #[error("not trusted: {0}")]
     Untrusted(String),
-    #[error("not an MQTT login")]
+    #[error("not an MQTT login, or a packet of too many filters")]
     Malformed,
     #[error("as many clients as allowed are connected")]
     Full,

@@ -8,7 +8,9 @@ use super::client_rejection::ClientRejection;
 #[derive(Debug)]
 pub(super) struct ConnectPacket {
     pub(super) packet: Vec<u8>,
-    /// Whether the client id is empty, so that the broker draws one.
+    /// The client id; empty if the broker is to draw one, and where rmqtt will find the packet malformed.
+    pub(super) client_id: String,
+    /// True if the client id is empty, so that the broker draws one.
     pub(super) has_generated_id: bool,
 }
 
@@ -20,9 +22,9 @@ const CONNECT: u8 = 0x10;
 /// The protocol level of MQTT 5, in which properties come before the client id.
 const MQTT_5: u8 = 5;
 
-/// Reads the first packet, which must be CONNECT. rmqtt itself would wait for its first bytes for ever.
-pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<ConnectPacket, ClientRejection> {
-    if stream.read_u8().await? != CONNECT {
+/// Reads the rest of the first packet, which must be CONNECT. rmqtt itself would wait for its first bytes for ever.
+pub(super) async fn read(first: u8, stream: &mut (impl AsyncRead + Unpin)) -> Result<ConnectPacket, ClientRejection> {
+    if first != CONNECT {
         return Err(ClientRejection::Malformed);
     }
     let mut packet = vec![CONNECT];
@@ -40,9 +42,11 @@ pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Connec
     }
     let mut body = vec![0; length];
     stream.read_exact(&mut body).await?;
-    let has_generated_id = client_id(&body).is_some_and(<[u8]>::is_empty);
+    let client_id = client_id(&body);
+    let has_generated_id = client_id.is_some_and(<[u8]>::is_empty);
+    let client_id = String::from_utf8_lossy(client_id.unwrap_or_default()).into_owned();
     packet.append(&mut body);
-    Ok(ConnectPacket { packet, has_generated_id })
+    Ok(ConnectPacket { packet, client_id, has_generated_id })
 }
 
 /// Length of the first packet in received bytes, if it is complete. Only built for the fuzz targets.
@@ -50,7 +54,8 @@ pub(super) async fn read(stream: &mut (impl AsyncRead + Unpin)) -> Result<Connec
 pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     use futures_util::FutureExt;
 
-    let login = read(&mut &*sent).now_or_never().expect("bytes that are there are not waited for").ok()?;
+    let (first, mut rest) = sent.split_first()?;
+    let login = read(*first, &mut rest).now_or_never().expect("bytes that are there are not waited for").ok()?;
     assert!(sent.starts_with(&login.packet), "rmqtt gets what the client sent");
     Some(login.packet.len())
 }
@@ -97,7 +102,7 @@ mod tests {
             [(v4(""), true), (v5(""), true), (v4("euclid"), false), (v5("euclid"), false), (v4(drawn), false)]
         {
             let packet = [&[CONNECT, body.len() as u8], &body[..]].concat();
-            let login = read(&mut &packet[..]).await.unwrap();
+            let login = read(packet[0], &mut &packet[1..]).await.unwrap();
             assert_eq!((login.packet, login.has_generated_id), (packet, has_generated_id));
         }
         for body in [&b""[..], b"\0\x04MQ", b"\0\x04MQTT\x05\x02\0\x3c\xff\xff\xff\xff", b"\0\x04MQTT\x04\x02\0\x3c\0"]

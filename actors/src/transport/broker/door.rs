@@ -13,10 +13,11 @@ mod programs;
 mod recent_reports;
 mod refusals;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::model::names::NodeName;
@@ -52,11 +53,11 @@ pub struct DoorSetup {
     pub encoding: Encoding,
     /// Reports of a vehicle and kind that the cell takes per second. Half of them are for programs.
     pub max_report_hz: u32,
-    /// Whether other nodes have links to this broker.
+    /// True if other nodes have links to this broker.
     pub serves_nodes: bool,
-    /// Whether this broker carries the cell's reports now.
+    /// True if this broker carries the cell's reports now.
     pub carries_reports: Arc<dyn Fn() -> bool + Send + Sync>,
-    /// Whether another node has this name.
+    /// True if another node has this name.
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
     /// Takes a program's report for the cell.
     pub report: Arc<dyn Fn(ReportKind, Arc<ObjectReport>) + Send + Sync>,
@@ -78,6 +79,8 @@ struct DoorState {
     queue: Mutex<Option<mpsc::Sender<Publication>>>,
     /// Last message of each topic that is retained, for the broker's next run.
     retained: Mutex<BTreeMap<String, Bytes>>,
+    /// Topics of these that the broker's present run lacks: its queue was full.
+    unsent: Mutex<BTreeSet<String>>,
     /// Filters of programs, and whether they match reports.
     filters: Mutex<BTreeMap<(ClientId, TopicFilter), bool>>,
     has_readers: AtomicBool,
@@ -85,6 +88,7 @@ struct DoorState {
     watches_reports: AtomicBool,
     recent_reports: Mutex<RecentReports>,
     throttles: [Mutex<TokenBucket>; ReportKind::COUNT],
+    descriptions: Mutex<TokenBucket>,
     refusals: Mutex<Refusals>,
 }
 
@@ -98,6 +102,11 @@ struct Publication {
 /// Messages that wait for the broker's thread; more are dropped and counted.
 const MAX_WAITING: usize = 256;
 
+/// Minimum time between two descriptions from programs, beyond a burst: each is checked, saved and told to all nodes.
+const DESCRIPTION_INTERVAL: Duration = Duration::from_secs(1);
+
+const DESCRIPTION_BURST: u32 = 8;
+
 /// Topics whose last message is retained: as many nodes as a cell can have, and some.
 const MAX_RETAINED: usize = 8192;
 
@@ -105,13 +114,15 @@ impl Door {
     /// The door of a node, for one broker.
     pub fn new(setup: DoorSetup) -> Self {
         let per_second = (setup.max_report_hz / 2).max(1);
-        let interval = std::time::Duration::from_secs(1) / per_second;
+        let interval = Duration::from_secs(1) / per_second;
         let now = clock::now();
         Self(Some(Arc::new(DoorState {
             throttles: std::array::from_fn(|_| Mutex::new(TokenBucket::new(per_second, interval, now))),
+            descriptions: Mutex::new(TokenBucket::new(DESCRIPTION_BURST, DESCRIPTION_INTERVAL, now)),
             setup,
             queue: Mutex::default(),
             retained: Mutex::default(),
+            unsent: Mutex::default(),
             filters: Mutex::default(),
             has_readers: AtomicBool::new(false),
             wants_reports: AtomicBool::new(false),
@@ -188,6 +199,11 @@ impl Door {
         }
         while let Some(publication) = queue.recv().await {
             publish(publication).await;
+            while queue.is_empty()
+                && let Some(late) = door.next_unsent()
+            {
+                publish(late).await;
+            }
         }
         std::future::pending::<()>().await;
     }
@@ -216,16 +232,27 @@ impl DoorState {
         if retained.get(&publication.topic) == Some(&publication.payload) || (!is_known && retained.len() >= room) {
             return;
         }
-        retained.insert(publication.topic.clone(), publication.payload.clone());
-        drop(retained);
-        self.send(publication);
+        let topic = publication.topic.clone();
+        retained.insert(topic.clone(), publication.payload.clone());
+        if !self.send(publication) {
+            lock(&self.unsent).insert(topic);
+        }
     }
 
-    fn send(&self, publication: Publication) {
+    fn next_unsent(&self) -> Option<Publication> {
+        let topic = lock(&self.unsent).pop_first()?;
+        let payload = lock(&self.retained).get(&topic)?.clone();
+        Some(Publication { topic, payload, retain: true })
+    }
+
+    /// Hands a message to the broker's present run, if there is one; false if it has no room.
+    fn send(&self, publication: Publication) -> bool {
         let queue = lock(&self.queue);
-        if queue.as_ref().is_some_and(|queue| queue.try_send(publication).is_err()) {
+        let has_room = queue.as_ref().is_none_or(|queue| queue.try_send(publication).is_ok());
+        if !has_room {
             self.setup.counters.count(Event::PublishRefused);
         }
+        has_room
     }
 
     /// Notes the filters of programs: what nobody reads is not even encoded.

@@ -84,7 +84,7 @@ pub enum BrokerError {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BrokerConfig {
-    /// Whether programs beside the node take part in the cell at its own `listen` address, whoever leads; default true.
+    /// True if programs beside the node take part in the cell at its own `listen` address, whoever leads; default true.
     /// Without, only nodes that may lead have a broker, and it is for nodes. Trade-off: a door costs some megabytes.
     pub door: bool,
     /// Largest MQTT packet in bytes; default: as `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` need. A client that
@@ -103,7 +103,7 @@ pub struct BrokerConfig {
     /// Maximum bytes of all retained messages together; default 67108864. A status has some hundred bytes, reputations
     /// some hundred for each vehicle. Messages beyond it are forwarded and not retained.
     pub max_retained_bytes: usize,
-    /// Whether the broker may listen on other than loopback addresses without `[tls]`; default false. Every host that
+    /// True if the broker may listen on other than loopback addresses without `[tls]`; default false. Every host that
     /// reaches it can then read everything and publish in any name.
     pub allow_plaintext: bool,
     /// Time limit of the TLS handshake and login in ms; default 5000. Trade-off: shorter frees places sooner, longer
@@ -362,7 +362,7 @@ async fn prepare(
         Some(policy) => {
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
-            let frontend = BrokerFrontend::new(public, own, policy, config);
+            let frontend = BrokerFrontend::new(public, own, (policy, door.clone()), config);
             let principals = frontend.principals();
             SubscriptionQuota::new(principals.clone(), Arc::clone(&policy.counters)).install(&context).await;
             InFlightMeter { in_flight: frontend.in_flight(), principals: principals.clone() }.install(&context).await;

@@ -1,7 +1,7 @@
 //! Public side of the embedded broker: TLS, connection limits, and the principal of each client.
 //!
 //! ```text
-//! client ── TCP ──> admission ── TLS ──> CONNECT within time and size ── relay ── loopback ──> rmqtt
+//! client ── TCP ──> admission ── TLS ── or WebSocket in it ──> CONNECT within time and size ── relay ── loopback ──> rmqtt
 //!                    by source     certificate of the cell                within its principal's limits
 //! ```
 //!
@@ -11,10 +11,11 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
 use rustls::pki_types::{CertificateDer, UnixTime};
-use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::{Semaphore, watch};
 use tokio::time::{Instant, interval, sleep, timeout_at};
@@ -25,11 +26,12 @@ use super::backlog::Backlog;
 use super::byte_throttle::ByteThrottle;
 use super::client_rejection::ClientRejection;
 use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
+use super::door::Door;
 use super::in_flight::InFlight;
 use super::permissions::AccessPolicy;
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
 use super::relay::RelayLimits;
-use super::{BrokerConfig, connect_packet};
+use super::{BrokerConfig, connect_packet, websocket};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::pki::{CertificateSubject, Credentials, LoadedCredentials};
@@ -44,6 +46,7 @@ pub(super) struct BrokerFrontend {
 
 struct FrontendState {
     credentials: Option<Arc<Credentials>>,
+    door: Door,
     principals: PrincipalRegistry,
     /// Address of rmqtt's own listener.
     backend: SocketAddr,
@@ -64,17 +67,18 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 const WRITE_TIMEOUT: Duration = Duration::from_secs(15);
 
 impl BrokerFrontend {
-    /// A frontend on a listener, for a broker that listens at `behind`.
+    /// A frontend on a listener, for a broker that listens at `backend`.
     pub(super) fn new(
         listener: TcpListener,
         backend: SocketAddr,
-        policy: &AccessPolicy,
+        (policy, door): (&AccessPolicy, Door),
         config: &BrokerConfig,
     ) -> Self {
         let interval = Duration::from_secs(1) / config.connects_per_s;
         let current = policy.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
         let shared = FrontendState {
             credentials: policy.credentials.clone(),
+            door,
             principals: PrincipalRegistry::default(),
             backend,
             places: Arc::new(Semaphore::new(config.max_clients)),
@@ -178,6 +182,7 @@ impl FrontendState {
         stream.set_nodelay(true)?;
         let mut stream = Box::pin(TimeoutStream::new(stream));
         stream.as_mut().set_write_timeout_pinned(Some(WRITE_TIMEOUT));
+        let wire_bytes = Arc::<AtomicUsize>::default();
         let login = async {
             if !matches!(stream.get_ref().peek(&mut [0]).await, Ok(1)) {
                 return Err(ClientRejection::Left);
@@ -189,7 +194,12 @@ impl FrontendState {
                 }
                 None => (stream as Stream, Vec::new()),
             };
-            let connect = connect_packet::read(&mut stream).await?;
+            let mut first = stream.read_u8().await?;
+            if first == websocket::FIRST_BYTE {
+                stream = Box::pin(websocket::accept(stream, Arc::clone(&wire_bytes)).await?);
+                first = stream.read_u8().await?;
+            }
+            let connect = connect_packet::read(first, &mut stream).await?;
             Ok((stream, certificates, connect))
         };
         let login = tokio::select! {
@@ -200,6 +210,8 @@ impl FrontendState {
         let identity = certificates.first().map(|certificate| CertificateSubject::of(certificate)).transpose();
         let identity = identity.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
         let principal = Principal::new(identity, from.ip(), connect.has_generated_id);
+        let is_program = self.door.is_program(&principal, &connect.client_id);
+        let principal = if is_program { principal.programs() } else { principal };
         let _part = self.quota.take(&principal).ok_or(ClientRejection::Crowded)?;
         let _place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| ClientRejection::Full)?;
 
@@ -212,7 +224,7 @@ impl FrontendState {
         backend.write_all(&connect.packet).await?;
         let _visit = slot.log_in();
         tokio::select! {
-            ended = self.limits.relay(stream, backend, &principal) => ended,
+            ended = self.limits.relay(stream, &wire_bytes, backend, &principal) => ended,
             error = certificate_invalidated(current, &certificates) => Err(ClientRejection::CertificateInvalidated(error)),
         }
     }

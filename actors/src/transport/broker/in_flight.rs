@@ -30,7 +30,7 @@ const MAX_BYTES: usize = 32 * 1024 * 1024;
 const COPY_BYTES: usize = 512;
 
 impl InFlight {
-    /// Whether a principal has to wait.
+    /// True if a principal has to wait.
     pub(super) fn is_full(&self, principal: &Arc<str>, has_large_share: bool) -> bool {
         let charges = self.charges();
         let bound = if has_large_share { MAX_BYTES_LARGE } else { MAX_BYTES_EACH };

@@ -17,7 +17,7 @@ pub(super) struct OutboundQueue {
 struct QueuedPacket {
     /// Bytes in the queue.
     bytes: usize,
-    /// Whether the packet is a message of QoS 0 of which no byte was sent yet.
+    /// True if the packet is a message of QoS 0 of which no byte was sent yet.
     is_droppable: bool,
 }
 
@@ -52,7 +52,7 @@ impl OutboundQueue {
                 Piece::Head(header, _) => {
                     let is_droppable = header.first().is_some_and(|first| first & !RETAIN == PUBLISH);
                     self.packets.push_back(QueuedPacket { bytes: header.len(), is_droppable });
-                    self.bytes.extend(header);
+                    self.append(&header);
                 }
                 Piece::Body(body) => {
                     // The packet may have been sent as far as it had come.
@@ -60,7 +60,7 @@ impl OutboundQueue {
                         Some(last) => last.bytes += body.len(),
                         None => self.packets.push_back(QueuedPacket { bytes: body.len(), is_droppable: false }),
                     }
-                    self.bytes.extend(body);
+                    self.append(body);
                 }
             }
             while self.packets.len() > self.max_packets || self.bytes.len() > MAX_BYTES {
@@ -74,6 +74,15 @@ impl OutboundQueue {
             }
         }
         Ok(dropped)
+    }
+
+    /// A long queue grows by an eighth: doubled, queues of clients that do not read would hold twice their bytes.
+    fn append(&mut self, more: &[u8]) {
+        let length = self.bytes.len() + more.len();
+        if length > self.bytes.capacity() && length > KEPT_BYTES {
+            self.bytes.reserve_exact(more.len() + length / 8);
+        }
+        self.bytes.extend(more);
     }
 
     /// Drops the oldest message that may be dropped; never the newest packet, whose end may be still to come.
@@ -183,6 +192,7 @@ mod tests {
         queue.advance(1);
         let dropped: usize = (1..60).map(|mark| queue.push(&message(mark, 255_000)).unwrap()).sum();
         assert!(queue.len() <= MAX_BYTES + 255_010 && dropped >= 40, "{} {dropped}", queue.len());
+        assert!(queue.bytes.capacity() <= (MAX_BYTES + 255_010) * 9 / 8, "{}", queue.bytes.capacity());
         queue.push(&message(60, 8_000_000)).unwrap();
         assert_eq!(queue.packets.len(), 2, "what is begun and what is newest");
     }

@@ -45,7 +45,7 @@ impl PacketScanner {
         None
     }
 
-    /// Whether the bytes so far end with a packet.
+    /// True if the bytes so far end with a packet.
     pub(super) fn is_between_packets(&self) -> bool {
         self.rest == 0 && self.header.is_empty()
     }

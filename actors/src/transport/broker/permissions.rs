@@ -12,6 +12,7 @@
 //! Only statuses, reputations and the cell's description may be retained: other messages are worthless when late. Everyone with a certificate
 //! of the cell may read everything. Topics and filters are bounded in length and in levels.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 
 use async_trait::async_trait;
@@ -26,7 +27,7 @@ use rmqtt::types::{
 
 use super::door::{Door, Place, Refusal};
 use super::principal::{LeaderCheck, Principal, PrincipalRegistry, is_run};
-use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::counters::Counters;
 use crate::transport::mqtt::ENVELOPE_BYTES;
 use crate::transport::pki::{CertificateSubject, Credentials};
 
@@ -64,7 +65,7 @@ impl Permissions {
         register.start().await;
     }
 
-    /// Whether the connection may log in under this client id with this last will.
+    /// True if the connection may log in under this client id with this last will.
     fn allows_login(&self, info: &ConnectInfo) -> bool {
         // Unregistered: a local process that connected past the frontend.
         let Some(principal) = self.principals.principal(info.id().remote_addr) else { return false };
@@ -101,7 +102,7 @@ impl Permissions {
         is_allowed.then_some(()).ok_or_else(refused)
     }
 
-    /// Whether a principal may publish on a topic. Without certificates every topic is allowed, within its limits of size
+    /// True if a principal may publish on a topic. Without certificates every topic is allowed, within its limits of size
     /// and retention.
     fn allows(&self, principal: &Principal, topic: &str, retain: bool, bytes: usize) -> bool {
         let may_publish = |identity: &Arc<CertificateSubject>| {
@@ -111,7 +112,7 @@ impl Permissions {
         self.is_within_limits(topic, retain, bytes) && principal.identity.as_ref().is_none_or(may_publish)
     }
 
-    /// Whether a message is within its topic's limits of size and retention.
+    /// True if a message is within its topic's limits of size and retention.
     fn is_within_limits(&self, topic: &str, retain: bool, bytes: usize) -> bool {
         if !is_topic_bounded(topic) {
             return false;
@@ -128,9 +129,13 @@ impl Permissions {
         if principal.is_some_and(|principal| self.door.is_program(&principal, client)) {
             self.door.note_refusal(client, topic, refusal);
         } else {
-            self.policy.counters.count(Event::ClientDenied);
+            self.count_denied(session.id.remote_addr);
             tracing::debug!(%client, topic, "message refused");
         }
+    }
+
+    fn count_denied(&self, address: Option<SocketAddr>) {
+        self.principals.count_denied(address, &self.policy.counters);
     }
 
     /// The filter as it is inside the broker.
@@ -149,7 +154,7 @@ const MAX_STATUS_BYTES: usize = 16 * 1024;
 /// Maximum length of a topic or filter in bytes.
 const MAX_TOPIC_BYTES: usize = 512;
 
-/// Whether rmqtt can hold a topic or filter.
+/// True if rmqtt can hold a topic or filter.
 pub(super) fn is_topic_bounded(topic: &str) -> bool {
     topic.len() <= MAX_TOPIC_BYTES && topic.split('/').count() <= MAX_TOPIC_LEVELS
 }
@@ -161,7 +166,7 @@ impl Handler for Permissions {
             Parameter::ClientAuthenticate(info) => HookResult::AuthResult(if self.allows_login(info) {
                 AuthResult::Allow(false, None)
             } else {
-                self.policy.counters.count(Event::ClientDenied);
+                self.count_denied(info.id().remote_addr);
                 tracing::debug!(client = %info.client_id(), "login refused");
                 AuthResult::NotAuthorized
             }),
@@ -174,8 +179,8 @@ impl Handler for Permissions {
                     }
                 })
             }
-            Parameter::ClientSubscribeCheckAcl(_, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
-                self.policy.counters.count(Event::ClientDenied);
+            Parameter::ClientSubscribeCheckAcl(session, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
+                self.count_denied(session.id.remote_addr);
                 HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
             }
             // QoS 0: an acknowledgement that never comes would hold messages in memory.
@@ -183,8 +188,8 @@ impl Handler for Permissions {
                 HookResult::SubscribeAclResult(SubscribeAclResult::new_success(QoS::AtMostOnce, None))
             }
             // An UNSUBACK cannot refuse. Such a filter is never subscribed, so that there is nothing to end.
-            Parameter::ClientUnsubscribe(_, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
-                self.policy.counters.count(Event::ClientDenied);
+            Parameter::ClientUnsubscribe(session, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
+                self.count_denied(session.id.remote_addr);
                 HookResult::TopicFilter(Some(TopicFilter::default()))
             }
             Parameter::ClientUnsubscribe(session, unsubscribe) => {
@@ -207,7 +212,7 @@ fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     }
 }
 
-/// Whether the topic's last message may be retained.
+/// True if the topic's last message may be retained.
 fn is_state(topic: &Topic) -> bool {
     matches!(topic, Topic::Nodes(_) | Topic::Reputations | Topic::Cell)
 }
@@ -224,7 +229,7 @@ fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderChe
     }
 }
 
-/// Whether a client id is the name and run of this node or of its observer. A connection ends an earlier one with the
+/// True if a client id is the name and run of this node or of its observer. A connection ends an earlier one with the
 /// same client id, so that foreign ids are refused.
 fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
     client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.may_act_as(name))

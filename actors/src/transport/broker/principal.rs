@@ -5,16 +5,19 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use ecod::model::names::NodeName;
+use ecod::wire::RejectReason;
 use rmqtt::types::{ClientId, TopicFilter};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::platform::throttle::host_network;
+use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::transport::pki::CertificateSubject;
 
 /// Decides whether a node may publish maps, verdicts and reputations.
 pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 
-/// Authenticated party of a connection: a node by its certificate, or else a host by its address.
+/// Authenticated party of a connection: a node by its certificate, or else a host by its address. Programs beside a node
+/// share its certificate or address, and are a party of their own: what they use up, the node does not lack.
 #[derive(Debug, Clone)]
 pub(super) struct Principal {
     /// Absent without certificates.
@@ -24,8 +27,10 @@ pub(super) struct Principal {
     quota_key: Option<Arc<str>>,
     /// Name under which its bytes count together, also for local clients.
     source: Arc<str>,
-    /// Whether the broker draws the client id.
+    /// True if the broker draws the client id.
     pub(super) has_generated_id: bool,
+    /// True if it is the programs beside the broker's node.
+    are_programs: bool,
 }
 
 impl Principal {
@@ -36,7 +41,14 @@ impl Principal {
             None => Some(host_network(from).to_string().into()),
         };
         let source = quota_key.clone().unwrap_or_else(|| THIS_MACHINE.into());
-        Self { identity: identity.map(Arc::new), quota_key, source, has_generated_id }
+        Self { identity: identity.map(Arc::new), quota_key, source, has_generated_id, are_programs: false }
+    }
+
+    /// The programs of this party, whose connections, messages and bytes count apart.
+    pub(super) fn programs(self) -> Self {
+        let apart = |key: &Arc<str>| Arc::from(format!("{key}, programs"));
+        let (quota_key, source) = (self.quota_key.as_ref().map(apart), apart(&self.source));
+        Self { quota_key, source, are_programs: true, ..self }
     }
 
     /// True if it is the node itself by its certificate; without certificates, a client of this machine.
@@ -54,16 +66,16 @@ impl Principal {
         self.quota_key.clone()
     }
 
-    /// Whether it sends maps, or may be a whole cell.
+    /// True if it sends maps, or may be a whole cell.
     pub(super) fn has_large_share(&self, elected: &LeaderCheck) -> bool {
         match &self.identity {
-            Some(identity) => identity.may_serve() && elected(identity.name()),
+            Some(identity) => !self.are_programs && identity.may_serve() && elected(identity.name()),
             None => self.quota_key.is_none(),
         }
     }
 }
 
-/// Whether the end of a client id is that of a node's run.
+/// True if the end of a client id is that of a node's run.
 pub(super) fn is_run(text: &str) -> bool {
     text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
@@ -123,6 +135,12 @@ impl PrincipalRegistry {
     /// Name under which the bytes of a connection count.
     pub(super) fn source(&self, address: Option<SocketAddr>) -> Option<Arc<str>> {
         Some(Arc::clone(&self.connections().get(&address?)?.principal.source))
+    }
+
+    /// Counts a refusal, also by the principal of the connection.
+    pub(super) fn count_denied(&self, address: Option<SocketAddr>, counters: &Counters) {
+        counters.count(Event::ClientDenied);
+        counters.reject(RejectReason::NotPermitted, self.source(address).as_deref().unwrap_or(OTHERS));
     }
 
     /// Notes that a connection has begun or ended a subscription. One that is made again counts once.
@@ -212,6 +230,17 @@ mod tests {
         drop(held);
         assert!(take("10.0.0.1").is_some() && take("10.0.0.3").is_some());
         assert_eq!(quota.connections.lock().unwrap().len(), 1, "who has left is forgotten");
+    }
+
+    #[test]
+    fn programs_use_up_nothing_of_their_node() {
+        let quota = ConnectionQuota::new(1);
+        let (node, programs) = (at("10.0.0.1"), at("10.0.0.1").programs());
+        let held = quota.take(&programs);
+        assert!(held.is_some() && quota.take(&programs).is_none());
+        assert!(quota.take(&node).is_some());
+        assert_ne!(node.source(), programs.source());
+        assert!(at("127.0.0.1").programs().quota_key().is_none(), "this machine's connections each count alone");
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use std::io;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
@@ -16,6 +17,7 @@ use super::in_flight::InFlight;
 use super::outbound_queue::OutboundQueue;
 use super::packet_scanner::{PacketScanner, Piece};
 use super::principal::{LeaderCheck, Principal};
+use super::subscriptions::MAX_SUBSCRIPTIONS;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, ShedReason};
 
@@ -38,14 +40,23 @@ const IN_FLIGHT_PAUSE: Duration = Duration::from_millis(2);
 
 const BUFFER_BYTES: usize = 8 * 1024;
 
+/// Maximum length of a SUBSCRIBE or UNSUBSCRIBE. rmqtt holds some hundred bytes for each of its filters at once.
+const MAX_FILTERS_BYTES: usize = MAX_SUBSCRIPTIONS * 256;
+
+/// Packet types, in the upper half of the first byte.
+const SUBSCRIBE: u8 = 8;
+const UNSUBSCRIBE: u8 = 10;
+
 impl RelayLimits {
-    /// Forwards bytes until either side ends or the client exceeds its limits.
+    /// Forwards bytes until either side ends or the client exceeds its limits. `wire_bytes` are those that the client has
+    /// sent, where they are more than its stream gives.
     ///
     /// # Errors
-    /// [`ClientRejection::Stalled`]; a connection that is lost otherwise has just ended.
+    /// [`ClientRejection::Stalled`] or [`ClientRejection::Malformed`]; a connection that is lost otherwise has just ended.
     pub(super) async fn relay(
         &self,
         client: impl AsyncRead + AsyncWrite,
+        wire_bytes: &AtomicUsize,
         broker: TcpStream,
         principal: &Principal,
     ) -> Result<(), ClientRejection> {
@@ -53,8 +64,8 @@ impl RelayLimits {
         let (from_client, to_client) = tokio::io::split(client);
         let (from_broker, mut to_broker) = broker.into_split();
         let up = async {
-            let forwarded = self.forward_up(from_client, &mut to_broker, principal, &slot).await;
-            (forwarded.is_ok(), to_broker.shutdown().await.is_ok())
+            let forwarded = self.forward_up((from_client, wire_bytes), &mut to_broker, principal, &slot).await;
+            (forwarded, to_broker.shutdown().await)
         };
         let down = self.forward_down(from_broker, to_client, principal, &slot, cut);
         tokio::pin!(up, down);
@@ -68,6 +79,9 @@ impl RelayLimits {
                 _ => Ok(()),
             },
             ended = &mut up => {
+                if matches!(&ended, (Err(error), _) if error.kind() == io::ErrorKind::InvalidData) {
+                    return Err(ClientRejection::Malformed);
+                }
                 let rest = timeout(FAREWELL_TIMEOUT, down).await;
                 tracing::trace!(?ended, ?rest, "the client ended the connection");
                 Ok(())
@@ -78,12 +92,13 @@ impl RelayLimits {
     /// Passes bytes to rmqtt at the principal's rate, and only while rmqtt keeps up.
     async fn forward_up(
         &self,
-        mut client: impl AsyncRead + Unpin,
+        (mut client, wire_bytes): (impl AsyncRead + Unpin, &AtomicUsize),
         broker: &mut (impl AsyncWrite + Unpin),
         principal: &Principal,
         slot: &BacklogSlot,
     ) -> io::Result<()> {
         let (mut buffer, mut scanner, mut unfinished) = (vec![0; BUFFER_BYTES], PacketScanner::default(), 0);
+        let (mut content, mut charged) = (0, 0);
         loop {
             let read = client.read(&mut buffer).await?;
             let received = buffer.get(..read).unwrap_or_default();
@@ -93,6 +108,9 @@ impl RelayLimits {
             let (mut pieces, mut packets) = (received, 0);
             while let Some(piece) = scanner.next(&mut pieces) {
                 match piece {
+                    Piece::Head(header, length) if has_too_many_filters(&header, length) => {
+                        return Err(io::ErrorKind::InvalidData.into());
+                    }
                     Piece::Head(..) => (packets, unfinished) = (packets + 1, 0),
                     Piece::Body(body) => unfinished += body.len(),
                 }
@@ -107,7 +125,10 @@ impl RelayLimits {
             slot.set_unfinished(unfinished, clock::now());
             let has_large_share = principal.has_large_share(&self.elected);
             let source = principal.source();
-            let wait = self.throttle.charge(source, has_large_share, (read, packets), clock::now());
+            content += read;
+            let due = content.max(wire_bytes.load(Ordering::Relaxed));
+            let wait = self.throttle.charge(source, has_large_share, (due - charged, packets), clock::now());
+            charged = due;
             if !wait.is_zero() {
                 sleep(wait).await;
             }
@@ -155,6 +176,10 @@ impl RelayLimits {
             }
         }
     }
+}
+
+fn has_too_many_filters(header: &[u8], length: usize) -> bool {
+    header.first().is_some_and(|first| matches!(first >> 4, SUBSCRIBE | UNSUBSCRIBE)) && length > MAX_FILTERS_BYTES
 }
 
 /// Sends some bytes, or, if there are none, those that TLS still holds.

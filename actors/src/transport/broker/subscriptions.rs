@@ -12,7 +12,7 @@ use rmqtt::types::SubscribeAclResult;
 use super::principal::{PrincipalRegistry, QuotaKey};
 use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
-use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::counters::Counters;
 
 /// Maximum subscriptions of one client, and of all clients of one certificate or address.
 pub(super) const MAX_SUBSCRIPTIONS: usize = 256;
@@ -29,7 +29,7 @@ pub(super) struct SubscriptionQuota {
 
 impl SubscriptionQuota {
     pub(super) fn new(principals: PrincipalRegistry, counters: Arc<Counters>) -> Self {
-        let rate = KeyedThrottle::new(2 * MAX_SUBSCRIPTIONS as u32, INTERVAL);
+        let rate = KeyedThrottle::new(MAX_SUBSCRIPTIONS as u32, INTERVAL);
         Self { rate: Mutex::new(rate), principals, counters }
     }
 
@@ -63,7 +63,7 @@ impl Handler for SharedQuota {
                 let is_allowed = principals.subscriptions(address) < MAX_SUBSCRIPTIONS
                     && rate.lock().unwrap_or_else(PoisonError::into_inner).allow(&source, clock::now());
                 if !is_allowed {
-                    counters.count(Event::ClientDenied);
+                    principals.count_denied(address, counters);
                     tracing::debug!(source = source.as_str(), "subscription refused");
                     let refused = SubscribeAclResult::new_failure(SubscribeAckReason::QuotaExceeded);
                     return (false, Some(HookResult::SubscribeAclResult(refused)));

@@ -60,7 +60,7 @@ pub struct MembershipConfig {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MulticastConfig {
-    /// Whether to greet and listen to greetings. Default true.
+    /// True if to greet and listen to greetings. Default true.
     pub enabled: bool,
     /// The group. Default 239.255.36.84, of the range that routers keep local.
     pub group: Ipv4Addr,
@@ -123,7 +123,7 @@ impl MembershipConfig {
         check_range("max_peers", self.max_peers as f64, 1.0, 4096.0)
     }
 
-    /// Whether a key is configured. Without one the key is public.
+    /// True if a key is configured. Without one the key is public.
     pub fn has_key(&self) -> bool {
         self.key.is_some() || self.key_file.is_some()
     }

@@ -117,7 +117,7 @@ pub(crate) struct Hello {
 /// More about a greeting.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Greeting {
-    /// Whether the sender asks for a new session: it lost the one there was, or hears nothing in it.
+    /// True if the sender asks for a new session: it lost the one there was, or hears nothing in it.
     pub(crate) wants_session: bool,
 }
 

@@ -10,12 +10,18 @@ use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
 use super::config::MembershipConfig;
-use super::frame::{FrameHeader, FrameKind, Version};
-use super::handshake::Identity;
-use super::key::{BROADCAST, CellKey, SessionId, session_of};
+use super::frame::{
+    FrameHeader, FrameKind, Greeting, HEADER_BYTES, Handshake, Hello, Introduction, NameClaim, Version,
+};
+use super::handshake::{Attestation, Identity, Prover, Side, SignedMessage, Transcript};
+use super::key::{BROADCAST, CellKey, Cookie, SessionId, session_of};
 use super::machine::{GossipMachine, GossipOutput, GossipSetup};
 use super::node_id::NodeId;
+use super::sessions::{decode, decode_first, encode};
 use super::trial_authority::TrialAuthority;
+
+/// Time at which all begins, in microseconds since 1970.
+const START: u64 = 1_700_000_000_000_000;
 
 const OWN: &str = "own";
 const PEER: &str = "peer";
@@ -28,6 +34,9 @@ static IDENTITIES: LazyLock<[Identity; 2]> = LazyLock::new(|| {
     [OWN, PEER].map(|name| authority.identity(name, Role::Auto))
 });
 
+/// Changes of single bytes: place, modulo the length, and bits to turn over.
+pub type Edits = Vec<(u16, u8)>;
+
 /// A node that hears a peer, whose frames can say anything.
 pub struct Listener {
     own: GossipMachine,
@@ -37,7 +46,16 @@ pub struct Listener {
     now: Timestamp,
     /// Frames of the peer that were forged; beyond those that it sent itself.
     forged: u64,
+    /// The peer's certificate and key, in a cell with certificates.
+    prover: Option<Prover>,
+    /// The last cookie that the node sent the peer in a challenge.
+    challenge: Option<Cookie>,
+    /// The node's last proof to the peer: its cookie, and the transcript that an accept is bound to.
+    proof: Option<(Cookie, Transcript)>,
 }
+
+/// Cookie of the peer's challenges. The peer believes any answer.
+const PEER_COOKIE: Cookie = [8; 16];
 
 impl Listener {
     /// A node and its peer, after their handshake, in a cell with certificates or without.
@@ -75,12 +93,14 @@ impl Listener {
 
     /// A node that has met nobody yet.
     pub fn alone(proves: bool) -> Self {
-        let now = Timestamp(1_700_000_000_000_000);
+        let now = Timestamp(START);
         let own = machine(OWN, 2, proves, now);
         let sessions = [(OWN, [2; 16]), (PEER, [1; 16])]
             .map(|(node, nonce)| if proves { session_of(&name(node), &nonce) } else { nonce });
         let version = if proves { Version::Certificate } else { Version::Key };
-        Self { own, key: key(), version, sessions, now, forged: 1 << 16 }
+        let prover = proves.then(|| Prover::new(IDENTITIES[1].clone(), [1; 16]));
+        let forged = 1 << 16;
+        Self { own, key: key(), version, sessions, now, forged, prover, challenge: None, proof: None }
     }
 
     /// Processes a datagram from the peer's address.
@@ -105,6 +125,51 @@ impl Listener {
         self.hear(&frame);
     }
 
+    /// Processes a greeting of the peer, which answers it with a challenge unless it knows the peer.
+    pub fn hear_greeting(&mut self, wants_session: bool) {
+        let mut body = encode(&Hello { name: name(PEER) });
+        if self.prover.is_some() {
+            body.extend(encode(&Greeting { wants_session }));
+        }
+        self.hear_sealed(0, &body);
+    }
+
+    /// Processes a challenge of the peer, which the node answers with its proof.
+    pub fn hear_challenge(&mut self, edits: &Edits) {
+        let challenge = encode(&Handshake::Challenge { cookie: PEER_COOKIE, name: name(PEER) });
+        self.hear_sealed(1, &edited(challenge, edits));
+    }
+
+    /// Processes the peer's proof with the node's last cookie. The peer signs what was made of its message; then the
+    /// attestation is changed.
+    pub fn hear_proof(&mut self, message: &Edits, attestation: &Edits) {
+        let Some(echo) = self.challenge else { return };
+        let proof = Handshake::Proof { echo, cookie: PEER_COOKIE, introduction: introduction() };
+        self.hear_signed(Side::Prover, OWN.as_bytes(), edited(encode(&proof), message), attestation);
+    }
+
+    /// Processes the peer's accept of the node's last proof, in the same way.
+    pub fn hear_accept(&mut self, message: &Edits, attestation: &Edits) {
+        let Some((echo, proof)) = self.proof else { return };
+        let accept = Handshake::Accept { echo, introduction: introduction() };
+        self.hear_signed(Side::Accepter, &proof, edited(encode(&accept), message), attestation);
+    }
+
+    fn hear_signed(&mut self, side: Side, context: &[u8], mut message: Vec<u8>, edits: &Edits) {
+        let [own, peer] = self.sessions;
+        // The frame that comes next.
+        let counter = self.forged + 1;
+        let head = FrameHeader { version: self.version, kind: FrameKind::Handshake, sender: peer, counter };
+        if let Some(prover) = &self.prover {
+            let head = head.bytes(self.key.tag());
+            let signed = SignedMessage { side, head, receiver: own, context, message: &message };
+            let ephemeral = prover.draw_ephemeral().map(|(_, public)| public);
+            let Some((attestation, _)) = ephemeral.and_then(|public| prover.attest(&signed, public)) else { return };
+            message.extend(edited(encode(&attestation), edits));
+        }
+        self.hear_sealed(1, &message);
+    }
+
     /// Lets time pass.
     pub fn wait(&mut self, ms: u64) {
         self.now = self.now + Duration::from_millis(ms);
@@ -119,8 +184,46 @@ impl Listener {
     }
 
     fn settle(&mut self) {
-        while self.own.poll().is_some() {}
+        while let Some(output) = self.own.poll() {
+            if let GossipOutput::Send { frame, .. } = output {
+                self.note_handshake(&frame);
+            }
+        }
     }
+
+    /// Keeps from the node's handshakes with the peer as much as the peer needs for its next step.
+    fn note_handshake(&mut self, frame: &[u8]) -> Option<()> {
+        let [own, peer] = self.sessions;
+        let head = FrameHeader::read(frame, self.key.tag()).ok()?;
+        let (open, sealed) = frame.split_at_checked(HEADER_BYTES)?;
+        let body = self.key.seal(&own, &peer).open(head.counter, open, sealed)?;
+        let (message, rest) = decode_first::<Handshake>(&body).ok()?;
+        match message {
+            Handshake::Challenge { cookie, .. } => self.challenge = Some(cookie),
+            Handshake::Proof { cookie, .. } if self.prover.is_some() => {
+                let (attestation, head) = (decode::<Attestation>(rest).ok()?, head.bytes(self.key.tag()));
+                let (side, message) = (Side::Prover, body.get(..body.len() - rest.len())?);
+                let signed = SignedMessage { side, head, receiver: peer, context: PEER.as_bytes(), message };
+                self.proof = Some((cookie, signed.transcript(&attestation)));
+            }
+            Handshake::Proof { cookie, .. } => self.proof = Some((cookie, Transcript::default())),
+            Handshake::Accept { .. } => {}
+        }
+        Some(())
+    }
+}
+
+fn edited(mut bytes: Vec<u8>, edits: &Edits) -> Vec<u8> {
+    let length = bytes.len();
+    for (place, bits) in edits {
+        bytes[usize::from(*place) % length] ^= bits;
+    }
+    bytes
+}
+
+/// The peer as it introduces itself.
+fn introduction() -> Introduction {
+    Introduction { id: node_id(PEER, Timestamp(START)), seen_at: address(0), claim: NameClaim::Free }
 }
 
 fn name(text: &'static str) -> NodeName {
@@ -133,16 +236,8 @@ fn key() -> CellKey {
 
 fn machine(node: &'static str, nonce: u8, proves: bool, now: Timestamp) -> GossipMachine {
     let identity = proves.then(|| IDENTITIES[usize::from(node == PEER)].clone());
-    let own = NodeId {
-        name: name(node),
-        run: now.micros(),
-        life: now.micros(),
-        role: Role::Auto,
-        gossip: SocketAddr::from((Ipv4Addr::UNSPECIFIED, 17_884)),
-        broker: None,
-    };
     let setup = GossipSetup {
-        own,
+        own: node_id(node, now),
         key: key(),
         session: [nonce; 16],
         identity,
@@ -151,6 +246,17 @@ fn machine(node: &'static str, nonce: u8, proves: bool, now: Timestamp) -> Gossi
         counters: Arc::default(),
     };
     GossipMachine::new(setup, &MembershipConfig::default(), now)
+}
+
+fn node_id(node: &'static str, now: Timestamp) -> NodeId {
+    NodeId {
+        name: name(node),
+        run: now.micros(),
+        life: now.micros(),
+        role: Role::Auto,
+        gossip: SocketAddr::from((Ipv4Addr::UNSPECIFIED, 17_884)),
+        broker: None,
+    }
 }
 
 fn address(index: usize) -> SocketAddr {

@@ -127,12 +127,12 @@ impl Prover {
         self.identity.credentials.certificate()
     }
 
-    /// Whether a certificate that was verified before has expired meanwhile.
+    /// True if a certificate that was verified before has expired meanwhile.
     pub(crate) fn has_expired(&self, proven: &Proven) -> bool {
         proven.expires.micros() / 1_000_000 < self.identity.wall.as_secs()
     }
 
-    /// Whether a node's certificate proves its name.
+    /// Verifies that a node's certificate proves its name.
     pub(crate) fn verify(&mut self, name: &NodeName, certificate: &[u8], from: SocketAddr) -> Option<Proven> {
         let checked = self.identity.credentials.verify_node(certificate, self.identity.wall);
         let refusal = match checked {
@@ -181,7 +181,7 @@ impl Prover {
         Ok((proven, transcript))
     }
 
-    /// Whether a challenge needs an answer: the proof for it is not under way already.
+    /// True if a challenge needs an answer: the proof for it is not under way already.
     pub(crate) fn wants_proof(&mut self, key: &PendingKey, now: Timestamp) -> bool {
         self.pending.retain(|_, proof| now.since(proof.since) < PROOF_TIMEOUT);
         let repeated = |proof: &PendingProof| now.since(proof.since) >= PROOF_RETRY;
@@ -243,7 +243,7 @@ impl Side {
 
 impl SignedMessage<'_> {
     /// Hash of the message and of everything that it is bound to, each part with its length.
-    fn transcript(&self, attestation: &Attestation) -> Transcript {
+    pub(super) fn transcript(&self, attestation: &Attestation) -> Transcript {
         let Attestation { ephemeral, nonce, certificate, signature: _ } = attestation;
         let mut hash = digest::Context::new(&digest::SHA256);
         let parts: [&[u8]; 8] =

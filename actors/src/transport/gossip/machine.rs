@@ -69,7 +69,7 @@ pub(crate) struct GossipMachine {
     unproven: HashMap<NodeName, Timestamp>,
     /// The name last reported as taken, and when.
     taken: Option<(NodeName, Timestamp)>,
-    /// Whether the node has to learn its address from others.
+    /// True if the node has to learn its address from others.
     learns_address: bool,
     left: bool,
     rng: ChaCha8Rng,
@@ -189,6 +189,7 @@ impl GossipMachine {
         for name in expelled {
             tracing::warn!(node = %name, "session ended: its certificate was revoked or has expired");
             self.gossip.remove(&name, at);
+            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Expelled { name }));
         }
         for address in greeted {
             self.send_hello(address, true, at);

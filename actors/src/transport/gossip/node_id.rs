@@ -27,7 +27,7 @@ pub(crate) struct NodeId {
 pub(crate) const MAX_CLAIMED_LIFE: u64 = 1 << 53;
 
 impl NodeId {
-    /// Whether the node itself could have reached the life: it starts with the time of day, and grows by single steps.
+    /// True if the node itself could have reached the life: it starts with the time of day, and grows by single steps.
     pub(crate) fn has_plausible_life(&self) -> bool {
         self.life <= 2 * MAX_CLAIMED_LIFE
     }

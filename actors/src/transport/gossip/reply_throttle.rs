@@ -31,12 +31,12 @@ impl ReplyThrottle {
         }
     }
 
-    /// Whether this session may be answered now.
+    /// True if this session may be answered now.
     pub(crate) fn allow(&mut self, session: &SessionId, from: SocketAddr, now: Timestamp) -> bool {
         self.by_session.allow(&(*session, from), now) && self.allow_host(from, now)
     }
 
-    /// Whether a proof from this address may be verified now, whatever session it claims: forged proofs must not use up
+    /// True if a proof from this address may be verified now, whatever session it claims: forged proofs must not use up
     /// the share of an honest one.
     pub(crate) fn allow_host(&mut self, from: SocketAddr, now: Timestamp) -> bool {
         let host = host_network(from.ip());

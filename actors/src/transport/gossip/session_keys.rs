@@ -10,7 +10,7 @@ pub(crate) struct KeySet {
     pub(crate) to: FrameCipher,
     pub(crate) from: FrameCipher,
     pub(crate) window: ReplayWindow,
-    /// Whether the other side has proven to have these keys: it has used them, or it made them.
+    /// True if the other side has proven to have these keys: it has used them, or it made them.
     pub(crate) is_confirmed: bool,
 }
 

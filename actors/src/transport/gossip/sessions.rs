@@ -78,7 +78,7 @@ pub(crate) enum FrameContent {
     Met {
         introduction: Introduction,
         answer: Option<Vec<u8>>,
-        /// Whether its session is accepted for its name.
+        /// True if its session is accepted for its name.
         speaks: bool,
     },
     /// A message of the SWIM protocol.
@@ -122,7 +122,7 @@ impl Sessions {
         }
     }
 
-    /// Whether sessions prove certificates.
+    /// True if sessions prove certificates.
     pub(crate) fn prove_certificates(&self) -> bool {
         self.prover.is_some()
     }
@@ -171,7 +171,7 @@ impl Sessions {
         Some((&peer.id, peer.proven.as_ref()?))
     }
 
-    /// Whether a node was heard a moment ago.
+    /// True if a node was heard a moment ago.
     pub(crate) fn is_heard(&self, name: &NodeName, now: Timestamp) -> bool {
         self.peers.speaker(name).is_some_and(|peer| now.since(peer.heard) < HEARD_TIME)
     }
@@ -182,7 +182,7 @@ impl Sessions {
         (now.since(peer.heard) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
     }
 
-    /// Whether a single node may be greeted now.
+    /// True if a single node may be greeted now.
     pub(crate) fn may_send_hello(&mut self, now: Timestamp) -> bool {
         self.greetings.allow(now) || self.throttled()
     }
@@ -239,7 +239,7 @@ impl Sessions {
             FrameKind::Handshake => {
                 let body = self.unseal(&head, &self.own, frame).ok_or(FrameEvent::BadSeal)?;
                 if !self.prove_certificates() {
-                    self.peers.take_counter(&head, arrival.now)?;
+                    self.peers.take_counter(&head, arrival.from, arrival.now)?;
                 }
                 self.handle_handshake(&head, &body, arrival)
             }
@@ -336,8 +336,8 @@ const HELLO_INTERVAL: Duration = Duration::from_millis(10);
 /// Idle time after which a session may be replaced. It is then sent to only if the gossip holds the node alive.
 const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Time for which a node that was heard is not doubted on the word of others. It is about as long as the gossip takes to
-/// find that a node is down.
+/// Time for which a node that was heard is not doubted on the word of others, and is not believed to be elsewhere. It is
+/// about as long as the gossip takes to find that a node is down.
 const HEARD_TIME: Duration = Duration::from_millis(400);
 
 /// Time for which frames of a node's earlier run may still arrive.
@@ -347,16 +347,16 @@ const MAX_TRANSIT: Duration = Duration::from_millis(500);
 const UNHEARD_TIMEOUT: Duration = Duration::from_millis(500);
 
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
-fn encode(message: &impl Serialize) -> Vec<u8> {
+pub(super) fn encode(message: &impl Serialize) -> Vec<u8> {
     postcard::to_allocvec(message).expect("plain values are always written")
 }
 
-fn decode<T: DeserializeOwned>(body: &[u8]) -> Result<T, FrameEvent> {
+pub(super) fn decode<T: DeserializeOwned>(body: &[u8]) -> Result<T, FrameEvent> {
     postcard::from_bytes(body).map_err(|_| FrameEvent::Malformed)
 }
 
 /// Decodes the beginning of a body; also gives the rest.
-fn decode_first<T: DeserializeOwned>(body: &[u8]) -> Result<(T, &[u8]), FrameEvent> {
+pub(super) fn decode_first<T: DeserializeOwned>(body: &[u8]) -> Result<(T, &[u8]), FrameEvent> {
     postcard::take_from_bytes(body).map_err(|_| FrameEvent::Malformed)
 }
 

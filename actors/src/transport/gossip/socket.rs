@@ -78,7 +78,7 @@ impl GossipSocket {
     }
 }
 
-/// Whether an address belongs to this machine: a socket can be bound to it.
+/// True if an address belongs to this machine: a socket can be bound to it.
 pub(crate) fn is_of_this_machine(ip: IpAddr) -> bool {
     ip.is_loopback() || ip.is_unspecified() || std::net::UdpSocket::bind((ip, 0)).is_ok()
 }

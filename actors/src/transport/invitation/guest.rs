@@ -17,7 +17,8 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 use super::{
-    CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REPLY_BYTES, Reply, Request, Token, Welcome, read_line, write_line,
+    CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REPLY_BYTES, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line,
+    write_line,
 };
 
 /// Maximum time for a connection to one address of the host.
@@ -80,10 +81,13 @@ impl Joined {
     /// Tells the host that all is on disk, so that the token is used up.
     ///
     /// # Errors
-    /// When the host is gone; the certificate is valid all the same.
+    /// When the host does not confirm it: it will revoke the certificate.
     pub async fn keep(mut self) -> io::Result<()> {
-        write_line(&mut self.stream, &KEPT).await?;
-        tokio::io::AsyncWriteExt::shutdown(&mut self.stream).await
+        let told = async {
+            write_line(&mut self.stream, &KEPT).await?;
+            read_line::<String>(&mut self.stream, MAX_REQUEST_BYTES).await
+        };
+        timeout(CONVERSATION_TIME, told).await?.map(drop)
     }
 }
 

@@ -222,5 +222,6 @@ async fn receive(
     }
     let kept: String = read_line(&mut stream, MAX_REQUEST_BYTES).await?;
     anyhow::ensure!(kept == KEPT, "{node} has not kept its files");
+    write_line(&mut stream, &KEPT).await?;
     Ok((from, node, serial))
 }

@@ -16,7 +16,7 @@ use crate::platform::secret::Secret;
 pub struct MqttConfig {
     /// An external broker as `host:port`; default none: the brokers embedded in the nodes are used.
     pub broker: Option<BrokerAddress>,
-    /// Whether the embedded brokers are used beside an external one; default false. Trade-off: the cell survives the loss
+    /// True if the embedded brokers are used beside an external one; default false. Trade-off: the cell survives the loss
     /// of the external broker, and every message is sent twice while it is there.
     pub fallback_to_embedded: bool,
     /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized packets away).
@@ -28,7 +28,7 @@ pub struct MqttConfig {
     /// PEM file with the CAs of the external broker's certificate; default none: plaintext. The host in `broker` must be
     /// a name in the certificate. A node with `[tls]` presents its own certificate.
     pub ca: Option<PathBuf>,
-    /// Whether payloads are signed with the cell's key and unsigned ones rejected; default false. For an external broker
+    /// True if payloads are signed with the cell's key and unsigned ones rejected; default false. For an external broker
     /// that others use too. Must be the same on every node. Other subscribers have to skip the signature.
     pub sign: bool,
     /// Encoding of sent payloads: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a

@@ -149,7 +149,7 @@ struct LinkTask {
     /// The refusal that was logged last.
     reported_refusal: Option<String>,
     has_reported_oversized: bool,
-    /// Whether the wrong clock of this machine was told.
+    /// True if the wrong clock of this machine was told.
     has_reported_clock: bool,
 }
 
@@ -237,12 +237,14 @@ impl LinkTask {
         // takes longer than a keep-alive was stalled on this side.
         let patience = 2 * config.keep_alive();
         let mut silent = Duration::ZERO;
-        let accepted = Instant::now();
+        // Time spent waiting for the own status. One wait alone, which may be a stall, is not enough for a verdict.
+        let mut listened = Duration::ZERO;
         let mut heard_itself = false;
         loop {
             let polled = Instant::now();
             let packet = connection.next(patience.saturating_sub(silent)).await;
             let packet = packet.inspect_err(|_| counters.count(Event::Disconnected))?;
+            listened += polled.elapsed().min(3 * config.connect_timeout() / 4);
             if matches!(packet, Packet::Sent) {
                 silent += polled.elapsed().min(config.keep_alive());
                 continue;
@@ -279,7 +281,7 @@ impl LinkTask {
                 // The return of the node's own status decides.
                 Packet::Accepted | Packet::Sent | Packet::PublishRefused(_) | Packet::Other => {}
             }
-            if !heard_itself && accepted.elapsed() > config.connect_timeout() && self.reported_refusal.is_none() {
+            if !heard_itself && listened > config.connect_timeout() && self.reported_refusal.is_none() {
                 self.report_refusal(NOT_HEARD.to_owned());
             }
         }

@@ -90,16 +90,16 @@ impl Security {
     /// connections are tried on and on, and succeed once the clock is set.
     pub fn clock_fault(&self) -> Option<String> {
         let credentials = self.credentials.as_ref()?.current();
-        let (wall, begins) = (clock::wall(), credentials.identity.begins());
+        let (wall, begins, expires) = (clock::wall(), credentials.identity.begins(), credentials.identity.expires());
         let date = |time: Timestamp| {
             let date = i64::try_from(time.micros()).ok().and_then(DateTime::from_timestamp_micros);
             date.map_or_else(|| time.to_string(), |date| date.format("%Y-%m-%dT%H:%MZ").to_string())
         };
-        (wall < begins).then(|| {
-            let (wall, begins) = (date(wall), date(begins));
+        (wall < begins || wall > expires).then(|| {
+            let (wall, begins, expires) = (date(wall), date(begins), date(expires));
             format!(
-                "this machine's clock says {wall}, and the node's certificate is valid from {begins} on: set the clock, \
-                 such as by `timedatectl set-ntp true`"
+                "this machine's clock says {wall}, and the node's certificate is valid from {begins} to {expires}: set the \
+                 clock, such as by `timedatectl set-ntp true`, or give it a new certificate by `ecod-node pki issue`"
             )
         })
     }
@@ -137,7 +137,7 @@ impl Security {
         if is_valid { SignatureState::Valid } else { SignatureState::Invalid }
     }
 
-    /// Whether arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz targets.
+    /// True if arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz targets.
     #[cfg(fuzzing)]
     pub fn rejects_forgery(&self, topic: &str, bytes: &[u8]) -> bool {
         let Some(key) = &self.signing else { return false };
@@ -201,11 +201,14 @@ mod tests {
     use crate::transport::pki::Authority;
 
     #[test]
-    fn a_clock_before_the_certificate_is_told_with_its_remedy() {
+    fn a_clock_before_or_after_the_certificate_is_told_with_its_remedy() {
         let (name, cell) = (NodeName::from_static("edge"), NodeName::from_static("lot"));
-        for (issued_after, is_wrong) in [(Duration::ZERO, false), (Duration::from_secs(30 * 86_400), true)] {
+        let month_us = 30 * 86_400 * 1_000_000;
+        let now = clock::now();
+        for (issued_at, is_wrong) in
+            [(now, false), (Timestamp(now.micros() + month_us), true), (Timestamp(now.micros() - month_us), true)]
+        {
             let directory = tempfile::tempdir().unwrap();
-            let issued_at = clock::now() + issued_after;
             let mut authority = Authority::init(directory.path(), &cell, issued_at).unwrap();
             authority.issue(&name, Role::Edge, Duration::from_secs(3600), issued_at).unwrap();
             let (certificate, key) = authority.files_of(&name);

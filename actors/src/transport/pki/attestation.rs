@@ -48,13 +48,13 @@ pub(super) fn signer(key: &PrivateKeyDer<'_>) -> Option<Box<dyn Signer>> {
     any_ecdsa_type(key).ok()?.choose_scheme(&[SignatureScheme::ECDSA_NISTP256_SHA256])
 }
 
-/// Whether the owner of a certificate signed a message.
+/// True if the owner of a certificate signed a message.
 pub(crate) fn is_signed_by(certificate: &[u8], message: &[u8], signature: &[u8]) -> bool {
     let Ok((_, parsed)) = X509Certificate::from_der(certificate) else { return false };
     is_signed_with(&parsed.public_key().subject_public_key.data, message, signature)
 }
 
-/// Whether the owner of a public key signed a message.
+/// True if the owner of a public key signed a message.
 pub(super) fn is_signed_with(public_key: &[u8], message: &[u8], signature: &[u8]) -> bool {
     UnparsedPublicKey::new(&ECDSA_P256_SHA256_ASN1, public_key).verify(message, signature).is_ok()
 }

@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 
 use super::subject::rights_uri;
 use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
-use crate::platform::state_file::replace_file;
+use crate::platform::state_file::{content, replace_file, with_checksum};
 
 /// Days for which a node's certificate is valid unless told otherwise.
 pub const DEFAULT_DAYS: u32 = 365;
@@ -70,7 +70,7 @@ pub enum AuthorityError {
     #[error("{0} has a CA already; a new one needs an empty directory")]
     Exists(PathBuf),
     /// The register cannot be read.
-    #[error("{path} cannot be understood: {reason}")]
+    #[error("{path} cannot be used: {reason}; put a copy of it back")]
     Register {
         /// The file.
         path: PathBuf,
@@ -217,7 +217,8 @@ impl Authority {
         self.register.issued.iter().any(|issued| issued.node == *node && is_valid(issued))
     }
 
-    /// Revokes all certificates of a node and rewrites the revocation list; returns their number.
+    /// Revokes all certificates of a node, also those that have expired, and rewrites the revocation list; returns their
+    /// number. Evidence that was signed in a certificate's time counts after it, until it is revoked.
     ///
     /// # Errors
     /// [`AuthorityError`] when there are none or the list cannot be written.
@@ -239,9 +240,9 @@ impl Authority {
         now: Timestamp,
     ) -> Result<usize, AuthorityError> {
         let _lock = self.lock()?;
-        let is_valid = |issued: &IssuedCertificate| issued.revoked_at_us.is_none() && issued.expires_at_us > now;
         let mut revoked = 0;
-        for issued in self.register.issued.iter_mut().filter(|issued| is_meant(issued) && is_valid(issued)) {
+        let issued = self.register.issued.iter_mut().filter(|issued| issued.revoked_at_us.is_none());
+        for issued in issued.filter(|issued| is_meant(issued)) {
             issued.revoked_at_us = Some(now);
             revoked += 1;
         }
@@ -292,7 +293,7 @@ impl Authority {
         write(&self.revocation_list(), &list.signed_by(issuer)?.pem()?)?;
         let text = serde_json::to_string_pretty(&self.register)
             .map_err(|error| AuthorityError::Register { path: REGISTER.into(), reason: error.to_string() })?;
-        write(&self.directory.join(REGISTER), &(text + "\n"))
+        replace(&self.directory.join(REGISTER), &with_checksum((text + "\n").as_bytes()), 0o644)
     }
 }
 
@@ -309,7 +310,9 @@ fn read_register(directory: &Path) -> Result<IssuedCertificates, AuthorityError>
         return Err(AuthorityError::Missing(directory.into()));
     }
     let text = read(&path)?;
-    serde_json::from_str(&text).map_err(|error| AuthorityError::Register { path, reason: error.to_string() })
+    let register = content(text.as_bytes());
+    let register = register.and_then(|register| serde_json::from_slice(register).map_err(|error| error.to_string()));
+    register.map_err(|reason| AuthorityError::Register { path, reason })
 }
 
 fn days(count: u32) -> Duration {
@@ -339,15 +342,15 @@ fn read(path: &Path) -> Result<String, AuthorityError> {
 }
 
 fn write(path: &Path, text: &str) -> Result<(), AuthorityError> {
-    replace(path, text, 0o644)
+    replace(path, text.as_bytes(), 0o644)
 }
 
 fn write_secret(path: &Path, text: &str) -> Result<(), AuthorityError> {
-    replace(path, text, 0o600)
+    replace(path, text.as_bytes(), 0o600)
 }
 
-fn replace(path: &Path, text: &str, mode: u32) -> Result<(), AuthorityError> {
-    replace_file(path, text.as_bytes(), mode).map_err(|source| AuthorityError::File { path: path.into(), source })
+fn replace(path: &Path, bytes: &[u8], mode: u32) -> Result<(), AuthorityError> {
+    replace_file(path, bytes, mode).map_err(|source| AuthorityError::File { path: path.into(), source })
 }
 
 #[cfg(test)]
@@ -397,6 +400,23 @@ mod tests {
         let mut later = Authority::open(directory.path()).unwrap();
         let revoked = [edge, euclid, gauss].map(|node| later.revoke(&node, clock::now()).ok());
         assert_eq!(revoked, [None, Some(1), Some(1)], "the edge's was revoked before");
+    }
+
+    #[test]
+    fn a_register_with_one_wrong_byte_is_told_and_not_used() {
+        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
+        let path = directory.path().join(REGISTER);
+        let whole = fs::read(&path).unwrap();
+        for place in 0..whole.len() {
+            let mut damaged = whole.clone();
+            damaged[place] ^= 1;
+            fs::write(&path, damaged).unwrap();
+            assert!(Authority::open(directory.path()).is_err(), "byte {place}");
+        }
+        fs::write(&path, whole).unwrap();
+        Authority::open(directory.path()).unwrap();
     }
 
     #[test]

@@ -68,6 +68,16 @@ impl EvidenceSigner {
         Some(LedgerShare { signed, ..share })
     }
 
+    /// The certificate with which this node signs, in base64.
+    pub fn certificate(&self) -> String {
+        BASE64.encode(self.loaded.certificate())
+    }
+
+    /// True if a certificate is one of the cell and not revoked; it may have expired.
+    pub fn is_of_cell(&mut self, certificate: &str) -> bool {
+        self.known(certificate).is_some()
+    }
+
     /// Reads changed certificates and revocation lists; true if there were any.
     pub fn reload(&mut self) -> bool {
         let loaded = self.credentials.current();
@@ -102,7 +112,7 @@ impl EvidenceSigner {
         self.verify_signature(share, &signatory)
     }
 
-    /// Whether the certificate of a share that was verified is still one of the cell and not revoked.
+    /// True if the certificate of a share that was verified is still one of the cell and not revoked.
     pub fn is_trusted(&mut self, share: &LedgerShare) -> bool {
         self.signatory(share).is_ok()
     }
@@ -114,16 +124,20 @@ impl EvidenceSigner {
         if is_signed { Ok(()) } else { Err(EvidenceError::Signature) }
     }
 
-    /// The aggregator whose counts a share has, by the certificate beside them.
-    fn signatory(&mut self, share: &LedgerShare) -> Result<Signatory, EvidenceError> {
-        let certificate = &share.signed.as_ref().ok_or(EvidenceError::Unsigned)?.certificate;
+    fn known(&mut self, certificate: &str) -> Option<Signatory> {
         if !self.known.contains_key(certificate) {
             if self.known.len() >= MAX_KNOWN {
                 self.known.clear();
             }
-            self.known.insert(certificate.clone(), signatory(certificate, &self.loaded));
+            self.known.insert(certificate.to_owned(), signatory(certificate, &self.loaded));
         }
-        let signatory = self.known.get(certificate).cloned().flatten().ok_or(EvidenceError::Certificate)?;
+        self.known.get(certificate).cloned().flatten()
+    }
+
+    /// The aggregator whose counts a share has, by the certificate beside them.
+    fn signatory(&mut self, share: &LedgerShare) -> Result<Signatory, EvidenceError> {
+        let certificate = &share.signed.as_ref().ok_or(EvidenceError::Unsigned)?.certificate;
+        let signatory = self.known(certificate).ok_or(EvidenceError::Certificate)?;
         let is_aggregator = share.lane().is_some_and(|lane| lane.leader == *signatory.subject.name());
         if is_aggregator && signatory.subject.may_serve() { Ok(signatory) } else { Err(EvidenceError::Signatory) }
     }
@@ -254,9 +268,12 @@ mod tests {
         assert_eq!(edge.verify(&from_old), Err(EvidenceError::Certificate));
         assert_eq!(edge.verify_again(&from_old), Ok(()), "what was taken in its time");
         authority.revoke(&name("gauss"), now).unwrap();
+        assert_eq!(authority.revoke(&name("old"), now).unwrap(), 1, "one that has expired");
         std::thread::sleep(Duration::from_millis(1100));
         assert!(edge.reload());
-        assert!(!edge.is_trusted(&from_gauss) && edge.verify_again(&from_gauss).is_err());
+        for revoked in [&from_gauss, &from_old] {
+            assert!(!edge.is_trusted(revoked) && edge.verify_again(revoked).is_err());
+        }
         let again = signer(&mut authority, "gauss", Role::Auto, DAY, now);
         std::thread::sleep(Duration::from_millis(1100));
         assert_eq!(edge.verify(&again.sign(share("gauss")).unwrap()), Ok(()), "a new certificate, new evidence");

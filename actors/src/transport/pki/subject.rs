@@ -69,7 +69,7 @@ impl CertificateSubject {
         &self.name
     }
 
-    /// Whether the node may serve a broker, and so lead.
+    /// True if the node may serve a broker, and so lead.
     pub fn may_serve(&self) -> bool {
         self.may_serve
     }
@@ -95,7 +95,7 @@ impl CertificateSubject {
         self.expires
     }
 
-    /// Whether the node may have a client of this name: its own, or that of a part or an observer which shares its
+    /// True if the node may have a client of this name: its own, or that of a part or an observer which shares its
     /// certificate. What parts see counts as their node's, so that one certificate is one vehicle.
     pub fn may_act_as(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))

@@ -6,7 +6,7 @@ use std::fs;
 use anyhow::Context;
 use serde::Serialize;
 
-/// What one process holds at a time, or the most of each that any of several does.
+/// Resources of one process at a time, or the most of each that any of several has.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub(super) struct Resources {
     pub(super) resident_kib: u64,
@@ -43,14 +43,14 @@ impl Display for Resources {
     }
 }
 
-/// What one process held at the end of each minute of its life.
+/// Resources of one process at the end of each minute of its life.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Series(Vec<Resources>);
 
 /// Fewer minutes than this show no growth: a process that comes to lead for the first time takes what that takes.
 const LEAST_MINUTES: usize = 9;
 
-/// What may be added from the middle third of a life to its last: a tenth and this.
+/// Allowed growth from the middle third of a life to its last, beside a tenth.
 const ALLOWED: Resources = Resources { resident_kib: 2048, descriptors: 8, threads: 4 };
 
 impl Series {
@@ -58,12 +58,12 @@ impl Series {
         self.0.push(resources);
     }
 
-    /// Whether the process lived for long enough to show whether it grows.
+    /// True if the process lived for long enough to show whether it grows.
     pub(super) fn is_telling(&self) -> bool {
         self.0.len() >= LEAST_MINUTES
     }
 
-    /// What grows, in words: the medians of the middle and the last third of the process's life are compared.
+    /// The resources that grow, in words: the medians of the middle and the last third of the process's life are compared.
     pub(super) fn growth(&self) -> Option<String> {
         if !self.is_telling() {
             return None;

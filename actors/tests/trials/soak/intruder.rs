@@ -20,7 +20,7 @@ use crate::settings::CELL;
 /// The name it goes by.
 const NAME: &str = "mallory";
 
-/// How often, and how many reports each time: 5000 a second.
+/// Time between two bursts of reports, and their size: 5000 a second.
 const FLOOD_TICK: Duration = Duration::from_millis(10);
 const FLOOD_BURST: u64 = 50;
 
@@ -79,7 +79,7 @@ impl Intruder {
                 1 => format!("ecod/v1/{CELL}/{kind}/edge"),
                 _ => topic(kind),
             };
-            // What a broker refuses is as good as sent.
+            // A refused message is as good as sent.
             let _ = clients[node].try_publish(topic, QoS::AtMostOnce, self.rng.random_ratio(1, 4), payload);
             let _ = udp.send_to(&bytes, self.gossips[node]).await;
             if let Ok(Ok(mut stream)) = timeout(JUNK_TICK, TcpStream::connect(self.brokers[node])).await {

@@ -48,7 +48,7 @@ impl Scene {
         imgproc::warp_perspective(flat, &mut self.0, &warp, size, area, transparent, Scalar::default()).unwrap();
     }
 
-    /// What a camera makes of it: blur of 0.7 and noise of 5 gray levels, both standard deviations.
+    /// The picture that a camera makes of it: blur of 0.7 and noise of 5 gray levels, both standard deviations.
     fn seen(&self) -> Frame {
         let (mut small, mut blurred, mut image) = (Mat::default(), Mat::default(), Mat::default());
         let size = Size::new(640, 480);

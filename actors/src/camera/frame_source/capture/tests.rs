@@ -6,7 +6,7 @@ use opencv::core::Mat;
 
 use super::*;
 
-/// What a scripted source does on one call.
+/// Action of a scripted source on one call.
 enum Step {
     Frame,
     Fail,

@@ -22,7 +22,7 @@ use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
 
 use super::refusals::RefusalReason;
-use super::{Door, DoorSetup, DoorState, Publication, Refusal, lock};
+use super::{DESCRIPTION_INTERVAL, Door, DoorSetup, DoorState, Publication, Refusal, lock};
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
 use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
@@ -64,7 +64,7 @@ impl Place {
 }
 
 impl Door {
-    /// Whether a client is a program beside the node, and not a node's link.
+    /// True if a client is a program beside the node, and not a node's link.
     pub(in crate::transport::broker) fn is_program(&self, principal: &Principal, client_id: &str) -> bool {
         let Some(DoorState { setup, .. }) = self.0.as_deref() else { return false };
         if client_id == setup.gateway_id {
@@ -82,7 +82,7 @@ impl Door {
         }
     }
 
-    /// Whether a program may leave a last will on this topic.
+    /// True if a program may leave a last will on this topic.
     pub(in crate::transport::broker) fn allows_will(&self, principal: &Principal, topic: &str) -> bool {
         self.0.as_deref().is_some_and(|door| door.may_say(principal, topic).is_ok())
     }
@@ -142,7 +142,7 @@ impl Door {
 }
 
 impl DoorState {
-    /// Whether a name is that of a vehicle without a node whose reports this broker brings to the cell.
+    /// True if a name is that of a vehicle without a node whose reports this broker brings to the cell.
     fn is_nodeless(&self, principal: &Principal, name: &NodeName) -> bool {
         (self.setup.carries_reports)() && self.is_nodeless_name(principal, name)
     }
@@ -180,17 +180,14 @@ impl DoorState {
         let now = clock::now();
         let throttle = self.throttles.get(kind as usize);
         if throttle.is_some_and(|throttle| !lock(throttle).allow(now)) {
-            return Err(Refusal {
-                reason: RefusalReason::Throttled,
-                text: format!(
-                    "the programs of {node} report more than {} times a second, half of mqtt.max_report_hz",
-                    setup.max_report_hz / 2
-                ),
-            });
+            let most = setup.max_report_hz / 2;
+            let text =
+                format!("the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz");
+            return Err(Refusal::new(RefusalReason::Throttled, text));
         }
-        let report = decode_report(payload, &name, &setup.limits).map_err(|reason| Refusal {
-            reason: RefusalReason::Rejected(reason),
-            text: format!("the report on {topic} is not usable: {reason}; see docs/protocol.md#rejections"),
+        let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
+            let text = format!("the report on {topic} is not usable: {reason}; see docs/protocol.md#rejections");
+            Refusal::new(RefusalReason::Rejected(reason), text)
         })?;
         (setup.report)(kind, Arc::new(report));
         Ok(())
@@ -203,12 +200,16 @@ impl DoorState {
             let text = format!("only programs on the machine of {node}, or with its certificate, set the description");
             return Err(Refusal::not_permitted(text));
         }
-        let malformed = |text| Refusal { reason: RefusalReason::Rejected(RejectReason::Malformed), text };
+        if !lock(&self.descriptions).allow(clock::now()) {
+            let text = format!("{node} takes no more than one description in {} s", DESCRIPTION_INTERVAL.as_secs());
+            return Err(Refusal::new(RefusalReason::Throttled, text));
+        }
+        let malformed = |text: String| Refusal::new(RefusalReason::Rejected(RejectReason::Malformed), text);
         let request: CellDescription = decode(payload, limits).map_err(|reason| malformed(reason.to_string()))?;
         (self.setup.describe)(request.text).map_err(malformed)
     }
 
-    /// Whether a filter of a program matches reports.
+    /// True if a filter of a program matches reports.
     fn is_of_reports(&self, filter: &str) -> bool {
         let (_, filter) = Place::of(filter);
         let node = &self.setup.node;

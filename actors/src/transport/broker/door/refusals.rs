@@ -26,9 +26,16 @@ pub(super) enum RefusalReason {
     Throttled,
 }
 
+/// Maximum length of a refusal's text in characters: it may quote what the program sent, and is shown to all.
+const MAX_TEXT: usize = 500;
+
 impl Refusal {
-    pub(in crate::transport::broker) fn not_permitted(text: impl Into<String>) -> Self {
-        Self { reason: RefusalReason::Rejected(RejectReason::NotPermitted), text: text.into() }
+    pub(super) fn new(reason: RefusalReason, text: impl AsRef<str>) -> Self {
+        Self { reason, text: text.as_ref().chars().take(MAX_TEXT).collect() }
+    }
+
+    pub(in crate::transport::broker) fn not_permitted(text: impl AsRef<str>) -> Self {
+        Self::new(RefusalReason::Rejected(RejectReason::NotPermitted), text)
     }
 
     /// The answer to the program; MQTT 3.1.1 has none but an acknowledgement.
@@ -54,12 +61,15 @@ impl RefusalReason {
 /// Refusals so far, by client and reason.
 #[derive(Debug, Default)]
 pub(super) struct Refusals {
-    known: BTreeMap<(String, RefusalReason), ClientRefusal>,
+    known: BTreeMap<(String, RefusalReason), (ClientRefusal, Timestamp)>,
     shown_at: Option<Timestamp>,
 }
 
-/// Clients and reasons that are shown; the first ones stay.
+/// Clients and reasons that are shown: the latest ones.
 const MAX_SHOWN: usize = 32;
+
+/// Maximum length of a client's name in characters, as it is shown.
+const MAX_CLIENT: usize = 128;
 
 /// Minimum time between two statuses for more of the same.
 const SHOW_INTERVAL: Duration = Duration::from_secs(1);
@@ -73,21 +83,61 @@ impl Refusals {
         refusal: &Refusal,
         now: Timestamp,
     ) -> Option<Vec<u8>> {
-        let key = (client.to_owned(), refusal.reason);
+        let client: String = client.chars().take(MAX_CLIENT).collect();
+        let key = (client.clone(), refusal.reason);
+        // Programs that draw a new name for each connection are many: what they do waits for the next status.
+        let has_room = self.known.len() < MAX_SHOWN;
         let is_first = !self.known.contains_key(&key);
-        if is_first && self.known.len() >= MAX_SHOWN {
-            return None;
+        if is_first && !has_room {
+            let oldest = self.known.iter().min_by_key(|(_, (_, at))| *at).map(|(key, _)| key.clone());
+            oldest.and_then(|oldest| self.known.remove(&oldest));
         }
-        let (client, reason) = (client.to_owned(), refusal.reason.as_str().to_owned());
+        let reason = refusal.reason.as_str().to_owned();
         let empty = || ClientRefusal { client, reason, topic: String::new(), text: String::new(), times: 0 };
-        let refused = self.known.entry(key).or_insert_with(empty);
+        let (refused, at) = self.known.entry(key).or_insert_with(|| (empty(), now));
         refused.times += 1;
-        (refused.topic, refused.text) = (topic.to_owned(), refusal.text.clone());
-        if !is_first && self.shown_at.is_some_and(|shown_at| now.since(shown_at) < SHOW_INTERVAL) {
+        (refused.topic, refused.text, *at) = (topic.to_owned(), refusal.text.clone(), now);
+        if !(is_first && has_room) && self.shown_at.is_some_and(|shown_at| now.since(shown_at) < SHOW_INTERVAL) {
             return None;
         }
         self.shown_at = Some(now);
-        let refused = self.known.values().cloned().collect();
+        let refused = self.known.values().map(|(refusal, _)| refusal.clone()).collect();
         serde_json::to_vec(&ClientRefusals { schema: SCHEMA_VERSION, node: node.clone(), refused }).ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shown(refusals: &mut Refusals, client: &str, at_s: u64) -> Option<Vec<String>> {
+        let (node, refusal) = (NodeName::from_static("euclid"), Refusal::not_permitted("no"));
+        let status = refusals.note(&node, (client, "detections/gauss"), &refusal, Timestamp(at_s * 1_000_000))?;
+        let status: ClientRefusals = serde_json::from_slice(&status).unwrap();
+        Some(status.refused.into_iter().map(|refusal| refusal.client).collect())
+    }
+
+    #[test]
+    fn who_misbehaves_now_is_shown_however_many_did_before() {
+        let mut refusals = Refusals::default();
+        for n in 0..MAX_SHOWN {
+            assert!(shown(&mut refusals, &format!("cron-{n:02}"), n as u64).is_some(), "the first of each at once");
+        }
+        assert_eq!(shown(&mut refusals, "cron-00", 31), None, "more of the same wait");
+        let clients = shown(&mut refusals, "planner", 33).unwrap();
+        assert_eq!(clients.len(), MAX_SHOWN);
+        assert!(clients.iter().any(|client| client == "planner") && clients.iter().any(|client| client == "cron-00"));
+        assert!(!clients.iter().any(|client| client == "cron-01"), "the one refused longest ago gives way");
+        let quick = (0..100).filter(|n| shown(&mut refusals, &format!("flood-{n}"), 34).is_some()).count();
+        assert!(quick <= 1, "names without number: {quick} statuses at once");
+    }
+
+    #[test]
+    fn what_a_program_sent_is_not_quoted_at_length() {
+        let refusal = Refusal::not_permitted("é".repeat(100_000));
+        assert_eq!(refusal.text.chars().count(), MAX_TEXT);
+        let mut refusals = Refusals::default();
+        let clients = shown(&mut refusals, &"x".repeat(60_000), 0).unwrap();
+        assert_eq!(clients[0].len(), MAX_CLIENT);
     }
 }

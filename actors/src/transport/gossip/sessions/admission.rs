@@ -103,7 +103,7 @@ impl Sessions {
         }
     }
 
-    /// Whether a cookie was issued to this session at this address a moment ago, and the introduction is plausible.
+    /// Checks that a cookie was issued to this session at this address a moment ago, and that the introduction is plausible.
     fn check_freshness(
         &self,
         session: &SessionId,

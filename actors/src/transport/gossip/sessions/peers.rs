@@ -7,7 +7,7 @@ use std::time::Duration;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
-use super::SESSION_IDLE_TIMEOUT;
+use super::{HEARD_TIME, SESSION_IDLE_TIMEOUT};
 use crate::platform::throttle::TokenBucket;
 use crate::transport::gossip::counters::FrameEvent;
 use crate::transport::gossip::frame::FrameHeader;
@@ -96,9 +96,17 @@ impl PeerTable {
     }
 
     /// Takes the counter of a handshake's frame in a cell without certificates. One far ahead may come, as the handshake
-    /// itself proves that it is fresh.
-    pub(super) fn take_counter(&mut self, head: &FrameHeader, now: Timestamp) -> Result<(), FrameEvent> {
+    /// itself proves that it is fresh. A session that is heard at one address is not taken over from another.
+    pub(super) fn take_counter(
+        &mut self,
+        head: &FrameHeader,
+        from: SocketAddr,
+        now: Timestamp,
+    ) -> Result<(), FrameEvent> {
         let Some(peer) = self.peers.get_mut(&head.sender) else { return Ok(()) };
+        if peer.address != from && now.since(peer.heard) < HEARD_TIME {
+            return Err(FrameEvent::Replayed);
+        }
         match peer.keys.take(head.counter) {
             Err(FrameEvent::Replayed) => Err(FrameEvent::Replayed),
             _ => {

@@ -104,6 +104,26 @@ fn a_counter_from_beyond_mutes_nobody() {
 }
 
 #[test]
+fn a_session_that_is_heard_is_not_taken_over_from_elsewhere() {
+    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    introduce(&mut a, &mut b);
+    let mut thief = End::new("a", 1);
+    thief.address = SocketAddr::from(([10, 0, 0, 9], 1));
+    thief.sessions.counter = u64::MAX - 100;
+    let mut take_over = |b: &mut End, now| {
+        let hello = thief.hello();
+        let challenge = answer(b.open(&hello, thief.address, now));
+        let proof = answer(thief.open(&challenge, b.address, now));
+        b.open(&proof, thief.address, now)
+    };
+    assert_eq!(take_over(&mut b, NOW), Err(FrameEvent::Replayed));
+    let (frame, heard) = (a.seal(&b.id.name, b"hi"), payload(&a, b"hi"));
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let later = NOW + Duration::from_secs(1);
+    assert!(matches!(take_over(&mut b, later), Ok(FrameContent::Met { .. })), "a node that has moved is met again");
+}
+
+#[test]
 fn a_member_that_floods_is_not_heard_for_long() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
     introduce(&mut a, &mut b);

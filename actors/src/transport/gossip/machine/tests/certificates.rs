@@ -105,7 +105,8 @@ fn a_revoked_node_is_down_when_the_list_is_read_and_stays_out_until_it_has_a_new
     for node in 1..=3 {
         let files = certified.authority.files(&node_name(node));
         certified.set_identity(node, TrialAuthority::read(&files, &name(node)));
-        assert_eq!(certified.events(node), [MembershipEvent::Down { name: node_name(4) }], "{node}");
+        let gone = [MembershipEvent::Expelled { name: node_name(4) }, MembershipEvent::Down { name: node_name(4) }];
+        assert_eq!(certified.events(node), gone, "{node}");
     }
     certified.cell.forget_events();
     certified.cell.run(5000);

@@ -1,0 +1,73 @@
+//! Exactly the maps that a node accepted, while the lead is handed over and behind an external broker.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use ecod::wire::Role;
+use tokio::time::sleep;
+
+use crate::cell::{Cell, Program};
+use crate::mosquitto::Mosquitto;
+use crate::reported;
+
+const MAPS: &[&str] = &["global_detections"];
+
+pub(crate) async fn planners<'a>(cell: &Cell, nodes: &[&'a str]) -> Vec<(&'a str, Program)> {
+    let mut planners = Vec::new();
+    for node in nodes {
+        planners.push((*node, cell.program("planner", node, MAPS).await));
+    }
+    planners
+}
+
+pub(crate) fn leaders<const N: usize>(names: [&str; N]) -> BTreeSet<String> {
+    names.map(str::to_owned).into()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_planned_handover_gives_every_program_the_maps_of_its_node() {
+    let mut cell = Cell::new();
+    for (name, role, priority) in [("gauss", Role::Auto, 200), ("noether", Role::Auto, 100), ("euclid", Role::Cav, 100)]
+    {
+        cell.start(name, role, |config| config.election.priority = priority).await;
+    }
+    cell.served_by("gauss").await;
+    cell.stands_by("noether").await;
+    let planners = planners(&cell, &["gauss", "noether", "euclid"]).await;
+    sleep(Duration::from_millis(500)).await;
+    cell.start("edge", Role::Edge, |_| ()).await;
+    cell.served_by("edge").await;
+    sleep(Duration::from_millis(500)).await;
+    for seen in cell.have_exactly(&planners).await {
+        assert_eq!(seen, leaders(["gauss", "edge"]));
+    }
+    drop(planners);
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn behind_mosquitto_programs_get_the_maps_of_their_node_also_when_the_leader_is_killed() {
+    let mosquitto = Mosquitto::start();
+    let mut cell = Cell::new();
+    for (name, role, priority) in [("gauss", Role::Auto, 200), ("noether", Role::Auto, 100), ("euclid", Role::Cav, 100)]
+    {
+        cell.start(name, role, |config| {
+            config.election.priority = priority;
+            config.mqtt.broker = Some(mosquitto.address());
+        })
+        .await;
+    }
+    cell.served_by("gauss").await;
+    cell.stands_by("noether").await;
+    let planners = planners(&cell, &["noether", "euclid"]).await;
+    let lidar = cell.program("lidar", "euclid", &[]).await;
+    reported(&cell, &lidar, "euclid--lidar", "noether", 3.1, "euclid").await;
+    cell.kill("gauss");
+    cell.served_by("noether").await;
+    reported(&cell, &lidar, "euclid--lidar", "noether", 2.9, "euclid").await;
+    for seen in cell.have_exactly(&planners).await {
+        assert_eq!(seen, leaders(["gauss", "noether"]));
+    }
+    drop(planners);
+    cell.stop().await;
+}
