@@ -23,7 +23,7 @@ const GATE_M: f64 = 3.0;
 const GAIN: f64 = 0.3;
 const PATIENCE: Duration = Duration::from_millis(500);
 
-/// What was found, with its score.
+/// An object that was found, with its score.
 #[derive(Debug, Clone)]
 pub(crate) struct Found {
     label: Label,
@@ -59,7 +59,7 @@ impl Latest {
         }
     }
 
-    /// What all vehicles found.
+    /// Objects that all vehicles found.
     pub(crate) fn union(&self, now: Timestamp) -> Vec<Found> {
         let fresh = self.0.values().filter(|(captured, _)| now.since(*captured) <= MAX_AGE);
         fresh.flat_map(|(_, found)| found.iter().cloned()).collect()

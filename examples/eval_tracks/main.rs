@@ -157,10 +157,10 @@ enum Event<'a> {
     Due(Timestamp),
 }
 
-/// How often the others say what they make of the reports.
+/// Time between two answers of the others.
 const PERIOD: Duration = Duration::from_millis(100);
 
-/// What an aggregator makes of a recording; `watch` hears of every report as it comes and of the time.
+/// Maps that an aggregator makes of a recording; `watch` hears of every report as it comes and of the time.
 fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<GlobalMap> {
     let config = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
     let mut aggregator: Option<Aggregator> = None;

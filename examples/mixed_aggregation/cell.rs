@@ -30,7 +30,7 @@ pub(crate) struct Cell {
     pub(crate) nodes: BTreeMap<&'static str, (NodeHandle, Runtime)>,
 }
 
-/// What the nodes missed, or should have.
+/// Maps that the nodes missed, or should have missed.
 #[derive(Default)]
 pub(crate) struct Record {
     /// Longest time between two maps.
@@ -85,7 +85,7 @@ impl Cell {
         epochs.all(|epoch| epoch.as_ref() == Some(&first)).then_some(first)
     }
 
-    /// What the map says of each place, and what the votes.
+    /// Labels of each place by the map, and by the votes.
     pub(crate) fn agreed(&self) -> (String, String) {
         let Some((node, _)) = self.nodes.values().next() else { return Default::default() };
         let map = node.newest_map().borrow().as_ref().map(|newest| Arc::clone(&newest.map));
@@ -100,7 +100,7 @@ impl Cell {
         (map.collect::<Vec<_>>().join(" "), votes.collect::<Vec<_>>().join(" "))
     }
 
-    /// What all nodes took from then on, by their map logs.
+    /// Maps that all nodes took from then on, by their logs.
     pub(crate) fn record(&self, from: Timestamp) -> anyhow::Result<Record> {
         let mut record = Record::default();
         for entry in std::fs::read_dir(self.directory.path())? {

@@ -24,7 +24,7 @@ use cell::{Cell, Record};
 /// The places of the cell and metres east; nobody is at the last.
 const PLACES: [(&str, f64); 3] = [("slot-0", 0.0), ("slot-1", 3.0), ("slot-2", 6.0)];
 
-/// What each vehicle reads at which places; all have all places in view, and noether misreads the first: without
+/// Labels that each vehicle reads, by place; all have all places in view, and noether misreads the first: without
 /// euclid, the map cannot tell who is right.
 const SEEN: [(&str, &[(usize, &str)]); 3] = [
     ("euclid", &[(0, "ABC123"), (1, "XYZ789")]),
@@ -32,7 +32,7 @@ const SEEN: [(&str, &[(usize, &str)]); 3] = [
     ("noether", &[(0, "ABC128"), (1, "XYZ789")]),
 ];
 
-/// What is done to the cell.
+/// A fault, or its end.
 enum Step {
     /// The edge starts; it is to lead in the end.
     StartEdge,

@@ -26,7 +26,7 @@ use vehicle::{Payload, Vehicle};
 /// Places and metres east.
 const PLACES: [(&str, f64); 3] = [("slot-0", 0.0), ("slot-1", 3.0), ("sign", 6.0)];
 
-/// What each vehicle reads at which places.
+/// Labels that each vehicle reads, by place.
 const SEEN: [(&str, [(usize, &str); 2]); 4] = [
     ("euclid", [(0, "ABC123"), (2, "stop")]),
     ("gauss", [(0, "ABC123"), (2, "stop")]),
@@ -36,7 +36,7 @@ const SEEN: [(&str, [(usize, &str); 2]); 4] = [
 
 const START: Timestamp = Timestamp(1_732_154_400_000_000);
 const REPORT_MS: u64 = 100;
-/// What a packet takes, and how finely time passes.
+/// Travel time of a packet, which is also the step of time.
 const TRAVEL: Duration = Duration::from_millis(1);
 /// Until the memberships know who is gone or back.
 const NOTICE_MS: u64 = 300;
@@ -167,7 +167,7 @@ impl Cell {
     }
 }
 
-/// What a vehicle sees.
+/// Report of a vehicle.
 fn report(node: usize, now: Timestamp) -> ObjectReport {
     let (name, seen) = SEEN[node];
     let object = |(place, label): (usize, &str)| PerceivedObject {

@@ -25,7 +25,7 @@ use ecod::wire::{
 };
 use uuid::Uuid;
 
-/// What vehicles send each other, as it travels.
+/// Messages between vehicles, on their way.
 #[derive(Debug, Clone)]
 pub(crate) enum Payload {
     Election(Vec<u8>),
@@ -53,9 +53,9 @@ pub(crate) struct Vehicle {
     pub(crate) map: Option<GlobalMap>,
     /// Votes that it settled in each of its leaderships.
     pub(crate) settled: BTreeMap<Epoch, u64>,
-    /// What is to be sent, to one vehicle or to all.
+    /// Messages to be sent, to one vehicle or to all.
     pub(crate) outbox: Vec<(Option<NodeName>, Payload)>,
-    /// What there is to tell.
+    /// News for the reader.
     pub(crate) news: Vec<String>,
 }
 
@@ -106,7 +106,7 @@ impl Vehicle {
         Member { name: self.name.clone(), run: 1, broker, is_on_this_machine: false }
     }
 
-    /// What the membership finds out about another vehicle.
+    /// Takes the membership's news of another vehicle.
     pub(crate) fn notice(&mut self, member: Member, is_there: bool, now: Timestamp) {
         if is_there {
             self.members.insert(member.name.clone(), member.clone());
@@ -123,7 +123,7 @@ impl Vehicle {
         }
         if now >= self.tick_at {
             self.tick_at = now + SHARE_PERIOD;
-            let shares = self.resync.tick(&self.ledger, &self.leadership, now);
+            let shares = self.resync.tick(&mut self.ledger, &self.leadership, now).shares;
             self.share(&shares);
         }
         self.alarm = self.alarm.min(self.aggregator.deadline());

@@ -1,8 +1,9 @@
-//! A node of the membership hears datagrams of strangers, and of a node that has the key and says anything with it.
+//! A node of the membership hears datagrams of strangers, of a holder of the key that says anything with it, and of a
+//! node that signs anything in its handshakes.
 
 #![no_main]
 
-use ecod_actors::transport::gossip::fuzzing::Listener;
+use ecod_actors::transport::gossip::fuzzing::{Edits, Listener};
 use libfuzzer_sys::arbitrary::{self, Arbitrary};
 use libfuzzer_sys::fuzz_target;
 
@@ -11,19 +12,45 @@ enum Step {
     /// A datagram as it is.
     Datagram(Vec<u8>),
     /// A body under the peer's seal.
-    Sealed { kind: u8, body: Vec<u8> },
+    Sealed {
+        kind: u8,
+        body: Vec<u8>,
+    },
+    /// A greeting of the peer.
+    Greeting {
+        wants_session: bool,
+    },
+    /// A step of the peer's handshake, as it should be but for these changes.
+    Challenge {
+        edits: Edits,
+    },
+    Proof {
+        message: Edits,
+        attestation: Edits,
+    },
+    Accept {
+        message: Edits,
+        attestation: Edits,
+    },
     /// Nothing for a while.
-    Wait { ms: u16 },
+    Wait {
+        ms: u16,
+    },
 }
 
 fuzz_target!(|input: (u8, Vec<Step>)| {
     let (cell, steps) = input;
     let proves = cell & 1 == 1;
-    let mut listener = if cell & 2 == 2 { Listener::alone(proves) } else { Listener::meet(proves) };
+    // A meeting costs as much as many other steps.
+    let mut listener = if cell & 0b1110 == 0 { Listener::meet(proves) } else { Listener::alone(proves) };
     for step in steps {
         match step {
             Step::Datagram(frame) => listener.hear(&frame),
             Step::Sealed { kind, body } => listener.hear_sealed(kind, &body),
+            Step::Greeting { wants_session } => listener.hear_greeting(wants_session),
+            Step::Challenge { edits } => listener.hear_challenge(&edits),
+            Step::Proof { message, attestation } => listener.hear_proof(&message, &attestation),
+            Step::Accept { message, attestation } => listener.hear_accept(&message, &attestation),
             Step::Wait { ms } => listener.wait(ms.into()),
         }
     }

@@ -65,7 +65,7 @@ fn take(mut resync: LedgerResync, share: &LedgerShare) -> ReputationLedger {
         let merged = resync.merge(share, &mut ledger, &candidates, &leadership, at, at);
         assert!(before.totals().is_empty() || before.totals() == ledger.totals(), "the same again changes nothing");
         assert!(merged.is_ok() || before == ledger, "what is refused changes nothing");
-        let _shares = resync.tick(&ledger, &leadership, at);
+        let _shares = resync.tick(&mut ledger, &leadership, at);
         resync.resume(&ledger, at);
     }
     assert!(ledger.lanes() <= MAX_LANES && ledger.entries().count() <= MAX_ENTRIES);

@@ -7,6 +7,7 @@
 use std::sync::LazyLock;
 
 use ecod::model::detection::parse_detections;
+use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod_actors::actors::reputation_keeper::read_saved;
 use ecod_actors::camera::vehicle_pose::read_pose;
@@ -22,7 +23,9 @@ fuzz_target!(|input: &[u8]| {
     let text = std::str::from_utf8(bytes).unwrap_or_default();
     match kind % 5 {
         0 => {
-            if let Ok((_, pose)) = read_pose(bytes, Timestamp(0), 0) {
+            if let Ok((_, stated)) = read_pose(bytes, Timestamp(0), 0)
+                && let Ok(pose) = stated.in_map(Some(&ORIGIN))
+            {
                 assert!(pose.position.x.is_finite() && pose.position.y.is_finite() && pose.heading_rad.is_finite());
             }
         }
@@ -35,6 +38,9 @@ fuzz_target!(|input: &[u8]| {
         _ => drop((Truth::parse(text), TrackTruth::is_in(text), TrackTruth::parse(text))),
     }
 });
+
+const ORIGIN: GeographicOrigin =
+    GeographicOrigin { latitude_deg: 52.2, longitude_deg: 21.0, height_m: 113.0, rotation_deg: 30.0 };
 
 /// Of a cell that signs, by 64 hexadecimal digits, which need no stretching.
 static SIGNING: LazyLock<Security> = LazyLock::new(|| {

@@ -17,6 +17,7 @@
 
 pub mod access;
 pub mod aggregator;
+pub mod doors;
 mod driver;
 mod echo;
 pub mod latency;

@@ -87,6 +87,24 @@ impl NodeProcess {
         Ok(())
     }
 
+    /// The address that the node names in its log by this message, as soon as it does.
+    ///
+    /// # Errors
+    /// When the process has ended by itself.
+    pub async fn address(&mut self, message: &str) -> anyhow::Result<SocketAddr> {
+        loop {
+            let log = fs::read_to_string(&self.log).unwrap_or_default();
+            // The last line may not be whole.
+            let whole = log.rsplit_once('\n').map_or("", |(whole, _)| whole);
+            let mut lines = whole.lines().filter(|line| line.contains(message));
+            if let Some((_, address)) = lines.next_back().and_then(|line| line.rsplit_once("address=")) {
+                return address.parse().with_context(|| format!("no address of node {}: {address}", self.name));
+            }
+            self.check()?;
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+
     /// The process's number, while it runs.
     pub fn pid(&self) -> Option<u32> {
         self.child.id()

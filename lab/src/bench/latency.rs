@@ -1,6 +1,6 @@
 //! Distribution of latencies.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
 use serde::Serialize;
@@ -40,6 +40,13 @@ pub struct Quantiles {
     pub missing: u64,
 }
 
+impl Quantiles {
+    /// Share of the answers that never came, in percent.
+    pub fn missing_percent(&self) -> f64 {
+        100.0 * self.missing as f64 / self.n.max(1) as f64
+    }
+}
+
 impl Default for Latencies {
     fn default() -> Self {
         Self { histogram: latencies(), missing: 0 }
@@ -56,9 +63,15 @@ impl Latencies {
 
     /// Takes in one answer that was due, or the time for which it was waited.
     pub(super) fn take(&mut self, due: Instant, arrival: Option<Instant>, waited_until: Instant) {
-        self.missing += u64::from(arrival.is_none());
-        let taken = arrival.unwrap_or(waited_until).saturating_duration_since(due);
-        self.histogram.saturating_record(u64::try_from(taken.as_nanos()).unwrap_or(u64::MAX));
+        let taken = |end: Instant| end.saturating_duration_since(due);
+        self.take_time(arrival.map(taken), taken(waited_until));
+    }
+
+    /// Takes in the time of one answer, or the time for which it was waited.
+    pub(super) fn take_time(&mut self, taken: Option<Duration>, waited: Duration) {
+        self.missing += u64::from(taken.is_none());
+        let nanos = taken.unwrap_or(waited).as_nanos();
+        self.histogram.saturating_record(u64::try_from(nanos).unwrap_or(u64::MAX));
     }
 
     /// Usual quantiles of the distribution.

@@ -19,6 +19,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::columns::columns;
 use crate::bench::access::BrokerAccess;
 use crate::bench::aggregator::OwnAggregator;
+use crate::bench::doors::DoorFigures;
 use crate::bench::latency::{Answers, Latencies, Quantiles};
 use crate::bench::load::Load;
 use crate::bench::measurement::{Measurement, Target, measure};
@@ -56,7 +57,10 @@ pub(super) struct BenchArguments {
     /// Measure instead what an aggregator of its own costs with 32 vehicles: memory, processor time, recording
     #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "no_saturate", "up_to"])]
     costs: bool,
-    /// Write the figures to this file as JSON, in the section `cell` or `costs`; other sections stay
+    /// Measure instead the door of a vehicle beside the vehicle itself and the leader's broker; fails if a goal is missed
+    #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "no_saturate", "up_to", "costs"])]
+    doors: bool,
+    /// Write the figures to this file as JSON, in the section `cell`, `costs` or `doors`; other sections stay
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 }
@@ -69,6 +73,8 @@ struct Figures {
     goals: BTreeMap<String, Goal>,
     #[serde(skip_serializing_if = "Option::is_none")]
     costs: Option<Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    doors: Option<DoorFigures>,
     #[serde(skip_serializing_if = "Option::is_none")]
     saturation: Option<Saturation>,
 }
@@ -140,6 +146,8 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
         print(&format!("cell {} through the broker at {}\n", target.cell, target.access.broker))?;
         compare(&target, arguments, &mut figures).await?;
         saturate(&target, arguments, &mut figures).await?;
+    } else if arguments.doors {
+        doors(&node_program()?, arguments, &mut figures).await?;
     } else {
         let program = node_program()?;
         print("an aggregator of this program's own with its embedded broker, in a process of its own, on loopback\n")?;
@@ -156,13 +164,25 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
     for (name, Goal { figure, goal, met }) in &figures.goals {
         print(&format!("{name}: {figure:.2}, goal {goal}: {}\n", if *met { "met" } else { "MISSED" }))?;
     }
-    match &arguments.out {
-        Some(path) => save(path, if arguments.costs { "costs" } else { "cell" }, &figures),
-        None => Ok(()),
+    if let Some(path) = &arguments.out {
+        save(path, arguments.section(), &figures)?;
     }
+    if arguments.doors && figures.goals.values().any(|goal| !goal.met) {
+        bail!("a goal of doors is missed");
+    }
+    Ok(())
 }
 
 impl BenchArguments {
+    /// Section of the figures.
+    fn section(&self) -> &'static str {
+        match (self.costs, self.doors) {
+            (true, _) => "costs",
+            (_, true) => "doors",
+            _ => "cell",
+        }
+    }
+
     /// The running cell to be measured, if it is to be one.
     fn running_cell(&self) -> anyhow::Result<Option<Target>> {
         let config = self.config.as_deref().map(NodeConfig::load_cell).transpose()?;
@@ -323,6 +343,32 @@ async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures
         "recording_cpu_percent": recording.percent(),
         "recording_cpu_percent_by_thread": recording.threads,
     }));
+    Ok(())
+}
+
+/// The door of a vehicle: what programs wait longer than their node, and what it costs.
+async fn doors(program: &Path, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
+    print("an edge and a vehicle with a door, each in a process of its own, on loopback\n\n")?;
+    let measured = crate::bench::doors::measure(program, Duration::from_secs(arguments.seconds)).await?;
+    let mut rows = vec![row(["way", "p50 µs", "p99 µs", "p99.9 µs", "n", "missing"])];
+    let ways = [
+        ("map at the node -> at its door", measured.behind_node),
+        ("report at a door -> map", measured.report_at_door),
+        ("report at the leader's broker -> map", measured.report_at_leader),
+    ];
+    for (way, Quantiles { p50_us, p99_us, p999_us, n, missing }) in ways {
+        let numbers = [p50_us, p99_us, p999_us].map(|us| format!("{us:.0}"));
+        rows.push([row([way]), numbers.to_vec(), row([&n.to_string(), &missing.to_string()])].concat());
+    }
+    print(&columns(&rows))?;
+    let DoorFigures { hop_us, resident_mb, door_mb, .. } = measured;
+    print(&format!(
+        "one hop {hop_us:.0} µs; an idle vehicle {resident_mb:.1} MB, of which the door {door_mb:.1} MB\n"
+    ))?;
+    for (name, figure, goal) in measured.goals() {
+        figures.goal(name.into(), figure, goal);
+    }
+    figures.doors = Some(measured);
     Ok(())
 }
 

@@ -23,7 +23,7 @@ use crate::report::tracks::percent;
 /// Flags of `eval`.
 #[derive(Debug, Args)]
 pub(super) struct EvalArguments {
-    /// What really stands at each location (JSON, or CSV with the columns item,truth), or where all objects were (JSON)
+    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places of all objects (JSON)
     #[arg(long, value_name = "FILE")]
     truth: PathBuf,
     /// Output of `replay`, or the map log of a node; `-` for standard input

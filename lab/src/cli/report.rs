@@ -17,7 +17,7 @@ use crate::report::{judged_by, judged_by_tracks};
 pub(super) struct ReportArguments {
     #[command(flatten)]
     page: PageArguments,
-    /// What really stands at each location (JSON, or CSV with the columns item,truth), or where all objects were (JSON)
+    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places of all objects (JSON)
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
 }

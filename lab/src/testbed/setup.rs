@@ -75,7 +75,7 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
             x_m: cav.pose.position.x,
             y_m: cav.pose.position.y,
             heading_deg: cav.pose.heading_rad.to_degrees(),
-            listen: None,
+            ..PoseConfig::default()
         },
         camera: Some(camera),
         ..cell(testbed, scene)

@@ -38,7 +38,7 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
         results.push(intersection::run(RECORDING, &recording)?);
     }
     if is_chosen(GENERATED) {
-        // What is left out of a recording is news, what is left out of its copies is not.
+        // Losses of the recording are news, those of its copies are not.
         let generate = || generated(arguments, &recording);
         results.extend(tracing::subscriber::with_default(NoSubscriber::new(), generate)?);
     }

@@ -1,0 +1,317 @@
+//! Figures of a door: how much later than its node a program has a map, how soon its reports are in the map, and what
+//! the door costs.
+//!
+//! ```text
+//! edge ── map ──> vehicle: its map log ──> door ── map ──> program
+//! program ── report ──> door ──> edge's broker ──> edge ── map ──> watcher at the edge's broker
+//! another ── report ───────────> edge's broker ──> edge ── map ──> the same watcher
+//! ```
+//!
+//! Edge and vehicle are processes of their own on loopback. Reports of the two ways take turns: only one of them has
+//! anything to wait for in a round.
+
+use std::collections::HashMap;
+use std::fs;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::wire::{Encoding, GlobalMap, Limits, ObjectReport, ReportKind, Role, Topic, Topics, decode, encode};
+use ecod_actors::messages::newest::ReceivedMap;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::platform::clock;
+use rumqttc::{AsyncClient, Event, EventLoop, Packet, QoS};
+use serde::Serialize;
+use tokio::task::AbortHandle;
+use tokio::time::{Instant, MissedTickBehavior, sleep, timeout};
+
+use super::access::BrokerAccess;
+use super::latency::{Latencies, Quantiles};
+use super::load;
+use super::two_hop;
+use super::usage::UsageMeter;
+use crate::node_process::NodeProcess;
+
+/// Everything that is measured at a door.
+#[derive(Debug, Clone, Serialize)]
+pub struct DoorFigures {
+    /// From a map's arrival at the node to its arrival at a program.
+    pub behind_node: Quantiles,
+    /// From a report at the door of a node that follows to its map at a program of the leader.
+    pub report_at_door: Quantiles,
+    /// From a report at the leader's broker to the same.
+    pub report_at_leader: Quantiles,
+    /// One hop through the door's broker, median in microseconds.
+    pub hop_us: f64,
+    /// Resident memory of the idle vehicle with a door, in megabytes.
+    pub resident_mb: f64,
+    /// Part of it that is not there without a door.
+    pub door_mb: f64,
+}
+
+impl DoorFigures {
+    /// Names, figures and what they may be at most.
+    pub fn goals(&self) -> [(&'static str, f64, f64); 4] {
+        let later_us = self.report_at_door.p50_us - self.report_at_leader.p50_us;
+        let missing_percent = self.report_at_door.missing_percent().max(self.report_at_leader.missing_percent());
+        [
+            ("door_behind_node_p99_ms", self.behind_node.p99_us / 1000.0, 1.0),
+            ("report_at_door_hops_more", later_us / self.hop_us, 1.0),
+            ("reports_missing_percent", missing_percent, 1.0),
+            ("door_mb", self.door_mb, 4.0),
+        ]
+    }
+}
+
+/// The vehicle, and a vehicle without a node at the leader's broker.
+const VEHICLE: &str = "euclid";
+const NODELESS: &str = "gauss";
+
+/// Time between two reports of a program.
+const PERIOD: Duration = Duration::from_millis(100);
+
+/// Turns of each way.
+const TURNS: u32 = 2;
+
+/// Time at the begin of a turn that is not counted: the maps forget the other way's reports.
+const WARM_UP: Duration = Duration::from_secs(4);
+
+/// Idle vehicles of each kind whose memory is read, and the time that each gets to settle.
+const IDLE_RUNS: usize = 3;
+const IDLE: Duration = Duration::from_secs(4);
+
+/// Time for the first map, and for the last.
+const PATIENCE: Duration = Duration::from_secs(20);
+const LAST_MAP: Duration = Duration::from_secs(1);
+
+/// Starts an edge and a vehicle, and measures each way for so long.
+///
+/// # Errors
+/// When a node cannot be started or ends, or no map comes.
+pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorFigures> {
+    let directory = std::env::temp_dir().join(format!("ecod-doors-{}", std::process::id()));
+    fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+    let edge = NodeConfig { landmarks: load::landmarks(), ..configuration("edge", Role::Edge) };
+    let mut edge = NodeProcess::start(program, &edge, &directory)?;
+    let leader = serves(&mut edge).await?;
+    let mut vehicle = configuration(VEHICLE, Role::Cav);
+    vehicle.membership.seeds = vec![timeout(PATIENCE, edge.address("gossiping")).await??.to_string()];
+    let (resident_mb, door_mb) = idle_memory(program, &vehicle, &directory).await?;
+    let map_log = directory.join("maps.jsonl");
+    vehicle.map_log = Some(map_log.clone());
+    let mut vehicle = NodeProcess::start(program, &vehicle, &directory)?;
+    let door = serves(&mut vehicle).await?;
+
+    let [at_door, at_leader] = [Watcher::connect(door).await?, Watcher::connect(leader).await?];
+    at_door.first_map().await?;
+    let [mut report_at_door, mut report_at_leader] = [Latencies::default(), Latencies::default()];
+    for _ in 0..TURNS {
+        let turn = duration / TURNS;
+        report_at_leader.add(&report(leader, NODELESS, turn, &at_leader).await?);
+        report_at_door.add(&report(door, &format!("{VEHICLE}--bench"), turn, &at_leader).await?);
+    }
+    let behind_node = behind_node(&map_log, &at_door)?;
+    let load = two_hop::Load { messages: 500, ..two_hop::Load::default() };
+    let hop_us = two_hop::raw(&door.into(), load).await?.value_at_quantile(0.5) as f64 / 2000.0;
+    vehicle.stop().await;
+    edge.stop().await;
+    if let Err(error) = fs::remove_dir_all(&directory) {
+        tracing::warn!(directory = %directory.display(), %error, "directory stays");
+    }
+    let [report_at_door, report_at_leader] = [report_at_door, report_at_leader].map(|way| way.quantiles());
+    let behind_node = behind_node.quantiles();
+    Ok(DoorFigures { behind_node, report_at_door, report_at_leader, hop_us, resident_mb, door_mb })
+}
+
+fn configuration(name: &'static str, role: Role) -> NodeConfig {
+    let free = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+    let mut config = NodeConfig {
+        name: Some(NodeName::from_static(name)),
+        cell: NodeName::from_static(CELL),
+        role,
+        listen: Some(free),
+        ..NodeConfig::default()
+    };
+    config.dashboard.enabled = false;
+    config.membership.bind = Some(free);
+    config.membership.multicast.enabled = false;
+    config
+}
+
+const CELL: &str = "bench";
+
+/// Topic on which nobody publishes: a login is over when its subscription is.
+const QUIET: &str = "ecod/bench/quiet";
+
+/// Address of a node's broker.
+async fn serves(node: &mut NodeProcess) -> anyhow::Result<SocketAddr> {
+    timeout(PATIENCE, node.address("broker serves"))
+        .await
+        .context("no broker listens by the node's log, or RUST_LOG hides it")?
+}
+
+/// Memory of an idle vehicle with a door, and the part of it that is the door's, in megabytes: medians.
+async fn idle_memory(program: &Path, vehicle: &NodeConfig, directory: &Path) -> anyhow::Result<(f64, f64)> {
+    let mut resident = [Vec::new(), Vec::new()];
+    for _ in 0..IDLE_RUNS {
+        for (has_door, resident) in [true, false].into_iter().zip(&mut resident) {
+            let mut config = vehicle.clone();
+            config.broker.door = has_door;
+            let mut node = NodeProcess::start(program, &config, directory)?;
+            sleep(IDLE).await;
+            node.check()?;
+            let usage = UsageMeter::start(node.pid().context("the vehicle ended")?).stop();
+            resident.push(usage.resident_bytes as f64 / 1e6);
+            node.stop().await;
+        }
+    }
+    let [with, without] = resident.map(|mut runs| {
+        runs.sort_by(f64::total_cmp);
+        runs.get(IDLE_RUNS / 2).copied().unwrap_or_default()
+    });
+    Ok((with, with - without))
+}
+
+/// A plain client that reads maps.
+struct Watcher {
+    /// The connection ends with it.
+    _client: AsyncClient,
+    maps: Arc<Mutex<Vec<Arrival>>>,
+    task: AbortHandle,
+}
+
+#[derive(Debug, Clone)]
+struct Arrival {
+    epoch: u64,
+    round: u64,
+    oldest_capture: Option<Timestamp>,
+    at: Timestamp,
+}
+
+impl Watcher {
+    async fn connect(broker: SocketAddr) -> anyhow::Result<Self> {
+        let topic = topics().path(&Topic::GlobalDetections);
+        let id = format!("ecod-bench-watcher-{}", broker.port());
+        let (client, events) = BrokerAccess::open(broker.into()).subscribed(&id, &[&topic]).await?;
+        let maps = Arc::<Mutex<Vec<Arrival>>>::default();
+        let task = tokio::spawn(watch(events, Arc::clone(&maps))).abort_handle();
+        Ok(Self { _client: client, maps, task })
+    }
+
+    async fn first_map(&self) -> anyhow::Result<()> {
+        let begun = Instant::now();
+        while self.maps().is_empty() {
+            ensure!(begun.elapsed() < PATIENCE, "no map comes to the door");
+            sleep(Duration::from_millis(20)).await;
+        }
+        Ok(())
+    }
+
+    fn maps(&self) -> Vec<Arrival> {
+        self.maps.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+impl Drop for Watcher {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+async fn watch(mut events: EventLoop, maps: Arc<Mutex<Vec<Arrival>>>) {
+    while let Ok(event) = events.poll().await {
+        let at = clock::now();
+        let Event::Incoming(Packet::Publish(publish)) = event else { continue };
+        if let Ok(map) = decode::<GlobalMap>(&publish.payload, &Limits::default()) {
+            let GlobalMap { epoch, round, oldest_capture_us: oldest_capture, .. } = map;
+            let arrival = Arrival { epoch, round, oldest_capture, at };
+            maps.lock().unwrap_or_else(PoisonError::into_inner).push(arrival);
+        }
+    }
+}
+
+fn topics() -> Topics {
+    Topics::new(&NodeName::from_static(CELL))
+}
+
+/// Reports at a broker in a name for so long; the times until the watcher has the maps that rest on the reports.
+async fn report(broker: SocketAddr, name: &str, duration: Duration, watcher: &Watcher) -> anyhow::Result<Latencies> {
+    let name = NodeName::new(name)?;
+    let topic = topics().path(&ReportKind::Detections.topic(name.clone()));
+    let id = format!("ecod-bench-{name}");
+    let (client, mut events) = BrokerAccess::open(broker.into()).subscribed(&id, &[QUIET]).await?;
+    let poll = tokio::spawn(async move { while events.poll().await.is_ok() {} });
+    let mut ticks = tokio::time::interval(PERIOD);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    let (begun, mut sent, mut seq) = (Instant::now(), Vec::new(), 0);
+    while begun.elapsed() < WARM_UP + duration {
+        ticks.tick().await;
+        seq += 1;
+        let captured_at = clock::now();
+        let report = ObjectReport {
+            node: name.clone(),
+            seq,
+            captured_at_us: captured_at,
+            ..load::report(0, &load::landmarks())
+        };
+        client.try_publish(&topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json))?;
+        if begun.elapsed() > WARM_UP {
+            sent.push(captured_at);
+        }
+    }
+    sleep(LAST_MAP).await;
+    poll.abort();
+    let (maps, mut latencies) = (watcher.maps(), Latencies::default());
+    for captured_at in sent {
+        // The leader's estimate of a clock is not exact to the microsecond.
+        let rests_on = |map: &&Arrival| map.oldest_capture.is_some_and(|oldest| oldest + PERIOD / 2 > captured_at);
+        let answer = maps.iter().filter(|map| map.at >= captured_at).find(rests_on);
+        latencies.take_time(answer.map(|map| map.at.since(captured_at)), LAST_MAP);
+    }
+    Ok(latencies)
+}
+
+/// Times by which the program at the door has each map later than its node.
+fn behind_node(map_log: &Path, at_door: &Watcher) -> anyhow::Result<Latencies> {
+    // Before the log: the node writes a map there before its door passes it on.
+    let at_door = at_door.maps();
+    let text = fs::read_to_string(map_log).with_context(|| format!("cannot read {}", map_log.display()))?;
+    let received = text.lines().filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
+    let received: HashMap<_, _> = received.map(|map| ((map.map.epoch, map.map.round), map.received_at)).collect();
+    let mut latencies = Latencies::default();
+    for Arrival { epoch, round, at, .. } in at_door {
+        let received_at = received.get(&(epoch, round)).context("a program has a map that its node did not accept")?;
+        latencies.take_time(Some(at.since(*received_at)), LAST_MAP);
+    }
+    Ok(latencies)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reports_that_never_reach_a_map_miss_a_goal() {
+        let missed = |missing| {
+            let way = Quantiles { p50_us: 100.0, p99_us: 200.0, p999_us: 300.0, n: 200, missing: 0 };
+            let report_at_door = Quantiles { missing, ..way };
+            let (behind_node, report_at_leader) = (way, way);
+            let figures = DoorFigures {
+                behind_node,
+                report_at_door,
+                report_at_leader,
+                hop_us: 50.0,
+                resident_mb: 20.0,
+                door_mb: 1.0,
+            };
+            let over = figures.goals().into_iter().filter(|(_, figure, goal)| figure > goal);
+            over.map(|(name, ..)| name).collect::<Vec<_>>()
+        };
+        assert!(missed(2).is_empty());
+        assert_eq!(missed(3), ["reports_missing_percent"]);
+    }
+}
