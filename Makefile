@@ -147,9 +147,9 @@ instructions: PACKAGES := build-essential ca-certificates valgrind
 instructions: setup ## instructions of the core's hot paths against the baseline; SAVE=1 writes a new one
 	packaging/instructions $(if $(SAVE),--save)
 
-liars: setup ## what lying vehicles achieve against VOTE: table in docs/vote.md, drawing in target/liars.svg
+liars: setup ## what lying vehicles achieve against VOTE, within a bound: table in docs/vote.md, drawing in target/liars.svg; SEEDS=n only checks
 	mkdir -p target
-	cargo run --release --locked --example liars -- --write-table docs/vote.md --svg target/liars.svg
+	cargo run --release --locked --example liars -- $(if $(SEEDS),--seeds $(SEEDS),--write-table docs/vote.md --svg target/liars.svg)
 
 clean: ## remove everything that was built
 	cargo clean

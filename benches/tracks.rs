@@ -59,7 +59,7 @@ fn round(figures: &mut Figures, observers: u32) -> f64 {
     median_ms
 }
 
-/// What an observer sees of a field of standing objects: the nearest around it, each a little off its place.
+/// Report of an observer in a field of standing objects: the nearest around it, each a little off its place.
 fn report(observer: u32, observers: u32, frame: u64, now: Timestamp) -> ObjectReport {
     let side = (f64::from(observers).sqrt() * PER_OBSERVER).ceil();
     let columns = (f64::from(observers)).sqrt().ceil() as u32;
