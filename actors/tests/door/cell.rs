@@ -331,8 +331,12 @@ impl Program {
 
     /// Publishes with QoS 1; the reason and its text in the answer.
     pub(crate) async fn ask(&self, topic: &str, payload: Vec<u8>) -> (String, String) {
+        self.ask_retained(topic, payload, false).await
+    }
+
+    pub(crate) async fn ask_retained(&self, topic: &str, payload: Vec<u8>, retain: bool) -> (String, String) {
         let before = self.answers.lock().unwrap().len();
-        self.publish(topic, payload, QoS::AtLeastOnce).await;
+        self.client.publish(format!("ecod/v1/lot/{topic}"), QoS::AtLeastOnce, retain, payload).await.unwrap();
         let deadline = Instant::now() + PATIENCE;
         loop {
             if let Some(answer) = self.answers.lock().unwrap().get(before) {

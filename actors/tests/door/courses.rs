@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
+use ecod::leadership::Position;
 use ecod::wire::Role;
 use tokio::time::sleep;
 
@@ -42,6 +43,38 @@ async fn a_planned_handover_gives_every_program_the_maps_of_its_node() {
         assert_eq!(seen, leaders(["gauss", "edge"]));
     }
     drop(planners);
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_vehicle_without_a_node_may_be_there_before_the_leader() {
+    let mut cell = Cell::new();
+    cell.start("edge", Role::Edge, |config| config.election.join_ms = 3000).await;
+    let euclid = cell.program("planner", "edge", &[]).await;
+    let empty = br#"{"schema":1,"node":"euclid--yolo","seq":1,"captured_at_us":1,"objects":[]}"#;
+    let answer = euclid.ask("detections/euclid--yolo", empty.to_vec()).await;
+    let position = cell.node("edge").leadership().borrow().position;
+    assert_eq!((answer.0.as_str(), position), ("Success", Position::Seeking), "{}", answer.1);
+    reported(&cell, &euclid, "euclid--yolo", "edge", 3.1, "euclid").await;
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn names_without_end_leave_room_for_the_statuses_of_nodes() {
+    let mut cell = Cell::new();
+    cell.start("edge", Role::Edge, |_| ()).await;
+    cell.served_by("edge").await;
+    let mallory = cell.program("mallory", "edge", &[]).await;
+    let status =
+        async |n: usize, text: &str| mallory.ask_retained(&format!("nodes/x{n}"), text.as_bytes().to_vec(), true).await;
+    for n in 0..256 {
+        assert_eq!(status(n, "hello").await.0, "Success", "{n}");
+    }
+    let (reason, text) = status(256, "hello").await;
+    assert!(reason == "NotAuthorized" && text.contains("256 vehicles without a node"), "{reason} {text}");
+    assert_eq!(status(7, "hello again").await.0, "Success", "its own place");
+    assert_eq!(status(8, "").await.0, "Success", "it gives up its place");
+    assert_eq!(status(256, "hello").await.0, "Success");
     cell.stop().await;
 }
 

@@ -45,10 +45,6 @@ def test_a_documented_program_does_what_it_says(
         text += "cell.close()\n"
     node = edge(ECOD_FUSION__TRACKS__MODE="on", **settings)
     text = re.sub("localhost:[18]883", node.address, text)
-    if not settings:
-        # Until it leads, the edge takes reports in no other name.
-        with ecod.Cell(node.address, cell_name) as cell:
-            next(cell.maps(timeout=20))
     is_endless = "while True" in text or "for map in" in text
     process = subprocess.Popen(
         [sys.executable, "-u", "-c", f"import ecod\n{text}"],

@@ -106,6 +106,20 @@ def test_a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell(
         assert not cell.counts, cell.counts
 
 
+def test_a_refusal_says_what_the_node_says(edge: Callable[..., Server], cell_name: str) -> None:
+    node = edge(ECOD_MQTT__MAX_PAYLOAD_BYTES="256")
+    with ecod.Cell(node.address, cell_name, node="euclid") as cell:
+
+        def report_at_length() -> bool:
+            for _ in range(20):
+                cell.report([CAR] * 200)
+                time.sleep(0.05)
+            return False
+
+        with pytest.raises(ecod.Refused, match=r"detections/euclid--python is too long, .* or \d+ bytes are too many for it"):
+            wait_for(report_at_length)
+
+
 def test_maps_go_on_after_the_node_is_killed_and_started_again(edge: Callable[..., Server], cell_name: str) -> None:
     node = edge()
     with ecod.Cell(node.address, cell_name, node="euclid") as cell:

@@ -339,9 +339,7 @@ impl NodeBuilder {
             encoding: self.config.mqtt.encoding,
             max_report_hz: self.config.mqtt.max_report_hz,
             serves_nodes: self.config.serves_nodes(),
-            carries_reports: Arc::new(move || {
-                matches!(leadership.borrow().position, Position::Leading | Position::StandingBy)
-            }),
+            follows: Arc::new(move || leadership.borrow().position == Position::Following),
             is_member: Arc::new(move |name| members.borrow().iter().any(|member| member.name == *name)),
             report: Arc::new(move |kind, report| {
                 gateway.send(GatewayMessage::PublishReport { kind, report });

@@ -55,8 +55,8 @@ pub struct DoorSetup {
     pub max_report_hz: u32,
     /// True if other nodes have links to this broker.
     pub serves_nodes: bool,
-    /// True if this broker carries the cell's reports now.
-    pub carries_reports: Arc<dyn Fn() -> bool + Send + Sync>,
+    /// True if the node only follows, so that its broker does not carry the cell's reports.
+    pub follows: Arc<dyn Fn() -> bool + Send + Sync>,
     /// True if another node has this name.
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
     /// Takes a program's report for the cell.
@@ -89,6 +89,8 @@ struct DoorState {
     recent_reports: Mutex<RecentReports>,
     throttles: [Mutex<TokenBucket>; ReportKind::COUNT],
     descriptions: Mutex<TokenBucket>,
+    /// Vehicles without a node whose status is retained.
+    nodeless: Mutex<BTreeSet<NodeName>>,
     refusals: Mutex<Refusals>,
 }
 
@@ -106,6 +108,9 @@ const MAX_WAITING: usize = 256;
 const DESCRIPTION_INTERVAL: Duration = Duration::from_secs(1);
 
 const DESCRIPTION_BURST: u32 = 8;
+
+/// Vehicles without a node whose statuses may be retained. Programs draw any number of names.
+const MAX_NODELESS: usize = 256;
 
 /// Topics whose last message is retained: as many nodes as a cell can have, and some.
 const MAX_RETAINED: usize = 8192;
@@ -128,6 +133,7 @@ impl Door {
             wants_reports: AtomicBool::new(false),
             watches_reports: AtomicBool::new(false),
             recent_reports: Mutex::default(),
+            nodeless: Mutex::default(),
             refusals: Mutex::default(),
         })))
     }

@@ -96,7 +96,7 @@ impl Permissions {
                 let text = format!("{topic} is too long, may not be retained, or {bytes} bytes are too many for it");
                 return Err(Refusal::not_permitted(text));
             }
-            return self.door.take(&principal, (place, topic), &publish.payload);
+            return self.door.take(&principal, (place, topic), publish);
         }
         let is_allowed = place == Place::Cell && self.allows(&principal, topic, retain, bytes);
         is_allowed.then_some(()).ok_or_else(refused)

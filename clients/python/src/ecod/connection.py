@@ -69,8 +69,8 @@ class Connection:
         client.on_connect = self._on_connect
         client.on_disconnect = lambda _client, _userdata, _flags, reason, _properties: self._lose(reason)
         client.on_message = lambda _client, _userdata, message: take(message.topic, bytes(message.payload))
-        client.on_subscribe = lambda _client, _userdata, mid, reasons, _properties: self._on_answer(mid, reasons[0])
-        client.on_publish = lambda _client, _userdata, mid, reason, _properties: self._on_answer(mid, reason)
+        client.on_subscribe = lambda _client, _userdata, mid, reasons, properties: self._on_answer(mid, reasons[0], properties)
+        client.on_publish = lambda _client, _userdata, mid, reason, properties: self._on_answer(mid, reason, properties)
         client.on_socket_open = _without_delay
         # The thread of `_run` alone writes to the socket; otherwise every caller would.
         client.on_socket_register_write = lambda *_: None
@@ -112,7 +112,7 @@ class Connection:
         for mid in [mid for mid, asked in list(self._asked.items()) if asked == topic and mid in self._denied]:
             self._asked.pop(mid, None)
             reason = self._denied.pop(mid, None)
-            raise Refused(f"the broker at {self.at} refuses {topic}: {reason}; does the certificate or user allow it?")
+            raise Refused(f"the broker at {self.at} refuses {topic}: {reason}")
 
     def close(self) -> None:
         """Sends what waits, and ends the connection."""
@@ -199,10 +199,11 @@ class Connection:
         with self.changed:
             self.changed.notify_all()
 
-    def _on_answer(self, mid: int, reason: Any) -> None:
+    def _on_answer(self, mid: int, reason: Any, properties: Any) -> None:
         if reason.is_failure:
-            log.warning("%s refuses %s: %s", self.at, self._asked.get(mid, "a request"), reason)
-            self._denied[mid] = str(reason)
+            text = getattr(properties, "ReasonString", None) or f"{reason}; does the certificate or user allow it?"
+            log.warning("%s refuses %s: %s", self.at, self._asked.get(mid, "a request"), text)
+            self._denied[mid] = text
             with self.changed:
                 self.changed.notify_all()
 

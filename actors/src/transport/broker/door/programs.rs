@@ -8,7 +8,8 @@
 //! | other topics of the cell | is refused |
 //! | anything else | without certificates reaches the programs at this door |
 //!
-//! Without certificates, the broker of the leader and of its standby also takes reports of vehicles that have no node.
+//! Without certificates, the broker of the leader and of its standby also takes reports of vehicles that have no node; so does
+//! that of a node that knows no leader yet.
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
@@ -20,9 +21,10 @@ use ecod::wire::{CellDescription, RejectReason, ReportKind, Topic, decode, decod
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
+use rmqtt::types::Publish;
 
 use super::refusals::RefusalReason;
-use super::{DESCRIPTION_INTERVAL, Door, DoorSetup, DoorState, Publication, Refusal, lock};
+use super::{DESCRIPTION_INTERVAL, Door, DoorSetup, DoorState, MAX_NODELESS, Publication, Refusal, lock};
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
 use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
@@ -92,16 +94,17 @@ impl Door {
         &self,
         principal: &Principal,
         (place, topic): (Place, &str),
-        payload: &Bytes,
+        publish: &Publish,
     ) -> Result<(), Refusal> {
         let Some(door) = self.0.as_deref() else { return Ok(()) };
         match place {
+            Place::Cell if publish.retain => door.take_nodeless(topic, &publish.payload),
             Place::Cell => Ok(()),
             Place::Door => door.may_say(principal, topic),
             Place::Inbound if door.setup.topics.parse(topic) == Some(Topic::Cell) => {
-                door.take_description(principal, payload)
+                door.take_description(principal, &publish.payload)
             }
-            Place::Inbound => door.take_report(principal, topic, payload),
+            Place::Inbound => door.take_report(principal, topic, &publish.payload),
         }
     }
 
@@ -144,7 +147,7 @@ impl Door {
 impl DoorState {
     /// True if a name is that of a vehicle without a node whose reports this broker brings to the cell.
     fn is_nodeless(&self, principal: &Principal, name: &NodeName) -> bool {
-        (self.setup.carries_reports)() && self.is_nodeless_name(principal, name)
+        !(self.setup.follows)() && self.is_nodeless_name(principal, name)
     }
 
     fn is_nodeless_name(&self, principal: &Principal, name: &NodeName) -> bool {
@@ -190,6 +193,22 @@ impl DoorState {
             Refusal::new(RefusalReason::Rejected(reason), text)
         })?;
         (setup.report)(kind, Arc::new(report));
+        Ok(())
+    }
+
+    /// Bounds the vehicles without a node whose statuses are retained; an empty status ends one's.
+    fn take_nodeless(&self, topic: &str, payload: &Bytes) -> Result<(), Refusal> {
+        let Some(Topic::Nodes(name)) = self.setup.topics.parse(topic) else { return Ok(()) };
+        let mut names = lock(&self.nodeless);
+        if payload.is_empty() {
+            names.remove(&name);
+        } else if names.len() < MAX_NODELESS {
+            names.insert(name);
+        } else if !names.contains(&name) {
+            let text =
+                format!("{MAX_NODELESS} vehicles without a node have a retained status here, and {name} has no room");
+            return Err(Refusal::not_permitted(text));
+        }
         Ok(())
     }
 
