@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,6 +66,10 @@ sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of S
 trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
 	cargo test --release --locked --test trials -- --ignored --exact trials --nocapture
+
+joining: PACKAGES += iproute2
+joining: setup ## three machines, in network namespaces, become a cell by the commands of the README
+	cargo test --locked --test joining -- --ignored --exact machines::three_machines_become_a_cell_by_the_commands_of_the_readme
 
 clocks: PACKAGES += libfaketime
 clocks: setup ## real cells with wrong clocks that step, as vehicle and as leader; TRIAL=NAME runs those with it in their name

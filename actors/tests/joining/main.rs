@@ -2,6 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
+mod machines;
+#[path = "../trials/network.rs"]
+#[allow(dead_code, reason = "the trials split the network, too")]
+mod network;
+
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Write};
 use std::net::UdpSocket;
@@ -22,7 +27,7 @@ fn ecod_node(arguments: &[&str]) -> Command {
     command
 }
 
-fn said(output: &Output) -> String {
+pub(crate) fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
 }
 
@@ -39,7 +44,7 @@ fn fails(arguments: &[&str]) -> String {
 }
 
 /// A process that ends with the test.
-struct Running(Child);
+pub(crate) struct Running(Child);
 
 impl Drop for Running {
     fn drop(&mut self) {
@@ -67,7 +72,7 @@ fn invite(directory: &str, seed: &str, names: &[&str]) -> (Running, Vec<String>)
     (host, tokens)
 }
 
-fn until(what: &str, holds: impl Fn() -> bool) {
+pub(crate) fn until(what: &str, holds: impl Fn() -> bool) {
     let deadline = Instant::now() + PATIENCE;
     while !holds() {
         assert!(Instant::now() < deadline, "never: {what}");

@@ -1,0 +1,102 @@
+//! The README's commands on three machines: network namespaces with an `/etc` and a `/var/lib` of their own.
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+use tempfile::TempDir;
+
+use crate::network::{Bridged, namespace};
+use crate::{Running, said, until};
+
+struct Machine {
+    number: usize,
+    files: TempDir,
+}
+
+impl Machine {
+    fn new(number: usize) -> Self {
+        let files = tempfile::tempdir().unwrap();
+        let copied = Command::new("cp").args(["-a", "/etc"]).arg(files.path()).status().unwrap();
+        assert!(copied.success());
+        fs::create_dir(files.path().join("lib")).unwrap();
+        Self { number, files }
+    }
+
+    /// A command of the README as root of this machine has it.
+    fn command(&self, line: &str) -> Command {
+        let program = PathBuf::from(env!("CARGO_BIN_EXE_ecod-node"));
+        let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
+        let own = r#"mount --bind "$0/etc" /etc && mount --bind "$0/lib" /var/lib && exec "$@""#;
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", &namespace(self.number), "sh", "-c", own]).arg(self.files.path());
+        for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+            command.env_remove(key);
+        }
+        command
+            .args(line.strip_prefix("sudo ").unwrap_or(line).split_whitespace())
+            .env("PATH", path)
+            .stdin(Stdio::null());
+        command
+    }
+
+    fn run(&self, line: &str) -> String {
+        let output = self.command(line).output().unwrap();
+        assert!(output.status.success(), "{line}: {}", said(&output));
+        said(&output)
+    }
+
+    /// Starts the node by the command that `init` or `join` told.
+    fn start(&self, told: &str) -> Running {
+        let line = told.split_once("start it: ").and_then(|(_, rest)| rest.lines().next()).expect(told);
+        let log = File::create(self.files.path().join("log")).unwrap();
+        let mut command = self.command(line);
+        command.arg("--map-log").arg(self.maps());
+        Running(command.stderr(log).stdout(Stdio::null()).spawn().unwrap())
+    }
+
+    fn maps(&self) -> PathBuf {
+        self.files.path().join("maps")
+    }
+
+    fn has_maps_of(&self, leader: &str) -> bool {
+        fs::read_to_string(self.maps()).unwrap_or_default().contains(&format!("\"aggregator\":\"{leader}\""))
+    }
+}
+
+/// The commands of the README that make a cell, without its comments.
+fn commands() -> [String; 3] {
+    let readme = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../README.md")).unwrap();
+    let lines = readme.lines().filter(|line| line.starts_with("sudo ecod-node "));
+    let lines: Vec<_> = lines.map(|line| line.split('#').next().unwrap().trim().to_owned()).collect();
+    lines.try_into().expect("init, invite and join")
+}
+
+#[test]
+#[ignore = "needs root for network namespaces: make joining"]
+fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
+    let network = Bridged::new(3).unwrap();
+    let machines @ [edge, gauss, euclid] = &[0, 1, 2].map(Machine::new);
+    let [init, invite, join] = commands();
+    let mut nodes = vec![edge.start(&edge.run(&init))];
+
+    let mut command = edge.command(&invite);
+    let mut host = Running(command.stdout(Stdio::piped()).stderr(Stdio::inherit()).spawn().unwrap());
+    let lines = BufReader::new(host.0.stdout.take().unwrap()).lines();
+    let tokens = lines.filter_map(|line| Some(line.unwrap().trim().strip_prefix("sudo ecod-node join ")?.to_owned()));
+    let tokens: Vec<_> = tokens.take(2).collect();
+    for (machine, token) in [euclid, gauss].into_iter().zip(&tokens) {
+        nodes.push(machine.start(&machine.run(&join.replace("TOKEN", token))));
+    }
+    assert!(host.0.wait().unwrap().success(), "all have joined");
+    until("maps of the edge on all machines", || machines.iter().all(|machine| machine.has_maps_of("edge")));
+
+    nodes.remove(0);
+    until("the other two go on", || {
+        let led_by = |leader| [gauss, euclid].iter().all(|machine| machine.has_maps_of(leader));
+        led_by("gauss") || led_by("euclid")
+    });
+    drop(nodes);
+    drop(network);
+}
