@@ -284,7 +284,7 @@ impl Cell {
         match packet {
             Packet::Election(to, message) => {
                 let from = message.from.clone();
-                self.handle(to, Input::Receive { from, rights: Rights::default(), message });
+                self.handle(to, Input::Receive { from, rights: Rights::ALL, message });
             }
             Packet::Map(to, map) => self.accept(to, map),
         }

@@ -141,7 +141,7 @@ impl Vehicle {
         match payload {
             Payload::Election(bytes) => {
                 let message = ElectionMessage::decode(bytes)?;
-                self.handle(Input::Receive { from: from.clone(), rights: Rights::default(), message }, now);
+                self.handle(Input::Receive { from: from.clone(), rights: Rights::ALL, message }, now);
             }
             Payload::Report(kind, bytes) => self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?,
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),

@@ -13,13 +13,6 @@ pub struct Rights {
     pub priority: u8,
 }
 
-/// Rights of all nodes in a cell without certificates: a node is what it declares.
-impl Default for Rights {
-    fn default() -> Self {
-        Self { role: Role::Edge, priority: u8::MAX }
-    }
-}
-
 /// Rights of a node that is issued a certificate for a role, with the priority that nodes have by default.
 impl From<Role> for Rights {
     fn from(role: Role) -> Self {
@@ -28,6 +21,9 @@ impl From<Role> for Rights {
 }
 
 impl Rights {
+    /// The rights of all nodes in a cell without certificates: a node is what it declares.
+    pub const ALL: Self = Self { role: Role::Edge, priority: u8::MAX };
+
     /// The rights of a node that never leads.
     pub const NONE: Self = Self { role: Role::Cav, priority: 0 };
 
@@ -81,8 +77,8 @@ mod tests {
         let auto = Rights { role: Role::Auto, priority: 100 };
         assert!(auto.allow(Role::Auto, 100) && auto.allow(Role::Auto, 7) && auto.allow(Role::Cav, 255));
         assert!(!auto.allow(Role::Auto, 101) && !auto.allow(Role::Edge, 100));
-        assert!(Rights::default().allow(Role::Edge, 255) && !Rights::NONE.allow(Role::Auto, 0));
+        assert!(Rights::ALL.allow(Role::Edge, 255) && !Rights::NONE.allow(Role::Auto, 0));
         assert_eq!(auto.limit_role(Role::Edge), Role::Auto);
-        assert_eq!(Rights::default().limit_role(Role::Cav), Role::Cav);
+        assert_eq!(Rights::ALL.limit_role(Role::Cav), Role::Cav);
     }
 }

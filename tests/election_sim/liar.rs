@@ -90,7 +90,7 @@ fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
         description: None,
     };
     for to in (0..world.nodes.len()).filter(|to| *to != liar) {
-        world.handle(to, Input::Receive { from: name.clone(), rights: Rights::default(), message: message.clone() });
+        world.handle(to, Input::Receive { from: name.clone(), rights: Rights::ALL, message: message.clone() });
     }
 }
 

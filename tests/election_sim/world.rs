@@ -170,7 +170,7 @@ impl World {
             Arrival::Packet { from, bytes } => {
                 let message = ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
                 let from = self.nodes[from].name.clone();
-                self.handle(to, Input::Receive { from, rights: Rights::default(), message });
+                self.handle(to, Input::Receive { from, rights: Rights::ALL, message });
             }
             Arrival::Relay { from, map } => self.relay(to, from, &map),
             Arrival::Map { map } => self.accept(to, &map),

@@ -94,6 +94,7 @@ pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> Share
     SharedFacts {
         patience: patience(&config.fusion),
         round_period_s: config.fusion.round.period_s,
+        algorithms: config.fusion.algorithms,
         landmarks: config.landmarks.clone().into(),
         problem: held.problem.clone().or_else(|| pose_problem(config)),
     }

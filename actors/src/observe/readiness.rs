@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::admission::timeliness::Timeliness;
-use ecod::aggregator::FusionConfig;
+use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::{Readiness, round_timeout};
 use ecod::leadership::timers::READINESS_STEPS;
@@ -56,6 +56,8 @@ pub struct SharedFacts {
     pub patience: Option<Duration>,
     /// Maximum time between two rounds of a live aggregator, in seconds.
     pub round_period_s: f64,
+    /// The algorithms that the cell runs.
+    pub algorithms: Algorithms,
     /// Known locations.
     pub landmarks: Arc<[LandmarkConfig]>,
     /// The reason why the node does not use the cell's description, or does not report.

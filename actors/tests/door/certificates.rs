@@ -33,7 +33,7 @@ async fn with_certificates_programs_get_the_maps_of_their_node_through_a_kill_an
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_program_with_the_certificate_of_another_node_reports_nothing() {
+async fn a_program_with_the_certificate_of_another_node_says_nothing() {
     let mut cell = Cell::with_certificates();
     for (name, role) in [("edge", Role::Edge), ("gauss", Role::Auto), ("euclid", Role::Cav)] {
         cell.start(name, role, |_| ()).await;
@@ -44,6 +44,10 @@ async fn a_program_with_the_certificate_of_another_node_reports_nothing() {
         let (reason, text) = stranger.ask(&format!("detections/{name}"), b"{}".to_vec()).await;
         assert!(reason == "NotAuthorized" && text.contains("euclid"), "{name}: {reason} {text}");
     }
+    let (reason, text) = stranger.ask_retained("nodes/euclid--lidar", b"{}".to_vec(), true).await;
+    assert!(reason == "NotAuthorized" && text.contains("euclid"), "{reason} {text}");
+    let own = cell.program("lidar", "euclid", &[]).await;
+    assert_eq!(own.ask_retained("nodes/euclid--lidar", b"{}".to_vec(), true).await.0, "Success");
     cell.stop().await;
 }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
+use ecod::aggregator::Algorithms;
 use ecod::leadership::Position;
 use ecod::wire::Role;
 use tokio::time::sleep;
@@ -75,6 +76,27 @@ async fn names_without_end_leave_room_for_the_statuses_of_nodes() {
     assert_eq!(status(7, "hello again").await.0, "Success", "its own place");
     assert_eq!(status(8, "").await.0, "Success", "it gives up its place");
     assert_eq!(status(256, "hello").await.0, "Success");
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_the_cell_would_not_use_is_refused_at_the_door() {
+    let mut cell = Cell::new();
+    cell.start("edge", Role::Edge, |config| config.fusion.algorithms = Algorithms::Pace).await;
+    cell.served_by("edge").await;
+    let program = cell.program("planner", "edge", &[]).await;
+    let report =
+        |name: &str| format!(r#"{{"schema":1,"node":"{name}","seq":1,"captured_at_us":1,"objects":[]}}"#).into_bytes();
+    let (reason, text) = program.ask("vote_detections/edge", report("edge")).await;
+    assert!(reason == "PayloadFormatInvalid" && text.contains("`fusion.algorithms`"), "{reason} {text}");
+    for part in 0..16 {
+        let name = format!("edge--{part}");
+        assert_eq!(program.ask(&format!("detections/{name}"), report(&name)).await.0, "Success", "{name}");
+    }
+    let (reason, text) = program.ask("detections/edge--16", report("edge--16")).await;
+    assert!(reason == "PayloadFormatInvalid" && text.contains("has 16 parts that report"), "{reason} {text}");
+    assert_eq!(program.ask("detections/edge--7", report("edge--7")).await.0, "Success", "it has its place");
+    assert_eq!(program.ask("detections/edge", report("edge")).await.0, "Success", "the node is no part");
     cell.stop().await;
 }
 

@@ -79,7 +79,7 @@ impl Cell {
         self.now = self.now + transit;
         let (leadership, now) = (self.leadership(to), self.now);
         let receiver = &mut self.nodes[to];
-        receiver.time.receive(&message, Rights::default(), now.shifted(receiver.steady_us));
+        receiver.time.receive(&message, Rights::ALL, now.shifted(receiver.steady_us));
         receiver.time.follow(&leadership, now.shifted(receiver.steady_us));
     }
 
@@ -213,7 +213,7 @@ fn stamps_of_a_liar_are_survived() {
                     description: None,
                 };
                 let now = cell.now;
-                cell.nodes[0].time.receive(&message, Rights::default(), now);
+                cell.nodes[0].time.receive(&message, Rights::ALL, now);
                 cell.look();
             }
         }

@@ -125,7 +125,7 @@ impl Scene {
 
     fn hear_in(&mut self, epoch: Epoch, body: Body) {
         let message = self.message(epoch, body);
-        self.take(Input::Receive { from: name("edge"), rights: Rights::default(), message });
+        self.take(Input::Receive { from: name("edge"), rights: Rights::ALL, message });
     }
 
     fn beat(&mut self) {
@@ -398,7 +398,7 @@ fn a_message_in_anothers_name_is_dropped() {
     let mut before = scene.machine.clone();
     let ended = Epoch::new(7, name("edge"));
     let message = scene.message(ended.clone(), Body::Resign { epoch: ended, last_round: 40 });
-    scene.take(Input::Receive { from: name("gauss"), rights: Rights::default(), message });
+    scene.take(Input::Receive { from: name("gauss"), rights: Rights::ALL, message });
     assert_eq!(scene.notices(), [&Notice::Misattributed { from: name("gauss"), claimed: name("edge") }]);
     before.deadline = scene.machine.deadline;
     assert_eq!(scene.machine, before);
@@ -422,7 +422,7 @@ fn is_followed(rights: Rights) -> bool {
 
 #[test]
 fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
-    assert!(is_followed(Rights::default()));
+    assert!(is_followed(Rights::ALL));
     assert!(is_followed(Rights { role: Role::Edge, priority: 100 }));
     assert!(is_followed(Rights { role: Role::Auto, priority: 50 }), "as an auto node");
     assert!(!is_followed(Rights::NONE));

@@ -8,7 +8,7 @@ use ecod::leadership::election::ElectionConfig;
 use ecod::leadership::node::{Input, NodeSettings};
 use ecod::model::epoch::Epoch;
 use ecod::replay::JournalEvent;
-use ecod::wire::{NodeState as NodeCondition, NodeStatus, Topics};
+use ecod::wire::{NodeState as NodeCondition, NodeStatus, ReportKind, Topics};
 use ractor::{ActorCell, ActorRef};
 
 use super::NodeBuilder;
@@ -329,6 +329,7 @@ impl NodeBuilder {
         }
         let (leadership, members) = (self.leadership(), self.members());
         let (own_config, description) = (self.own_config.clone(), self.slots.description.clone());
+        let shared = self.shared.subscribe();
         let (gateway, to_watch, live_state) =
             (self.slots.gateway.clone(), self.slots.gateway.clone(), Arc::clone(&self.live_state));
         Door::new(DoorSetup {
@@ -340,6 +341,10 @@ impl NodeBuilder {
             max_report_hz: self.config.mqtt.max_report_hz,
             serves_nodes: self.config.serves_nodes(),
             follows: Arc::new(move || leadership.borrow().position == Position::Following),
+            fuses: Arc::new(move |kind| match kind {
+                ReportKind::Detections => shared.borrow().algorithms.pace(),
+                ReportKind::VoteDetections => shared.borrow().algorithms.vote(),
+            }),
             is_member: Arc::new(move |name| members.borrow().iter().any(|member| member.name == *name)),
             report: Arc::new(move |kind, report| {
                 gateway.send(GatewayMessage::PublishReport { kind, report });

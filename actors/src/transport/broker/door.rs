@@ -21,6 +21,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{
     CellDescription, Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind, Reputations, Topic, Topics,
     encode,
@@ -57,6 +58,8 @@ pub struct DoorSetup {
     pub serves_nodes: bool,
     /// True if the node only follows, so that its broker does not carry the cell's reports.
     pub follows: Arc<dyn Fn() -> bool + Send + Sync>,
+    /// True if the cell uses reports of this kind.
+    pub fuses: Arc<dyn Fn(ReportKind) -> bool + Send + Sync>,
     /// True if another node has this name.
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
     /// Takes a program's report for the cell.
@@ -89,6 +92,8 @@ struct DoorState {
     recent_reports: Mutex<RecentReports>,
     throttles: [Mutex<TokenBucket>; ReportKind::COUNT],
     descriptions: Mutex<TokenBucket>,
+    /// Parts of the node that report, and when they last did.
+    parts: Mutex<BTreeMap<NodeName, Timestamp>>,
     /// Vehicles without a node whose status is retained.
     nodeless: Mutex<BTreeSet<NodeName>>,
     refusals: Mutex<Refusals>,
@@ -108,6 +113,9 @@ const MAX_WAITING: usize = 256;
 const DESCRIPTION_INTERVAL: Duration = Duration::from_secs(1);
 
 const DESCRIPTION_BURST: u32 = 8;
+
+/// Time after which a silent part gives way to another.
+const PART_RETENTION: Duration = Duration::from_secs(10);
 
 /// Vehicles without a node whose statuses may be retained. Programs draw any number of names.
 const MAX_NODELESS: usize = 256;
@@ -133,6 +141,7 @@ impl Door {
             wants_reports: AtomicBool::new(false),
             watches_reports: AtomicBool::new(false),
             recent_reports: Mutex::default(),
+            parts: Mutex::default(),
             nodeless: Mutex::default(),
             refusals: Mutex::default(),
         })))

@@ -184,7 +184,11 @@ impl Sessions {
 
     /// True if a single node may be greeted now.
     pub(crate) fn may_send_hello(&mut self, now: Timestamp) -> bool {
-        self.greetings.allow(now) || self.throttled()
+        let may_send = self.greetings.allow(now);
+        if !may_send {
+            self.counters.count(FrameEvent::Throttled);
+        }
+        may_send
     }
 
     /// Ends the session of an earlier run of a node; false when there is none. Of a node that proves its certificate
@@ -276,7 +280,7 @@ impl Sessions {
             Some(_) => Err(FrameEvent::Superseded),
             None if kind == FrameKind::Gossip => Ok(FrameContent::Gossip { from, body }),
             None => {
-                let rights = peer.proven.as_ref().map_or(Rights::default(), |proven| proven.rights);
+                let rights = peer.proven.as_ref().map_or(Rights::ALL, |proven| proven.rights);
                 Ok(FrameContent::Payload { from, rights, body })
             }
         }
@@ -314,11 +318,6 @@ impl Sessions {
     }
 
     /// Counts a frame that is not sent; always false.
-    fn throttled(&self) -> bool {
-        self.counters.count(FrameEvent::Throttled);
-        false
-    }
-
     fn version(&self) -> Version {
         if self.prove_certificates() { Version::Certificate } else { Version::Key }
     }

@@ -56,7 +56,7 @@ impl CertificateSubject {
         let rights = match rights {
             _ if !may_serve => Rights::NONE,
             Some(rights) => parse_rights(rights).ok_or(InvalidCertificate::Rights)?,
-            None => Rights::default(),
+            None => Rights::ALL,
         };
         let time = |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
         let validity = parsed.validity();
@@ -155,8 +155,8 @@ mod tests {
     fn a_certificate_of_a_version_that_wrote_no_rights_still_lets_a_broker_lead() {
         let broker = || rcgen::SanType::DnsName(BROKER_NAME.try_into().unwrap());
         let uri = |text: &str| rcgen::SanType::URI(text.try_into().unwrap());
-        assert_eq!(subject(vec![broker()]).unwrap().rights(), Rights::default());
-        assert_eq!(subject(vec![uri("https://example.org"), broker()]).unwrap().rights(), Rights::default());
+        assert_eq!(subject(vec![broker()]).unwrap().rights(), Rights::ALL);
+        assert_eq!(subject(vec![uri("https://example.org"), broker()]).unwrap().rights(), Rights::ALL);
         assert_eq!(subject(Vec::new()).unwrap().rights(), Rights::NONE, "a vehicle's");
         assert_eq!(subject(vec![uri("ecod:role=edge;priority=9")]).unwrap().rights(), Rights::NONE, "without a broker");
         let both = subject(vec![broker(), uri("ecod:role=auto;priority=9")]).unwrap();

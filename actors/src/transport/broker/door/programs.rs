@@ -16,7 +16,9 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use bytes::Bytes;
+use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::{CellDescription, RejectReason, ReportKind, Topic, decode, decode_report};
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
@@ -24,7 +26,9 @@ use rmqtt::session::Session;
 use rmqtt::types::Publish;
 
 use super::refusals::RefusalReason;
-use super::{DESCRIPTION_INTERVAL, Door, DoorSetup, DoorState, MAX_NODELESS, Publication, Refusal, lock};
+use super::{
+    DESCRIPTION_INTERVAL, Door, DoorSetup, DoorState, MAX_NODELESS, PART_RETENTION, Publication, Refusal, lock,
+};
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
 use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
@@ -158,7 +162,7 @@ impl DoorState {
     fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), Refusal> {
         let node = &self.setup.node;
         match self.setup.topics.parse(topic) {
-            Some(Topic::Nodes(name)) if name.vehicle() == *node && name != *node => Ok(()),
+            Some(Topic::Nodes(name)) if name.vehicle() == *node && name != *node && self.is_own(principal) => Ok(()),
             None if principal.identity.is_none() => Ok(()),
             _ => Err(Refusal::not_permitted(format!(
                 "programs do not publish {topic}; reports go to detections/{node}--<part> and vote_detections/{node}--<part>"
@@ -174,8 +178,7 @@ impl DoorState {
             _ => return Err(Refusal::not_permitted(format!("{topic} is no topic for reports"))),
         };
         let node = &setup.node;
-        let is_own = principal.identity.as_ref().is_none_or(|identity| identity.name() == node);
-        if name.vehicle() != *node || !is_own || (name != *node && (setup.is_member)(&name)) {
+        if name.vehicle() != *node || !self.is_own(principal) || (name != *node && (setup.is_member)(&name)) {
             return Err(Refusal::not_permitted(format!(
                 "this is the door of {node}: its programs report as {node} or {node}--<part>, not as {name}"
             )));
@@ -192,8 +195,37 @@ impl DoorState {
             let text = format!("the report on {topic} is not usable: {reason}; see docs/protocol.md#rejections");
             Refusal::new(RefusalReason::Rejected(reason), text)
         })?;
+        if !(setup.fuses)(kind) {
+            let text = format!("the cell does not use {topic}: `fusion.algorithms` leaves it out");
+            return Err(Refusal::new(RefusalReason::Rejected(RejectReason::NotFused), text));
+        }
+        if !self.admits_part(&name, now) {
+            let text = format!("{node} has {MAX_PARTS} parts that report, and {name} would be one more");
+            return Err(Refusal::new(RefusalReason::Rejected(RejectReason::TooManyVehicles), text));
+        }
         (setup.report)(kind, Arc::new(report));
         Ok(())
+    }
+
+    /// True if the certificate, where there are any, is the node's.
+    fn is_own(&self, principal: &Principal) -> bool {
+        principal.identity.as_ref().is_none_or(|identity| *identity.name() == self.setup.node)
+    }
+
+    /// True if the aggregator has room for this part of the node, too.
+    fn admits_part(&self, name: &NodeName, now: Timestamp) -> bool {
+        let mut parts = lock(&self.parts);
+        if *name == self.setup.node {
+            return true;
+        }
+        if parts.len() >= MAX_PARTS && !parts.contains_key(name) {
+            parts.retain(|_, heard| now.since(*heard) < PART_RETENTION);
+        }
+        let has_room = parts.len() < MAX_PARTS || parts.contains_key(name);
+        if has_room {
+            parts.insert(name.clone(), now);
+        }
+        has_room
     }
 
     /// Bounds the vehicles without a node whose statuses are retained; an empty status ends one's.

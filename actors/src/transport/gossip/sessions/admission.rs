@@ -38,8 +38,8 @@ impl Sessions {
         if !wants_session && is_accepted && is_there && is_alive() {
             return Ok(FrameContent::Nothing);
         }
-        if !self.challenges.allow(&head.sender, arrival.from, arrival.now) && !self.throttled() {
-            return Ok(FrameContent::Nothing);
+        if !self.challenges.allow(&head.sender, arrival.from, arrival.now) {
+            return Err(FrameEvent::Throttled);
         }
         let cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
         let challenge = Handshake::Challenge { cookie, name: arrival.own.name.clone() };
@@ -57,8 +57,8 @@ impl Sessions {
         let signed = body.get(..body.len() - attestation.len()).unwrap_or_default();
         match message {
             Handshake::Challenge { cookie, name } => {
-                if !self.proofs.allow(&head.sender, arrival.from, arrival.now) && !self.throttled() {
-                    return Ok(FrameContent::Nothing);
+                if !self.proofs.allow(&head.sender, arrival.from, arrival.now) {
+                    return Err(FrameEvent::Throttled);
                 }
                 let claim = (arrival.known)(&name).filter(|known| !known.alive);
                 let claim = claim.map_or(NameClaim::Free, |known| NameClaim::After(known.life));
@@ -158,8 +158,8 @@ impl Sessions {
         if self.peers.get(&head.sender).is_some_and(|peer| head.counter <= peer.proof_counter) {
             return Err(FrameEvent::Replayed);
         }
-        if !self.verifications.allow_host(arrival.from, arrival.now) && !self.throttled() {
-            return Ok(FrameContent::Nothing);
+        if !self.verifications.allow_host(arrival.from, arrival.now) {
+            return Err(FrameEvent::Throttled);
         }
         let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
         let signed = SignedMessage {

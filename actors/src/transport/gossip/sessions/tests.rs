@@ -48,7 +48,7 @@ impl End {
 }
 
 fn payload(from: &End, body: &[u8]) -> FrameContent {
-    let rights = from.sessions.prover.as_ref().map_or(Rights::default(), |_| Role::Auto.into());
+    let rights = from.sessions.prover.as_ref().map_or(Rights::ALL, |_| Role::Auto.into());
     FrameContent::Payload { from: from.id.name.clone(), rights, body: body.to_vec() }
 }
 
