@@ -324,7 +324,13 @@ impl LedgerResync {
             self.followed.insert(leader.clone(), Followed { since, last: now });
         }
         self.followed.retain(|_, followed| now.since(followed.last) < LAST_WORD_TIME);
-        ledger.end_trials(now, |lane| leader.is_some_and(|leader| ![&lane.leader, &self.name].contains(&leader)))
+        let has_failed = |lane: &Epoch| leader.is_some_and(|leader| ![&lane.leader, &self.name].contains(&leader));
+        let judged = ledger.end_trials(now, has_failed);
+        if judged.iter().any(|(lane, is_evidence)| *is_evidence && self.leader.as_ref() != Some(lane)) {
+            // A leader that ended and leads again may have lost what it had counted.
+            (self.wait, self.repeats) = (self.wait.max(1), REPEATS);
+        }
+        !judged.is_empty()
     }
 
     /// End of the trial of what a leader tells of itself, unless it is over.

@@ -85,22 +85,24 @@ impl ReputationLedger {
         changed
     }
 
-    /// Ends trials: those that `has_failed` names, whose shares and counts are dropped, and those whose time is over. True
-    /// if there were any.
-    pub fn end_trials(&mut self, now: Timestamp, has_failed: impl Fn(&Epoch) -> bool) -> bool {
-        let before = self.on_trial.len();
+    /// Ends trials: those that `has_failed` names, whose shares and counts are dropped, and those whose time is over. The
+    /// result is their lanes, and whether each is evidence now.
+    pub fn end_trials(&mut self, now: Timestamp, has_failed: impl Fn(&Epoch) -> bool) -> Vec<(Epoch, bool)> {
+        let mut ended = Vec::new();
         for (lane, (tried, ends_at)) in std::mem::take(&mut self.on_trial) {
             if has_failed(&lane) {
                 let kept = self.statements.get(&lane).map(|statements| statements.signed.clone()).unwrap_or_default();
                 self.forget(&lane);
                 kept.iter().for_each(|share| _ = self.merge_statement(share, None));
+                ended.push((lane, false));
             } else if now >= ends_at {
                 tried.signed.iter().for_each(|share| _ = self.merge_statement(share, None));
+                ended.push((lane, true));
             } else {
                 self.on_trial.insert(lane, (tried, ends_at));
             }
         }
-        self.on_trial.len() < before
+        ended
     }
 
     /// The signed shares behind the lanes of other aggregators, without those on trial.

@@ -209,6 +209,10 @@ impl World {
                 fail("the elected leader's are there, and it is no successor of it");
             }
         }
+        // The last rounds of a leadership that was gone back to may arrive when the next one has begun.
+        if of_this_run().next().is_some_and(|last| last.epoch == map.epoch) {
+            return;
+        }
         let Some(later) = of_this_run().find(|accepted| accepted.epoch > map.epoch) else { return };
         // Nobody can have forged what it published itself.
         if later.epoch.leader == node.name {
