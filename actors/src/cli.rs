@@ -111,6 +111,9 @@ pub struct Failure {
 /// Exit code for an unusable configuration or argument.
 const USAGE: u8 = 2;
 
+/// Exit code of a node whose name is another's.
+const NAME_TAKEN: u8 = 4;
+
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     exit("ecod-node", parse().and_then(run_command))
@@ -194,6 +197,11 @@ impl From<anyhow::Error> for Failure {
 }
 
 impl Failure {
+    /// A node whose name is another's.
+    fn name_taken(error: anyhow::Error) -> Self {
+        Self { error, code: NAME_TAKEN }
+    }
+
     /// A configuration or argument that cannot be used.
     pub fn usage(error: impl Into<anyhow::Error>) -> Self {
         Self { error: error.into(), code: USAGE }

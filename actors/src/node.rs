@@ -35,6 +35,7 @@ use std::time::Duration;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::Readiness;
+use ecod::model::names::NodeName;
 use ecod::wire::{CellDescription, Reputations, Verdicts};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
 use tokio::sync::watch;
@@ -90,18 +91,28 @@ struct NodeState {
 }
 
 /// A node that could not start or had to give up.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, Clone, thiserror::Error)]
 pub enum NodeError {
     /// A part did not start, or the node gave up on one.
     #[error("{0}")]
     Failed(String),
+    /// Another node has the name, and the cell takes that one's word.
+    #[error(
+        "another running node of the cell {cell} is called {name}: give one of them another name, or stop that one"
+    )]
+    NameTaken {
+        /// The name of both.
+        name: NodeName,
+        /// Their cell.
+        cell: NodeName,
+    },
 }
 
 /// A running node.
 pub struct NodeHandle {
     supervisor: ActorRef<NodeMessage>,
     ended: JoinHandle<()>,
-    failure: watch::Receiver<Option<String>>,
+    failure: watch::Receiver<Option<NodeError>>,
     newest: Newest,
     broker: watch::Receiver<Option<SocketAddr>>,
     listens_at: watch::Receiver<Option<SocketAddr>>,
@@ -220,7 +231,7 @@ impl NodeHandle {
     /// [`NodeError`] always says why; the node never ends well by itself.
     pub async fn failed(&mut self) -> Result<(), NodeError> {
         let why = self.failure.wait_for(Option::is_some).await.ok().and_then(|why| why.clone());
-        Err(NodeError::Failed(why.unwrap_or_else(|| "the supervisor ended".into())))
+        Err(why.unwrap_or_else(|| NodeError::Failed("the supervisor ended".into())))
     }
 
     /// Stops all parts, the camera first and the broker last, and waits until they have ended.
@@ -303,7 +314,7 @@ impl Actor for Node {
             Err(format!("parts ended more than {MAX_RESTARTS} times in {RESTART_SPAN:?}, the last: {part:?}: {why}")
                 .into())
         };
-        restarted.inspect_err(|error| state.builder.give_up(error.to_string()))
+        restarted.inspect_err(|error| state.builder.give_up(NodeError::Failed(error.to_string())))
     }
 
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {

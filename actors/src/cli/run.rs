@@ -14,9 +14,9 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
 use super::{Failure, print};
-use crate::node;
 use crate::node::config::NodeConfig;
 use crate::node::service::ServiceManager;
+use crate::node::{self, NodeError};
 use crate::transport::mqtt::BrokerAddress;
 use crate::transport::pki::OBSERVER_MARK;
 
@@ -98,7 +98,10 @@ pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Fail
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     #[cfg(feature = "camera")]
     crate::camera::frame_source::capture::wait_for_readers(SHUTDOWN_TIMEOUT);
-    Ok(served?)
+    served.map_err(|error| match error.downcast_ref() {
+        Some(NodeError::NameTaken { .. }) => Failure::name_taken(error),
+        _ => error.into(),
+    })
 }
 
 impl RunArguments {

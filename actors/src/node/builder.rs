@@ -20,6 +20,7 @@ use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, S
 use tokio::sync::watch;
 use uuid::Uuid;
 
+use super::NodeError;
 use super::description::{HeldDescription, rates_by_evidence, shared_facts};
 use super::slots::{ActorKind, ActorSlots};
 use crate::actors::broker::Broker;
@@ -88,7 +89,7 @@ pub(super) struct NodeBuilder {
     leadership: watch::Sender<Leadership>,
     live_state: Arc<LiveState>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
-    failed: watch::Sender<Option<String>>,
+    failed: watch::Sender<Option<NodeError>>,
 }
 
 /// Maximum time for a part to stop.
@@ -116,7 +117,7 @@ impl NodeBuilder {
         own_config: NodeConfig,
         security: Security,
         mut held: HeldDescription,
-        failed: watch::Sender<Option<String>>,
+        failed: watch::Sender<Option<NodeError>>,
     ) -> Self {
         let config = held.lay_over(&own_config).unwrap_or_else(|| own_config.clone());
         let counters = Arc::<Counters>::default();
@@ -216,7 +217,7 @@ impl NodeBuilder {
         self.leadership.subscribe()
     }
 
-    pub(super) fn give_up(&self, why: String) {
+    pub(super) fn give_up(&self, why: NodeError) {
         self.failed.send_replace(Some(why));
     }
 

@@ -97,11 +97,13 @@ pub enum MembershipEvent {
         /// Time of arrival by this node's clock.
         received_at: Timestamp,
     },
-    /// Two running nodes have one name, perhaps this node's. Only the later started one is accepted.
+    /// Two running nodes have one name, perhaps this node's. Only the first one is accepted.
     NameTaken {
         /// The name.
         name: NodeName,
     },
+    /// Another node has this node's name, and nobody accepts this one.
+    Excluded,
 }
 
 /// Callback for events. It runs on the membership's own task and must not block.

@@ -110,8 +110,9 @@ impl ElectionDriver {
                 }
             },
             MembershipEvent::NameTaken { name } => {
-                return tracing::error!(%name, "two nodes have this name; the election cannot tell them apart");
+                return tracing::error!(%name, "two nodes have this name; the first one takes part");
             }
+            MembershipEvent::Excluded => return tracing::error!("another node has this node's name"),
         };
         self.handle(input).await;
     }

@@ -31,7 +31,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::config::NodeConfig;
 use crate::node::slots::ActorKind;
-use crate::node::{ActorSlots, NodeMessage};
+use crate::node::{ActorSlots, NodeError, NodeMessage};
 use crate::observe::dashboard::{NodeFacts, NodeSources};
 use crate::observe::readiness::Vitals;
 use crate::observe::recorder::{LogIdentity, LogItem};
@@ -39,13 +39,18 @@ use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::ShedReason;
 use crate::transport::broker::{Door, DoorSetup};
-use crate::transport::gossip::{EventSink, MembershipConfig};
+use crate::transport::gossip::{EventSink, MembershipConfig, MembershipEvent};
 use crate::transport::mqtt::{Incoming, LinkState, Subscriber, SubscriptionRole};
 
 impl NodeBuilder {
     pub(super) fn membership_arguments(&self) -> MembershipArguments {
         let election = self.slots.election.clone();
+        let failed = self.failed.clone();
+        let taken = NodeError::NameTaken { name: self.name.clone(), cell: self.config.cell.clone() };
         let events: EventSink = Arc::new(move |event| {
+            if event == MembershipEvent::Excluded {
+                failed.send_replace(Some(taken.clone()));
+            }
             election.send(LeaderElectionMessage::Membership { event });
         });
         let membership = &self.config.membership;

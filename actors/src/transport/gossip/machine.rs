@@ -69,6 +69,8 @@ pub(crate) struct GossipMachine {
     unproven: HashMap<NodeName, Timestamp>,
     /// The name last reported as taken, and when.
     taken: Option<(NodeName, Timestamp)>,
+    /// Since when all others say that this node's name is another's.
+    excluded_since: Option<Timestamp>,
     /// True if the node has to learn its address from others.
     learns_address: bool,
     left: bool,
@@ -106,6 +108,7 @@ impl GossipMachine {
             pending: HashMap::new(),
             unproven: HashMap::new(),
             taken: None,
+            excluded_since: None,
             left: false,
             rng: ChaCha8Rng::seed_from_u64(seed.wrapping_add(1)),
             outputs: VecDeque::new(),
@@ -251,8 +254,9 @@ impl GossipMachine {
             NameClaim::Free => (),
             NameClaim::After(life) if life <= MAX_CLAIMED_LIFE => self.gossip.start_life_after(life, at),
             NameClaim::After(_) => (),
-            NameClaim::Taken => self.report_taken(self.gossip.own().name.clone(), at),
+            NameClaim::Taken => return self.step_back(at),
         }
+        self.excluded_since = None;
         let own = self.gossip.own().gossip.ip();
         if self.learns_address && (own.is_unspecified() || own.is_loopback() && !seen_at.ip().is_loopback()) {
             self.gossip.change(at, |own| own.gossip = seen_at);
@@ -362,6 +366,15 @@ impl GossipMachine {
         }
     }
 
+    /// Takes the word of a node that another run has this node's name. The other one may just have ended.
+    fn step_back(&mut self, at: Timestamp) {
+        let since = *self.excluded_since.get_or_insert(at);
+        if at.since(since) >= NAME_PATIENCE && self.gossip.alive().is_empty() {
+            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Excluded));
+        }
+        self.report_taken(self.gossip.own().name.clone(), at);
+    }
+
     /// A node as others are told of it: by what it has proven itself, if nodes of the cell do, and not by hearsay.
     fn member(&self, id: &NodeId) -> Member {
         let address = self.sessions.address(&id.name);
@@ -396,6 +409,9 @@ const MULTICAST_EVERY: u64 = 10;
 /// Minimum time between two greetings of a node that is known by hearsay only, and maximum such nodes in that time.
 const UNPROVEN_INTERVAL: Duration = Duration::from_secs(1);
 const MAX_UNPROVEN: usize = 256;
+
+/// Time after which a node whose name is another's gives up: well beyond that in which a run that ended is found to be down.
+const NAME_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);

@@ -55,6 +55,7 @@ pub(crate) struct Sessions {
 /// State of a name in the gossip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct KnownMember {
+    pub(crate) run: u64,
     pub(crate) life: u64,
     pub(crate) alive: bool,
 }

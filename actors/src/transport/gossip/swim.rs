@@ -91,7 +91,8 @@ impl Swim {
     /// The state of another node.
     pub(crate) fn known(&self, name: &NodeName) -> Option<KnownMember> {
         let member = self.foca.iter_membership_state().find(|member| member.id().name == *name)?;
-        Some(KnownMember { life: member.id().life, alive: member.state() != State::Down })
+        let NodeId { run, life, .. } = *member.id();
+        Some(KnownMember { run, life, alive: member.state() != State::Down })
     }
 
     /// Time at which [`Self::tick`] is next needed.

@@ -60,8 +60,11 @@ impl Sessions {
                 if !self.proofs.allow(&head.sender, arrival.from, arrival.now) {
                     return Err(FrameEvent::Throttled);
                 }
-                let claim = (arrival.known)(&name).filter(|known| !known.alive);
-                let claim = claim.map_or(NameClaim::Free, |known| NameClaim::After(known.life));
+                let claim = match (arrival.known)(&name) {
+                    Some(KnownMember { life, alive: false, .. }) => NameClaim::After(life),
+                    Some(_) if self.is_heard_elsewhere(head, &name, arrival.from) => NameClaim::Taken,
+                    _ => NameClaim::Free,
+                };
                 let introduction = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
                 let own_cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
                 let proof = Handshake::Proof { echo: cookie, cookie: own_cookie, introduction };
@@ -226,14 +229,26 @@ impl Sessions {
         Err(refusal)
     }
 
-    /// Other claims to the name of a node that has just proven itself.
+    /// Other claims to the name of a node that has just proven itself. A run that is alive elsewhere keeps its name; one at
+    /// the same address must have ended.
     fn claim(&self, head: &FrameHeader, id: &NodeId, arrival: &Arrival<'_>) -> NameClaim {
         let is_speaker = self.peers.speaker_id(&id.name) == Some(head.sender);
+        let is_elsewhere = self.peers.speaker(&id.name).is_none_or(|speaker| speaker.address != arrival.from);
         match (arrival.known)(&id.name) {
-            Some(KnownMember { life, alive: true }) if life > id.life && !is_speaker => NameClaim::Taken,
-            Some(KnownMember { life, alive: false }) if life >= id.life => NameClaim::After(life),
+            Some(KnownMember { run, life, alive: true })
+                if !is_speaker && (life > id.life || run != id.run && is_elsewhere) =>
+            {
+                NameClaim::Taken
+            }
+            Some(KnownMember { life, alive: false, .. }) if life >= id.life => NameClaim::After(life),
             _ => NameClaim::Free,
         }
+    }
+
+    /// True if another session at another address is accepted for a name.
+    fn is_heard_elsewhere(&self, head: &FrameHeader, name: &NodeName, from: SocketAddr) -> bool {
+        self.peers.speaker_id(name).is_some_and(|speaker| speaker != head.sender)
+            && self.peers.speaker(name).is_some_and(|speaker| speaker.address != from)
     }
 
     /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
