@@ -177,7 +177,7 @@ impl DescriptionExchange {
     /// Sets the cell's description at this node, which may lead. Nothing happens if the content is that of the present
     /// one.
     pub fn set(&mut self, text: String, hash: ContentHash, now: Timestamp) -> Vec<DescriptionEffect> {
-        if !self.may_lead || self.stamp().version > 0 && self.stamp().hash == hash {
+        if !self.may_lead || self.current.as_ref().is_some_and(|current| current.text == text) {
             return Vec::new();
         }
         let of_candidates = self.statements.values().filter(|statement| statement.may_lead);

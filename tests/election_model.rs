@@ -227,8 +227,13 @@ impl Cell {
             }
             Effect::AskParts => {
                 let links = (0..nodes).map(|index| (broker(index).into(), LinkState::Up)).collect();
-                let sample =
-                    HealthSample { broker_serves: true, links: Some(links), fuser_runs: true, rejects_reports: false };
+                let sample = HealthSample {
+                    broker_serves: true,
+                    links: Some(links),
+                    fuser_runs: true,
+                    rejects_reports: false,
+                    contradicts: false,
+                };
                 return Some(Input::PartsAnswered { sample });
             }
             Effect::HoldRound

@@ -211,6 +211,33 @@ async fn a_killed_supervisor_fails_the_node_and_takes_its_parts_with_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_second_node_of_a_name_takes_no_part_and_says_why() {
+    let edge = edge().await;
+    let near = |name: &str, role| {
+        let mut config = config(name, role);
+        config.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
+        config
+    };
+    let euclid = node::start(near("euclid", Role::Auto)).await.unwrap();
+    let of_edge = |node: &NodeHandle| {
+        node.leadership()
+            .borrow()
+            .epoch
+            .as_ref()
+            .is_some_and(|epoch| (epoch.term, epoch.leader.as_str()) == (1, "edge"))
+    };
+    timeout(PATIENCE, euclid.leadership().wait_for(|now| now.position == Position::StandingBy)).await.unwrap().unwrap();
+    let mut second = node::start(near("euclid", Role::Cav)).await.unwrap();
+    let error = timeout(PATIENCE, second.failed()).await.expect("it gives up").unwrap_err();
+    assert!(error.to_string().contains("another running node of the cell lot-1 is called euclid"), "{error}");
+    second.stop().await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert!(of_edge(&edge) && of_edge(&euclid) && edge.members().borrow().len() == 1);
+    euclid.stop().await;
+    edge.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_busy_port_is_an_error_that_names_it() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();

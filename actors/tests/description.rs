@@ -269,6 +269,25 @@ async fn a_node_whose_own_file_contradicts_says_so_with_both_values_and_goes_on(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_candidate_whose_own_file_contradicts_leads_only_if_nobody_else_can() {
+    let edge = start("edge", Role::Edge, &[]).await;
+    let mut of_its_own = config("noether", Role::Auto, &[&edge], (&described(&["mine"], ""), None));
+    of_its_own.election.priority = 200;
+    let noether = node::start(of_its_own).await.unwrap();
+    let euclid = start("euclid", Role::Auto, &[&edge, &noether]).await;
+    all_follow(&[&edge, &noether, &euclid]).await;
+    set(described(&["slot-0"], ""), &edge).await;
+    shows(&edge, &["# noether: version 1, hash", "not used", "# euclid: version 1, hash"]).await;
+    // Longer than until the next look at its parts, of which it tells the leader.
+    sleep(Duration::from_secs(2)).await;
+    edge.stop().await;
+    map_where(&noether, "of euclid", |map| map.aggregator.as_str() == "euclid" && places(map) == ["slot-0"]).await;
+    euclid.stop().await;
+    map_where(&noether, "of its own", |map| map.aggregator.as_str() == "noether").await;
+    noether.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_candidate_may_start_its_cell_with_a_description_and_does_not_undo_later_ones() {
     let state = tempfile::tempdir().unwrap();
     let file = state.path().join("cell.toml");

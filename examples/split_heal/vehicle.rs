@@ -237,8 +237,13 @@ impl Vehicle {
                 let brokers = self.members.values().filter_map(|member| member.broker.clone());
                 let brokers = brokers.chain([broker(self.index).into()]);
                 let links = brokers.map(|broker| (broker, LinkState::Up)).collect();
-                let sample =
-                    HealthSample { broker_serves: true, links: Some(links), fuser_runs: true, rejects_reports: false };
+                let sample = HealthSample {
+                    broker_serves: true,
+                    links: Some(links),
+                    fuser_runs: true,
+                    rejects_reports: false,
+                    contradicts: false,
+                };
                 return Some(Input::PartsAnswered { sample });
             }
             // Nobody restarts here, and everybody sends to all.

@@ -69,6 +69,8 @@ fn a_change_here_is_the_next_version_and_goes_out_at_once() {
     let effects = euclid.set("new".into(), ContentHash([7; 32]), at(1));
     assert!(matches!(&effects[..], [Adopt { .. }, Publish { description }] if description.version == 9));
     assert_eq!(euclid.set("new".into(), ContentHash([7; 32]), at(2)), [], "it is that already");
+    let effects = euclid.set("new".into(), ContentHash([8; 32]), at(3));
+    assert_eq!(effects, [], "whoever set it: the hash is also of its setter");
     let mut gauss = DescriptionExchange::new(name("gauss"), false, None);
     assert_eq!(gauss.set("new".into(), ContentHash([7; 32]), at(1)), [], "it only follows");
 }

@@ -40,6 +40,8 @@ pub struct HealthSample {
     pub fuser_runs: bool,
     /// True if the fuser rejects nearly all vehicles' reports for their time.
     pub rejects_reports: bool,
+    /// True if the node does not use the cell's description, as its own configuration contradicts it.
+    pub contradicts: bool,
 }
 
 impl HealthMonitor {
@@ -133,8 +135,8 @@ impl HealthMonitor {
     }
 
     /// Health of the parts, for the election. A node that uses an external broker, its own, or both, needs one of them.
-    /// A stalled link does not count as a link, and rejected reports do not count as usable. Both are overlooked in a
-    /// leader with `no_other` to lead: it would make way for nobody.
+    /// A stalled link does not count as a link, rejected reports do not count as usable, nor settings of its own that
+    /// contradict the cell's. All of this is overlooked in a leader with `no_other` to lead: it would make way for nobody.
     pub fn health(&self, plane: &DataPlane, brokers: &Brokers, no_other: bool, round_period: Duration) -> Health {
         let external = self.is_up(plane.external.as_ref(), no_other);
         let embedded = plane.embedded && self.sample.broker_serves;
@@ -146,6 +148,7 @@ impl HealthMonitor {
             gateway: self.sample.links.is_some()
                 && (external || (embedded && self.is_up(brokers.own.as_ref(), no_other))),
             reports: no_other || !self.sample.rejects_reports,
+            settings: no_other || !self.sample.contradicts,
             load_percent: self.load_percent,
         }
     }
@@ -186,7 +189,7 @@ mod tests {
     }
 
     fn sample(links: Option<BTreeMap<BrokerAddress, LinkState>>) -> HealthSample {
-        HealthSample { broker_serves: true, links, fuser_runs: true, rejects_reports: false }
+        HealthSample { broker_serves: true, links, fuser_runs: true, rejects_reports: false, contradicts: false }
     }
 
     /// A monitor of parts that answered, and have closed a round.
@@ -243,16 +246,16 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_that_rejects_nearly_all_reports_makes_way_if_another_could_lead() {
-        let mut monitor = monitor(Timestamp(60_000_000));
+    fn a_leader_with_unusable_reports_or_settings_of_its_own_makes_way_if_another_could_lead() {
         let (plane, brokers) =
             (DataPlane { external: None, embedded: true }, Brokers { own: Some(address(1)), ..Brokers::default() });
-        monitor.note_sample(HealthSample {
-            rejects_reports: true,
-            ..sample(Some(BTreeMap::from([(address(1), LinkState::Up)])))
-        });
-        assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
-        assert!(monitor.health(&plane, &brokers, true, PERIOD).is_fit(), "nobody else could do better");
+        for (rejects_reports, contradicts) in [(true, false), (false, true)] {
+            let mut monitor = monitor(Timestamp(60_000_000));
+            let links = Some(BTreeMap::from([(address(1), LinkState::Up)]));
+            monitor.note_sample(HealthSample { rejects_reports, contradicts, ..sample(links) });
+            assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
+            assert!(monitor.health(&plane, &brokers, true, PERIOD).is_fit(), "nobody else could do better");
+        }
     }
 
     #[test]

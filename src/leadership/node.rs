@@ -405,7 +405,8 @@ impl LeadershipNode {
         let (plane, brokers) = (self.links.plane(), self.links.brokers());
         let health = self.monitor.health(plane, brokers, no_other, self.round_period);
         let is_reached = self.is_reached(no_other);
-        self.set_health(Health { broker: health.broker && is_reached, ..health }, now);
+        let settings = health.settings || self.election.leader().is_none();
+        self.set_health(Health { broker: health.broker && is_reached, settings, ..health }, now);
     }
 
     /// True if this node is logged in at a broker with which the challenger would lead: its own, or an external one. If

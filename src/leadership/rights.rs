@@ -55,7 +55,9 @@ impl Rights {
         );
         let Candidacy { role, priority, .. } = message.candidacy;
         message.candidacy.role = self.limit_role(role);
-        message.candidacy.priority = priority.min(self.priority);
+        if message.candidacy.role != Role::Cav {
+            message.candidacy.priority = priority.min(self.priority);
+        }
         (self.may_lead() || !claims).then_some(message)
     }
 }

@@ -289,7 +289,13 @@ impl Node {
     pub(crate) fn sample(&self) -> HealthSample {
         let links = || self.links.iter().map(|(broker, state)| (address_of(*broker), *state)).collect();
         let links = self.gateway_works.then(links);
-        HealthSample { broker_serves: self.broker_works, links, fuser_runs: true, rejects_reports: false }
+        HealthSample {
+            broker_serves: self.broker_works,
+            links,
+            fuser_runs: true,
+            rejects_reports: false,
+            contradicts: false,
+        }
     }
 }
 

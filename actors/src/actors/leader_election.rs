@@ -35,6 +35,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::observe::readiness::SharedFacts;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
@@ -42,7 +43,7 @@ use crate::transport::broker::Door;
 use crate::transport::gossip::Member;
 
 /// Where the parts that the election commands or asks are reached.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Parts {
     /// Sends messages to other nodes.
     pub membership: ActorSlot<MembershipMessage>,
@@ -58,6 +59,8 @@ pub struct Parts {
     pub broker: ActorSlot<BrokerMessage>,
     /// Shows the node's status to programs.
     pub door: Door,
+    /// Settings of the cell, and whether the node uses them.
+    pub shared: watch::Receiver<SharedFacts>,
 }
 
 /// Arguments of an election's start.

@@ -60,6 +60,8 @@ pub struct SharedFacts {
     pub algorithms: Algorithms,
     /// Known locations.
     pub landmarks: Arc<[LandmarkConfig]>,
+    /// True if the node does not use the cell's description.
+    pub contradicts: bool,
     /// The reason why the node does not use the cell's description, or does not report.
     pub problem: Option<String>,
 }

@@ -69,6 +69,8 @@ pub struct Health {
     pub gateway: bool,
     /// Vehicles' reports are usable: not nearly all of them are rejected for their time.
     pub reports: bool,
+    /// The node uses the cell's description, or nobody leads.
+    pub settings: bool,
     /// Processor load of the machine, 0 to 100 %.
     pub load_percent: u8,
 }
@@ -76,7 +78,7 @@ pub struct Health {
 impl Health {
     /// All parts work.
     pub fn is_fit(&self) -> bool {
-        self.broker && self.fuser && self.gateway && self.reports
+        self.broker && self.fuser && self.gateway && self.reports && self.settings
     }
 }
 

@@ -14,7 +14,7 @@ fn euclid() -> Election {
 /// A fit node that finds this term on its disk.
 fn euclid_after(saved_term: u64) -> Election {
     let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), saved_term, NOW);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 0 };
     election.handle(ElectionInput::Health { health }, NOW);
     election
 }
@@ -143,7 +143,7 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
     let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
     let mut now = Timestamp(1_000_000);
     let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 0 };
     election.handle(ElectionInput::Health { health }, now);
     let status = || Body::Status { over: None, no_login: Vec::new() };
     for seq in 1.. {
@@ -361,7 +361,7 @@ fn a_resignation_of_a_stranger_neither_mutes_nor_deafens() {
 fn a_liar_that_waits_for_the_end_of_the_leader_does_not_come_before_the_standby() {
     let config = ElectionConfig { priority: 120, ..ElectionConfig::default() };
     let mut election = Election::new(config, NodeName::from_static("euclid"), 7, NOW);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 0 };
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 0 };
     election.handle(ElectionInput::Health { health }, NOW);
     election.handle(of_edge(1, 8, beat(1)), NOW);
     let ElectionInput::Receive { message } = claim_of_gauss(1) else { panic!("no message") };

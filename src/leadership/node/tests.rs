@@ -79,6 +79,7 @@ impl Scene {
                         links: Some(BTreeMap::new()),
                         fuser_runs: true,
                         rejects_reports: false,
+                        contradicts: false,
                     },
                 },
                 effect => {
@@ -426,6 +427,16 @@ fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
     assert!(is_followed(Rights { role: Role::Edge, priority: 100 }));
     assert!(is_followed(Rights { role: Role::Auto, priority: 50 }), "as an auto node");
     assert!(!is_followed(Rights::NONE));
+}
+
+/// An observer has no rights, and the priority that nodes have by default.
+#[test]
+fn who_only_follows_declares_nothing_by_its_priority() {
+    let mut scene = Scene::new(Role::Auto, None);
+    let mut message = scene.message(Epoch::new(7, name("edge")), Body::Status { over: None, no_login: Vec::new() });
+    (message.epoch, message.candidacy.role, message.candidacy.priority) = (None, Role::Cav, 100);
+    scene.take(Input::Receive { from: name("edge"), rights: Rights::NONE, message });
+    assert!(!scene.notices().iter().any(|notice| matches!(notice, Notice::Overreached { .. })));
 }
 
 /// A leader hands its lead to an `edge`, but not to a node that only says that it is one.
