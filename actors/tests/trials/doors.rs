@@ -128,7 +128,7 @@ mod tests {
     #[test]
     fn a_clock_that_is_ahead_does_not_hide_a_delay() {
         let verdict = judge(&run([(1, 100), (2, 200)]), run([(1, 99), (2, 201)]));
-        assert_eq!(verdict.delays, [-1000, 1000]);
+        assert_eq!(verdict.delays, [-1000, 1000], "negative for a node whose date is later than the program's");
     }
 
     #[test]
