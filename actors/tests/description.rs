@@ -17,9 +17,6 @@ use tokio::time::{sleep, timeout};
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Most rounds until a change holds at every node, on a machine that others use, too.
-const MAX_ROUNDS: u64 = 10;
-
 /// A node of a cell whose other nodes gossip at `seeds`. Its own file says `toml`.
 fn config(name: &str, role: Role, seeds: &[&NodeHandle], (toml, state): (&str, Option<&Path>)) -> NodeConfig {
     let directory = tempfile::tempdir().unwrap();
@@ -177,10 +174,7 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
         assert_eq!(now.epoch, before.epoch, "nothing restarted");
     }
     println!("rounds from each answer to the change at gauss, euclid and the edge: {taken:?}");
-    let mut rounds = taken.concat();
-    rounds.sort_unstable();
-    assert!(rounds[rounds.len() / 2] <= 2, "mostly: {taken:?}");
-    assert!(rounds.iter().all(|rounds| *rounds <= MAX_ROUNDS), "everywhere: {taken:?}");
+    assert!(taken.iter().flatten().all(|rounds| *rounds <= 2), "{taken:?}");
 
     let shown = shows(&gauss, &["# edge: version 6", "# euclid: version 6", "# gauss: version 6"]).await;
     assert!(shown.contains("version 6, hash") && shown.contains("set by euclid") && shown.contains("id = \"new-6\""));
