@@ -180,6 +180,26 @@ mod tests {
         }
     }
 
+    #[tokio::test]
+    async fn a_door_that_cannot_listen_where_it_is_told_to_is_broken_and_a_free_port_will_do_otherwise() {
+        let port = TcpListener::bind("127.0.0.1:0").unwrap();
+        let cav = NodeConfig { role: Role::Cav, listen: port.local_addr().ok(), ..config() };
+        let mut beside_another_broker = NodeConfig { role: Role::Auto, ..cav.clone() };
+        beside_another_broker.mqtt.broker = port.local_addr().ok().map(Into::into);
+        for config in [&cav, &beside_another_broker] {
+            let found = finding(config, "broker port").await;
+            assert!(found.verdict == CheckResult::Broken && found.fix.unwrap().contains("`listen`"));
+        }
+        let unset = NodeConfig { listen: None, ..cav.clone() };
+        // Somebody has it: this test or another.
+        let _taken = TcpListener::bind(unset.broker_listen());
+        let found = finding(&unset, "broker port").await;
+        assert!(found.verdict == CheckResult::Doubtful && found.fix.unwrap().contains("`listen`"));
+        let mut closed = cav;
+        closed.broker.door = false;
+        assert!(examine(&closed, Path::new("node.toml")).await.iter().all(|finding| finding.check != "broker port"));
+    }
+
     #[cfg(feature = "camera")]
     #[tokio::test]
     async fn a_pose_port_in_use_is_named() {

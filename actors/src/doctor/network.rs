@@ -37,9 +37,15 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
             ),
         });
     }
-    if config.may_lead() && plane.embedded {
+    if config.has_broker() {
         let port = Port { check: "broker port", address: config.broker_listen(), key: "listen" };
-        findings.push(port.of(TcpListener::bind(port.address)));
+        let bound = TcpListener::bind(port.address);
+        let free_one_will_do = config.may_listen_at_any_port();
+        findings.push(if free_one_will_do {
+            port.or_another(bound, "programs look for it there")
+        } else {
+            port.of(bound)
+        });
     }
     findings
 }

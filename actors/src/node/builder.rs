@@ -346,7 +346,7 @@ impl NodeBuilder {
             Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor).await.map_err(cause)?;
         let before = *self.listens_at.borrow();
         let mut address = before.unwrap_or(self.config.broker_listen());
-        let takes_any_port = before.is_none() && self.config.listen.is_none() && !self.config.serves_nodes();
+        let takes_any_port = before.is_none() && self.config.may_listen_at_any_port();
         let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
         let bound = loop {
             attempts -= 1;

@@ -313,6 +313,11 @@ impl NodeConfig {
         self.serves_nodes() || self.broker.door
     }
 
+    /// True if the broker takes a free port where the usual one is in use: only programs of this machine need it.
+    pub fn may_listen_at_any_port(&self) -> bool {
+        self.listen.is_none() && !self.serves_nodes()
+    }
+
     /// Which brokers carry the cell's data.
     pub fn data_plane(&self) -> DataPlane {
         let external = self.mqtt.broker.clone();

@@ -123,11 +123,19 @@ mod tests {
 
     /// A host that waits for `gauss`.
     async fn host(wait: Duration) -> Scene {
+        host_for(wait, &[]).await
+    }
+
+    /// The same for others, too.
+    async fn host_for(wait: Duration, others: &[&'static str]) -> Scene {
         let directory = tempfile::tempdir().unwrap();
         let authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let addresses = vec![listener.local_addr().unwrap()];
         let mut host = Host::new(authority, "a key of the cell".into(), vec!["10.0.0.1:1".into()]).unwrap();
+        for other in others {
+            host.invite(&NodeName::from_static(other), Role::Cav, addresses.clone()).unwrap();
+        }
         let token = host.invite(&NodeName::from_static("gauss"), Role::Cav, addresses).unwrap();
         let visits = Arc::<Mutex<Vec<String>>>::default();
         let noted = Arc::clone(&visits);
@@ -157,6 +165,18 @@ mod tests {
         assert!(subject.name().as_str() == "gauss" && !subject.may_serve());
         joined.keep().await.unwrap();
         assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), [], "nobody is waited for");
+        assert!(matches!(redeem(&token).await, Err(JoinError::Unreachable { .. })));
+    }
+
+    #[tokio::test]
+    async fn guests_that_have_not_joined_in_time_are_named_and_find_nobody() {
+        let (wait, began) = (Duration::from_secs(2), Instant::now());
+        let Scene { token, mut serving, .. } = host_for(wait, &["euclid", "noether"]).await;
+        redeem(&token).await.unwrap().keep().await.unwrap();
+        assert!(timeout(wait / 2, &mut serving).await.is_err(), "the others have time");
+        let left = timeout(SOON, serving).await.unwrap().unwrap();
+        assert_eq!(left, ["euclid", "noether"].map(NodeName::from_static));
+        assert!(began.elapsed() >= wait);
         assert!(matches!(redeem(&token).await, Err(JoinError::Unreachable { .. })));
     }
 

@@ -1,14 +1,15 @@
 //! Exactly the maps that a node accepted, while the lead is handed over and behind an external broker.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use ecod::aggregator::Algorithms;
 use ecod::leadership::Position;
-use ecod::wire::Role;
-use tokio::time::sleep;
+use ecod::model::names::NodeName;
+use ecod::wire::{NodeState, NodeStatus, Reputation, Reputations, Role, Verdicts};
+use tokio::time::{sleep, timeout};
 
-use crate::cell::{Cell, Program};
+use crate::cell::{Cell, PATIENCE, Program};
 use crate::mosquitto::Mosquitto;
 use crate::reported;
 
@@ -44,6 +45,82 @@ async fn a_planned_handover_gives_every_program_the_maps_of_its_node() {
         assert_eq!(seen, leaders(["gauss", "edge"]));
     }
     drop(planners);
+    cell.stop().await;
+}
+
+fn messages<T: serde::de::DeserializeOwned>(program: &Program, topic: &str) -> Vec<T> {
+    program.heard_on(topic).iter().map(|heard| serde_json::from_slice(&heard.payload).unwrap()).collect()
+}
+
+/// The newest reputations that a program got of this leader.
+fn reputations_by(program: &Program, leader: &str) -> Option<BTreeMap<NodeName, Reputation>> {
+    let all = messages::<Reputations>(program, "reputations").into_iter();
+    let of_leader = |message: &Reputations| message.aggregator.as_ref().is_some_and(|name| name.as_str() == leader);
+    all.filter(of_leader).last().map(|message| message.reputations)
+}
+
+fn votes_of(program: &Program, leader: &str, voter: &str) -> u64 {
+    let reputations = reputations_by(program, leader).unwrap_or_default();
+    reputations.get(&NodeName::new(voter).unwrap()).map_or(0, |reputation| reputation.correct)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn verdicts_reputations_and_statuses_go_on_at_the_doors_when_the_leader_is_killed() {
+    let mut cell = Cell::of_four_with(|config| {
+        config.fusion.vote.weighted.freshness_s = 0.2;
+        config.reputations.publish_period_s = 0.1;
+    })
+    .await;
+    let (mut voters, mut displays) = (Vec::new(), Vec::new());
+    for node in ["gauss", "noether", "euclid"] {
+        voters.push((format!("{node}--lidar"), cell.program("lidar", node, &[]).await));
+        displays.push(cell.program("display", node, &["global_verdicts", "reputations", "nodes/+"]).await);
+    }
+    let votes = async |seqs: std::ops::Range<u64>, holds: &dyn Fn() -> bool| {
+        let voting = async {
+            for seq in seqs {
+                for (name, voter) in &voters {
+                    voter.vote(name, seq, "east").await;
+                }
+                sleep(Duration::from_millis(50)).await;
+                if holds() {
+                    return;
+                }
+            }
+        };
+        timeout(PATIENCE, voting).await.expect("votes count");
+    };
+    votes(0..10_000, &|| displays.iter().all(|display| votes_of(display, "edge", "euclid") > 3)).await;
+    // The last votes become evidence, which the edge tells the others.
+    sleep(Duration::from_secs(3)).await;
+    let before: Vec<_> = displays.iter().map(|display| reputations_by(display, "edge").unwrap()).collect();
+    assert!(before.iter().all(|reputations| *reputations == before[0]), "{before:?}");
+
+    cell.kill("edge");
+    cell.served_by("gauss").await;
+    let known = |_: &Cell| displays.iter().all(|display| reputations_by(display, "gauss").as_ref() == Some(&before[0]));
+    cell.until("the reputations are as before at each door", known).await;
+    let counted = votes_of(&displays[0], "gauss", "euclid");
+    votes(10_000..20_000, &|| displays.iter().all(|display| votes_of(display, "gauss", "euclid") > counted)).await;
+    for display in &displays {
+        let verdicts: Vec<Verdicts> = messages(display, "global_verdicts");
+        let rounds: Vec<_> = verdicts.iter().map(|message| (message.epoch, message.round)).collect();
+        assert!(rounds.windows(2).all(|pair| pair[0] < pair[1]), "in order, none twice: {rounds:?}");
+        let by: BTreeSet<_> = verdicts.iter().map(|message| message.aggregator.to_string()).collect();
+        assert_eq!(by, leaders(["edge", "gauss"]));
+        let last = |node: &str| messages::<NodeStatus>(display, &format!("nodes/{node}")).pop();
+        cell.until("each status tells who leads", |_| {
+            let is = |node, state| last(node).is_some_and(|status| status.state == state);
+            let follows =
+                |node| last(node).is_some_and(|status| status.aggregator.is_some_and(|by| by.as_str() == "gauss"));
+            is("edge", NodeState::Offline)
+                && is("gauss", NodeState::Aggregating)
+                && follows("noether")
+                && follows("euclid")
+        })
+        .await;
+    }
+    drop((voters, displays));
     cell.stop().await;
 }
 

@@ -61,8 +61,25 @@ impl Machine {
     }
 
     fn has_maps_of(&self, leader: &str) -> bool {
-        fs::read_to_string(self.maps()).unwrap_or_default().contains(&format!("\"aggregator\":\"{leader}\""))
+        self.has_maps_with(&format!("\"aggregator\":\"{leader}\""))
     }
+
+    fn has_place(&self, id: &str) -> bool {
+        self.has_maps_with(&format!("\"id\":\"{id}\""))
+    }
+
+    fn has_maps_with(&self, text: &str) -> bool {
+        fs::read_to_string(self.maps()).unwrap_or_default().contains(text)
+    }
+}
+
+/// The command of the next page that describes the cell, and the described example on this machine.
+fn describing(machine: &Machine) -> String {
+    let example = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/node/cell.toml");
+    fs::copy(example, machine.files.path().join("etc/cell.toml")).unwrap();
+    let page = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/first-cell.md")).unwrap();
+    let line = page.lines().find(|line| line.starts_with("sudo ecod-node cell set ")).expect("a command");
+    line.strip_suffix(" cell.toml").expect(line).to_owned() + " /etc/cell.toml"
 }
 
 /// The commands of the README that make a cell, without its comments.
@@ -91,6 +108,19 @@ fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
     }
     assert!(host.0.wait().unwrap().success(), "all have joined");
     until("maps of the edge on all machines", || machines.iter().all(|machine| machine.has_maps_of("edge")));
+
+    let set = edge.run(&describing(edge));
+    assert!(set.starts_with("version 1, hash "), "{set}");
+    until("maps with the described places on all machines", || {
+        machines.iter().all(|machine| machine.has_place("slot-0"))
+    });
+    let shown = "sudo ecod-node cell show --config /etc/ecod/node.toml";
+    until("each machine shows that all use it", || {
+        machines.iter().all(|machine| {
+            let shown = machine.run(shown);
+            ["edge", "gauss", "euclid"].iter().all(|node| shown.contains(&format!("# {node}: version 1")))
+        })
+    });
 
     nodes.remove(0);
     until("the other two go on", || {

@@ -126,7 +126,7 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
 }
 
 #[test]
-fn who_has_not_joined_in_time_is_named() {
+fn init_and_invite_say_why_they_refuse() {
     let machine = tempfile::tempdir().unwrap();
     let missing = fails(&["invite", "gauss", "--dir", machine.path().to_str().unwrap()]);
     assert!(missing.contains("has no CA"), "{missing}");

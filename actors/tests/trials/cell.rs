@@ -31,6 +31,9 @@ const MOSQUITTO: &str = "/usr/sbin/mosquitto";
 /// The edge's place in the cell.
 pub(crate) const EDGE: usize = 0;
 
+/// Fewest nodes of a cell in which a vehicle may not lead.
+const LEAST_WITH_CAV: usize = 5;
+
 /// Time for all processes to start and agree.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -78,6 +81,11 @@ struct Node {
     door: Option<Process>,
     paused: bool,
     runs: usize,
+}
+
+/// True if this node of so many may not lead: the last one, unless the cell is small.
+pub(crate) fn is_cav(nodes: usize, index: usize) -> bool {
+    nodes >= LEAST_WITH_CAV && index == nodes - 1
 }
 
 /// True if there is a mosquitto here.
@@ -259,9 +267,10 @@ impl Cell {
         self.bridged()?.split(&self.apart)
     }
 
-    /// The leader's packets do not reach the last vehicle, or do again.
+    /// The leader's packets do not reach the last vehicle that may lead, or do again.
     pub(crate) fn cut_one_way(&mut self, cut: bool) -> anyhow::Result<()> {
-        let last = self.nodes.len() - 1;
+        let nodes = self.nodes.len();
+        let last = (0..nodes).rfind(|index| !is_cav(nodes, *index)).context("the cell has no nodes")?;
         self.unreached = cut.then_some(last);
         self.bridged()?.cut_one_way(EDGE, last, cut)
     }

@@ -23,8 +23,9 @@ const CLIENT: &str = "/usr/bin/mosquitto_sub";
 pub(crate) struct DoorVerdict {
     /// The most by which the longest wait for a map at a door exceeds that at its node.
     pub(crate) longer_gap: Option<Duration>,
-    /// For each map, how much later the program had it than the node.
-    pub(crate) delays: Vec<Duration>,
+    /// For each map, how much later the program had it than the node, in microseconds. Negative where the cell's time,
+    /// by which the node dates, is ahead of the machine's clock.
+    pub(crate) delays: Vec<i64>,
     /// Maps that a program got twice, out of order or not at all, and maps that its node never accepted.
     pub(crate) wrong: u64,
     /// Ends of phases at which a program was without maps.
@@ -66,7 +67,7 @@ pub(crate) fn judge_doors(
         }
         let accepted_at: HashMap<_, _> =
             own.iter().flat_map(|run| &run.accepted).map(|map| (key(map), map.at)).collect();
-        let delay = |map: &Accepted| Some(map.at.since(*accepted_at.get(&key(map))?));
+        let delay = |map: &Accepted| Some(map.at.micros_from(*accepted_at.get(&key(map))?));
         verdict.delays.extend(door.accepted.iter().filter_map(delay));
     }
     verdict
@@ -120,8 +121,14 @@ mod tests {
     fn a_program_may_be_later_than_its_node_and_begin_later() {
         let node = run([(1, 100), (2, 200), (3, 350), (4, 450)]);
         let verdict = judge(&node, run([(2, 201), (3, 354), (4, 451)]));
-        let delays = [1, 4, 1].map(Duration::from_millis).to_vec();
+        let delays = vec![1000, 4000, 1000];
         assert_eq!(verdict, DoorVerdict { longer_gap: Some(Duration::from_millis(3)), delays, wrong: 0, unserved: 0 });
+    }
+
+    #[test]
+    fn a_clock_that_is_ahead_does_not_hide_a_delay() {
+        let verdict = judge(&run([(1, 100), (2, 200)]), run([(1, 99), (2, 201)]));
+        assert_eq!(verdict.delays, [-1000, 1000], "negative for a node whose date is later than the program's");
     }
 
     #[test]

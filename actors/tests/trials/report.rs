@@ -50,6 +50,10 @@ struct Doors {
     longer_gap_us: Gaps,
     /// By how much a program has a map later than its node.
     delay_us: Gaps,
+    /// Maps whose delays these are.
+    maps: u64,
+    /// Those of them that a program seems to have before its node, whose clock is ahead.
+    early_maps: u64,
     wrong_maps: u64,
     /// Programs that were without maps at the end of a phase.
     unserved: u64,
@@ -104,9 +108,13 @@ impl Doors {
 
     fn new(verdicts: &[&Verdict], all: &[Verdict]) -> Self {
         let doors = || verdicts.iter().map(|verdict| &verdict.doors);
+        let delays = || doors().flat_map(|door| door.delays.iter().copied());
+        let micros = |delay: i64| Duration::from_micros(delay.try_into().unwrap_or_default());
         Self {
             longer_gap_us: Gaps::new(doors().filter_map(|door| door.longer_gap), MICROS),
-            delay_us: Gaps::new(doors().flat_map(|door| door.delays.iter().copied()), MICROS),
+            delay_us: Gaps::new(delays().map(micros), MICROS),
+            maps: delays().count() as u64,
+            early_maps: delays().filter(|delay| *delay < 0).count() as u64,
             wrong_maps: all.iter().map(|verdict| verdict.doors.wrong).sum(),
             unserved: doors().map(|door| door.unserved).sum(),
         }
@@ -122,7 +130,17 @@ impl Doors {
         let none = |what: &str, count: u64| (count > 0).then(|| format!("{what} at doors {count}, must be 0"));
         let counts = [none("wrong maps", self.wrong_maps), none("programs without maps", self.unserved)];
         let longer = over("longer gap at doors", &self.longer_gap_us, Self::LONGER_GAP_BAR).filter(|_| trials >= 10);
-        counts.into_iter().chain([longer, over("delay at doors", &self.delay_us, Self::DELAY_BAR)]).flatten()
+        let Self { maps, early_maps, .. } = self;
+        let early = (early_maps * 4 > *maps).then(|| {
+            format!(
+                "clocks differ: {early_maps} of {maps} maps at doors before their nodes had them, at most a quarter"
+            )
+        });
+        counts
+            .into_iter()
+            .chain([early])
+            .chain([longer, over("delay at doors", &self.delay_us, Self::DELAY_BAR)])
+            .flatten()
     }
 }
 
@@ -209,15 +227,16 @@ pub(crate) fn table(outcomes: &[Outcome]) -> String {
 /// The same trials as programs beside the vehicles see them.
 fn doors_table(outcomes: &[Outcome]) -> String {
     let mut text = format!(
-        "\n{:<29}{:>6}{:>12}{:>9}{:>12}{:>9}{:>9}{:>7}{:>9}\n",
-        "at doors", "nodes", "longer gap", "max", "later, p50", "p99", "max", "wrong", "without"
+        "\n{:<29}{:>6}{:>12}{:>9}{:>12}{:>9}{:>9}{:>7}{:>7}{:>9}\n",
+        "at doors", "nodes", "longer gap", "max", "later, p50", "p99", "max", "early", "wrong", "without"
     );
     for Outcome { scenario, nodes, doors, .. } in outcomes {
-        let Doors { longer_gap_us: longer, delay_us: delay, wrong_maps, unserved } = doors;
+        let Doors { longer_gap_us: longer, delay_us: delay, early_maps: early, wrong_maps: wrong, unserved, .. } =
+            doors;
         let [longer, longest] = [longer.p50, longer.max].map(millis);
         let [p50, p99, max] = [delay.p50, delay.p99, delay.max].map(millis);
         text += &format!(
-            "{scenario:<29}{nodes:>6}{longer:>12}{longest:>9}{p50:>12}{p99:>9}{max:>9}{wrong_maps:>7}{unserved:>9}\n"
+            "{scenario:<29}{nodes:>6}{longer:>12}{longest:>9}{p50:>12}{p99:>9}{max:>9}{early:>7}{wrong:>7}{unserved:>9}\n"
         );
     }
     text + "in ms: how much longer a program waited than its node, p50 and most of the trials, and how much later it had each map\n\n"
@@ -260,8 +279,8 @@ mod tests {
     #[test]
     fn programs_are_served_as_their_nodes_are() {
         let doors = |longer, later, wrong, unserved| {
-            let (longer, later) = (Duration::from_millis(longer), Duration::from_micros(later));
-            let doors = DoorVerdict { longer_gap: Some(longer), delays: vec![later], wrong, unserved };
+            let longer_gap = Some(Duration::from_millis(longer));
+            let doors = DoorVerdict { longer_gap, delays: vec![later], wrong, unserved };
             let verdict = Verdict { gap: Some(Duration::from_millis(150)), doors, ..Verdict::default() };
             Outcome::new(&SCENARIOS[0], 5, &vec![verdict; 10]).misses()
         };
@@ -270,6 +289,8 @@ mod tests {
         assert_eq!(doors(6, 1001, 0, 0), misses);
         assert_eq!(doors(0, 0, 1, 0), ["wrong maps at doors 10, must be 0"]);
         assert_eq!(doors(0, 0, 0, 1), ["programs without maps at doors 10, must be 0"]);
+        let misses = ["clocks differ: 10 of 10 maps at doors before their nodes had them, at most a quarter"];
+        assert_eq!(doors(0, -1, 0, 0), misses);
     }
 
     #[test]
@@ -311,7 +332,7 @@ mod tests {
             "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "void": 0, "gap_ms": {"p50": 150, "p99": 150, "max": 150},
             "stale_accepted": 0, "missed_rounds": 0, "unrecovered": 0, "double_leader_after_quiet": 0,
             "false_failovers": 0, "reputations_changed": 0,
-            "doors": {"longer_gap_us": {"p50": null, "p99": null, "max": null}, "delay_us": {"p50": null, "p99": null, "max": null}, "wrong_maps": 0, "unserved": 0},
+            "doors": {"longer_gap_us": {"p50": null, "p99": null, "max": null}, "delay_us": {"p50": null, "p99": null, "max": null}, "maps": 0, "early_maps": 0, "wrong_maps": 0, "unserved": 0},
         }]);
         assert_eq!(json, expected);
     }

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
 
-use crate::cell::{EDGE, Plan};
+use crate::cell::{EDGE, Plan, is_cav};
 use crate::network;
 use crate::ports::Ports;
 
@@ -52,7 +52,11 @@ pub(crate) fn configuration(
     broker: Option<SocketAddr>,
     shared: &Path,
 ) -> String {
-    let role = if index == EDGE { "edge" } else { "auto" };
+    let role = match index {
+        EDGE => "edge",
+        _ if is_cav(plan.nodes, index) => "cav",
+        _ => "auto",
+    };
     let seeds: Vec<_> = all.iter().take(3).map(|seed| format!("\"{}\"", seed.gossip)).collect();
     let seeds = if plan.bridged { String::new() } else { seeds.join(", ") };
     let mut text = format!(

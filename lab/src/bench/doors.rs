@@ -282,10 +282,22 @@ fn behind_node(map_log: &Path, at_door: &Watcher) -> anyhow::Result<Latencies> {
     let text = fs::read_to_string(map_log).with_context(|| format!("cannot read {}", map_log.display()))?;
     let received = text.lines().filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
     let received: HashMap<_, _> = received.map(|map| ((map.map.epoch, map.map.round), map.received_at)).collect();
+    let delay = |Arrival { epoch, round, at, .. }: &Arrival| {
+        let received_at =
+            received.get(&(*epoch, *round)).context("a program has a map that its node did not accept")?;
+        Ok(at.micros_from(*received_at))
+    };
+    delays(&at_door.iter().map(delay).collect::<anyhow::Result<Vec<_>>>()?)
+}
+
+/// These microseconds as times, unless too many of them are negative: the cell's time, by which the log is dated, is ahead
+/// of this machine's clock then.
+fn delays(micros: &[i64]) -> anyhow::Result<Latencies> {
+    let early = micros.iter().filter(|delay| **delay < 0).count();
+    ensure!(100 * early <= micros.len(), "clocks differ: {early} of {} maps before the node had them", micros.len());
     let mut latencies = Latencies::default();
-    for Arrival { epoch, round, at, .. } in at_door {
-        let received_at = received.get(&(epoch, round)).context("a program has a map that its node did not accept")?;
-        latencies.take_time(Some(at.since(*received_at)), LAST_MAP);
+    for delay in micros {
+        latencies.take_time(Some(Duration::from_micros((*delay).try_into().unwrap_or_default())), LAST_MAP);
     }
     Ok(latencies)
 }
@@ -293,6 +305,16 @@ fn behind_node(map_log: &Path, at_door: &Watcher) -> anyhow::Result<Latencies> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn delays_by_a_clock_that_is_ahead_are_no_figures() {
+        let mut micros = vec![350; 99];
+        micros.push(-1);
+        assert!(delays(&micros).unwrap().quantiles().p50_us > 349.0);
+        micros.push(-650);
+        let error = delays(&micros).unwrap_err().to_string();
+        assert!(error.contains("clocks differ: 2 of 101"), "{error}");
+    }
 
     #[test]
     fn reports_that_never_reach_a_map_miss_a_goal() {
