@@ -118,7 +118,7 @@ live-check: setup ## record with the feature foxglove, and look on as Foxglove d
 tracing-check: setup ## follow a detection through two nodes, with the feature otel
 	cargo test --locked -p ecod-actors --features otel --test tracing
 
-fuzz: setup ## every decoder and the fuser against hostile input, SECONDS=60 each or RUNS=n executions each; TARGETS=payload,... runs those only
+fuzz: setup ## decoders, evidence and the fuser against hostile input, SECONDS=60 each or RUNS=n executions each; TARGETS=payload,... runs those only
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
 
 verify-handshake: ## the membership's handshake against an attacker that has the network, the cell's key and a certificate; needs Verifpal

@@ -47,30 +47,43 @@ fn signed_by_edge(signer: &EvidenceSigner, share: &LedgerShare) -> LedgerShare {
     signer.sign(share).expect("a key of the right kind")
 }
 
-/// `gauss` takes the share twice, and again after a restart.
-fn take(mut resync: LedgerResync, share: &LedgerShare) -> ReputationLedger {
+/// Leaders that `gauss` follows, by the second: the one that counted, through the trial of its evidence or replaced
+/// before its end, and back afterwards.
+const STEADY: &[(u64, &str)] = &[(1, "edge"), (2, "edge"), (3, "edge"), (30, "edge")];
+const REPLACED: &[(u64, &str)] = &[(1, "edge"), (2, "edge"), (3, "edge"), (12, "euclid"), (30, "euclid"), (60, "edge")];
+
+/// `gauss` takes the share again and again, also after restarts, while it follows these leaders.
+fn take(mut resync: LedgerResync, share: &LedgerShare, leaders: &[(u64, &'static str)]) -> ReputationLedger {
     let candidates = [share.node.clone()];
-    let epoch = Some(Epoch::new(7, NodeName::from_static("edge")));
-    let leadership = Leadership {
-        position: Position::Following,
-        epoch,
-        standby: None,
-        term: 1 << 40,
-        is_deserted: false,
-        is_yielding: false,
-    };
     let mut ledger = ReputationLedger::default();
-    for at in [1_000_000, 2_000_000, 3_000_000].map(Timestamp) {
+    let mut epoch: Option<Epoch> = None;
+    for (term, (second, leader)) in (7..).zip(leaders) {
+        let at = Timestamp(second * 1_000_000);
+        let is_another = epoch.as_ref().is_none_or(|epoch| epoch.leader.as_str() != *leader);
+        if is_another {
+            epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
+        }
+        let leadership = Leadership {
+            position: Position::Following,
+            epoch: epoch.clone(),
+            standby: None,
+            term: 1 << 40,
+            is_deserted: false,
+            is_yielding: false,
+        };
+        // Ends trials.
+        let _shares = resync.tick(&mut ledger, &leadership, at);
         let before = ledger.clone();
         let merged = resync.merge(share, &mut ledger, &candidates, &leadership, at, at);
-        assert!(before.totals().is_empty() || before.totals() == ledger.totals(), "the same again changes nothing");
+        let is_unchanged = before.totals().is_empty() || before.totals() == ledger.totals();
+        assert!(is_another || is_unchanged, "the same again changes nothing");
         assert!(merged.is_ok() || before == ledger, "what is refused changes nothing");
         let _shares = resync.tick(&mut ledger, &leadership, at);
         resync.resume(&ledger, at);
+        assert!(ledger.lanes() <= MAX_LANES && ledger.entries().count() <= MAX_ENTRIES);
+        let reputations = ledger.reputations(&ReputationConfig::default());
+        assert!(reputations.values().all(|reputation| (0.3..=1.0).contains(&reputation.score)));
     }
-    assert!(ledger.lanes() <= MAX_LANES && ledger.entries().count() <= MAX_ENTRIES);
-    let reputations = ledger.reputations(&ReputationConfig::default());
-    assert!(reputations.values().all(|reputation| (0.3..=1.0).contains(&reputation.score)));
     ledger
 }
 
@@ -82,12 +95,20 @@ fuzz_target!(|input: &[u8]| {
     let transplanted = LedgerShare { signed: honest.signed.clone(), ..share };
     let is_honest = transplanted.entries == honest.entries && transplanted.marks == honest.marks;
     assert_eq!(signer.verify(&transplanted).is_ok(), is_honest);
-    let _unsigned = take(LedgerResync::new(NodeName::from_static("gauss"), 10), &transplanted);
+    let unsigned = || LedgerResync::new(NodeName::from_static("gauss"), 10);
+    take(unsigned(), &transplanted, STEADY);
+    take(unsigned(), &transplanted, REPLACED);
 
     let signed = signed_by_edge(&signer, &transplanted);
     assert_eq!(signer.verify(&signed).is_ok(), !signed.is_empty(), "whatever edge says, it is the one who said it");
-    let mut ledger = take(LedgerResync::signed(NodeName::from_static("gauss"), 10), &signed);
-    assert!(ledger.statements().all(|statement| signer.is_trusted(statement)));
-    ledger.retain_statements(|_| false);
-    assert_eq!(ledger.totals().len(), 0, "all that came by a certificate goes with it");
+    let resync = || LedgerResync::signed(NodeName::from_static("gauss"), 10);
+    for leaders in [STEADY, REPLACED] {
+        let mut ledger = take(resync(), &signed, leaders);
+        assert!(ledger.statements().all(|statement| signer.is_trusted(statement)));
+        ledger.retain_statements(|_| false);
+        assert_eq!(ledger.totals().len(), 0, "all that came by a certificate goes with it");
+    }
+    let is_said_by_itself = signed.node.as_str() == "edge";
+    let others = take(resync(), &signed, &REPLACED[..REPLACED.len() - 1]);
+    assert!(!is_said_by_itself || others.totals().is_empty(), "what was on trial when another followed is gone");
 });

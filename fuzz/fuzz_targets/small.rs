@@ -1,4 +1,4 @@
-//! Whatever else is read: poses, recorded detections, signed payloads, files of state and of truth.
+//! Whatever else is read: poses, recorded detections, signed payloads and rounds, certificates, files of state and of truth.
 //!
 //! The first byte of an input chooses what the rest is.
 
@@ -13,7 +13,8 @@ use ecod_actors::actors::reputation_keeper::read_saved;
 use ecod_actors::camera::vehicle_pose::read_pose;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::platform::secret::Secret;
-use ecod_actors::transport::mqtt::Security;
+use ecod_actors::transport::mqtt::{Security, splits_as_appended};
+use ecod_actors::transport::pki::CertificateSubject;
 use ecod_lab::eval::Truth;
 use ecod_lab::eval::tracks::TrackTruth;
 use libfuzzer_sys::fuzz_target;
@@ -21,7 +22,7 @@ use libfuzzer_sys::fuzz_target;
 fuzz_target!(|input: &[u8]| {
     let Some((kind, bytes)) = input.split_first() else { return };
     let text = std::str::from_utf8(bytes).unwrap_or_default();
-    match kind % 5 {
+    match kind % 7 {
         0 => {
             if let Ok((_, stated)) = read_pose(bytes, Timestamp(0), 0)
                 && let Ok(pose) = stated.in_map(Some(&ORIGIN))
@@ -35,7 +36,9 @@ fuzz_target!(|input: &[u8]| {
         }
         2 => assert!(SIGNING.rejects_forgery("ecod/lot-1/detections/euclid", bytes)),
         3 => read_saved(bytes),
-        _ => drop((Truth::parse(text), TrackTruth::is_in(text), TrackTruth::parse(text))),
+        4 => drop((Truth::parse(text), TrackTruth::is_in(text), TrackTruth::parse(text))),
+        5 => assert!(splits_as_appended(bytes)),
+        _ => drop(CertificateSubject::of(bytes)),
     }
 });
 

@@ -200,6 +200,28 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn strangers_that_say_nothing_hold_a_guest_up_for_as_long_as_a_conversation_may_last() {
+        const STRANGERS: usize = host::MAX_VISITS + 6;
+        let Scene { token, serving, directory: _directory, .. } = host(CONVERSATION_TIME + SOON).await;
+        let mut silent = Vec::new();
+        for _ in 0..STRANGERS {
+            silent.push(tokio::net::TcpStream::connect(token.addresses[0]).await.unwrap());
+        }
+        let began = Instant::now();
+        let refused = redeem(&token).await.err();
+        assert!(matches!(refused, Some(JoinError::Unreachable { .. })), "{refused:?}");
+        let joined = loop {
+            if let Ok(joined) = redeem(&token).await {
+                break joined;
+            }
+            assert!(began.elapsed() < CONVERSATION_TIME + SOON, "held up for ever");
+        };
+        assert!(began.elapsed() < CONVERSATION_TIME + Duration::from_secs(5), "{:?}", began.elapsed());
+        joined.keep().await.unwrap();
+        assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), []);
+    }
+
+    #[tokio::test]
     async fn other_names_secrets_and_hosts_get_nothing() {
         let Scene { token, visits, serving, directory } = host(Duration::from_secs(3)).await;
         let secret = Token { secret: [0; 16], ..token.clone() };

@@ -15,5 +15,7 @@ pub use ecod::leadership::{BrokerAddress, InvalidAddress};
 pub use inbox::{Delivery, Incoming, Subscriber};
 pub use link::LinkEvent;
 pub use probe::probe;
+#[cfg(fuzzing)]
+pub use round_signature::splits_as_appended;
 pub use security::{ENVELOPE_BYTES, Security, SecurityError};
 pub use subscription_role::SubscriptionRole;

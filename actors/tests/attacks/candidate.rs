@@ -15,6 +15,7 @@ use tokio::time::sleep;
 
 use crate::cell::{CANDIDATE, CELL, LEADER, Target};
 use crate::client::{log_in, publish, send_for_ever};
+use crate::description::set_and_undone;
 use crate::insider::Insider;
 use crate::row::{Means, Row, UNHARMED};
 use crate::shares::inverted;
@@ -24,7 +25,7 @@ pub(crate) const ROWS: &[Row] = &[
         attack: "30 connections flood with maps of 8 MB",
         means: Means::Candidate,
         on_brokers: true,
-        deeds: (3_000_000, "bytes"),
+        deeds: (20_000_000, "bytes"),
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(flood(target)),
@@ -62,7 +63,7 @@ pub(crate) const ROWS: &[Row] = &[
         on_brokers: true,
         deeds: (30, "maps"),
         bar: UNHARMED,
-        quick: false,
+        quick: true,
         run: |target| Box::pin(largest_round(target)),
     },
     Row {
@@ -71,8 +72,17 @@ pub(crate) const ROWS: &[Row] = &[
         on_brokers: true,
         deeds: (30, "shares"),
         bar: UNHARMED,
-        quick: false,
+        quick: true,
         run: |target| Box::pin(forged_evidence(target)),
+    },
+    Row {
+        attack: "a description that is set again and again, also after it is undone",
+        means: Means::Candidate,
+        on_brokers: false,
+        deeds: (5, "looks"),
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(set_and_undone(target)),
     },
 ];
 
@@ -88,7 +98,7 @@ async fn flood(target: Target) -> anyhow::Result<()> {
     Ok(())
 }
 
-async fn join(target: &Target, role: Role) -> anyhow::Result<Insider> {
+pub(crate) async fn join(target: &Target, role: Role) -> anyhow::Result<Insider> {
     Insider::join(target, (CANDIDATE, role), Some(Arc::clone(&target.credentials))).await?.admitted().await
 }
 
@@ -121,7 +131,7 @@ async fn largest_round(target: Target) -> anyhow::Result<()> {
 }
 
 /// Publishes the same again and again, over a new connection whenever one ends.
-async fn publish_for_ever(target: &Target, packets: &[Vec<u8>]) -> anyhow::Result<()> {
+pub(crate) async fn publish_for_ever(target: &Target, packets: &[Vec<u8>]) -> anyhow::Result<()> {
     loop {
         if let Ok(mut stream) = log_in(target, &target.candidate, CANDIDATE).await {
             while stream.write_all(&packets.concat()).await.is_ok() {

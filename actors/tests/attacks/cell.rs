@@ -33,14 +33,15 @@ pub(crate) const CELL: &str = "lot";
 const KEY: &str = "5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e";
 
 /// The nodes: the edge, a candidate, and the vehicle whose map log is read.
-const NODES: [(&str, Role); 3] = [("edge", Role::Edge), ("v01", Role::Auto), ("v02", Role::Cav)];
+pub(crate) const NODES: [(&str, Role); 3] = [("edge", Role::Edge), ("v01", Role::Auto), ("v02", Role::Cav)];
 
 /// The vehicle, and the node that may lead, whose certificates the attackers hold.
 pub(crate) const VEHICLE: &str = "gauss";
 pub(crate) const CANDIDATE: &str = "turing";
 
-/// The node that leads.
+/// The node that leads, and the vehicle whose map log is read.
 pub(crate) const LEADER: &str = NODES[0].0;
+pub(crate) const OBSERVED: &str = NODES[2].0;
 
 /// Time for all processes to start and agree, and for how long they must have agreed.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
@@ -53,13 +54,13 @@ const FRAME_SIZE: (usize, usize) = (160, 120);
 
 /// Kind of the object, and its place.
 const LABEL: &str = "car";
-const LANDMARK: &str = "\n[[landmarks]]\nid = \"ahead\"\nx_m = 6.6\ny_m = 0.0\n";
+pub(crate) const LANDMARK: &str = "\n[[landmarks]]\nid = \"ahead\"\nx_m = 6.6\ny_m = 0.0\n";
 
 /// Where attackers are on loopback.
 const ELSEWHERE: Ipv4Addr = Ipv4Addr::new(127, 66, 6, 6);
 
 /// Time between two maps.
-const ROUND: Duration = Duration::from_millis(100);
+pub(crate) const ROUND: Duration = Duration::from_millis(100);
 
 /// Running nodes with their files; all end with it.
 pub(crate) struct Cell {
@@ -113,8 +114,8 @@ pub(crate) struct Target {
     pub(crate) credentials: Arc<Credentials>,
     /// A certificate of another CA, for [`key_holder::NAME`](crate::key_holder::NAME).
     pub(crate) foreign: Arc<Credentials>,
-    /// Directory of the cell's CA, for whoever defends the cell.
-    pub(crate) pki: PathBuf,
+    /// Directory of the CA's files, `pki`, and of each node's, for whoever defends the cell.
+    pub(crate) home: PathBuf,
 }
 
 impl Target {
@@ -160,9 +161,8 @@ impl Cell {
             }
             let text = configuration(name, role, broker, gossip, &seeds, &tls, home);
             fs::write(directory.join("node.toml"), text)?;
-            let program = std::env::var("PROGRAM").unwrap_or_else(|_| PROGRAM.to_owned());
             let namespace = network.as_ref().map(|_| network::namespace(index));
-            let mut command = command(Path::new(&program), namespace.as_deref());
+            let mut command = command(&program(), namespace.as_deref());
             command
                 .env_clear()
                 .envs(std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")));
@@ -207,7 +207,7 @@ impl Cell {
             candidate: client(&self.candidate, CANDIDATE)?,
             credentials: load(&self.candidate, CANDIDATE)?,
             foreign: load(&self.foreign, key_holder::NAME)?,
-            pki: self.directory.path().join("pki"),
+            home: self.directory.path().to_owned(),
         })
     }
 
@@ -241,7 +241,7 @@ impl Cell {
 
     /// Maps that the vehicle has accepted since a time.
     fn maps(&self, since: Timestamp) -> anyhow::Result<Vec<Line>> {
-        let file = self.directory.path().join("v02/maps.jsonl");
+        let file = self.directory.path().join(OBSERVED).join("maps.jsonl");
         let text = fs::read_to_string(&file).unwrap_or_default();
         let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
         let lines = whole.lines().map(serde_json::from_str::<Line>);
@@ -333,6 +333,11 @@ fn longest_gap_ms(maps: &[Line], from: Timestamp) -> u64 {
 /// The honest vehicles.
 fn honest() -> BTreeSet<&'static str> {
     NODES.into_iter().filter(|(_, role)| *role != Role::Edge).map(|(name, _)| name).collect()
+}
+
+/// The program under test.
+pub(crate) fn program() -> PathBuf {
+    std::env::var("PROGRAM").unwrap_or_else(|_| PROGRAM.to_owned()).into()
 }
 
 /// A picture: the vehicles see by recorded detections, but all else is as with a camera.

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use ecod::leadership::election::{Body, Candidacy, ElectionMessage};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
-use ecod::wire::{Encoding, Role, SCHEMA_VERSION};
+use ecod::wire::{DescriptionStamp, Encoding, Role, SCHEMA_VERSION};
 use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
 use ecod_actors::platform::clock;
@@ -34,6 +34,8 @@ pub(crate) struct Insider {
     counters: Arc<FrameCounters>,
     target: Target,
     members: watch::Receiver<Vec<Member>>,
+    /// The description that it states.
+    description: Option<DescriptionStamp>,
 }
 
 impl Insider {
@@ -66,7 +68,7 @@ impl Insider {
         };
         let (membership, _) = Actor::spawn(None, Membership, arguments).await?;
         sleep(ADMISSION).await;
-        Ok(Self { name, role, run, membership, counters, target: target.clone(), members })
+        Ok(Self { name, role, run, membership, counters, target: target.clone(), members, description: None })
     }
 
     /// The same, once all nodes have admitted it.
@@ -74,6 +76,11 @@ impl Insider {
         let known = self.members.borrow().len();
         anyhow::ensure!(known == self.target.gossip.len(), "admitted by {known} nodes only");
         Ok(self)
+    }
+
+    /// The same, with this description of the cell.
+    pub(crate) fn stating(self, description: DescriptionStamp) -> Self {
+        Self { description: Some(description), ..self }
     }
 
     /// Knocks for ever, and is admitted by nobody.
@@ -105,7 +112,7 @@ impl Insider {
                 epoch: epoch.clone(),
                 hears_you: true,
                 clock: None,
-                description: None,
+                description: self.description.map(Box::new),
                 body: body.clone(),
             };
             let payload = Bytes::from(message.encode(Encoding::Cbor));

@@ -13,14 +13,14 @@ pub(crate) const ROWS: &[Row] = &[Row {
     on_brokers: false,
     deeds: (1, "revocation"),
     // Half a second passes until the list is read, and a second until the next leader's first map.
-    bar: Bar { maps: 0.5, honest: 0.5, longest_gap_ms: Some(1500), is_replaced: true, ..UNHARMED },
+    bar: Bar { longest_gap_ms: Some(1500), is_replaced: true, ..UNHARMED },
     quick: true,
     run: |target| Box::pin(revoked(target)),
 }];
 
 /// Its own list stays as it was.
 async fn revoked(target: Target) -> anyhow::Result<()> {
-    Authority::open(&target.pki)?.revoke(&NodeName::from_static(LEADER), clock::now())?;
+    Authority::open(&target.home.join("pki"))?.revoke(&NodeName::from_static(LEADER), clock::now())?;
     target.did(1);
     Ok(())
 }

@@ -16,6 +16,7 @@
 mod candidate;
 mod cell;
 mod client;
+mod description;
 mod insider;
 mod key_holder;
 mod leader;

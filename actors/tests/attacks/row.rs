@@ -4,7 +4,7 @@ use std::fmt;
 use std::fmt::Write as _;
 use std::pin::Pin;
 
-use crate::cell::{Target, Victim};
+use crate::cell::{ROUND, Target, Victim};
 
 /// One attack by one kind of attacker.
 pub(crate) struct Row {
@@ -61,7 +61,7 @@ pub(crate) struct Bar {
     pub(crate) honest: f64,
     /// Most memory of the edge at any time, in MB.
     pub(crate) rss_mb: u64,
-    /// Longest time without a map, in ms.
+    /// Longest time without a map, in ms. Maps of that time are not expected.
     pub(crate) longest_gap_ms: Option<u64>,
     /// True if another node leads in the end than in the beginning.
     pub(crate) is_replaced: bool,
@@ -110,8 +110,10 @@ impl Row {
 impl Bar {
     fn is_met(&self, outcome: &Outcome) -> bool {
         let part = |count: usize, of: usize| count as f64 / of.max(1) as f64;
-        part(outcome.maps, outcome.expected) >= self.maps
-            && part(outcome.honest, outcome.expected.max(outcome.maps)) >= self.honest
+        let missed = self.longest_gap_ms.map_or(0, |most| most / ROUND.as_millis() as u64) as usize;
+        let expected = outcome.expected.saturating_sub(missed);
+        part(outcome.maps, expected) >= self.maps
+            && part(outcome.honest, expected.max(outcome.maps)) >= self.honest
             && outcome.rss_mb <= self.rss_mb
             && self.longest_gap_ms.is_none_or(|most| outcome.longest_gap_ms <= most)
             && outcome.is_replaced == self.is_replaced

@@ -3,13 +3,20 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use anyhow::Context;
 use futures_util::future::join_all;
+use futures_util::{SinkExt, StreamExt};
 use rustls::ClientConfig;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 use tokio::time::sleep;
+use tokio_rustls::client::TlsStream;
+use tokio_tungstenite::client_async;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 
 use crate::cell::{CELL, Target, VEHICLE};
-use crate::client::{log_in, log_in_as, publish, send_for_ever, subscribe};
+use crate::client::{log_in, log_in_as, publish, secure, send_for_ever, subscribe};
 use crate::packets::{packet, text};
 use crate::row::{Means, Row, UNHARMED};
 
@@ -18,7 +25,7 @@ pub(crate) const ROWS: &[Row] = &[
         attack: "30 connections flood with 255 kB",
         means: Means::Vehicle,
         on_brokers: true,
-        deeds: (3_000_000, "bytes"),
+        deeds: (20_000_000, "bytes"),
         bar: UNHARMED,
         quick: true,
         run: |target| Box::pin(flood(target, 0)),
@@ -27,7 +34,7 @@ pub(crate) const ROWS: &[Row] = &[
         attack: "30 readers of everything read nothing, beside a flood",
         means: Means::Vehicle,
         on_brokers: true,
-        deeds: (3_000_000, "bytes"),
+        deeds: (20_000_000, "bytes"),
         bar: UNHARMED,
         quick: true,
         run: |target| Box::pin(flood(target, 30)),
@@ -76,6 +83,15 @@ pub(crate) const ROWS: &[Row] = &[
         bar: UNHARMED,
         quick: true,
         run: |target| Box::pin(claims(target)),
+    },
+    Row {
+        attack: "30 WebSockets flood with empty frames",
+        means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (20_000_000, "bytes"),
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(websockets(target)),
     },
 ];
 
@@ -164,7 +180,7 @@ async fn abandoned_sessions(target: Target) -> anyhow::Result<()> {
 }
 
 async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<()> {
-    let mut stream = crate::client::secure(target, tls).await?;
+    let mut stream = secure(target, tls).await?;
     let id = format!("{VEHICLE}-{}", uuid::Uuid::now_v7().simple());
     // Not a clean session.
     stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x00\0\0", &text(&id)])).await?;
@@ -202,4 +218,35 @@ async fn claims(target: Target) -> anyhow::Result<()> {
         }
         sleep(Duration::from_millis(50)).await;
     }
+}
+
+/// Pings of the greatest length over WebSockets, and a ping of MQTT now and then.
+async fn websockets(target: Target) -> anyhow::Result<()> {
+    // No bit is changed by a mask of zeros.
+    let ping = [&[0x89, 0x80 | 125, 0, 0, 0, 0][..], &[b'x'; 125]].concat();
+    let frames = [ping.repeat(60), vec![0x82, 0x82, 0, 0, 0, 0, 0xc0, 0]].concat();
+    let send = |_| async {
+        loop {
+            if let Ok(mut stream) = log_in_by_websocket(&target).await {
+                while stream.write_all(&frames).await.is_ok() {
+                    target.did(frames.len());
+                }
+            }
+            sleep(Duration::from_millis(100)).await;
+        }
+    };
+    join_all((0..CONNECTIONS).map(send)).await;
+    Ok(())
+}
+
+async fn log_in_by_websocket(target: &Target) -> anyhow::Result<TlsStream<TcpStream>> {
+    let mut request = "wss://broker.ecod.internal/".into_client_request()?;
+    request.headers_mut().insert("sec-websocket-protocol", "mqtt".parse()?);
+    let (mut socket, _) = client_async(request, secure(target, &target.vehicle).await?).await?;
+    let id = format!("{VEHICLE}-{}", uuid::Uuid::now_v7().simple());
+    let login = packet(0x10, &[b"\0\x04MQTT\x04\x02\0\0", &text(&id)]);
+    socket.send(Message::binary(login)).await?;
+    let answer = socket.next().await.context("no answer to the login")??;
+    anyhow::ensure!(answer.into_data()[..] == [0x20, 2, 0, 0], "the login was refused");
+    Ok(socket.into_inner())
 }

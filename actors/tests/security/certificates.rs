@@ -1,7 +1,7 @@
 //! Clients that have no certificate of the cell, or none that is still good.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
 use ecod_actors::telemetry::counters::Event;
@@ -65,6 +65,20 @@ async fn an_expired_certificate_is_refused() {
     let refused = Client::new(cell.address, "gauss", &client_config("gauss", &expired)).log_in().await;
     assert!(refused.as_ref().is_err_and(|error| error.to_lowercase().contains("expired")), "{refused:?}");
     cell.counted(Event::ClientUntrusted, 1).await;
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn who_is_connected_when_its_certificate_expires_is_cut_off_within_half_a_minute() {
+    const VALID: Duration = Duration::from_secs(4);
+    let mut cell = Cell::start().await;
+    let brief = cell.pki.issue("gauss", Role::Auto, VALID);
+    let issued = Instant::now();
+    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &brief));
+    gauss.log_in().await.unwrap();
+    timeout(VALID + Duration::from_secs(32), gauss.drive()).await.expect("still connected");
+    assert!(issued.elapsed() > VALID, "it was valid: {:?}", issued.elapsed());
+    cell.counted(Event::ClientExpelled, 1).await;
     cell.honest_traffic_goes_on().await;
 }
 

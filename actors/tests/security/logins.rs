@@ -1,5 +1,8 @@
 //! Leaders at whose broker their followers cannot log in, while their messages pass.
 
+use std::fs;
+use std::io::{self, Write};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use ecod::wire::Role;
@@ -7,7 +10,7 @@ use ecod_actors::node::NodeHandle;
 use ecod_actors::transport::pki::TlsConfig;
 use tokio::time::{Instant, sleep};
 
-use crate::fixture::{DAY, Pki};
+use crate::fixture::{Client, DAY, Pki, SOON, client_config};
 use crate::nodes::{aggregator, start, start_cell, start_with, until};
 
 /// An edge whose broker has room for its own node only.
@@ -34,6 +37,63 @@ async fn followers_of_a_leader_that_lets_nobody_in_go_on_to_the_next() {
     sleep(Duration::from_secs(7)).await;
     assert!(nodes.into_iter().all(follows_euclid), "{:?}", nodes.map(aggregator));
     assert_eq!(euclid.leadership().borrow().term, term, "the lead moved again");
+    for node in [gauss, euclid, edge] {
+        node.stop().await;
+    }
+}
+
+/// Lines of the log of this thread.
+#[derive(Clone, Default)]
+struct Log(Arc<Mutex<Vec<u8>>>);
+
+impl Log {
+    fn has(&self, text: &str) -> bool {
+        String::from_utf8_lossy(&self.0.lock().unwrap()).contains(text)
+    }
+}
+
+impl Write for Log {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.lock().unwrap().write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Sessions of the membership go on by the former certificate. New connections meet the other one.
+#[tokio::test]
+async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_and_go_on_to_the_next() {
+    let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
+    let files = [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Cav)]
+        .map(|(node, role)| pki.issue(node, role, DAY));
+    let foreign = elsewhere.issue("edge", Role::Edge, DAY);
+    let tls = client_config("gauss", &files[2]);
+    // The edge alone trusts the other CA.
+    let own = TlsConfig { ca: files[0].ca.with_file_name("both.pem"), revocation_list: None, ..files[0].clone() };
+    let both = [&files[0].ca, &foreign.ca].map(|ca| fs::read_to_string(ca).unwrap());
+    fs::write(&own.ca, both.concat()).unwrap();
+    let [_, euclid, gauss] = files;
+    let [edge, euclid, gauss] = start_cell([own.clone(), euclid, gauss]).await;
+    let broker = edge.broker_address().unwrap();
+    for (from, to) in [(&foreign.certificate, &own.certificate), (&foreign.key, &own.key)] {
+        fs::copy(from, to).unwrap();
+    }
+    let refused = Instant::now() + SOON;
+    while Client::new(broker, "gauss", &tls).log_in().await.is_ok() {
+        assert!(Instant::now() < refused, "the edge keeps its certificate");
+    }
+    let log = Log::default();
+    let writer = log.clone();
+    let lines = tracing_subscriber::fmt().with_ansi(false).with_writer(move || writer.clone()).finish();
+    let _logging = tracing::subscriber::set_default(lines);
+    for node in [&euclid, &gauss] {
+        node.slots().gateway.get().unwrap().kill();
+    }
+    let follows_euclid = |node: &NodeHandle| aggregator(node).as_deref() == Some("euclid");
+    until("euclid leads all", || [&edge, &euclid, &gauss].into_iter().all(follows_euclid)).await;
+    assert!(log.has("no login at the brokers of these nodes") && log.has(r#"at=["edge"]"#), "no warning");
     for node in [gauss, euclid, edge] {
         node.stop().await;
     }

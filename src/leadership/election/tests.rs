@@ -243,17 +243,29 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
         election.tick(now);
     }
     let lie = Epoch::new(election.term() + 1, edge.clone());
-    let message = message(&hopper, 1, Some(&lie), Body::Status { over: None, no_login: Vec::new() });
-    let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
-    election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
+    let tell = |election: &mut Election, seq, now| {
+        let message = message(&hopper, seq, Some(&lie), Body::Status { over: None, no_login: Vec::new() });
+        let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
+        election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
+    };
+    tell(&mut election, 1, now);
     assert!(election.is_leading());
     // True news come from the other leader itself.
-    election.handle(received(&edge, 3, Some(&lie), beat_after(election.epoch().cloned().as_ref())), now);
-    assert_eq!(election.leader(), Some(&edge));
+    let mut told = election.clone();
+    told.handle(received(&edge, 3, Some(&lie), beat_after(election.epoch().cloned().as_ref())), now);
+    assert_eq!(told.leader(), Some(&edge));
+    let (began, mut seq) = (now, 1);
+    while election.is_leading() {
+        (now, seq) = (now + Duration::from_millis(50), seq + 1);
+        assert!(now.since(began) < Duration::from_secs(2), "nobody follows");
+        election.tick(now);
+        tell(&mut election, seq, now);
+    }
+    assert!(now.since(began) > Duration::from_millis(800), "{:?}", now.since(began));
 }
 
-/// Epochs that euclid led in during the twenty seconds after gauss had refused its first one.
-fn renewals(gauss_follows: bool) -> Vec<Epoch> {
+/// Times at which euclid began another term after gauss had refused its first one.
+fn renewals(gauss_follows: bool, time: Duration) -> Vec<Timestamp> {
     let gauss = NodeName::from_static("gauss");
     let (mut election, mut now, mut seq) = (euclid(), NOW, 0);
     let mut status = |election: &mut Election, epoch: Option<&Epoch>, over: Option<Epoch>, now| {
@@ -267,15 +279,15 @@ fn renewals(gauss_follows: bool) -> Vec<Epoch> {
     }
     let first = election.epoch().cloned();
     status(&mut election, None, first.clone(), now);
-    let end = now + Duration::from_secs(20);
+    let end = now + time;
     let mut led = Vec::new();
     while now < end {
         now = election.next_deadline();
         for effect in election.tick(now) {
             if let ElectionEffect::Lead { epoch, .. } = effect {
-                led.push(epoch);
+                led.push(now);
                 // Gauss sent this before it heard of the new epoch.
-                status(&mut election, None, led.last().cloned(), now);
+                status(&mut election, None, Some(epoch), now);
             }
         }
         let epoch = election.epoch().cloned();
@@ -287,8 +299,17 @@ fn renewals(gauss_follows: bool) -> Vec<Epoch> {
 
 #[test]
 fn a_leader_whom_all_follow_again_does_not_lead_on_in_another_term() {
-    assert_eq!(renewals(true).len(), 1);
-    assert!(renewals(false).len() > 1, "nobody follows");
+    let time = Duration::from_secs(20);
+    assert_eq!(renewals(true, time).len(), 1);
+    assert!(renewals(false, time).len() > 1, "nobody follows");
+}
+
+#[test]
+fn one_that_refuses_every_term_has_a_leader_begin_another_every_ten_seconds_at_most() {
+    let began = renewals(false, Duration::from_secs(120));
+    let pauses: Vec<_> = began.windows(2).map(|pair| pair[1].since(pair[0])).collect();
+    let frequent = pauses.iter().filter(|pause| **pause < Duration::from_secs(10)).count();
+    assert!(frequent <= 6 && pauses.len() - frequent >= 9, "{pauses:?}");
 }
 
 #[test]

@@ -58,7 +58,7 @@ pub enum Visit {
 const MAX_FAILURES: usize = 256;
 
 /// Conversations at once; more wait.
-const MAX_VISITS: usize = 64;
+pub(super) const MAX_VISITS: usize = 64;
 
 /// Wait after an error of the listener, such as too many open files.
 const PAUSE: Duration = Duration::from_millis(100);

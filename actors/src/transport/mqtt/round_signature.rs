@@ -77,6 +77,20 @@ pub(super) fn split(payload: &[u8]) -> Option<(&[u8], Vec<u8>)> {
     })
 }
 
+/// True if a signature comes off arbitrary bytes as it was put on. Only built for the fuzz targets.
+#[cfg(fuzzing)]
+pub fn splits_as_appended(bytes: &[u8]) -> bool {
+    drop(split(bytes));
+    let length = *SIGNATURE_BYTES.end();
+    let signature = [&[SEQUENCE, length - 2], &vec![0x5a; usize::from(length) - 2][..]].concat();
+    let mut signed = Vec::new();
+    let appended = append(bytes, |statement| {
+        signed = statement.to_vec();
+        Some(signature.clone())
+    });
+    appended.is_none_or(|appended| split(&appended) == Some((&signed[..], signature)))
+}
+
 /// The field's name in CBOR.
 fn name() -> Vec<u8> {
     const TEXT: u8 = 0x60;

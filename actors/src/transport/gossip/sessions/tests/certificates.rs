@@ -267,14 +267,9 @@ fn two_handshakes_at_once_leave_both_understood() {
     }
 }
 
-/// The cell's key forges challenges without end, from made-up addresses and from those of nodes.
-#[test]
-fn forged_challenges_leave_room_for_nodes_that_were_met() {
-    let mut authority = TrialAuthority::new();
-    let [mut a, mut b, mut c] = [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));
-    introduce(&mut a, &mut b);
-    introduce(&mut a, &mut c);
-    let (key, receiver) = (cell_key(), a.sessions.own);
+/// The cell's key forges challenges without end, for nearly a second, from made-up addresses and from that of a node.
+fn forge_challenges(to: &mut End, in_place_of: SocketAddr) {
+    let (key, receiver) = (cell_key(), to.sessions.own);
     for number in 1..=2000_u64 {
         let head = FrameHeader {
             version: Version::Certificate,
@@ -284,14 +279,35 @@ fn forged_challenges_leave_room_for_nodes_that_were_met() {
         };
         let challenge = Handshake::Challenge { cookie: Default::default(), name: NodeName::from_static("mallory") };
         let forged = head.write(key.tag(), &encode(&challenge), &key.seal(&head.sender, &receiver));
-        let from = if number % 2 == 0 { b.address } else { SocketAddr::from(([10, 1, (number % 256) as u8, 1], 1)) };
-        let _ = a.open(&forged, from, NOW + Duration::from_micros(450 * number));
+        let from = if number % 2 == 0 { in_place_of } else { SocketAddr::from(([10, 1, (number % 256) as u8, 1], 1)) };
+        let _ = to.open(&forged, from, NOW + Duration::from_micros(450 * number));
     }
-    let mut again = node(&mut authority, "c", 3);
-    again.id.run = 2;
+}
+
+/// True if a node that has restarted is met again.
+fn meets_again(a: &mut End, restarted: &mut End, at: Timestamp) -> bool {
+    let challenge = answer(restarted.open(&a.hello(), a.address, at));
+    let Ok(FrameContent::Answer(proof)) = a.open(&challenge, restarted.address, at) else { return false };
+    let accept = answer(restarted.open(&proof, a.address, at));
+    matches!(a.open(&accept, restarted.address, at), Ok(FrameContent::Met { .. }))
+}
+
+#[test]
+fn forged_challenges_hold_up_handshakes_of_the_node_whose_address_they_bear_and_nothing_else() {
+    let mut authority = TrialAuthority::new();
+    let [mut a, mut b, mut c] = [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));
+    introduce(&mut a, &mut b);
+    introduce(&mut a, &mut c);
+    forge_challenges(&mut a, b.address);
     let later = NOW + Duration::from_millis(950);
-    let challenge = answer(again.open(&a.hello(), a.address, later));
-    let proof = answer(a.open(&challenge, c.address, later));
-    let accept = answer(again.open(&proof, a.address, later));
-    assert!(matches!(a.open(&accept, c.address, later), Ok(FrameContent::Met { .. })));
+    let mut restarted = |name, id| {
+        let mut end = node(&mut authority, name, id);
+        end.id.run = 2;
+        end
+    };
+    assert!(meets_again(&mut a, &mut restarted("c", 3), later), "another node's places are its own");
+    assert_both_heard(&mut a, &mut b);
+    let mut b = restarted("b", 2);
+    assert!(!meets_again(&mut a, &mut b, later));
+    assert!(meets_again(&mut a, &mut b, later + Duration::from_secs(1)), "the attack is over");
 }

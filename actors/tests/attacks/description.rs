@@ -1,0 +1,100 @@
+//! A description that a candidate sets, and how the cell's owner undoes it.
+
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{bail, ensure};
+use ecod::description::MAX_FIRST_VERSION;
+use ecod::leadership::election::Body;
+use ecod::model::names::NodeName;
+use ecod::wire::{CellDescription, Encoding, Role, SCHEMA_VERSION, encode};
+use ecod_actors::platform::clock;
+use ecod_actors::platform::content_hash::content_hash;
+use ecod_actors::transport::pki::Authority;
+use tokio::process::Command;
+use tokio::time::sleep;
+
+use crate::candidate::{join, publish_for_ever};
+use crate::cell::{CANDIDATE, CELL, LANDMARK, LEADER, NODES, OBSERVED, Target, program};
+use crate::client::publish;
+
+/// Maximum time until all nodes have a description.
+const PATIENCE: Duration = Duration::from_secs(6);
+
+/// Longest time from a changed revocation list until no node uses anything of the revoked one.
+const GONE_WITHIN: Duration = Duration::from_secs(2);
+
+/// The attacker never stops. The owner revokes its certificate and sets the right description, which stays.
+pub(crate) async fn set_and_undone(target: Target) -> anyhow::Result<()> {
+    // A setting that costs no map: only descriptions show whose counts.
+    let text = format!("{LANDMARK}\n[fusion.pace]\ngate_m = 0.6\n");
+    let set_by = NodeName::from_static(LEADER);
+    let hash = content_hash(&set_by, &text);
+    let forged = CellDescription { schema: SCHEMA_VERSION, version: MAX_FIRST_VERSION - 1, hash, set_by, text };
+    let attack = set_for_ever(Target { deeds: Arc::default(), ..target.clone() }, &forged);
+    tokio::select! {
+        ended = attack => ended,
+        undone = undo(&target, &forged) => undone,
+    }
+}
+
+/// States the description as a candidate, and publishes it at the broker.
+async fn set_for_ever(target: Target, forged: &CellDescription) -> anyhow::Result<()> {
+    let member = join(&target, Role::Auto).await?.stating(forged.stamp());
+    let packet = [publish(&format!("ecod/v1/{CELL}/cell"), &encode(forged, Encoding::Json))];
+    let status = Body::Status { over: None, no_login: Vec::new() };
+    tokio::try_join!(member.repeat(1, None, status), publish_for_ever(&target, &packet)).map(drop)
+}
+
+/// One deed is a look at the cell, in which all nodes use the right description and no other.
+async fn undo(target: &Target, forged: &CellDescription) -> anyhow::Result<()> {
+    used_by_all(target, &forged.hash.to_string()).await?;
+    Authority::open(&target.home.join("pki"))?.revoke(&NodeName::from_static(CANDIDATE), clock::now())?;
+    fs::copy(target.home.join("pki/revoked.pem"), target.home.join(LEADER).join("revoked.pem"))?;
+    sleep(GONE_WITHIN).await;
+    let file = target.home.join("right.toml");
+    fs::write(&file, LANDMARK)?;
+    let set = cell(target, LEADER, &["set".as_ref(), &file]).await?;
+    let hash = content_hash(&NodeName::from_static(LEADER), LANDMARK).to_string();
+    ensure!(set.starts_with(&format!("version {MAX_FIRST_VERSION}, hash {hash}")), "{set}");
+    used_by_all(target, &hash).await?;
+    loop {
+        let shown = cell(target, OBSERVED, &["show".as_ref()]).await?;
+        ensure!(is_used_by_all(&shown, &hash), "the right description did not stay: {shown}");
+        target.did(1);
+        sleep(Duration::from_millis(500)).await;
+    }
+}
+
+async fn used_by_all(target: &Target, hash: &str) -> anyhow::Result<()> {
+    let started = Instant::now();
+    loop {
+        let shown = cell(target, OBSERVED, &["show".as_ref()]).await?;
+        if is_used_by_all(&shown, hash) {
+            return Ok(());
+        }
+        if started.elapsed() > PATIENCE {
+            bail!("not all nodes use {hash}: {shown}");
+        }
+    }
+}
+
+/// True if the observed vehicle has the description, and says that all nodes use it.
+fn is_used_by_all(shown: &str, hash: &str) -> bool {
+    let states = |name: &str| {
+        let line = shown.lines().find(|line| line.starts_with(&format!("# {name}: ")));
+        line.is_some_and(|line| line.contains(hash) && !line.contains("not used"))
+    };
+    NODES.iter().all(|(name, _)| states(name)) && states(&format!("cell {CELL}"))
+}
+
+/// Output of `ecod-node cell` at the door of a node.
+async fn cell(target: &Target, node: &str, arguments: &[&Path]) -> anyhow::Result<String> {
+    let mut command = Command::new(program());
+    command.arg("cell").args(arguments).args(["--config", "node.toml"]);
+    let output = command.current_dir(target.home.join(node)).kill_on_drop(true).output().await?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    Ok(String::from_utf8(output.stdout)?)
+}
