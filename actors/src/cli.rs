@@ -154,6 +154,8 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     let level = match &cli.command {
         _ if is_service => "info,rmqtt=warn,rmqtt_net=warn",
         Some(Command::Top(_)) => "off",
+        // The command tells of refusals itself.
+        Some(Command::Cell(_)) => "warn,rumqttc=off",
         _ => "warn",
     };
     let _export = logging::start(cli.log_format, is_service, level);

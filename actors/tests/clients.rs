@@ -12,9 +12,11 @@ use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::{Authority, TlsConfig};
 
 /// An edge of the cell that the documentation speaks of.
-async fn edge() -> (NodeHandle, SocketAddr) {
+async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {
     let landmark = |id: &str, x_m| LandmarkConfig {
         id: id.into(),
         x_m,
@@ -29,6 +31,7 @@ async fn edge() -> (NodeHandle, SocketAddr) {
         role: Role::Edge,
         listen: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
         landmarks: vec![landmark("slot-0", 0.0), landmark("slot-1", 2.5)],
+        tls,
         ..NodeConfig::default()
     };
     config.membership.bind = Some(SocketAddr::from(([127, 0, 0, 1], 0)));
@@ -64,16 +67,16 @@ fn commands(document: &str, section: &str) -> Vec<String> {
     blocks.map(|block| block.split("```").next().unwrap().to_owned()).collect()
 }
 
-/// Both blocks are run as they are, but for the port: the first reports, the second waits for a map and for verdicts.
+/// The first two blocks are run as they are, but for the port: the first reports, the second waits for a map and for verdicts.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_documented_commands_of_mosquitto_report_and_receive() {
     let is_installed = found("sh", &["-c", "command -v mosquitto_pub mosquitto_sub"]);
     assert!(is_installed, "mosquitto_pub is missing: install Debian's package mosquitto-clients");
-    let (node, broker) = edge().await;
+    let (node, broker) = edge(None).await;
     let (maps, verdicts) = (node.newest_map(), node.newest_verdicts());
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");
-        let [report, receive] = &*scripts else { panic!("{scripts:?}") };
+        let [report, receive, _with_certificates] = &*scripts else { panic!("{scripts:?}") };
         let run = |script: &str| {
             let script = script.replace("-p 1883", &format!("-p {}", broker.port()));
             let mut shell = Command::new("sh");
@@ -108,4 +111,29 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
         (&verdicts["verdicts"][0]["landmark"], &verdicts["verdicts"][0]["label"]),
         (&"slot-0".into(), &"car".into())
     );
+}
+
+/// The third block is run as it is, but for directory and port.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_documented_commands_of_mosquitto_receive_by_a_nodes_certificate() {
+    let directory = tempfile::tempdir().unwrap();
+    let (cell, name) = (NodeName::from_static("lot-1"), NodeName::from_static("edge"));
+    let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
+    authority.issue(&name, Role::Edge, Duration::from_secs(86_400), clock::now()).unwrap();
+    let (certificate, key) = authority.files_of(&name);
+    std::fs::copy(&certificate, directory.path().join("node.pem")).unwrap();
+    std::fs::copy(&key, directory.path().join("node.key")).unwrap();
+    let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+    let (node, broker) = edge(Some(tls)).await;
+    let output = tokio::task::spawn_blocking(move || {
+        let scripts = commands("docs/protocol.md", "From a shell");
+        let [_report, _receive, with_certificates] = &*scripts else { panic!("{scripts:?}") };
+        let script = with_certificates.replace("/etc/ecod", directory.path().to_str().unwrap());
+        let script = script.replace("-p 8883", &format!("-W 30 -p {}", broker.port()));
+        Command::new("sh").args(["-e", "-c", &script]).stdin(Stdio::null()).output().unwrap()
+    });
+    let output = output.await.unwrap();
+    node.stop().await;
+    let map: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{}", said(&output)));
+    assert_eq!(map["aggregator"], "edge");
 }

@@ -146,10 +146,16 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
     let gauss = start("gauss", Role::Cav, &[&edge]).await;
     all_follow(&[&edge, &euclid, &gauss]).await;
     assert!(show(&gauss).await.starts_with("# cell lot-1: no description\n"));
+    let nothing = cell("diff", Some(String::new()), &gauss).await;
+    let told = String::from_utf8(nothing.stderr).unwrap();
+    assert!(nothing.status.code() == Some(1) && told.contains("the cell has no description yet"), "{told}");
 
     let tracked = "[fusion.tracks]\nmode = \"on\"\n";
     let first = set(described(&["slot-0", "slot-1"], tracked), &euclid).await;
-    assert!(first.starts_with("version 1, hash ") && first.ends_with("set by euclid\n"), "{first}");
+    assert!(
+        first.starts_with("version 1, hash ") && first.ends_with(", known locations: 2, set by euclid\n"),
+        "{first}"
+    );
     let reports = reporting(&gauss);
     let is_seen = |map: &GlobalMap| {
         map.landmarks.iter().any(|state| state.label.as_deref() == Some("ABC123")) && !map.objects.is_empty()
@@ -268,9 +274,14 @@ async fn a_node_whose_own_file_contradicts_says_so_with_both_values_and_goes_on(
     );
     let vehicle = start("vehicle", Role::Cav, &[&edge]).await;
     let refused = cell("set", Some(described(&["x"], "")), &vehicle).await;
-    assert!(String::from_utf8(refused.stderr).unwrap().contains("never leads"));
+    let told = String::from_utf8(refused.stderr).unwrap();
+    assert!(told.contains("never leads") && told.lines().count() == 1, "{told}");
     let unusable = cell("set", Some("[fusion.pace]\ngate_m = -1".into()), &edge).await;
-    assert_eq!(unusable.status.code(), Some(2));
+    let told = String::from_utf8(unusable.stderr).unwrap();
+    assert!(unusable.status.code() == Some(2) && told.matches("`fusion.pace.gate_m`").count() == 1, "{told}");
+    let huge = cell("set", Some("#".repeat(256 * 1024 + 1)), &edge).await;
+    let told = String::from_utf8(huge.stderr).unwrap();
+    assert!(huge.status.code() == Some(2) && told.contains("at most 262144 bytes"), "{told}");
     for node in [vehicle, euclid, edge] {
         node.stop().await;
     }

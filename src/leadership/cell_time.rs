@@ -162,7 +162,7 @@ impl CellTime {
         let mut events = Vec::new();
         if let Some(before) = self.wall_offset_us.replace(wall_offset_us) {
             let step = wall_offset_us.saturating_sub(before);
-            events.extend((step.saturating_abs() >= MIN_WALL_STEP_US).then_some(ClockEvent::WallStepped(step)));
+            events.extend((step.saturating_abs() >= MIN_LOGGED_STEP_US).then_some(ClockEvent::WallStepped(step)));
         }
         let elapsed = self.looked_at.replace(now).map_or(Duration::ZERO, |before| now.since(before));
         self.peers.retain(|_, peer| now.since(peer.last.received_us) < CLOCK_MEMORY);
@@ -188,7 +188,7 @@ impl CellTime {
         let most = micros(elapsed) * MAX_CLOCK_SLEW / 1_000_000;
         let offset_us = if is_jump { target } else { start.saturating_add(error.clamp(-most, most)) };
         self.reading = Some(ClockReading { offset_us, error_us: Some(0) });
-        (is_jump && error != 0).then_some(ClockEvent::CellJumped(error))
+        (is_jump && error.saturating_abs() >= MIN_LOGGED_STEP_US).then_some(ClockEvent::CellJumped(error))
     }
 
     /// The wall clocks of all candidates that were set, as offsets from this node's steady clock.
@@ -202,8 +202,8 @@ impl CellTime {
     }
 }
 
-/// Step of a wall clock that is logged; less is noise of reading two clocks.
-const MIN_WALL_STEP_US: i64 = 5_000;
+/// Step of a clock that is logged; less is noise of reading two clocks.
+const MIN_LOGGED_STEP_US: i64 = 5_000;
 
 fn micros(duration: Duration) -> i64 {
     i64::try_from(duration.as_micros()).unwrap_or(i64::MAX)

@@ -1,16 +1,18 @@
 //! `ecod-node cell`: the settings that all nodes of a cell share, at the door of one of them.
 
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use clap::{Args, Subcommand};
 use ecod::leadership::BrokerAddress;
 use ecod::model::names::NodeName;
 use ecod::wire::{CellDescription, ContentHash, Encoding, NodeState, NodeStatus, SCHEMA_VERSION, Topic, Topics};
-use ecod::wire::{decode, encode};
+use ecod::wire::{MAX_DESCRIPTION_BYTES, decode, encode};
 use serde_json::{Map, Value, json};
 use uuid::Uuid;
 
@@ -58,6 +60,9 @@ pub(super) struct DoorArguments {
     door: Option<SocketAddr>,
 }
 
+/// Configuration of the machine's node, if it was made by `init`, `join` or the package.
+const SERVICE_CONFIGURATION: &str = "/etc/ecod/node.toml";
+
 /// Maximum time for the node's answer.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -73,14 +78,18 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
     match command {
         CellCommand::Set { file, door } => {
             let text = read(file)?;
+            let places = SharedConfig::parse(&text).map_err(Failure::usage)?.landmarks.len();
             let described = DoorClient::open(door).await?.set(&text).await?;
             let CellDescription { version, hash, set_by, .. } = described;
-            Ok(print(&format!("version {version}, hash {hash}, set by {set_by}\n"))?)
+            Ok(print(&format!("version {version}, hash {hash}, known locations: {places}, set by {set_by}\n"))?)
         }
         CellCommand::Show { door } => Ok(print(&DoorClient::open(door).await?.show().await?)?),
         CellCommand::Diff { file, door } => {
             let text = read(file)?;
             let described = DoorClient::open(door).await?.present().await?;
+            if described.version == 0 {
+                return Err(anyhow!("the cell has no description yet; `ecod-node cell set` gives it one").into());
+            }
             let lines = differences(&settings(&described.text)?, &settings(&text)?);
             let (file, version) = (file.display(), described.version);
             if lines.is_empty() {
@@ -94,10 +103,17 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
 
 /// The text of a description, whose values are checked.
 fn read(file: &Path) -> Result<String, Failure> {
-    let text = std::fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()));
-    let text = text.map_err(Failure::usage)?;
+    let text = read_bounded(file).with_context(|| format!("cannot read {}", file.display())).map_err(Failure::usage)?;
     SharedConfig::parse(&text).with_context(|| file.display().to_string()).map_err(Failure::usage)?;
     Ok(text)
+}
+
+/// The text of a file that is small enough for a description; no more of a larger one is read.
+fn read_bounded(file: &Path) -> anyhow::Result<String> {
+    let mut bytes = Vec::new();
+    File::open(file)?.take(MAX_DESCRIPTION_BYTES as u64 + 1).read_to_end(&mut bytes)?;
+    ensure!(bytes.len() <= MAX_DESCRIPTION_BYTES, "a description has at most {MAX_DESCRIPTION_BYTES} bytes");
+    Ok(String::from_utf8(bytes)?)
 }
 
 /// A program's connection to a node.
@@ -129,7 +145,12 @@ impl DoorClient {
         let mut door = Self { client, connection, config, topics };
         let accepted = door.connection.next(PATIENCE).await;
         accepted.with_context(|| {
-            format!("no node at {address}: it must run on this machine; `--door` names another address of it")
+            let unread = arguments.config.is_none() && Path::new(SERVICE_CONFIGURATION).exists();
+            let remedy = match unread {
+                true => format!("`--config {SERVICE_CONFIGURATION}` reads that of this machine's node"),
+                false => "`--door` names another address of it".to_owned(),
+            };
+            format!("no node at {address}: it must run on this machine; {remedy}")
         })?;
         door.client.subscribe(&[door.topics.path(&Topic::Cell), door.topics.filter("nodes/+")]);
         Ok(door)

@@ -25,7 +25,7 @@ use crate::node::config::NodeConfig;
 use crate::platform::clock;
 use crate::transport::gossip::DEFAULT_PORT;
 use crate::transport::invitation::{Host, Token, Visit, Welcome, redeem};
-use crate::transport::pki::{Authority, DEFAULT_DAYS};
+use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, check_name};
 use files::NodeDirectory;
 
 /// Flags of `init`.
@@ -109,8 +109,10 @@ impl JoinArguments {
 
 /// Makes a cell's CA and key, and the files of its first node.
 pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
-    let directory = arguments.node.directory.vacant()?;
     let InitArguments { cell, name, role, .. } = arguments;
+    // Before anything is written: a directory with a CA is no place for another.
+    check_name(name).map_err(Failure::usage)?;
+    let directory = arguments.node.directory.vacant()?;
     let (role, now) = (role_named(role), clock::now());
     let mut authority = Authority::init(&directory.pki(), cell, now).map_err(|error| anyhow!(error))?;
     let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
@@ -134,9 +136,11 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
     print(&format!(
         "made the cell {cell} and its node {name} in {directory}\n\
          keep {}/ca.key safe: whoever has it can let nodes in\n\
-         let others in: {}\n",
+         let others in: {}\n\
+         while it runs, tell it the known locations: ecod-node cell set --config {} cell.toml\n",
         directory.pki().display(),
-        directory.command("invite NAME")
+        directory.command("invite NAME"),
+        directory.configuration().display()
     ))?;
     arguments.node.start(&directory)
 }
@@ -144,7 +148,13 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
 /// Lets nodes in until all have joined or the time is over.
 pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
     let directory = arguments.directory.directory()?;
-    let authority = Authority::open(&directory.pki()).map_err(|error| anyhow!(error))?;
+    let authority = Authority::open(&directory.pki()).map_err(|error| match error {
+        AuthorityError::Missing(pki) => anyhow!(
+            "{} has no CA: run `ecod-node invite` on the machine where `ecod-node init` made the cell",
+            pki.display()
+        ),
+        error => error.into(),
+    })?;
     for name in arguments.names.iter().filter(|name| authority.has_certificate(name, clock::now())) {
         eprintln!("{name} has a certificate already, which stays valid; `ecod-node pki revoke` ends it");
     }

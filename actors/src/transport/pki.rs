@@ -22,6 +22,7 @@ mod evidence;
 mod subject;
 
 pub(crate) use attestation::{Distrust, MAX_CERTIFICATE_BYTES, is_signed_by};
+pub(crate) use authority::check_name;
 pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
 pub use broker_trust::{BrokerIdentity, BrokerTrust};
 pub use config::TlsConfig;

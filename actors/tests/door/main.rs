@@ -179,7 +179,14 @@ async fn a_claim_of_another_name_is_refused_aloud() {
             assert!(text.contains(name), "{topic}: {text}");
         }
         let (reason, text) = program.ask(&format!("detections/{own}"), payload("gauss")).await;
-        assert!(reason == "PayloadFormatInvalid" && text.contains("node_mismatch"), "{reason} {text}");
+        let is_told = text.contains("node_mismatch (it names gauss)");
+        assert!(reason == "PayloadFormatInvalid" && is_told, "{reason} {text}");
+        let without_seq = format!(r#"{{"schema":1,"node":"{own}","captured_at_us":1,"objects":[]}}"#).into_bytes();
+        for (payload, flaw) in [(without_seq, "missing field `seq`"), (b"garbage".to_vec(), "expected value at line 1")]
+        {
+            let (_, text) = program.ask(&format!("detections/{own}"), payload).await;
+            assert!(text.contains("malformed") && text.contains(flaw), "{text}");
+        }
         let rejects = cell.node(name).counters().rejects_by_source();
         let denied = rejects.iter().find(|count| count.source == "mallory" && count.reason.as_str() == "not_permitted");
         assert_eq!(denied.map(|count| count.times), Some(5));

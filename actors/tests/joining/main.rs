@@ -87,7 +87,12 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
     let gossip = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
 
     let said = succeeds(&["init", "lot-1", "edge", "--role", "edge", "--dir", edge]);
-    assert!(said.contains("ecod-node invite NAME --dir") && said.contains("start it: ecod-node --config"), "{said}");
+    assert!(
+        said.contains("ecod-node invite NAME --dir")
+            && said.contains("ecod-node cell set --config")
+            && said.contains("start it: ecod-node --config"),
+        "{said}"
+    );
     let mut nodes = vec![run(Path::new(edge), &gossip)];
     let (mut host, tokens) = invite(edge, &gossip, &["gauss", "euclid"]);
     let [for_gauss, for_euclid] = &*tokens else { panic!("{tokens:?}") };
@@ -129,8 +134,10 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
 fn init_and_invite_say_why_they_refuse() {
     let machine = tempfile::tempdir().unwrap();
     let missing = fails(&["invite", "gauss", "--dir", machine.path().to_str().unwrap()]);
-    assert!(missing.contains("has no CA"), "{missing}");
+    assert!(missing.contains("has no CA: run `ecod-node invite` on the machine where `ecod-node init`"), "{missing}");
     let directory = machine.path().to_str().unwrap();
+    let reserved = fails(&["init", "lot-1", "edge--a", "--dir", directory]);
+    assert!(reserved.contains("names of nodes have no `--`"), "{reserved}");
     succeeds(&["init", "lot-1", "edge", "--dir", directory]);
     let again = fails(&["init", "lot-1", "edge", "--dir", directory]);
     assert!(again.contains("belongs to a node already"), "{again}");

@@ -116,7 +116,7 @@ def test_a_refusal_says_what_the_node_says(edge: Callable[..., Server], cell_nam
                 time.sleep(0.05)
             return False
 
-        with pytest.raises(ecod.Refused, match=r"detections/euclid--python is too long, .* or \d+ bytes are too many for it"):
+        with pytest.raises(ecod.Refused, match=r"\d+ bytes on .*/detections/euclid--python, at most 256"):
             wait_for(report_at_length)
 
 
@@ -167,7 +167,23 @@ def test_a_cell_with_certificates_takes_a_program_by_its_own(
         ecod.Cell(node.address, cell_name, node="gauss", part="", **other)
     with pytest.raises(ecod.Unreachable, match=f"no TLS with {node.address} .*broker.example.*check .*`broker_name`"):
         ecod.Cell(node.address, cell_name, node="euclid", broker_name="broker.example", **other)
-    with pytest.raises(ecod.Unreachable, match=f"{node.address} .*certificate"):
+    with pytest.raises(ecod.Unreachable, match=f"{node.address} .*`cert` and `key` are not given"):
         ecod.Cell(node.address, cell_name, node="euclid", ca=other["ca"], timeout=3.0)
-    with pytest.raises(ecod.Unreachable, match=f"{node.address} .*without TLS"):
+    with pytest.raises(ecod.Unreachable, match=f"{node.address} .*without TLS.* takes `ca`, `cert` and `key`"):
         ecod.Cell(node.address, cell_name, node="euclid", timeout=3.0)
+
+
+def test_certificates_of_the_environment_are_those_of_the_programs_node(
+    start: Callable[..., Server], cell_name: str, pki: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = pki("euclid", "cav")  # Its certificate has the name of a door alone.
+    files = {"ECOD_TLS__CA": own["ca"], "ECOD_TLS__CERTIFICATE": own["cert"], "ECOD_TLS__KEY": own["key"]}
+
+    def command(port: int) -> list[str]:
+        return [program(), "--name", "euclid", "--role", "cav", "--cell", cell_name, "--listen", f"127.0.0.1:{port}", "--no-dashboard"]
+
+    node = start(command, {"ECOD_MEMBERSHIP__BIND": "127.0.0.1:0", "ECOD_MEMBERSHIP__MULTICAST__ENABLED": "false", **files})
+    for name, value in {"ECOD_BROKER": node.address, "ECOD_CELL": cell_name, "ECOD_NAME": "euclid", **files}.items():
+        monkeypatch.setenv(name, value)
+    with ecod.Cell() as cell:
+        assert next(cell.statuses(timeout=20)).node == "euclid"

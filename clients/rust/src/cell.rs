@@ -42,17 +42,24 @@ pub struct Settings {
 
 impl Default for Settings {
     /// Settings by the environment: `ECOD_BROKER` (default `localhost`), `ECOD_CELL` (`cell`), `ECOD_NAME` (the
-    /// machine's host name), `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD`. The part is `rust`, the timeout 10 s.
+    /// machine's host name), `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD`; `ECOD_TLS__CA`, `ECOD_TLS__CERTIFICATE` and
+    /// `ECOD_TLS__KEY` are the files of the node beside which the program runs. The part is `rust`, the timeout 10 s.
     fn default() -> Self {
         let setting = |name| env::var(name).ok().filter(|value| !value.is_empty());
         let or = |name, default: &str| setting(name).unwrap_or_else(|| default.to_owned());
+        let identity = setting("ECOD_TLS__CERTIFICATE").zip(setting("ECOD_TLS__KEY"));
+        let tls = setting("ECOD_TLS__CA").map(|ca| Tls {
+            ca: ca.into(),
+            identity: identity.map(|(certificate, key)| (certificate.into(), key.into())),
+            broker_name: Some(Tls::DOOR_NAME.to_owned()),
+        });
         Self {
             broker: or("ECOD_BROKER", "localhost"),
             cell: or("ECOD_CELL", "cell"),
             node: setting("ECOD_NAME").unwrap_or_else(host_name),
             part: "rust".to_owned(),
             login: setting("ECOD_MQTT__USER").map(|user| (user, or("ECOD_MQTT__PASSWORD", ""))),
-            tls: None,
+            tls,
             timeout: Duration::from_secs(10),
         }
     }
@@ -310,7 +317,12 @@ impl<M> Iterator for Messages<M> {
                 return Some(Err(refusal));
             }
             let waited = began.elapsed();
-            let remedy = if state.is_connected() { "does a node lead the cell of this name?" } else { "no connection" };
+            let remedy = match state.is_connected() {
+                false => "no connection",
+                // A status comes with a change alone.
+                true if self.number > 0 && self.filter.ends_with("/nodes/+") => "nothing has changed since the last",
+                true => "does a node lead the cell of this name?",
+            };
             let silence = || format!("nothing on {} from {} for {waited:.1?}; {remedy}", self.filter, self.shared.at);
             if self.timeout.is_some_and(|timeout| waited >= timeout) {
                 return Some(Err(Error::Silent(silence())));

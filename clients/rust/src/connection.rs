@@ -195,7 +195,7 @@ impl Shared {
             }
             _ => Error::Unreachable(format!(
                 "cannot log in at {}: {reason}; is a node or broker there that speaks MQTT 5, {}?",
-                self.at, "and do both speak TLS or neither, with certificates of the cell"
+                self.at, "and do both speak TLS (then the port is 8883) or neither, with certificates of the cell"
             )),
         };
         state.login.get_or_insert(Err(refusal));

@@ -163,6 +163,14 @@ fn with_certificates_a_program_speaks_for_its_node_alone() {
     agreed(&vehicle.unwrap(), "euclid");
     assert!(connect(&cav, "euclid", Some(&cav_tls)).is_ok(), "the door of a node that never leads");
     let (certificate, key) = cav_tls.identity.clone().unwrap();
+    let at = [("ECOD_BROKER", &*cav.door), ("ECOD_CELL", "lot-1"), ("ECOD_NAME", "euclid")];
+    let files = [("ECOD_TLS__CA", &cav_tls.ca), ("ECOD_TLS__CERTIFICATE", &certificate), ("ECOD_TLS__KEY", &key)];
+    let mut planner = Command::new(example("brake_planner"));
+    let mut planner = planner.args(["0", "0", "0", "10"]).envs(at).envs(files).stdout(Stdio::piped()).spawn().unwrap();
+    let decided = BufReader::new(planner.stdout.take().unwrap()).lines().next().unwrap().unwrap();
+    assert_eq!(decided, "BRAKE: no map for 500ms", "the environment names the certificate");
+    planner.kill().unwrap();
+    planner.wait().unwrap();
     let leading = Tls::of_cell(&cav_tls.ca, certificate, key);
     assert!(connect(&edge, "euclid", Some(&leading)).is_ok(), "the broker of a node that may lead");
 

@@ -172,8 +172,8 @@ impl fmt::Display for NodeDirectory {
 
 /// Comment at the beginning of `node.toml`.
 const HEAD: &str = "\
-# Known locations, pose and camera are yours to add: docs/first-cell.md. `ecod-node --config FILE --print-config` shows
-# every key with its value.
+# Pose and camera are yours to add: docs/first-cell.md. `ecod-node --config FILE --print-config` shows every key with its
+# value. Known locations belong to the whole cell: `ecod-node cell set --config FILE cell.toml` gives them to all nodes.
 ";
 
 #[cfg(test)]

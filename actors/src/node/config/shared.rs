@@ -48,7 +48,7 @@ pub enum DescriptionError {
     Malformed(String),
     /// A value is out of its range.
     #[error("in the description, {0}")]
-    OutOfRange(#[from] ConfigError),
+    OutOfRange(ConfigError),
     /// The node's own configuration says something else.
     #[error(
         "configuration key `{key}`: this node's own configuration says {own}, the description of the cell says \
@@ -62,6 +62,13 @@ pub enum DescriptionError {
         /// The value of the description.
         described: String,
     },
+}
+
+// Not by thiserror, which would also make it the source: it would be told twice.
+impl From<ConfigError> for DescriptionError {
+    fn from(error: ConfigError) -> Self {
+        Self::OutOfRange(error)
+    }
 }
 
 /// Shared keys that a node's own configuration states, by file, environment or flags. They are no part of a

@@ -92,10 +92,7 @@ impl Permissions {
         let principal = self.principals.principal(session.id.remote_addr).ok_or_else(refused)?;
         let (retain, bytes) = (publish.retain, publish.payload.len());
         if self.door.is_program(&principal, &session.id.client_id) {
-            if !self.is_within_limits(topic, retain, bytes) {
-                let text = format!("{topic} is too long, may not be retained, or {bytes} bytes are too many for it");
-                return Err(Refusal::not_permitted(text));
-            }
+            self.check_limits(topic, retain, bytes).map_err(Refusal::not_permitted)?;
             return self.door.take(&principal, (place, topic), publish);
         }
         let is_allowed = place == Place::Cell && self.allows(&principal, topic, retain, bytes);
@@ -114,13 +111,26 @@ impl Permissions {
 
     /// True if a message is within its topic's limits of size and retention.
     fn is_within_limits(&self, topic: &str, retain: bool, bytes: usize) -> bool {
+        self.check_limits(topic, retain, bytes).is_ok()
+    }
+
+    /// The limit that a message exceeds, if any.
+    fn check_limits(&self, topic: &str, retain: bool, bytes: usize) -> Result<(), String> {
         if !is_topic_bounded(topic) {
-            return false;
+            let (length, levels) = (topic.len(), topic.split('/').count());
+            let most = format!("at most {MAX_TOPIC_BYTES} and {MAX_TOPIC_LEVELS}");
+            return Err(format!("the topic has {length} bytes and {levels} levels, {most}"));
         }
-        let topic = self.policy.topics.parse(topic);
+        let parsed = self.policy.topics.parse(topic);
         let limits = &self.policy.limits;
-        let limit = topic.as_ref().map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
-        bytes <= limit + ENVELOPE_BYTES && (!retain || topic.as_ref().is_some_and(is_state))
+        let limit = parsed.as_ref().map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
+        if bytes > limit + ENVELOPE_BYTES {
+            return Err(format!("{bytes} bytes on {topic}, at most {limit}"));
+        }
+        if retain && !parsed.as_ref().is_some_and(is_state) {
+            return Err(format!("{topic} may not be retained"));
+        }
+        Ok(())
     }
 
     fn note_refusal(&self, session: &Session, publish: &Publish, refusal: &Refusal) {

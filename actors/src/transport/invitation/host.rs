@@ -23,7 +23,7 @@ use super::{
     CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line, write_line,
 };
 use crate::platform::clock;
-use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, OBSERVER_MARK};
+use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, check_name};
 
 /// A cell's CA and key, and the nodes that it has invited.
 pub struct Host {
@@ -100,9 +100,7 @@ impl Host {
         rights: impl Into<Rights>,
         addresses: Vec<SocketAddr>,
     ) -> Result<Token, AuthorityError> {
-        if node.as_str().contains(OBSERVER_MARK) {
-            return Err(AuthorityError::Name(node.clone()));
-        }
+        check_name(node)?;
         let mut secret = [0; 16];
         let drawn = SystemRandom::new().fill(&mut secret);
         drawn.map_err(|_| AuthorityError::Crypto("the system gives no random numbers".into()))?;

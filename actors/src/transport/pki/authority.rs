@@ -173,9 +173,7 @@ impl Authority {
         now: Timestamp,
         key: &impl PublicKeyData,
     ) -> Result<(String, String), AuthorityError> {
-        if node.as_str().contains(OBSERVER_MARK) {
-            return Err(AuthorityError::Name(node.clone()));
-        }
+        check_name(node)?;
         let mut parameters = CertificateParams::default();
         parameters.distinguished_name.push(DnType::CommonName, node.as_str());
         parameters.use_authority_key_identifier_extension = true;
@@ -295,6 +293,14 @@ impl Authority {
             .map_err(|error| AuthorityError::Register { path: REGISTER.into(), reason: error.to_string() })?;
         replace(&self.directory.join(REGISTER), &with_checksum((text + "\n").as_bytes()), 0o644)
     }
+}
+
+/// Checks that a node may have a certificate under the name.
+///
+/// # Errors
+/// [`AuthorityError::Name`] when it is one of an observer.
+pub(crate) fn check_name(node: &NodeName) -> Result<(), AuthorityError> {
+    if node.as_str().contains(OBSERVER_MARK) { Err(AuthorityError::Name(node.clone())) } else { Ok(()) }
 }
 
 const CA: &str = "ca.pem";

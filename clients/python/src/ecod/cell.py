@@ -27,8 +27,8 @@ Objects = Iterable[Union[PerceivedObject, Mapping[str, Any]]]
 AnyPose = Union[Pose, tuple[float, float, float]]
 Time = Union[datetime, float]
 
-# Brokers of a cell are known by this name at every address; their certificates bear it.
-BROKER_NAME = "broker.ecod.internal"
+# Brokers of a cell are known by this name at every address, and doors of nodes by the other; their certificates bear it.
+BROKER_NAME, DOOR_NAME = "broker.ecod.internal", "door.ecod.internal"
 
 # Largest report by default: `mqtt.max_payload_bytes` of nodes.
 MAX_REPORT_BYTES = 256 * 1024
@@ -43,8 +43,9 @@ class Cell:
     `broker` is the HOST:PORT of a node or broker (`ECOD_BROKER`, default localhost:1883, with `ca` port 8883). `cell` is
     the cell's name (`ECOD_CELL`, default `cell`). The program reports as `<node>--<part>`, or as `node` itself if `part`
     is empty; `node` is `ECOD_NAME` or the machine's host name by default. `ca`, `cert` and `key` are PEM files for TLS;
-    `broker_name` is the name in the broker's certificate, None for the host. `user` and `password` are
-    `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD` by default.
+    `broker_name` is the name in the broker's certificate, None for the host. Without them `ECOD_TLS__CA`,
+    `ECOD_TLS__CERTIFICATE` and `ECOD_TLS__KEY` are those of the node beside which the program runs. `user` and `password`
+    are `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD` by default.
 
     Raises `Unreachable` or `Refused` unless the broker lets the program in within `timeout` seconds.
     """
@@ -65,6 +66,9 @@ class Cell:
         timeout: float = 10.0,
     ) -> None:
         env = os.environ.get
+        if not (ca or cert or key) and env("ECOD_TLS__CA"):
+            ca, cert, key = (env(f"ECOD_TLS__{name}") for name in ("CA", "CERTIFICATE", "KEY"))
+            broker_name = DOOR_NAME if broker_name == BROKER_NAME else broker_name
         address = host_and_port(broker or env("ECOD_BROKER") or "localhost", 8883 if ca else 1883)
         self.cell = _name("cell", cell or env("ECOD_CELL") or "cell")
         node = node or env("ECOD_NAME") or re.sub("[^A-Za-z0-9_]", "-", socket.gethostname().split(".")[0])
@@ -193,7 +197,12 @@ class Cell:
             self._connection.raise_if_refused(self._root + stream.topic)
             waited = time.monotonic() - began
             silence = f"nothing on {self._root}{stream.topic} from {self._connection.at} for {waited:.1f} s; "
-            silence += "does a node lead the cell (argument `cell` or ECOD_CELL)?" if self._connection.is_connected else "no connection"
+            if not self._connection.is_connected:
+                silence += "no connection"
+            elif number and not stream.has_rounds:
+                silence += "nothing has changed since the last"
+            else:
+                silence += "does a node lead the cell (argument `cell` or ECOD_CELL)?"
             if timeout is not None and waited >= timeout:
                 raise Silent(silence)
             if waited >= SILENCE_S and not is_told:
@@ -253,9 +262,12 @@ def micros(moment: Optional[Time]) -> int:
             raise Invalid(f"not sent: captured_at {moment} has no time zone; datetime.now(timezone.utc) has one")
         moment = moment.timestamp()
     try:
-        return round(moment * 1e6)
+        since_1970_us = round(moment * 1e6)
     except (ValueError, OverflowError, TypeError):
         raise Invalid(f"not sent: captured_at {moment!r} must be a datetime or Unix seconds") from None
+    if since_1970_us >= 2**53:
+        raise Invalid(f"not sent: captured_at {moment!r} must be Unix seconds; this looks like milliseconds or less")
+    return since_1970_us
 
 
 def _name(what: str, name: str) -> str:

@@ -40,6 +40,10 @@ MAX_WAITING = 16
 FINAL = frozenset({0x81, 0x82, 0x84, 0x85, 0x86, 0x87, 0x8A, 0x8C})
 
 
+# Remedy for a program without TLS.
+WITH_CERTIFICATES = " A cell with certificates has port 8883, and takes `ca`, `cert` and `key`"
+
+
 class Connection:
     """An MQTT 5 client with a thread of its own, which gives messages to `take`."""
 
@@ -137,7 +141,8 @@ class Connection:
         except ssl.SSLError as error:
             raise Unreachable(f"no TLS with {at}: {error}; check `ca`, `cert`, `key`, `broker_name`") from error
         except OSError as error:
-            raise Unreachable(f"cannot connect to {at}: {error}; is a node or a broker running there?") from error
+            remedy = f"is a node or a broker running there?{'' if tls else WITH_CERTIFICATES}"
+            raise Unreachable(f"cannot connect to {at}: {error}; {remedy}") from error
         except Exception as error:  # of many kinds, for bytes that are no MQTT
             raise Unreachable(f"{at} does not speak MQTT 5: {error!r}") from error
         if self._answer is None or self._answer.is_failure:
@@ -145,8 +150,13 @@ class Connection:
             self._client.loop(0.0)
             if self._answer is not None:
                 raise self._refusal or Refused(f"{at} refuses the login: {self._answer}; try again later")
-            check = "speak MQTT 5, without TLS" if tls is None else "speak MQTT 5, and take the certificate in `cert`"
-            raise Unreachable(f"{at} does not answer the login; does it {check}?")
+            if tls is None:
+                check = f"without TLS?{WITH_CERTIFICATES}"
+            elif getattr(tls, "has_certificate", True):
+                check = "and take the certificate in `cert`?"
+            else:
+                check = "and take programs without a certificate? `cert` and `key` are not given"
+            raise Unreachable(f"{at} does not answer the login; does it speak MQTT 5, {check}")
 
     def _run(self) -> None:
         """Carries messages until the connection is closed, and connects anew after every loss."""
@@ -235,6 +245,7 @@ class _CellContext(ssl.SSLContext):
     """TLS with a broker that is known by a name and not by its address."""
 
     broker_name: str
+    has_certificate: bool
 
     def wrap_socket(self, *args: Any, **named: Any) -> ssl.SSLSocket:
         return super().wrap_socket(*args, **{**named, "server_hostname": self.broker_name})
@@ -243,7 +254,7 @@ class _CellContext(ssl.SSLContext):
 def tls_context(ca: str, cert: Optional[str], key: Optional[str], broker_name: str) -> ssl.SSLContext:
     """TLS by PEM files, with a broker of this name."""
     context = _CellContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.broker_name = broker_name
+    context.broker_name, context.has_certificate = broker_name, bool(cert)
     try:
         context.load_verify_locations(ca)
         if cert:

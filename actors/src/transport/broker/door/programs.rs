@@ -19,7 +19,7 @@ use bytes::Bytes;
 use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{CellDescription, RejectReason, ReportKind, Topic, decode, decode_report};
+use ecod::wire::{CellDescription, ObjectReport, RejectReason, ReportKind, Topic, decode, decode_report};
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
@@ -192,7 +192,8 @@ impl DoorState {
             return Err(Refusal::new(RefusalReason::Throttled, text));
         }
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
-            let text = format!("the report on {topic} is not usable: {reason}; see docs/protocol.md#rejections");
+            let flaw = flaw(payload, reason);
+            let text = format!("the report on {topic} is not usable: {reason}{flaw}; see docs/protocol.md#rejections");
             Refusal::new(RefusalReason::Rejected(reason), text)
         })?;
         if !(setup.fuses)(kind) {
@@ -281,6 +282,16 @@ impl DoorState {
             levels.next().is_none_or(|level| level == "#")
         })
     }
+}
+
+/// More about a report in JSON that is rejected for this reason.
+fn flaw(payload: &[u8], reason: RejectReason) -> String {
+    let flaw = match (reason, serde_json::from_slice::<ObjectReport>(payload)) {
+        (RejectReason::Malformed, Err(error)) if payload.is_ascii() => format!(" ({error})"),
+        (RejectReason::NodeMismatch, Ok(report)) => format!(" (it names {})", report.node),
+        _ => String::new(),
+    };
+    flaw.replace(char::is_control, " ")
 }
 
 /// Hooks of rmqtt that keep programs and nodes apart.
