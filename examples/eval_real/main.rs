@@ -61,7 +61,8 @@ fn main() -> anyhow::Result<()> {
     let kitti = find(kitti::DETECTIONS).zip(find(kitti::TRUTH));
     let wildtrack = find(wildtrack::BOXES).zip(find(wildtrack::CAMERAS)).zip(find(wildtrack::TRUTH));
     for set in LABEL_SETS {
-        find((&format!("{}/{set}", LABELS.0), LABELS.1));
+        let path = format!("{}/{set}", LABELS.0);
+        find((&path, LABELS.1));
     }
     missing.iter().for_each(|what| eprintln!("{what}"));
     println!("{HEADER}");

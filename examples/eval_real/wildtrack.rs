@@ -69,7 +69,8 @@ pub(super) fn convert(boxes: &Path, cameras: &Path, truth: &Path, work: &Path) -
     }
     let (mut truth, mut detections, mut reports) = (String::new(), String::new(), Vec::new());
     for (number, (frame, boxes)) in (1..).zip(boxes) {
-        for [x, y] in positions.get(&frame.parse()?).into_iter().flatten() {
+        let frame: u64 = frame.parse()?;
+        for [x, y] in positions.get(&frame).into_iter().flatten() {
             writeln!(truth, "{number},-1,0,0,0,0,1,{x},{y},0")?;
         }
         for (camera, to_ground) in to_ground.iter().enumerate() {
