@@ -62,7 +62,7 @@ fn main() -> anyhow::Result<()> {
     let wildtrack = find(wildtrack::BOXES).zip(find(wildtrack::CAMERAS)).zip(find(wildtrack::TRUTH));
     for set in LABEL_SETS {
         let path = format!("{}/{set}", LABELS.0);
-        find((&path, LABELS.1));
+        find((path.as_str(), LABELS.1));
     }
     missing.iter().for_each(|what| eprintln!("{what}"));
     println!("{HEADER}");
